@@ -1,0 +1,37 @@
+/* Dimension and precision: every kernel file is built with -DDIM=2|3 -DREAL=double|float. */
+#ifndef DIM
+#error "build with -DDIM=2 or -DDIM=3"
+#endif
+#ifndef REAL
+#error "build with -DREAL=double or -DREAL=float"
+#endif
+/* Geometry relies on each operation being rounded as written; contraction is asked for by fma() only. */
+#pragma OPENCL FP_CONTRACT OFF
+
+#define CLVORO_JOIN_(a, b) a##b
+#define CLVORO_JOIN(a, b) CLVORO_JOIN_(a, b)
+#define CLVORO_IS_double 1
+#define CLVORO_IS_float 0
+#define IS_DOUBLE CLVORO_JOIN(CLVORO_IS_, REAL)
+#if IS_DOUBLE
+#if defined(__OPENCL_C_VERSION__) && __OPENCL_C_VERSION__ < 120
+#pragma OPENCL EXTENSION cl_khr_fp64 : enable
+#endif
+#define REAL_EPS DBL_EPSILON
+#define REAL_MAX DBL_MAX
+#else
+#define REAL_EPS FLT_EPSILON
+#define REAL_MAX FLT_MAX
+#endif
+#define REAL2 CLVORO_JOIN(REAL, 2)
+#define REAL3 CLVORO_JOIN(REAL, 3)
+#define REAL4 CLVORO_JOIN(REAL, 4)
+/* A literal in the working precision: R(0.5). */
+#define R(x) ((REAL)(x))
+
+/* Rounds to 1 ulp where a*b and c*d cancel (Kahan): the determinant of two short vectors. */
+inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)
+{
+    const REAL cd = c * d;
+    return fma(a, b, -cd) + fma(-c, d, cd);
+}

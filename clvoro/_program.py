@@ -1,0 +1,133 @@
+"""Find, specialise, build and cache the OpenCL programs; run their kernels.
+
+A stage's source is `cl_kernels/<stage>.cl`. Its `#include "common/x.h"` lines are pasted here, once each,
+with `#line` directives, so that the complete text is what the driver (and its cache) sees.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from .errors import BuildError
+
+_INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
+_lock = threading.Lock()
+_programs: dict[tuple, cl.Program] = {}
+
+
+def kernel_folder() -> Path:
+    """Folder of the `.cl` files: inside the installed package, else beside it in a checkout."""
+    inside = Path(__file__).parent / "cl_kernels"
+    return inside if inside.is_dir() else Path(__file__).parent.parent / "cl_kernels"
+
+
+def source_text(name: str, _seen: set[str] | None = None) -> str:
+    """Return the text of `cl_kernels/<name>` with every include pasted in once."""
+    seen = set() if _seen is None else _seen
+    lines = [f'#line 1 "{name}"']
+    for number, line in enumerate((kernel_folder() / name).read_text().splitlines(), start=1):
+        match = _INCLUDE.match(line)
+        if match is None:
+            lines.append(line)
+        elif match[1] not in seen:
+            seen.add(match[1])
+            lines += [source_text(match[1], seen), f'#line {number + 1} "{name}"']
+        else:
+            lines.append("")
+    return "\n".join(lines)
+
+
+def build_program(
+    ctx: cl.Context, name: str, defines: Mapping[str, object], prelude: str
+) -> cl.Program:
+    """Build `cl_kernels/<name>` after `prelude`; the same text on the same context is built once.
+
+    Raises
+    ------
+    BuildError
+        With the compiler's log, if the source does not compile.
+    """
+    text = prelude + "\n" + source_text(name)
+    options = tuple(f"-D{key}={value}" for key, value in sorted(defines.items()))
+    key = (ctx.int_ptr, text, options)
+    with _lock:
+        if key not in _programs:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", cl.CompilerWarning)
+                    _programs[key] = cl.Program(ctx, text).build(options=list(options))
+            except cl.Error as error:
+                raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
+        return _programs[key]
+
+
+@dataclass(frozen=True)
+class Engine:
+    """One device, ready to work: context, in-order queue, dimension and precision.
+
+    Attributes
+    ----------
+    ctx, queue : pyopencl.Context, pyopencl.CommandQueue
+    dim : 2 or 3
+    real : numpy.dtype, float64 or float32
+    """
+
+    ctx: cl.Context
+    queue: cl.CommandQueue
+    dim: int
+    real: np.dtype
+    groups: int = field(init=False)
+    """Number of work-groups that a block-wise kernel (scan, reduction) is cut into."""
+    group_size: int = field(init=False)
+    """Work-items per group of such a kernel: 1 on a CPU (a plain loop per core), 128 on a GPU."""
+
+    def __post_init__(self) -> None:
+        device = self.queue.device
+        cpu = bool(device.type & cl.device_type.CPU)
+        units = device.max_compute_units
+        object.__setattr__(self, "groups", min(512, units * (4 if cpu else 8)))
+        object.__setattr__(self, "group_size", 1 if cpu else 128)
+
+    def kernels(
+        self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
+    ) -> SimpleNamespace:
+        """Build `cl_kernels/<stage>.cl` and return its kernels as attributes, each with arguments of its own."""
+        real = "double" if self.real == np.float64 else "float"
+        full = {"DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size, **(defines or {})}
+        program = build_program(self.ctx, f"{stage}.cl", full, prelude)
+        return SimpleNamespace(**{k.function_name: k for k in program.all_kernels()})
+
+    def run(self, kernel: cl.Kernel, size: int, *args: object) -> cl.Event:
+        """Enqueue `kernel` over `size` work-items; arrays pass as their buffers."""
+        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, (max(int(size), 1),), None)
+
+    def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
+        """Enqueue a block-wise `kernel`: `groups` work-groups of `group_size` (see common/blocks.h)."""
+        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+        size = (self.groups * self.group_size,)
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, size, (self.group_size,))
+
+    def empty(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
+        """Return an uninitialised device array; `dtype` defaults to the engine's precision."""
+        return cla.empty(self.queue, shape, self.real if dtype is None else dtype)
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
+        """Return a device array of zeros."""
+        return cla.zeros(self.queue, shape, self.real if dtype is None else dtype)
+
+    def upload(self, host: object, dtype: object = None) -> cla.Array:
+        """Copy a host array to the device in the engine's precision (or `dtype`)."""
+        return cla.to_device(
+            self.queue, np.ascontiguousarray(host, self.real if dtype is None else dtype)
+        )

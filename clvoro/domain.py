@@ -1,0 +1,72 @@
+"""Domains: what is meshed, as the host describes it and as the device sees it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import InputError
+
+
+@dataclass(frozen=True)
+class Box:
+    """Axis-aligned box in 2D or 3D.
+
+    Parameters
+    ----------
+    lower, upper : sequences of 2 or 3 floats
+        Opposite corners. Wall ``2 a`` is the lower one of axis a, wall ``2 a + 1`` the upper one.
+
+    Raises
+    ------
+    InputError
+        If the corners are not 2 or 3 finite numbers each with lower < upper.
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        lower = np.asarray(self.lower, dtype=float)
+        upper = np.asarray(self.upper, dtype=float)
+        if lower.ndim != 1 or lower.shape != upper.shape or lower.size not in (2, 3):
+            raise InputError(
+                f"Box got corners of shape {lower.shape} and {upper.shape}, expected 2 or 3 "
+                "coordinates each; write Box((0, 0), (2.5, 1.5))"
+            )
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
+            raise InputError(
+                f"Box got lower {self.lower} and upper {self.upper}, expected finite numbers with "
+                "lower < upper in every direction; exchange or correct the corners"
+            )
+        object.__setattr__(self, "lower", tuple(lower.tolist()))
+        object.__setattr__(self, "upper", tuple(upper.tolist()))
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return len(self.lower)
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Edge lengths, (d,)."""
+        return np.subtract(self.upper, self.lower)
+
+    @property
+    def measure(self) -> float:
+        """Area or volume."""
+        return float(np.prod(self.extent))
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
+
+        The scale is a power of two, so that scaling itself rounds nothing.
+        """
+        return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool."""
+        return ((points >= self.lower) & (points <= self.upper)).all(axis=1)

@@ -1,0 +1,33 @@
+"""Errors that clvoro raises; all derive from `ClvoroError`."""
+
+
+class ClvoroError(Exception):
+    """Base of every error that clvoro raises."""
+
+
+class InputError(ClvoroError, ValueError):
+    """An argument has the wrong value or shape: what arrived, what was expected, the remedy."""
+
+
+class InputTypeError(ClvoroError, TypeError):
+    """An argument has the wrong type."""
+
+
+class DeviceError(ClvoroError, RuntimeError):
+    """No usable OpenCL device, or the device lacks what was asked of it."""
+
+
+class BuildError(DeviceError):
+    """A kernel did not compile; the message carries the compiler's log."""
+
+
+class MemoryLimitError(ClvoroError, MemoryError):
+    """A run needs more memory than the device has; says how many cells and bytes."""
+
+
+class SizeFieldError(InputError):
+    """A size field is not positive and finite on the domain; the message names the place."""
+
+
+class SolverError(ClvoroError, ArithmeticError):
+    """A linear solve broke down (not positive definite, or not finite)."""

@@ -1,0 +1,149 @@
+"""What a run gives back: `Diagram` and `Result`, as NumPy arrays in the caller's order and units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .domain import Box
+
+HISTORY_DTYPE = np.dtype(
+    [
+        ("step", "i4"),  # 0 is the start, before any motion
+        ("level", "i4"),  # 0 is the finest; coarser levels count up
+        ("cells", "i4"),
+        ("mean_error", "f8"),  # mean of |e|, the paper's (3.1)
+        ("max_error", "f8"),
+        ("mean_quality", "f8"),  # the paper's (4.1) in 2D, isoperimetric quotient in 3D
+        ("min_quality", "f8"),
+        ("energy", "f8"),  # CVT energy, the paper's (2.3), in physical units
+        ("lloyd", "f8"),  # mean length of the Lloyd displacement over h
+        ("poisson", "f8"),  # mean length of the metric correction over h
+        ("iterations", "i4"),  # of the linear solver in this step
+        ("residual", "f8"),  # its relative residual at the end
+        ("changed", "i4"),  # cells whose set of neighbours changed in this step
+        ("ever_changed", "f8"),  # share of cells whose set of neighbours has changed so far
+        ("inserted", "i4"),
+        ("deleted", "i4"),
+        ("seconds", "f8"),  # wall time since the run began
+    ]
+)
+"""One row per step of a run."""
+
+
+class Diagram:
+    """A Voronoi diagram clipped to its domain. Every attribute is a NumPy array, fetched when first asked for.
+
+    Attributes
+    ----------
+    points : (n, d) float
+        Generators.
+    volumes : (n,) float
+        Areas in 2D.
+    centroids : (n, d) float
+    neighbour_starts : (n + 1,) int32
+        Row i of the graph is ``neighbours[neighbour_starts[i]:neighbour_starts[i + 1]]``.
+    neighbours : (m,) int32
+        A generator's index, or ``-1 - b`` for the boundary piece b of the domain. In 2D in
+        counter-clockwise order around the cell.
+    face_measures : (m,) float
+        Lengths in 2D, areas in 3D.
+    face_centroids : (m, d) float
+    vertices : (v, d) float
+        Each Voronoi vertex once.
+    cell_vertex_starts : (n + 1,) int32, 2D only
+    cell_vertices : (m,) int32, 2D only
+        Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1.
+    """
+
+    _NAMES = (
+        "points", "volumes", "centroids", "neighbour_starts", "neighbours", "face_measures",
+        "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices",
+    )  # fmt: skip
+
+    def __init__(self, domain: Box, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]):
+        self.domain = domain
+        self._arrays = dict(arrays)
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name not in Diagram._NAMES:
+            raise AttributeError(name)
+        value = self._arrays[name]
+        if callable(value):
+            value = self._arrays[name] = value()
+        return value
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        return f"Diagram({len(self)} cells in {self.domain})"
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """The two halves of one step, before they are combined: the paper's Figure 6."""
+
+    points: np.ndarray
+    lloyd: np.ndarray
+    poisson: np.ndarray
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished (or interrupted) run.
+
+    Attributes
+    ----------
+    points : (n, d) float
+    diagram : Diagram
+    size : (n,) float
+        Target size h at the generators.
+    error : (n,) float
+        Signed metric error, the paper's (3.1).
+    quality : (n,) float
+        Cell quality, the paper's (4.1).
+    history : structured array of `HISTORY_DTYPE`
+    converged : bool
+    stop_reason : str
+    initial, final : Displacements or None
+        Lloyd and Poisson displacements of the first and of the last step.
+    settings : dict
+        What is needed to repeat the run.
+    """
+
+    points: np.ndarray
+    diagram: Diagram
+    size: np.ndarray
+    error: np.ndarray
+    quality: np.ndarray
+    history: np.ndarray
+    converged: bool
+    stop_reason: str
+    initial: Displacements | None = None
+    final: Displacements | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the mesh to `path`: `.npz` (reload with `clvoro.load`) or `.vtu`, or any format meshio knows."""
+        from .io import save
+
+        save(self, path)
+
+    def plot(self, colour: str = "error", **options: Any) -> Any:
+        """Draw the cells coloured by `"error"`, `"quality"`, `"size"` or `"sides"`; returns the Matplotlib figure."""
+        from .report import plot_cells
+
+        return plot_cells(self, colour, **options)
+
+    def __repr__(self) -> str:
+        e, q = np.abs(self.error), self.quality
+        return (
+            f"Result({len(self.points)} cells, mean |e| {e.mean():.4f}, max |e| {e.max():.4f}, "
+            f"mean Q {q.mean():.4f}, min Q {q.min():.4f}; {self.stop_reason})"
+        )
