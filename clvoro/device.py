@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 
-from . import _pip_runtime
+from . import _runtimes
 from .errors import DeviceError, InputTypeError
 
-_pip_runtime.register()
+_runtimes.prepare()
 
 INSTALL_HINT = (
     "install a CPU runtime (`apt-get install pocl-opencl-icd`, or without root rights on x86-64 "

@@ -1,4 +1,4 @@
-"""Make OpenCL runtimes that pip installed known to the OpenCL loader.
+"""What OpenCL runtimes need before the first query of platforms: to be found, and a cache to write.
 
 pip cannot write to `/etc/OpenCL/vendors`, where the loader looks for runtimes. Intel's CPU runtime
 (`pip install "clvoro[cpu]"`) therefore lies in `<prefix>/lib` unseen. Loaders read two further
@@ -10,6 +10,10 @@ of platforms:
 - `$OCL_ICD_FILENAMES`, in Khronos' loader, which other builds of PyOpenCL use.
 
 `OCL_ICD_VENDORS` would *replace* the system's runtimes, and stays the user's.
+
+PoCL lists no device and PyOpenCL's cache of binaries raises if the user's cache folder cannot be
+written (a container under a foreign user id, a cluster's read-only home). The process then gets a
+cache of its own.
 """
 
 from __future__ import annotations
@@ -24,12 +28,44 @@ _DISTRIBUTION = "intel-opencl-rt"
 _LIBRARY = "libintelocl.so"
 
 
-def register() -> Path | None:
+def prepare() -> None:
+    """Do both; call it after `import pyopencl` and before the first query of platforms."""
+    provide_cache()
+    announce()
+
+
+def provide_cache() -> Path | None:
+    """Point `XDG_CACHE_HOME` to a temporary folder if the user's cache folder cannot be written.
+
+    Returns
+    -------
+    pathlib.Path or None
+        The temporary folder, if one was needed. It goes away with this process.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    try:
+        place = _cache_home()
+        place.mkdir(parents=True, exist_ok=True)
+        if os.access(place, os.W_OK | os.X_OK):
+            return None
+    except (OSError, RuntimeError):  # no such folder can be made, or nobody's home
+        pass
+    folder = _temporary_folder()
+    os.environ["XDG_CACHE_HOME"] = str(folder)
+    return folder
+
+
+def _cache_home() -> Path:
+    """Return the user's cache folder, as PoCL and PyOpenCL see it."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+def announce() -> Path | None:
     """Announce Intel's CPU runtime, if pip installed it and nobody announced it before.
 
-    Call it after `import pyopencl` and before the first query of platforms. Costs a fraction of a
-    millisecond when the runtime is not installed. Never raises: a runtime that cannot be announced
-    is a device less, which the choice of a device reports.
+    Costs a fraction of a millisecond when the runtime is not installed. Never raises: a runtime
+    that cannot be announced is a device less, which the choice of a device reports.
 
     Returns
     -------
@@ -40,14 +76,16 @@ def register() -> Path | None:
         return None
     try:
         library = _installed_library()
-        if library is None or _already_announced():
+        if library is None or _known_to_system():
             return None
         home = _loader_home(library)
-    except (OSError, ValueError, metadata.PackageNotFoundError):
+    except (OSError, RuntimeError, ValueError, metadata.PackageNotFoundError):
         return None
     os.environ["PYOPENCL_HOME"] = str(home)
-    others = os.environ.get("OCL_ICD_FILENAMES")
-    os.environ["OCL_ICD_FILENAMES"] = f"{others}:{library}" if others else str(library)
+    # A child process inherits this variable, while PyOpenCL resets the other one in it.
+    others = os.environ.get("OCL_ICD_FILENAMES", "")
+    if "intelocl" not in others:
+        os.environ["OCL_ICD_FILENAMES"] = f"{others}:{library}" if others else str(library)
     return library
 
 
@@ -60,10 +98,8 @@ def _installed_library() -> Path | None:
     return None
 
 
-def _already_announced() -> bool:
+def _known_to_system() -> bool:
     """Tell whether the loader finds an Intel CPU runtime anyway; two copies would collide."""
-    if "intelocl" in os.environ.get("OCL_ICD_FILENAMES", ""):
-        return True
     vendors = os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH")
     place = Path(vendors or "/etc/OpenCL/vendors")
     entries = place.glob("*.icd") if place.is_dir() else [place] if place.is_file() else []
@@ -81,8 +117,6 @@ def _loader_home(library: Path) -> Path:
     The folder's name is a hash of what is in it, so that environments do not disturb each other
     and a second process finds it complete.
     """
-    import platformdirs  # PyOpenCL depends on it
-
     own = Path(os.environ.get("PYOPENCL_HOME", os.devnull)) / ".libs"
     entries = {"clvoro-intel-cpu.icd": str(library)}
     for icd in sorted(own.glob("*.icd")):
@@ -91,10 +125,7 @@ def _loader_home(library: Path) -> Path:
         entries[icd.name] = str(own / name) if (own / name).is_file() else name
     text = "\n".join(f"{key}={value}" for key, value in sorted(entries.items()))
     name = "icd-" + hashlib.sha256(text.encode()).hexdigest()[:16]
-    try:
-        return _write_home(Path(platformdirs.user_cache_dir("clvoro")) / name, entries)
-    except OSError:  # no home directory, or one that cannot be written
-        return _temporary_home(entries)
+    return _write_home(_cache_home() / "clvoro" / name, entries)
 
 
 def _write_home(home: Path, entries: dict[str, str]) -> Path:
@@ -111,18 +142,18 @@ def _write_home(home: Path, entries: dict[str, str]) -> Path:
     return home
 
 
-def _temporary_home(entries: dict[str, str]) -> Path:
-    """Fill a private temporary folder that goes away with this process."""
+def _temporary_folder() -> Path:
+    """Make a private temporary folder that goes away with this process."""
     import atexit
     import shutil
     import tempfile
 
-    home = Path(tempfile.mkdtemp(prefix="clvoro-icd-"))
+    folder = Path(tempfile.mkdtemp(prefix="clvoro-cache-"))
     owner = os.getpid()  # a forked child runs the hook too, and must leave the folder
 
     def remove() -> None:
         if os.getpid() == owner:
-            shutil.rmtree(home, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(remove)
-    return _write_home(home, entries)
+    return folder
