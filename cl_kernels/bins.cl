@@ -1,0 +1,142 @@
+#include "common/bins.h"
+
+/* Generators are counted into bins, level by level, then placed by a counting sort. The order in which atomics arrive
+   only decides ranks within a bin, and the last pass sorts each bin by generator index: the result is deterministic. */
+
+/* Per generator i: keys[i] = its bin in grid 0, ranks[i] = its place in the bin. counts must be zero. */
+kernel void count_root(global const REAL *points, const FRAME frame, const int side, global int *keys,
+                       global int *ranks, global int *counts)
+{
+    const int i = get_global_id(0);
+    const int key = bin_in_grid(points + DIM * i, frame, (int2)(0, side));
+    keys[i] = key;
+    ranks[i] = atomic_inc(counts + key);
+}
+
+/* Bins per axis of the grid that divides a bin of `count` generators; 0 keeps the bin whole. */
+inline int child_side(int count)
+{
+    if (count <= SPLIT_COUNT)
+        return 0;
+    int side = 2;
+    while (side < MAX_CHILD_SIDE && count > OCCUPANCY * (DIM == 2 ? 4 * side * side : 8 * side * side * side))
+        side *= 2;
+    return side;
+}
+
+/* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins? */
+kernel void plan_children(global const int *counts, const int begin, global int *grid_flags, global int *child_bins)
+{
+    const int b = get_global_id(0);
+    const int side = child_side(counts[begin + b]);
+    grid_flags[b] = side > 0;
+    child_bins[b] = DIM == 2 ? side * side : side * side * side;
+}
+
+/* Per bin b of the newest level: bins[b] = (first item, count). starts are the prefix sums of this level's counts. A
+   bin below level 0 starts where its parent starts: `parents[b]` names its grid, whose first bin and first item are
+   known. */
+kernel void place_bins(global const int *counts, global const int *starts, const int begin, global const int *bin_grid,
+                       global const int2 *grid_shapes, global const int *grid_items, global int2 *bins)
+{
+    const int b = get_global_id(0);
+    int start = starts[b];
+    if (begin > 0) {
+        const int g = bin_grid[begin + b];
+        start += grid_items[g] - starts[grid_shapes[g].s0 - begin];
+    }
+    bins[begin + b] = (int2)(start, counts[begin + b]);
+}
+
+/* Per divided bin b: create grid g over its box, and note in each of the new bins which grid it belongs to. */
+kernel void make_grids(global int2 *bins, const int begin, const int next_begin, const int first_grid,
+                       global const int *grid_ids, global const int *child_firsts, global int *bin_grid,
+                       global FRAME *grid_frames, global int2 *grid_shapes, global int *grid_items)
+{
+    const int b = get_global_id(0);
+    const int2 bin = bins[begin + b];
+    const int side = child_side(bin.s1);
+    if (side == 0)
+        return;
+    const int parent = bin_grid[begin + b];
+    const int g = first_grid + grid_ids[b];
+    const int first = next_begin + child_firsts[b];
+    const uint code = begin + b - grid_shapes[parent].s0;
+    const FRAME frame = grid_frames[parent];
+    const REAL edge = 1 / FRAME_INVERSE(frame);
+    FRAME child = frame;
+    /* The bin's corner, from the de-interleaved Morton code. */
+    uint index[3] = {0, 0, 0};
+    for (int bit = 0; bit < 16; ++bit)
+        for (int a = 0; a < DIM; ++a)
+            if (DIM * bit + a < 32)
+                index[a] |= ((code >> (DIM * bit + a)) & 1u) << bit;
+    child.s0 += index[0] * edge;
+    child.s1 += index[1] * edge;
+#if DIM == 2
+    child.s2 = frame.s2 * side;
+    const int volume = side * side;
+#else
+    child.s2 += index[2] * edge;
+    child.s3 = frame.s3 * side;
+    const int volume = side * side * side;
+#endif
+    grid_frames[g] = child;
+    grid_shapes[g] = (int2)(first, side);
+    grid_items[g] = bin.s0;
+    for (int c = 0; c < volume; ++c)
+        bin_grid[first + c] = g;
+    bins[begin + b] = (int2)(-1 - g, bin.s1);
+}
+
+/* Per generator i whose bin was divided: count it into its new bin. */
+kernel void count_children(global const REAL *points, global const int2 *bins, global const FRAME *grid_frames,
+                           global const int2 *grid_shapes, global int *keys, global int *ranks, global int *counts)
+{
+    const int i = get_global_id(0);
+    const int g = -1 - bins[keys[i]].s0;
+    if (g < 0)
+        return;
+    const int key = bin_in_grid(points + DIM * i, grid_frames[g], grid_shapes[g]);
+    keys[i] = key;
+    ranks[i] = atomic_inc(counts + key);
+}
+
+/* Per generator i: its place in the order of bins. */
+kernel void place_items(global const int *keys, global const int *ranks, global const int2 *bins, global int *items)
+{
+    const int i = get_global_id(0);
+    items[bins[keys[i]].s0 + ranks[i]] = i;
+}
+
+/* Per bin: sort its items by generator index (Shell's sort: a leaf holds a handful, but duplicates may pile up). */
+kernel void sort_bins(global const int2 *bins, global int *items)
+{
+    const int2 bin = bins[get_global_id(0)];
+    if (bin.s0 < 0)
+        return;
+    global int *list = items + bin.s0;
+    int gap = 1;
+    while (gap < bin.s1 / 9)
+        gap = 3 * gap + 1;
+    for (; gap > 0; gap /= 3)
+        for (int k = gap; k < bin.s1; ++k) {
+            const int item = list[k];
+            int at = k;
+            for (; at >= gap && list[at - gap] > item; at -= gap)
+                list[at] = list[at - gap];
+            list[at] = item;
+        }
+}
+
+/* Per place p: the generator's position, and the edge of the leaf that it lies in. */
+kernel void gather_items(global const int *items, global const REAL *points, global const int *keys,
+                         global const int *bin_grid, global const FRAME *grid_frames, global REAL *binned,
+                         global float *reach)
+{
+    const int p = get_global_id(0);
+    const int i = items[p];
+    for (int a = 0; a < DIM; ++a)
+        binned[DIM * p + a] = points[DIM * i + a];
+    reach[p] = (float)(1 / FRAME_INVERSE(grid_frames[bin_grid[keys[i]]]));
+}

@@ -1,0 +1,283 @@
+#include "common/bins.h"
+#include "common/polygon.h"
+
+/* Bits of the word in which kernels report what went wrong. */
+#define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY */
+#define FLAG_COINCIDE 2  /* two generators at the same place; flags[1] is the smallest index of one */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
+
+#define KEEP_WORDS ((ROW_CAPACITY + 31) / 32)
+#define MAX_DEPTH 8 /* levels of bins; bins.py's MAX_LEVELS */
+
+inline void raise_flag(global int *flags, int flag, int generator)
+{
+    atomic_or(flags, flag);
+    atomic_min(flags + 1, generator);
+}
+
+/* Range of bins of one grid that the square (cube) of half-width w around x covers. */
+typedef struct {
+    int from[DIM];
+    int to[DIM];
+} range_t;
+
+inline range_t covered(const REAL *x, REAL w, FRAME frame, int side)
+{
+    const REAL inverse = FRAME_INVERSE(frame);
+    range_t r;
+    r.from[0] = axis_bin(x[0] - w, frame.s0, inverse, side);
+    r.to[0] = axis_bin(x[0] + w, frame.s0, inverse, side);
+    r.from[1] = axis_bin(x[1] - w, frame.s1, inverse, side);
+    r.to[1] = axis_bin(x[1] + w, frame.s1, inverse, side);
+    return r;
+}
+
+/* Clip the cell at place p by every generator in the bins that the square of half-width w covers and the square of
+   half-width `inner` does not (inner < 0: no bin was opened before). Returns FLAG_* or 0. */
+inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, bool warm, global const REAL *binned,
+                        global const int *items, global const int2 *bins, global const FRAME *grid_frames,
+                        global const int2 *grid_shapes)
+{
+    /* The grids that are open, from the root down, and the bin at which each was left. */
+    int grids[MAX_DEPTH], at_x[MAX_DEPTH], at_y[MAX_DEPTH];
+    bool inside[MAX_DEPTH]; /* was the grid's own bin opened for the inner square? */
+    int depth = 0;
+    grids[0] = 0;
+    inside[0] = inner >= 0;
+    at_x[0] = -1;
+    while (depth >= 0) {
+        const int g = grids[depth];
+        const FRAME frame = grid_frames[g];
+        const int2 shape = grid_shapes[g];
+        const range_t outer = covered(x, w, frame, shape.s1);
+        range_t done = outer;
+        if (inside[depth])
+            done = covered(x, inner, frame, shape.s1);
+        int ix = at_x[depth], iy = at_y[depth];
+        if (ix < 0) {
+            ix = outer.from[0];
+            iy = outer.from[1];
+        }
+        bool descend = false;
+        for (; iy <= outer.to[1] && !descend; ++iy, ix = outer.from[0]) {
+            const bool row_done = inside[depth] && iy >= done.from[1] && iy <= done.to[1];
+            const uint code_y = spread(iy) << 1;
+            for (; ix <= outer.to[0]; ++ix) {
+                const bool bin_done = row_done && ix >= done.from[0] && ix <= done.to[0];
+                const int2 bin = bins[shape.s0 + (spread(ix) | code_y)];
+                if (bin.s0 < 0) {
+                    /* Leave this grid after the bin, and go down. */
+                    at_x[depth] = ix + 1;
+                    at_y[depth] = iy;
+                    if (ix == outer.to[0]) {
+                        at_x[depth] = outer.from[0];
+                        at_y[depth] = iy + 1;
+                    }
+                    ++depth;
+                    grids[depth] = -1 - bin.s0;
+                    inside[depth] = bin_done;
+                    at_x[depth] = -1;
+                    descend = true;
+                    break;
+                }
+                if (bin_done)
+                    continue;
+                for (int q = bin.s0; q < bin.s0 + bin.s1; ++q) {
+                    const REAL d[2] = {binned[2 * q] - x[0], binned[2 * q + 1] - x[1]};
+                    const REAL d2 = d[0] * d[0] + d[1] * d[1];
+                    if (d2 >= 4 * cell->reach2)
+                        continue;
+                    const int j = items[q];
+                    if (j == i)
+                        continue;
+                    if (d2 == 0)
+                        return FLAG_COINCIDE;
+                    if (!clip_cell(cell, d, d2, j, warm))
+                        return FLAG_FULL;
+                }
+            }
+        }
+        if (!descend)
+            --depth;
+    }
+    return 0;
+}
+
+/* Per place p in bin order: the cell of generator i = items[p] as its list of neighbours, counter-clockwise.
+
+   V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
+   after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
+   square of bins that it has seen covers that circle. With `warm` the neighbours of an earlier, similar diagram are
+   clipped first, and the search only has to confirm them.
+
+   rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; row_counts[i] of them */
+kernel void clip_cells(global const REAL *binned, global const int *items, global const float *reach,
+                       global const int2 *bins, global const FRAME *grid_frames, global const int2 *grid_shapes,
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
+                       global const int *old_starts, global const int *old_neighbours, global int *rows,
+                       global int *row_counts, global int *flags)
+{
+    const int p = get_global_id(0);
+    const int i = items[p];
+    const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    cell_t cell;
+    start_cell(&cell, x, lower, upper);
+    int flag = 0;
+    REAL w = reach[p], inner = -1;
+    if (warm) {
+        const int end = old_starts[i + 1];
+        for (int k = old_starts[i]; k < end && flag == 0; ++k) {
+            const int j = old_neighbours[k];
+            if (j < 0)
+                continue;
+            const REAL d[2] = {points[2 * j] - x[0], points[2 * j + 1] - x[1]};
+            const REAL d2 = d[0] * d[0] + d[1] * d[1];
+            if (d2 == 0)
+                flag = FLAG_COINCIDE;
+            else if (!clip_cell(&cell, d, d2, j, false))
+                flag = FLAG_FULL;
+        }
+        w = 2 * sqrt(cell.reach2);
+    }
+    while (flag == 0) {
+        flag = clip_by_bins(&cell, x, i, w, inner, warm, binned, items, bins, grid_frames, grid_shapes);
+        const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
+        if (need <= w)
+            break;
+        inner = w;
+        w = fmin(need, 2 * w);
+    }
+    if (flag == 0) {
+        drop_short_faces(&cell, 16 * REAL_EPS, x, points);
+        if (cell.n > ROW_CAPACITY)
+            flag = FLAG_FULL;
+    }
+    if (flag) {
+        raise_flag(flags, flag, i);
+        cell.n = 0;
+    }
+    for (int k = 0; k < cell.n; ++k)
+        rows[i * ROW_CAPACITY + k] = cell.faces[k];
+    row_counts[i] = cell.n;
+}
+
+/* Per generator i: bit k of keep[i * KEEP_WORDS ...] marks a neighbour that also lists i. Rounding may let one of two cells see a face of no
+   length that the other does not see; such a face is dropped, so that the graph is symmetric. */
+kernel void match_faces(global const int *rows, global const int *row_counts, global uint *keep, global int *counts,
+                        global int *flags)
+{
+    const int i = get_global_id(0);
+    const int n = row_counts[i];
+    uint word = 0;
+    int count = 0;
+    for (int k = 0; k < n; ++k) {
+        const int j = rows[i * ROW_CAPACITY + k];
+        bool mutual = j < 0;
+        if (!mutual) {
+            const int m = row_counts[j];
+            for (int q = 0; q < m && !mutual; ++q)
+                mutual = rows[j * ROW_CAPACITY + q] == i;
+        }
+        if (mutual) {
+            word |= 1u << (k % 32);
+            ++count;
+        }
+        if (k % 32 == 31 || k == n - 1) {
+            keep[i * KEEP_WORDS + k / 32] = word;
+            word = 0;
+        }
+    }
+    counts[i] = count;
+    if (count < 3)
+        raise_flag(flags, FLAG_COLLAPSED, i);
+}
+
+/* Corner between the faces a and b (in this order) of generator i, relative to x_i. It is computed from the generators
+   in the order of their indices, so that the cells that share the corner agree on it to a rounding. */
+inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower,
+                    const REAL *upper)
+{
+    if (a >= 0 && b >= 0) {
+        /* Circumcentre of the triangle o, p, q relative to o. */
+        const int o = min(i, min(a, b)), q = max(i, max(a, b));
+        const int p = i + a + b - o - q;
+        const REAL ox = points[2 * o], oy = points[2 * o + 1];
+        const REAL ux = points[2 * p] - ox, uy = points[2 * p + 1] - oy;
+        const REAL vx = points[2 * q] - ox, vy = points[2 * q + 1] - oy;
+        const REAL u2 = ux * ux + uy * uy, v2 = vx * vx + vy * vy;
+        const REAL twice = 2 * difference_of_products(ux, vy, uy, vx);
+        return (REAL2)(difference_of_products(u2, vy, v2, uy) / twice + (ox - x[0]),
+                       difference_of_products(v2, ux, u2, vx) / twice + (oy - x[1]));
+    }
+    if (a < 0 && b < 0) {
+        /* Two walls: a corner of the box, one wall across each axis. */
+        const int wa = -1 - a, wb = -1 - b;
+        const int wx = wa < 2 ? wa : wb, wy = wa < 2 ? wb : wa;
+        return (REAL2)((wx % 2 ? upper[0] : lower[0]) - x[0], (wy % 2 ? upper[1] : lower[1]) - x[1]);
+    }
+    /* The bisector of o and q meets a wall. */
+    const int j = max(a, b), wall = -1 - min(a, b);
+    const int axis = wall / 2;
+    const int o = min(i, j), q = max(i, j);
+    const REAL level = wall % 2 ? upper[axis] : lower[axis];
+    const REAL d_across = points[2 * q + axis] - points[2 * o + axis];
+    const REAL d_along = points[2 * q + 1 - axis] - points[2 * o + 1 - axis];
+    const REAL across = level - points[2 * o + axis];
+    const REAL d2 = d_across * d_across + d_along * d_along;
+    const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along + (points[2 * o + 1 - axis] - x[1 - axis]);
+    return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
+}
+
+/* Per generator i: its faces as row i of the graph, and its cell's measures. All vectors are relative to x_i.
+
+   starts, neighbours        the graph; faces in counter-clockwise order
+   face_measures (m,)        length of a face
+   face_centroids (m, 2)
+   volumes (n,)              A_i
+   offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
+   moments (n,)              integral of |y - x_i|^2 over the cell (the paper's 2.3) */
+kernel void measure_cells(global const int *rows, global const int *row_counts, global const uint *keep,
+                          global const int *starts, global const REAL *points, const REAL4 box_lower,
+                          const REAL4 box_upper, global int *neighbours, global REAL *face_measures,
+                          global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
+                          global REAL *moments)
+{
+    const int i = get_global_id(0);
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    int faces[ROW_CAPACITY];
+    int n = 0;
+    const int listed = row_counts[i];
+    for (int k = 0; k < listed; ++k)
+        if ((keep[i * KEEP_WORDS + k / 32] >> (k % 32)) & 1u)
+            faces[n++] = rows[i * ROW_CAPACITY + k];
+    const int start = starts[i];
+    REAL area = 0, cx = 0, cy = 0, moment = 0;
+    if (n >= 3) {
+        const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
+        REAL2 v = origin;
+        for (int k = 0; k < n; ++k) {
+            const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
+            const REAL2 e = w - v;
+            const REAL2 sum = v + w;
+            /* The triangle x_i, v, w: area cross / 2, centroid (v + w) / 3, second moment area (v.v + w.w + v.w) / 6. */
+            const REAL cross = difference_of_products(v.s0, w.s1, v.s1, w.s0);
+            area += cross;
+            cx += cross * sum.s0;
+            cy += cross * sum.s1;
+            moment += cross * (dot(v, v) + dot(w, w) + dot(v, w));
+            neighbours[start + k] = faces[k];
+            face_measures[start + k] = sqrt(dot(e, e));
+            face_centroids[2 * (start + k)] = sum.s0 / 2;
+            face_centroids[2 * (start + k) + 1] = sum.s1 / 2;
+            v = w;
+        }
+    }
+    volumes[i] = area / 2;
+    offsets[2 * i] = area > 0 ? cx / (3 * area) : 0;
+    offsets[2 * i + 1] = area > 0 ? cy / (3 * area) : 0;
+    moments[i] = moment / 12;
+}

@@ -1,0 +1,174 @@
+/* A convex polygon around its generator, and its clip by the half-plane nearer to the generator than to a neighbour.
+   Coordinates are relative to the generator: differences of close positions are exact, so cells stay accurate
+   whatever their size. */
+#include "common/real.h"
+
+#ifndef CELL_CAPACITY
+#error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
+#endif
+
+/* Face k runs counter-clockwise from corner k to corner k + 1 and belongs to faces[k]: a generator, or -1 - wall. */
+typedef struct {
+    int n;
+    REAL x[CELL_CAPACITY];
+    REAL y[CELL_CAPACITY];
+    int faces[CELL_CAPACITY];
+    REAL reach2; /* largest squared distance of a corner from the generator */
+} cell_t;
+
+/* The whole box around generator x. */
+inline void start_cell(cell_t *cell, const REAL *x, const REAL *lower, const REAL *upper)
+{
+    cell->n = 4;
+    cell->x[0] = cell->x[3] = lower[0] - x[0];
+    cell->x[1] = cell->x[2] = upper[0] - x[0];
+    cell->y[0] = cell->y[1] = lower[1] - x[1];
+    cell->y[2] = cell->y[3] = upper[1] - x[1];
+    cell->faces[0] = -1 - 2;
+    cell->faces[1] = -1 - 1;
+    cell->faces[2] = -1 - 3;
+    cell->faces[3] = -1 - 0;
+    const REAL rx = fmax(-cell->x[0], cell->x[1]);
+    const REAL ry = fmax(-cell->y[0], cell->y[2]);
+    cell->reach2 = rx * rx + ry * ry;
+}
+
+/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2. False if the cell is full.
+   A cut shallower than rounding is none, so that cocircular generators do not shred a corner. */
+inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool seen_before)
+{
+    const int n = cell->n;
+    const REAL level = d2 / 2;
+    const REAL depth = 4 * REAL_EPS * d2;
+    REAL s[CELL_CAPACITY];
+    int cut = -1;
+    for (int k = 0; k < n; ++k) {
+        s[k] = cell->x[k] * d[0] + cell->y[k] * d[1] - level;
+        if (s[k] > depth)
+            cut = k;
+    }
+    if (cut < 0)
+        return true;
+    if (seen_before)
+        for (int k = 0; k < n; ++k)
+            if (cell->faces[k] == neighbour)
+                return true;
+
+    /* The corners cut off are first..last, cyclically. */
+    int first = cut;
+    int before = first == 0 ? n - 1 : first - 1;
+    while (s[before] > depth && before != cut) {
+        first = before;
+        before = first == 0 ? n - 1 : first - 1;
+    }
+    int last = cut;
+    int after = last == n - 1 ? 0 : last + 1;
+    while (s[after] > depth && after != cut) {
+        last = after;
+        after = last == n - 1 ? 0 : last + 1;
+    }
+    /* Where the bisector meets the faces before -> first and last -> after. */
+    const REAL ta = fmax(-s[before], R(0)) / (s[first] - fmin(s[before], R(0)));
+    const REAL ax = cell->x[before] + ta * (cell->x[first] - cell->x[before]);
+    const REAL ay = cell->y[before] + ta * (cell->y[first] - cell->y[before]);
+    const REAL tb = fmax(-s[after], R(0)) / (s[last] - fmin(s[after], R(0)));
+    const REAL bx = cell->x[after] + tb * (cell->x[last] - cell->x[after]);
+    const REAL by = cell->y[after] + tb * (cell->y[last] - cell->y[after]);
+    const int last_face = cell->faces[last];
+
+    int a; /* where the new corners go: a and a + 1 */
+    if (first <= last && first > 0) {
+        /* The gap lies inside the list: move the tail so that it is two wide. */
+        const int shift = 2 - (last - first + 1);
+        if (shift > 0) {
+            if (n + shift > CELL_CAPACITY)
+                return false;
+            for (int k = n - 1; k > last; --k) {
+                cell->x[k + shift] = cell->x[k];
+                cell->y[k + shift] = cell->y[k];
+                cell->faces[k + shift] = cell->faces[k];
+            }
+        } else if (shift < 0) {
+            for (int k = last + 1; k < n; ++k) {
+                cell->x[k + shift] = cell->x[k];
+                cell->y[k + shift] = cell->y[k];
+                cell->faces[k + shift] = cell->faces[k];
+            }
+        }
+        cell->n = n + shift;
+        a = first;
+    } else {
+        /* The gap wraps around the ends: the kept corners after..before move to the front. */
+        const int kept = before - after + 1;
+        if (kept + 2 > CELL_CAPACITY)
+            return false;
+        if (after > 0)
+            for (int k = 0; k < kept; ++k) {
+                cell->x[k] = cell->x[k + after];
+                cell->y[k] = cell->y[k + after];
+                cell->faces[k] = cell->faces[k + after];
+            }
+        cell->n = kept + 2;
+        a = kept;
+    }
+    cell->x[a] = ax;
+    cell->y[a] = ay;
+    cell->faces[a] = neighbour;
+    cell->x[a + 1] = bx;
+    cell->y[a + 1] = by;
+    cell->faces[a + 1] = last_face;
+
+    REAL reach2 = 0;
+    for (int k = 0; k < cell->n; ++k)
+        reach2 = fmax(reach2, cell->x[k] * cell->x[k] + cell->y[k] * cell->y[k]);
+    cell->reach2 = reach2;
+    return true;
+}
+
+/* A vector across the face of `label`, pointing out of the cell at x; its length has no meaning for a wall. */
+inline REAL2 face_direction(int label, const REAL *x, global const REAL *points)
+{
+    if (label >= 0)
+        return (REAL2)(points[2 * label] - x[0], points[2 * label + 1] - x[1]);
+    const int wall = -1 - label;
+    const REAL sign = wall % 2 == 0 ? -1 : 1;
+    return wall < 2 ? (REAL2)(sign, 0) : (REAL2)(0, sign);
+}
+
+/* Drop faces that are shorter than `noise`, the rounding of positions in the unit box: they arise where more than three
+   cells meet in one point, as in a lattice. A face that is long beside the distance of its generators is real (in a
+   cluster everything is tiny) and stays, and so does one whose two neighbours are so nearly parallel that they would
+   meet elsewhere. */
+inline void drop_short_faces(cell_t *cell, REAL noise, const REAL *x, global const REAL *points)
+{
+    for (int k = cell->n - 1; k >= 0 && cell->n > 3; --k) {
+        const int n = cell->n;
+        const int next = k == n - 1 ? 0 : k + 1;
+        const REAL ex = cell->x[next] - cell->x[k];
+        const REAL ey = cell->y[next] - cell->y[k];
+        const REAL e2 = ex * ex + ey * ey;
+        if (e2 > noise * noise || cell->faces[k] < 0)
+            continue;
+        const REAL2 d = face_direction(cell->faces[k], x, points);
+        if (e2 > R(1e-6) * dot(d, d))
+            continue;
+        const REAL2 u = face_direction(cell->faces[k == 0 ? n - 1 : k - 1], x, points);
+        const REAL2 v = face_direction(cell->faces[next], x, points);
+        const REAL turn = u.s0 * v.s1 - u.s1 * v.s0;
+        if (turn <= 0 || turn * turn < R(4e-4) * dot(u, u) * dot(v, v))
+            continue;
+        /* Face k and corner k + 1 go; the faces before and after now meet in corner k. */
+        for (int m = k; m < n - 1; ++m) {
+            cell->faces[m] = cell->faces[m + 1];
+            if (m > k) {
+                cell->x[m] = cell->x[m + 1];
+                cell->y[m] = cell->y[m + 1];
+            }
+        }
+        if (next == 0) {
+            cell->x[0] = cell->x[k];
+            cell->y[0] = cell->y[k];
+        }
+        cell->n = n - 1;
+    }
+}

@@ -1,0 +1,152 @@
+"""Neighbour search: generators sorted into hierarchical bins along a Morton curve (`bins.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Scan
+from ._program import Engine
+
+OCCUPANCY = 2.0
+"""Generators per bin that the grids aim at: fewer bins to open against fewer generators to test."""
+SPLIT_COUNT = 10
+"""A bin that holds more is divided by a grid of its own. Uniform random sets (Poisson, mean 2) stay on one level."""
+MAX_CHILD_SIDE = 64
+MAX_LEVELS = 8
+"""Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
+
+
+@dataclass(frozen=True)
+class BinnedPoints:
+    """Generators in bins, on the device; see `common/bins.h` for the layout.
+
+    Attributes
+    ----------
+    items : (n,) int32
+        Generator indices in bin order, ascending within a bin.
+    points : (n, d) real
+        Positions in the same order.
+    reach : (n,) float32
+        Edge of the leaf that holds the generator, in the same order.
+    bins : (b, 2) int32
+    grid_frames : (g, 4) real
+    grid_shapes : (g, 2) int32
+    """
+
+    items: cla.Array
+    points: cla.Array
+    reach: cla.Array
+    bins: cla.Array
+    grid_frames: cla.Array
+    grid_shapes: cla.Array
+
+
+class Bins:
+    """Sort generators into bins. Buffers are kept from call to call and grow when needed."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._kernels = engine.kernels(
+            "bins",
+            {
+                "SPLIT_COUNT": SPLIT_COUNT,
+                "MAX_CHILD_SIDE": MAX_CHILD_SIDE,
+                "OCCUPANCY": int(OCCUPANCY),
+            },
+        )
+        self._capacity: tuple[int, int] = (0, 0)
+
+    def _reserve(self, n: int, bins: int) -> None:
+        """Make room for `n` generators and `bins` bins, keeping what the bins hold."""
+        engine, d = self.engine, self.engine.dim
+        if n > self._capacity[0]:
+            self._keys = engine.empty(n, np.int32)
+            self._ranks = engine.empty(n, np.int32)
+            self._items = engine.empty(n, np.int32)
+            self._points = engine.empty((n, d))
+            self._reach = engine.empty(n, np.float32)
+        if bins > self._capacity[1]:
+            old = self._capacity[1]
+            for name, width in (("counts", 1), ("bins", 2), ("grid_of", 1)):
+                grown = engine.zeros(bins * width, np.int32)
+                if old:
+                    grown[: old * width] = getattr(self, f"_{name}")[: old * width]
+                setattr(self, f"_{name}", grown)
+            # A divided bin holds more than SPLIT_COUNT generators, so grids are far fewer than bins.
+            self._frames = self._grown("_frames", (bins // 4 + 1) * 4, engine.real)
+            self._shapes = self._grown("_shapes", (bins // 4 + 1) * 2, np.int32)
+            self._grid_items = self._grown("_grid_items", bins // 4 + 1, np.int32)
+            self._starts = engine.empty(bins + 1, np.int32)
+            self._flags = engine.empty(bins + 1, np.int32)
+            self._sizes = engine.empty(bins + 1, np.int32)
+        self._capacity = (max(n, self._capacity[0]), max(bins, self._capacity[1]))
+
+    def _grown(self, name: str, size: int, dtype: object) -> cla.Array:
+        grown = self.engine.zeros(size, dtype)
+        old = getattr(self, name, None)
+        if old is not None:
+            grown[: old.size] = old
+        return grown
+
+    def build(self, points: cla.Array, n: int) -> BinnedPoints:
+        """Sort the first `n` of `points` (n, d; normalised coordinates in [0, 1]) into bins.
+
+        The host reads two integers per level; uniform sets have one level.
+        """
+        engine, k, d = self.engine, self._kernels, self.engine.dim
+        side = max(1, round((n / OCCUPANCY) ** (1 / d)))
+        root_bins = (1 << (side - 1).bit_length()) ** d
+        self._reserve(n, root_bins + n // 2)
+        self._counts.fill(0)
+        frame = np.zeros(4, engine.real)
+        frame[2 if d == 2 else 3] = side
+        self._frames[:4] = frame
+        self._shapes[:2] = np.array([0, side], np.int32)
+        self._grid_of[:root_bins].fill(0)
+        engine.run(
+            k.count_root, n, points, frame, np.int32(side), self._keys, self._ranks, self._counts
+        )
+        begin, size, grids = 0, root_bins, 1
+        for level in range(MAX_LEVELS):
+            end = begin + size
+            self._scan.exclusive(self._counts, self._starts, size, first=begin)
+            engine.run(
+                k.place_bins, size, self._counts, self._starts, np.int32(begin), self._grid_of,
+                self._shapes, self._grid_items, self._bins,
+            )  # fmt: skip
+            if level == MAX_LEVELS - 1:
+                break
+            engine.run(
+                k.plan_children, size, self._counts, np.int32(begin), self._flags, self._sizes
+            )
+            self._scan.exclusive(self._flags, self._flags, size)
+            self._scan.exclusive(self._sizes, self._sizes, size)
+            new_grids = int(self._flags[size].get())
+            if new_grids == 0:
+                break
+            new_bins = int(self._sizes[size].get())
+            self._reserve(n, end + new_bins)
+            engine.run(
+                k.make_grids, size, self._bins, np.int32(begin), np.int32(end), np.int32(grids),
+                self._flags, self._sizes, self._grid_of, self._frames, self._shapes,
+                self._grid_items,
+            )  # fmt: skip
+            engine.run(
+                k.count_children, n, points, self._bins, self._frames, self._shapes,
+                self._keys, self._ranks, self._counts,
+            )  # fmt: skip
+            begin, size, grids = end, new_bins, grids + new_grids
+        total = begin + size
+        engine.run(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
+        engine.run(k.sort_bins, total, self._bins, self._items)
+        engine.run(
+            k.gather_items, n, self._items, points, self._keys, self._grid_of, self._frames,
+            self._points, self._reach,
+        )  # fmt: skip
+        return BinnedPoints(
+            self._items, self._points, self._reach, self._bins, self._frames, self._shapes
+        )

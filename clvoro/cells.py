@@ -1,0 +1,170 @@
+"""The tessellation: every cell clipped by its neighbours and walls, its faces, volume and centroid (`cells.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Scan
+from ._program import Engine
+from .bins import BinnedPoints
+from .domain import Box
+from .errors import ClvoroError, InputError
+
+CELL_CAPACITY = 24
+ROW_CAPACITY = 20
+FULL, COINCIDE, COLLAPSED = 1, 2, 4
+
+
+@dataclass(frozen=True)
+class Tessellation:
+    """A Voronoi diagram on the device: normalised coordinates, vectors relative to the generator of the row.
+
+    Attributes
+    ----------
+    n : int
+    points : (n, d) real
+    starts : (n + 1,) int32
+    neighbours : (m,) int32
+        A generator, or ``-1 - wall``; counter-clockwise in 2D.
+    face_measures : (m,) real
+    face_centroids : (m, d) real
+        Relative to the generator.
+    volumes : (n,) real
+    offsets : (n, d) real
+        Centroid minus generator: the Lloyd displacement.
+    moments : (n,) real
+        Integral of the squared distance from the generator over the cell.
+    """
+
+    n: int
+    points: cla.Array
+    starts: cla.Array
+    neighbours: cla.Array
+    face_measures: cla.Array
+    face_centroids: cla.Array
+    volumes: cla.Array
+    offsets: cla.Array
+    moments: cla.Array
+
+
+class Cells:
+    """Tessellate a box. Buffers are reused: a `Tessellation` lives until the second call after it."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._capacity = 0
+        self._turn = 0
+        self._build(CELL_CAPACITY, ROW_CAPACITY)
+
+    def _build(self, cell_capacity: int, row_capacity: int) -> None:
+        self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
+        self._kernels = self.engine.kernels(
+            "cells", {"CELL_CAPACITY": cell_capacity, "ROW_CAPACITY": row_capacity}
+        )
+
+    def _reserve(self, n: int) -> None:
+        if n <= self._capacity:
+            return
+        engine, d = self.engine, self.engine.dim
+        # A planar graph has at most 3 n - 6 edges, and every cell at most one face on each wall it touches.
+        m = 7 * n + 8
+        self._rows = engine.empty(n * self.row_capacity, np.int32)
+        self._row_counts = engine.empty(n, np.int32)
+        self._keep = engine.empty(n * ((self.row_capacity + 31) // 32), np.uint32)
+        self._flags = engine.empty(2, np.int32)
+        # Two sets in turn: the previous diagram stays valid, for a warm start and to compare neighbours.
+        self._sets = [
+            {
+                "starts": engine.empty(n + 1, np.int32),
+                "neighbours": engine.empty(m, np.int32),
+                "face_measures": engine.empty(m),
+                "face_centroids": engine.empty((m, d)),
+                "volumes": engine.empty(n),
+                "offsets": engine.empty((n, d)),
+                "moments": engine.empty(n),
+            }
+            for _ in range(2)
+        ]
+        self._capacity = n
+
+    def tessellate(
+        self,
+        box: Box,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | None = None,
+    ) -> Tessellation:
+        """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
+
+        Parameters
+        ----------
+        previous : Tessellation, optional
+            A diagram of the same generators at earlier positions: clipping starts from its neighbours.
+
+        Raises
+        ------
+        InputError
+            If two generators coincide or are too close for the precision; names the first.
+        """
+        engine, k = self.engine, self._kernels
+        self._reserve(n)
+        origin, scale = box.frame
+        lower, upper = np.zeros(4, engine.real), np.zeros(4, engine.real)
+        lower[: box.dim] = (np.array(box.lower) - origin) / scale
+        upper[: box.dim] = (np.array(box.upper) - origin) / scale
+        arrays = self._sets[self._turn]
+        self._turn = 1 - self._turn
+        warm = previous is not None and previous.n == n
+        old = (
+            (previous.starts, previous.neighbours)
+            if previous is not None and warm
+            else (self._row_counts, self._row_counts)
+        )
+        while True:
+            self._flags.set(np.array([0, 2**31 - 1], np.int32))
+            engine.run(
+                k.clip_cells, n, binned.points, binned.items, binned.reach, binned.bins,
+                binned.grid_frames, binned.grid_shapes, points, lower, upper, np.int32(warm),
+                *old, self._rows, self._row_counts, self._flags,
+            )  # fmt: skip
+            engine.run(
+                k.match_faces, n, self._rows, self._row_counts, self._keep, arrays["starts"],
+                self._flags,
+            )  # fmt: skip
+            flags, generator = (int(v) for v in self._flags.get())
+            if not flags & FULL:
+                break
+            self._enlarge()
+            k = self._kernels
+        if flags:
+            self._refuse(flags, generator, points)
+        self._scan.exclusive(arrays["starts"], arrays["starts"], n)
+        engine.run(
+            k.measure_cells, n, self._rows, self._row_counts, self._keep, arrays["starts"], points,
+            lower, upper, arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
+            arrays["volumes"], arrays["offsets"], arrays["moments"],
+        )  # fmt: skip
+        return Tessellation(n=n, points=points, **arrays)
+
+    def _enlarge(self) -> None:
+        if self.row_capacity >= 512:
+            raise ClvoroError(
+                f"a cell has more than {self.row_capacity} faces; so many cocircular generators "
+                "are not supported: remove or perturb some"
+            )
+        n = self._capacity
+        self._build(2 * self.cell_capacity, 2 * self.row_capacity)
+        self._rows = self.engine.empty(n * self.row_capacity, np.int32)
+        self._keep = self.engine.empty(n * ((self.row_capacity + 31) // 32), np.uint32)
+
+    def _refuse(self, flags: int, generator: int, points: cla.Array) -> None:
+        what = "coincides with another" if flags & COINCIDE else "is too close to others"
+        raise InputError(
+            f"generator {generator} {what} in {self.engine.real}; expected distinct generators: "
+            "remove duplicates (numpy.unique(points, axis=0)) or use dtype='float64'"
+        )
