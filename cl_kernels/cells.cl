@@ -1,4 +1,5 @@
 #include "common/bins.h"
+#include "common/corner.h"
 #include "common/polygon.h"
 
 /* Bits of the word in which kernels report what went wrong. */
@@ -192,42 +193,6 @@ kernel void match_faces(global const int *rows, global const int *row_counts, gl
     counts[i] = count;
     if (count < 3)
         raise_flag(flags, FLAG_COLLAPSED, i);
-}
-
-/* Corner between the faces a and b (in this order) of generator i, relative to x_i. It is computed from the generators
-   in the order of their indices, so that the cells that share the corner agree on it to a rounding. */
-inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower,
-                    const REAL *upper)
-{
-    if (a >= 0 && b >= 0) {
-        /* Circumcentre of the triangle o, p, q relative to o. */
-        const int o = min(i, min(a, b)), q = max(i, max(a, b));
-        const int p = i + a + b - o - q;
-        const REAL ox = points[2 * o], oy = points[2 * o + 1];
-        const REAL ux = points[2 * p] - ox, uy = points[2 * p + 1] - oy;
-        const REAL vx = points[2 * q] - ox, vy = points[2 * q + 1] - oy;
-        const REAL u2 = ux * ux + uy * uy, v2 = vx * vx + vy * vy;
-        const REAL twice = 2 * difference_of_products(ux, vy, uy, vx);
-        return (REAL2)(difference_of_products(u2, vy, v2, uy) / twice + (ox - x[0]),
-                       difference_of_products(v2, ux, u2, vx) / twice + (oy - x[1]));
-    }
-    if (a < 0 && b < 0) {
-        /* Two walls: a corner of the box, one wall across each axis. */
-        const int wa = -1 - a, wb = -1 - b;
-        const int wx = wa < 2 ? wa : wb, wy = wa < 2 ? wb : wa;
-        return (REAL2)((wx % 2 ? upper[0] : lower[0]) - x[0], (wy % 2 ? upper[1] : lower[1]) - x[1]);
-    }
-    /* The bisector of o and q meets a wall. */
-    const int j = max(a, b), wall = -1 - min(a, b);
-    const int axis = wall / 2;
-    const int o = min(i, j), q = max(i, j);
-    const REAL level = wall % 2 ? upper[axis] : lower[axis];
-    const REAL d_across = points[2 * q + axis] - points[2 * o + axis];
-    const REAL d_along = points[2 * q + 1 - axis] - points[2 * o + 1 - axis];
-    const REAL across = level - points[2 * o + axis];
-    const REAL d2 = d_across * d_across + d_along * d_along;
-    const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along + (points[2 * o + 1 - axis] - x[1 - axis]);
-    return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 }
 
 /* Per generator i: its faces as row i of the graph, and its cell's measures. All vectors are relative to x_i.

@@ -1,4 +1,5 @@
 #include "common/real.h"
+#include "common/blocks.h"
 
 /* Exclusive prefix sums in three passes. One work-item stands for one contiguous chunk of the array. */
 
@@ -44,4 +45,61 @@ kernel void scan_chunks(global const int *values, const int first, global const 
     }
     if (end == n && w == get_global_size(0) - 1)
         out[n] = total;
+}
+
+/* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier), so that float32 totals of
+   millions of terms stay exact to a few ulp. */
+typedef struct {
+    REAL sum, sum_low, magnitude, magnitude_low, least, largest;
+} summary_t;
+
+inline void add_compensated(REAL *sum, REAL *low, REAL value)
+{
+    const REAL total = *sum + value;
+    *low += fabs(*sum) >= fabs(value) ? (*sum - total) + value : (value - total) + *sum;
+    *sum = total;
+}
+
+inline void merge_summary(summary_t *a, summary_t b)
+{
+    add_compensated(&a->sum, &a->sum_low, b.sum);
+    a->sum_low += b.sum_low;
+    add_compensated(&a->magnitude, &a->magnitude_low, b.magnitude);
+    a->magnitude_low += b.magnitude_low;
+    a->least = fmin(a->least, b.least);
+    a->largest = fmax(a->largest, b.largest);
+}
+
+/* Block-wise: partials[group] = summary of the group's items. */
+kernel void summarise_blocks(global const REAL *values, const int n, global summary_t *partials)
+{
+    local summary_t shares[GROUP_SIZE];
+    const int t = get_local_id(0);
+    summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
+    for (BLOCK_LOOP(i, n)) {
+        const REAL value = values[i];
+        add_compensated(&mine.sum, &mine.sum_low, value);
+        add_compensated(&mine.magnitude, &mine.magnitude_low, fabs(value));
+        mine.least = fmin(mine.least, value);
+        mine.largest = fmax(mine.largest, value);
+    }
+    shares[t] = mine;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (t == 0) {
+        for (int s = 1; s < GROUP_SIZE; ++s)
+            merge_summary(&mine, shares[s]);
+        partials[get_group_id(0)] = mine;
+    }
+}
+
+/* One work-item: out[4 slot ...] = sum, sum of magnitudes, least, largest. */
+kernel void combine_blocks(global const summary_t *partials, const int groups, const int slot, global REAL *out)
+{
+    summary_t all = partials[0];
+    for (int g = 1; g < groups; ++g)
+        merge_summary(&all, partials[g]);
+    out[4 * slot] = all.sum + all.sum_low;
+    out[4 * slot + 1] = all.magnitude + all.magnitude_low;
+    out[4 * slot + 2] = all.least;
+    out[4 * slot + 3] = all.largest;
 }

@@ -1,0 +1,22 @@
+"""Voronoi meshes that meet a size field, adapted with OpenCL."""
+
+from . import sizing
+from .adapter import Adapter
+from .device import create_context, list_devices
+from .domain import Box
+from .errors import ClvoroError
+from .results import Diagram, Displacements, Result
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Adapter",
+    "Box",
+    "ClvoroError",
+    "Diagram",
+    "Displacements",
+    "Result",
+    "create_context",
+    "list_devices",
+    "sizing",
+]

@@ -58,6 +58,7 @@ class Cells:
         self._scan = Scan(engine)
         self._capacity = 0
         self._turn = 0
+        self._n = 0
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -90,6 +91,16 @@ class Cells:
             for _ in range(2)
         ]
         self._capacity = n
+        self._views_for(n)
+
+    def _views_for(self, n: int) -> None:
+        """Cut the buffers to `n` cells (the faces' keep their spare room: their number is only known on the device)."""
+        lengths = {"starts": n + 1, "volumes": n, "offsets": n, "moments": n}
+        self._views = [
+            {name: a[: lengths[name]] if name in lengths else a for name, a in arrays.items()}
+            for arrays in self._sets
+        ]
+        self._n = n
 
     def tessellate(
         self,
@@ -113,11 +124,10 @@ class Cells:
         """
         engine, k = self.engine, self._kernels
         self._reserve(n)
-        origin, scale = box.frame
-        lower, upper = np.zeros(4, engine.real), np.zeros(4, engine.real)
-        lower[: box.dim] = (np.array(box.lower) - origin) / scale
-        upper[: box.dim] = (np.array(box.upper) - origin) / scale
-        arrays = self._sets[self._turn]
+        lower, upper = box.device_corners(engine.real)
+        if n != self._n:
+            self._views_for(n)
+        arrays = self._views[self._turn]
         self._turn = 1 - self._turn
         warm = previous is not None and previous.n == n
         old = (

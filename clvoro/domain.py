@@ -67,6 +67,13 @@ class Box:
         """
         return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
 
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner in the device's coordinates, padded to four numbers as kernels take them."""
+        origin, scale = self.frame
+        corners = np.zeros((2, 4), real)
+        corners[:, : self.dim] = (np.array([self.lower, self.upper]) - origin) / scale
+        return corners[0], corners[1]
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool."""
         return ((points >= self.lower) & (points <= self.upper)).all(axis=1)

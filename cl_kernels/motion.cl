@@ -1,0 +1,84 @@
+#include "common/real.h"
+
+/* Per generator i: u = -grad phi (the paper's 3.3). The solver's potential is psi = -phi, from -div grad psi = e, so that
+   u = grad psi, with
+   grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i),
+   which is exact for linear psi in a closed cell; walls carry no flux. speed[i] = |u| / h. */
+kernel void follow_potential(global const int *starts, global const int *neighbours,
+                              global const REAL *face_measures, global const REAL *face_centroids,
+                              global const REAL *volumes, global const REAL *points, global const REAL *psi,
+                              global const REAL *h, global REAL *u, global REAL *speed)
+{
+    const int i = get_global_id(0);
+    REAL sum[DIM] = {0};
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        REAL d2 = 0;
+        for (int a = 0; a < DIM; ++a) {
+            const REAL d = points[DIM * j + a] - points[DIM * i + a];
+            d2 += d * d;
+        }
+        const REAL flux = face_measures[k] / sqrt(d2) * (psi[j] - psi[i]);
+        for (int a = 0; a < DIM; ++a)
+            sum[a] += flux * face_centroids[DIM * k + a];
+    }
+    REAL u2 = 0;
+    for (int a = 0; a < DIM; ++a) {
+        const REAL ua = sum[a] / volumes[i];
+        u[DIM * i + a] = ua;
+        u2 += ua * ua;
+    }
+    speed[i] = sqrt(u2) / h[i];
+}
+
+/* Per generator i: correction = alpha u with one alpha for all, alpha = min(limit, k / max_i(|u_i| / h_i)) (the paper's
+   3.5); summaries[4 slot + 3] is that maximum. */
+kernel void relax_globally(global const REAL *summaries, const int slot, const REAL limit, const REAL k, global REAL *u,
+                           global REAL *speed)
+{
+    const int i = get_global_id(0);
+    const REAL fastest = summaries[4 * slot + 3];
+    const REAL alpha = fastest * limit > k ? k / fastest : limit;
+    for (int a = 0; a < DIM; ++a)
+        u[DIM * i + a] *= alpha;
+    speed[i] *= alpha;
+}
+
+/* Per generator i: length of a displacement over h. */
+kernel void measure_displacement(global const REAL *u, global const REAL *h, global REAL *speed)
+{
+    const int i = get_global_id(0);
+    REAL u2 = 0;
+    for (int a = 0; a < DIM; ++a)
+        u2 += u[DIM * i + a] * u[DIM * i + a];
+    speed[i] = sqrt(u2) / h[i];
+}
+
+/* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the box: what
+   would leave is reflected, so that no two generators meet on a wall. */
+kernel void move_generators(global const REAL *lloyd, const REAL a, global const REAL *correction, const REAL b,
+                            global const REAL *h, const REAL clip, const REAL4 box_lower, const REAL4 box_upper,
+                            global REAL *points)
+{
+    const int i = get_global_id(0);
+    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
+    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
+    REAL d[DIM];
+    REAL d2 = 0;
+    for (int c = 0; c < DIM; ++c) {
+        d[c] = a * lloyd[DIM * i + c] + b * correction[DIM * i + c];
+        d2 += d[c] * d[c];
+    }
+    const REAL longest = clip * h[i];
+    const REAL scale = clip > 0 && d2 > longest * longest ? longest / sqrt(d2) : 1;
+    for (int c = 0; c < DIM; ++c) {
+        REAL y = points[DIM * i + c] + scale * d[c];
+        if (y < lower[c])
+            y = 2 * lower[c] - y;
+        if (y > upper[c])
+            y = 2 * upper[c] - y;
+        points[DIM * i + c] = clamp(y, lower[c], upper[c]);
+    }
+}

@@ -1,0 +1,76 @@
+#include "common/corner.h"
+
+/* Corners of cells and the vertices that they share. Corner k of cell i, at place c = starts[i] + k, lies between its
+   faces k - 1 and k. Walking from cell to cell around the point visits all corners that are one vertex; the least of
+   them owns it. The walk uses the graph alone, so it needs no tolerance and holds for any number of cells at a point. */
+
+inline int find_face(global const int *starts, global const int *neighbours, int cell, int neighbour)
+{
+    int k = starts[cell];
+    while (neighbours[k] != neighbour)
+        ++k;
+    return k;
+}
+
+/* Per generator i: owners[c] of each of its corners. */
+kernel void find_owners(global const int *starts, global const int *neighbours, global int *owners,
+                        global int *is_owner)
+{
+    const int i = get_global_id(0);
+    const int begin = starts[i], end = starts[i + 1];
+    for (int c = begin; c < end; ++c) {
+        int owner = c;
+        /* Clockwise around the point, over face k, whose far side starts where this corner is. */
+        int cell = i, at = c, steps = 0;
+        bool wall = false;
+        do {
+            const int next = neighbours[at];
+            if (next < 0) {
+                wall = true;
+                break;
+            }
+            at = find_face(starts, neighbours, next, cell) + 1;
+            if (at == starts[next + 1])
+                at = starts[next];
+            cell = next;
+            owner = min(owner, at);
+        } while (at != c && ++steps < MAX_CELLS_AT_VERTEX);
+        /* At a wall the walk is open: the other way, over face k - 1. */
+        cell = i;
+        at = c;
+        for (steps = 0; wall && steps < MAX_CELLS_AT_VERTEX; ++steps) {
+            const int face = at == starts[cell] ? starts[cell + 1] - 1 : at - 1;
+            const int next = neighbours[face];
+            if (next < 0)
+                break;
+            at = find_face(starts, neighbours, next, cell);
+            cell = next;
+            owner = min(owner, at);
+        }
+        owners[c] = owner;
+        is_owner[c] = owner == c;
+    }
+}
+
+/* Per generator i: cell_vertices[c] = number of the vertex at corner c; the owner writes its position, relative to the
+   box's frame. ids are the prefix sums of is_owner. */
+kernel void place_vertices(global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                           global const int *starts, global const int *neighbours, global const int *owners,
+                           global const int *ids, global int *cell_vertices, global REAL *vertices)
+{
+    const int i = get_global_id(0);
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int begin = starts[i], end = starts[i + 1];
+    for (int c = begin; c < end; ++c) {
+        const int v = ids[owners[c]];
+        cell_vertices[c] = v;
+        if (owners[c] == c) {
+            const int previous = neighbours[c == begin ? end - 1 : c - 1];
+            const REAL2 y = corner(i, x, previous, neighbours[c], points, lower, upper);
+            vertices[2 * v] = clamp(x[0] + y.s0, lower[0], upper[0]);
+            vertices[2 * v + 1] = clamp(x[1] + y.s1, lower[1], upper[1]);
+        }
+    }
+}

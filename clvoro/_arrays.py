@@ -1,0 +1,84 @@
+"""Checks at the door: what a caller passes is looked at once, here, and trusted from then on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import InputError, InputTypeError
+
+if TYPE_CHECKING:
+    from .domain import Box
+
+
+def check_points(points: object, domain: Box) -> np.ndarray:
+    """Return `points` as a float64 array (n, d) inside `domain`.
+
+    Raises
+    ------
+    InputTypeError
+        If `points` is not an array of real numbers.
+    InputError
+        If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
+    """
+    array = np.asarray(points)
+    if array.dtype.kind not in "fiu":
+        raise InputTypeError(
+            f"points has dtype {array.dtype}, expected real numbers; convert with points.astype(float)"
+        )
+    d = domain.dim
+    if array.ndim != 2 or array.shape[1] != d:
+        remedy = "pass points.T" if array.ndim == 2 and array.shape[0] == d else "reshape it"
+        raise InputError(f"points has shape {array.shape}, expected (n, {d}); {remedy}")
+    if len(array) == 0:
+        raise InputError(f"points has shape {array.shape}, expected at least one generator")
+    array = array.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"points[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of "
+            f"{len(array)} points are not); remove them"
+        )
+    bad = np.flatnonzero(~domain.contains(array))
+    if bad.size:
+        raise InputError(
+            f"points[{bad[0]}] is {array[bad[0]]}, outside {domain} ({bad.size} of {len(array)} "
+            "points are); move or remove them, or enlarge the domain"
+        )
+    return array
+
+
+def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
+    """Return the indices of two equal rows of `points` (n, d), or None."""
+    order = np.lexsort(points.T)
+    equal = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
+    if not equal.size:
+        return None
+    i, j = sorted(order[equal[0] : equal[0] + 2].tolist())
+    return i, j
+
+
+def check_integer(name: str, value: object, least: int) -> int:
+    """Return `value` as an int of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise InputTypeError(
+            f"{name} is {value!r} of type {type(value).__name__}, expected an integer"
+        )
+    if value < least:
+        raise InputError(f"{name} is {value}, expected at least {least}")
+    return int(value)
+
+
+def check_number(name: str, value: object, *, above: float = -np.inf, least: float = -np.inf) -> float:
+    """Return `value` as a finite float above `above` and not under `least`."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputTypeError(
+            f"{name} is {value!r} of type {type(value).__name__}, expected a number"
+        ) from None
+    if not np.isfinite(number) or number <= above or number < least:
+        bound = f"> {above:g}" if above > -np.inf else f">= {least:g}"
+        raise InputError(f"{name} is {value!r}, expected a finite number {bound}")
+    return number

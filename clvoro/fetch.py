@@ -1,0 +1,114 @@
+"""From a tessellation on the device to a `Diagram` on the host: physical units, the caller's order."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._program import Engine
+from .cells import Tessellation
+from .domain import Box
+from .results import Diagram
+from .vertices import VertexNumbering, Vertices
+
+
+def fetch_diagram(engine: Engine, domain: Box, t: Tessellation, labels: cla.Array) -> Diagram:
+    """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for."""
+    fetched = _Fetched(engine, domain, t, labels)
+    names = (name for name in Diagram._NAMES if not name.startswith("_"))
+    return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
+
+
+class _Fetched:
+    """A copy of a tessellation, since the stages reuse their buffers, and how to read it."""
+
+    def __init__(self, engine: Engine, domain: Box, t: Tessellation, labels: cla.Array) -> None:
+        self.engine, self.domain, self.n = engine, domain, t.n
+        self.origin, self.scale = domain.frame
+        self.labels = labels.get()[: t.n]
+        m = int(t.starts[t.n].get())
+        self.t = Tessellation(
+            n=t.n,
+            points=t.points[: t.n].copy(),
+            starts=t.starts.copy(),
+            neighbours=t.neighbours[:m].copy(),
+            face_measures=t.face_measures[:m].copy(),
+            face_centroids=t.face_centroids[:m].copy(),
+            volumes=t.volumes.copy(),
+            offsets=t.offsets.copy(),
+            moments=t.moments,
+        )
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """Device row of each row of the result, (n,)."""
+        return np.argsort(self.labels, kind="stable")
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Device `starts` (n + 1,)."""
+        return self.t.starts.get()
+
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """Device row that each face of the result belongs to, (m,)."""
+        return np.repeat(self.order, np.diff(self.starts)[self.order])
+
+    @cached_property
+    def slots(self) -> np.ndarray:
+        """Place in the device's arrays of each face of the result, (m,)."""
+        m = len(self.owners)
+        return self.starts[self.owners] + np.arange(m) - self.neighbour_starts()[self.ranks[self.owners]]
+
+    @cached_property
+    def ranks(self) -> np.ndarray:
+        """Row of the result of each device row, (n,)."""
+        inverse = np.empty(self.n, np.int32)
+        inverse[self.order] = np.arange(self.n, dtype=np.int32)
+        return inverse
+
+    @cached_property
+    def shared(self) -> Vertices:
+        """Vertices, each once."""
+        return VertexNumbering(self.engine).number(self.domain, self.t)
+
+    def _read(self, array: cla.Array, rows: np.ndarray, power: int) -> np.ndarray:
+        return array.get().astype(np.float64)[rows] * self.scale**power
+
+    # One method for each of Diagram's arrays.
+
+    def points(self) -> np.ndarray:
+        return self._read(self.t.points, self.order, 1) + self.origin
+
+    def volumes(self) -> np.ndarray:
+        return self._read(self.t.volumes, self.order, self.engine.dim)
+
+    def centroids(self) -> np.ndarray:
+        return self._read(self.t.offsets, self.order, 1) + self.points()
+
+    def neighbour_starts(self) -> np.ndarray:
+        return np.concatenate([[0], np.cumsum(np.diff(self.starts)[self.order])]).astype(np.int32)
+
+    def neighbours(self) -> np.ndarray:
+        j = self.t.neighbours.get()[self.slots]
+        return np.where(j >= 0, self.ranks[np.maximum(j, 0)], j).astype(np.int32)
+
+    def face_measures(self) -> np.ndarray:
+        return self._read(self.t.face_measures, self.slots, self.engine.dim - 1)
+
+    def face_centroids(self) -> np.ndarray:
+        own = self._read(self.t.points, self.owners, 1) + self.origin
+        return self._read(self.t.face_centroids, self.slots, 1) + own
+
+    def vertices(self) -> np.ndarray:
+        positions = self.shared.positions.get().astype(np.float64) * self.scale + self.origin
+        # A rounding may not carry a corner out of the domain.
+        return np.clip(positions, self.domain.lower, self.domain.upper)
+
+    def cell_vertex_starts(self) -> np.ndarray:
+        return self.neighbour_starts()
+
+    def cell_vertices(self) -> np.ndarray:
+        return self.shared.cell_vertices.get()[self.slots]

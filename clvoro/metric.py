@@ -1,0 +1,42 @@
+"""How good a diagram is: metric error, quality, and whose neighbours changed (`metric.cl`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._program import Engine
+from .cells import Tessellation
+
+
+class Metric:
+    """Evaluate cells against their target size."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("metric")
+
+    def evaluate(self, t: Tessellation, h: cla.Array, error: cla.Array, quality: cla.Array) -> None:
+        """Write the paper's (3.1), signed, to `error` (n,) and its (4.1) to `quality` (n,)."""
+        self.engine.run(
+            self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, h, error,
+            quality,
+        )  # fmt: skip
+
+    def compare_neighbours(
+        self,
+        t: Tessellation,
+        labels: cla.Array,
+        first: bool,
+        signatures: cla.Array,
+        changed: cla.Array,
+        ever: cla.Array,
+    ) -> None:
+        """Write 1 to `changed` (n,) and `ever` (n,) where the set of neighbours differs from the last call's.
+
+        `signatures` (n,) uint64 carries what is compared; `first` only records it.
+        """
+        self.engine.run(
+            self._kernels.compare_neighbours, t.n, t.starts, t.neighbours, labels, np.int32(first),
+            signatures, changed, ever,
+        )  # fmt: skip

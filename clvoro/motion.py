@@ -1,0 +1,70 @@
+"""Moving generators: the correction's displacement, and the move itself (`motion.cl`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Summaries
+from ._program import Engine
+from .cells import Tessellation
+from .domain import Box
+
+
+class Motion:
+    """The kernels of `motion.cl`, one method each."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("motion")
+
+    def follow_potential(
+        self, t: Tessellation, psi: cla.Array, h: cla.Array, u: cla.Array, speed: cla.Array
+    ) -> None:
+        """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d) and |u| / h to `speed` (n,)."""
+        self.engine.run(
+            self._kernels.follow_potential, t.n, t.starts, t.neighbours, t.face_measures,
+            t.face_centroids, t.volumes, t.points, psi, h, u, speed,
+        )  # fmt: skip
+
+    def relax_globally(
+        self,
+        summaries: Summaries,
+        name: str,
+        limit: float,
+        k: float,
+        u: cla.Array,
+        speed: cla.Array,
+    ) -> None:
+        """Scale `u` and `speed` by alpha = min(limit, k / max(speed)), the paper's (3.5).
+
+        The summary `name` of the speeds has been collected.
+        """
+        real = self.engine.real.type
+        n = speed.shape[0]
+        self.engine.run(
+            self._kernels.relax_globally, n, summaries.values, np.int32(summaries.slots[name]),
+            real(limit), real(k), u, speed,
+        )  # fmt: skip
+
+    def measure_displacement(self, u: cla.Array, h: cla.Array, speed: cla.Array) -> None:
+        """Write |u| / h to `speed` (n,)."""
+        self.engine.run(self._kernels.measure_displacement, speed.shape[0], u, h, speed)
+
+    def move_generators(
+        self,
+        box: Box,
+        points: cla.Array,
+        lloyd: cla.Array,
+        a: float,
+        correction: cla.Array,
+        b: float,
+        h: cla.Array,
+        clip: float = 0.0,
+    ) -> None:
+        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `box`."""
+        real = self.engine.real.type
+        self.engine.run(
+            self._kernels.move_generators, h.shape[0], lloyd, real(a), correction, real(b), h,
+            real(clip), *box.device_corners(self.engine.real), points,
+        )  # fmt: skip
