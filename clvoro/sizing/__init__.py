@@ -1,0 +1,27 @@
+"""Size fields h(x), the wanted edge length of a cell, and the stage that evaluates them."""
+
+from .bind import bind
+from .distance import Circle, Distance, Polygon, Polyline, Segment, Sphere
+from .expression import Expression
+from .field import Constant, Field, Function, as_field, maximum, minimum
+from .raster import Raster
+from .stage import Sizing
+
+__all__ = [
+    "Circle",
+    "Constant",
+    "Distance",
+    "Expression",
+    "Field",
+    "Function",
+    "Polygon",
+    "Polyline",
+    "Raster",
+    "Segment",
+    "Sizing",
+    "Sphere",
+    "as_field",
+    "bind",
+    "maximum",
+    "minimum",
+]

@@ -1,0 +1,288 @@
+"""The base of all size fields, the simplest ones, and what combines them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from numbers import Real
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError
+
+if TYPE_CHECKING:
+    from .bind import Binder
+
+
+class Field:
+    """A size field h(x): called with points it gives sizes.
+
+    Every field is evaluated on the host by calling it, in float64: slow, and the reference. Fields
+    with ``on_device`` true are also turned into OpenCL by `bind`. Fields combine: ``2 * f``, ``f /
+    2``, ``f + g``, ``f + 0.01``, `minimum`, `maximum`.
+
+    Attributes
+    ----------
+    dim : int or None
+        2 or 3 if the field belongs to one dimension, None if it fits both.
+    on_device : bool
+        Whether the field has a device form.
+    """
+
+    dim: int | None = None
+    on_device: bool = True
+
+    def __call__(self, points: object) -> np.ndarray:
+        """Return h at `points`.
+
+        Parameters
+        ----------
+        points : (n, d) float
+            Physical coordinates.
+
+        Returns
+        -------
+        (n,) float64
+            Sizes, in the unit of the coordinates.
+
+        Raises
+        ------
+        InputError
+            If `points` does not have the shape (n, d) with the field's d.
+        """
+        try:
+            array = np.asarray(points, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputTypeError(
+                f"points of a size field are {type(points).__name__}, expected numbers of "
+                "shape (n, d)"
+            ) from error
+        if array.ndim != 2 or array.shape[1] not in (2, 3):
+            hint = "; pass points.T" if array.ndim == 2 and array.shape[0] in (2, 3) else ""
+            raise InputError(
+                f"points of a size field have shape {array.shape}, expected (n, 2) or (n, 3){hint}"
+            )
+        self.check_dim(array.shape[1])
+        return self._evaluate(array)
+
+    def check_dim(self, dim: int) -> None:
+        """Raise InputError if the field cannot serve `dim` dimensions."""
+        if self.dim is not None and self.dim != dim:
+            raise InputError(
+                f"the size field {self!r} is for {self.dim} dimensions, got a domain or points "
+                f"of {dim}; build it with {dim} coordinates"
+            )
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def _emit(self, binder: Binder) -> str:
+        """Add the field to `binder` and return the name of the variable that holds h'."""
+        raise NotImplementedError
+
+    def __mul__(self, factor: object) -> Field:
+        if not isinstance(factor, Real):
+            return NotImplemented
+        return Scaled(self, factor)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor: object) -> Field:
+        if not isinstance(divisor, Real):
+            return NotImplemented
+        return Scaled(self, 1.0 / positive("a divisor of a size field", divisor))
+
+    def __add__(self, other: object) -> Field:
+        if not isinstance(other, (Field, Real)) and not callable(other):
+            return NotImplemented
+        return Combined("+", self, as_field(other))
+
+    __radd__ = __add__
+
+
+class Constant(Field):
+    """The same size everywhere; a plain number given as size field becomes one.
+
+    Raises
+    ------
+    InputError
+        If `value` is not positive and finite.
+    """
+
+    def __init__(self, value: float):
+        self.value = positive("a constant size h", value)
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        return np.full(len(points), self.value)
+
+    def _emit(self, binder: Binder) -> str:
+        return binder.variable(f"data[{binder.store(self.value / binder.scale)}]")
+
+    def __repr__(self) -> str:
+        return f"Constant({self.value!r})"
+
+
+class Function(Field):
+    """A vectorised Python callable ``h(points (n, d)) -> (n,)``, evaluated on the host.
+
+    Each evaluation brings the points to the host and takes the sizes back (8 to 16 bytes per
+    coordinate both ways, and the queue waits meanwhile), and runs at the speed of the callable, (1
+    + 2 d) times where the gradient of h is needed too. Any field combined with a `Function` is
+    evaluated on the host as a whole. Where a `Raster`, `Distance` or `Expression` can say the same,
+    it is much faster.
+
+    The callable gets C-contiguous float64 points in physical coordinates, inside the domain or on
+    its walls.
+    """
+
+    on_device = False
+
+    def __init__(self, function: Callable[[np.ndarray], np.ndarray]):
+        if not callable(function):
+            raise InputTypeError(
+                f"Function got {type(function).__name__}, expected a callable "
+                "h(points (n, d)) -> (n,)"
+            )
+        self.function = function
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        sizes = np.asarray(self.function(np.ascontiguousarray(points)))
+        if sizes.dtype.kind not in "fiu":
+            raise InputTypeError(
+                f"{self!r} returned values of type {sizes.dtype}, expected real numbers of shape "
+                f"({len(points)},)"
+            )
+        if sizes.shape != (len(points),):
+            raise InputError(
+                f"{self!r} returned shape {sizes.shape} for {len(points)} points, expected "
+                f"({len(points)},); it must be vectorised, h(points (n, d)) -> (n,)"
+            )
+        return sizes.astype(float)
+
+    def _emit(self, binder: Binder) -> str:
+        raise InputError(
+            f"{self!r} runs on the host and has no device form; use Expression, Raster or Distance"
+        )
+
+    def __repr__(self) -> str:
+        return f"Function({getattr(self.function, '__name__', type(self.function).__name__)})"
+
+
+class Scaled(Field):
+    """A field times a positive number; made by ``2 * field``."""
+
+    def __init__(self, field: Field, factor: float):
+        self.field, self.factor = field, positive("a factor of a size field", factor)
+        self.dim, self.on_device = field.dim, field.on_device
+
+    def check_dim(self, dim: int) -> None:  # noqa: D102
+        self.field.check_dim(dim)
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        return self.factor * self.field._evaluate(points)
+
+    def _emit(self, binder: Binder) -> str:
+        inner = self.field._emit(binder)
+        return binder.variable(f"data[{binder.store(self.factor)}] * {inner}")
+
+    def __repr__(self) -> str:
+        return f"{self.factor!r} * {self.field!r}"
+
+
+_COMBINE = {
+    "+": (np.add, "{} + {}"),
+    "min": (np.minimum, "size_min({}, {})"),
+    "max": (np.maximum, "size_max({}, {})"),
+}
+
+
+class Combined(Field):
+    """Two or more fields under one of ``+``, ``min``, ``max``."""
+
+    def __init__(self, operation: str, *fields: Field):
+        dims = {f.dim for f in fields} - {None}
+        if len(dims) > 1:
+            raise InputError(
+                f"a size field was combined from fields of {sorted(dims)} dimensions, expected "
+                "fields of the same dimension"
+            )
+        self.operation, self.fields = operation, fields
+        self.dim = dims.pop() if dims else None
+        self.on_device = all(f.on_device for f in fields)
+
+    def check_dim(self, dim: int) -> None:  # noqa: D102
+        for f in self.fields:
+            f.check_dim(dim)
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        combine = _COMBINE[self.operation][0]
+        result = self.fields[0]._evaluate(points)
+        for f in self.fields[1:]:
+            result = combine(result, f._evaluate(points))
+        return result
+
+    def _emit(self, binder: Binder) -> str:
+        template = _COMBINE[self.operation][1]
+        name = self.fields[0]._emit(binder)
+        for f in self.fields[1:]:
+            name = binder.variable(template.format(name, f._emit(binder)))
+        return name
+
+    def __repr__(self) -> str:
+        if self.operation == "+":
+            return "(" + " + ".join(map(repr, self.fields)) + ")"
+        return f"{self.operation}imum({', '.join(map(repr, self.fields))})"
+
+
+def minimum(*fields: object) -> Field:
+    """Return the least of `fields` (fields, numbers or callables) at each point, as a field."""
+    return _combined("min", fields)
+
+
+def maximum(*fields: object) -> Field:
+    """Return the greatest of `fields` (fields, numbers or callables) at each point, as a field."""
+    return _combined("max", fields)
+
+
+def _combined(operation: str, fields: tuple[object, ...]) -> Field:
+    if not fields:
+        raise InputError(f"{operation}imum got no size field, expected at least one")
+    made = [as_field(f) for f in fields]
+    return made[0] if len(made) == 1 else Combined(operation, *made)
+
+
+def as_field(size: object) -> Field:
+    """Return `size` as a `Field`: a number becomes a `Constant`, a callable a `Function`.
+
+    Raises
+    ------
+    InputTypeError
+        If it is neither a number, nor a callable, nor a field.
+    """
+    if isinstance(size, Field):
+        return size
+    if isinstance(size, np.ndarray) and size.ndim == 0:
+        size = size.item()
+    if isinstance(size, Real) and not isinstance(size, (bool, np.bool_)):
+        return Constant(size)
+    if callable(size):
+        return Function(size)
+    hint = ""
+    if isinstance(size, str):
+        hint = f"; write sizing.Expression({size!r})"
+    elif isinstance(size, (np.ndarray, list, tuple)):
+        hint = "; write sizing.Raster(values, lower, upper)"
+    raise InputTypeError(
+        f"size is {type(size).__name__}, expected a number, a callable h(points (n, d)) -> (n,) "
+        f"or a field of clvoro.sizing{hint}"
+    )
+
+
+def positive(what: str, value: object) -> float:
+    """Return `value` as a float, or raise the error that `what` must be positive and finite."""
+    if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
+        raise InputTypeError(f"{what} is {value!r}, expected a positive number")
+    if not (value > 0 and math.isfinite(value)):
+        raise InputError(f"{what} is {value!r}, expected a positive, finite number")
+    return float(value)
