@@ -1,0 +1,284 @@
+"""The paper's validation case: its claims, one by one, against what is measured.
+
+Runs Lloyd only, Poisson only and both coupled from the same uniform random start, for several
+starts, and prints for each claim of the paper what was measured and whether it holds:
+
+    python bench/paper_case.py [--seeds 3] [--steps 100] [--k 0.5] [--device NAME] [--json]
+
+Exits with 1 if a claim does not hold. `--pictures DIR` also writes the pictures of the first start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import clvoro
+from clvoro.cases import load_case
+from clvoro.results import Result
+from clvoro.summary import summary
+
+METHODS = ("lloyd", "poisson", "coupled")
+FIRST_SEED = 20251
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One sentence of the paper.
+
+    Attributes
+    ----------
+    text : str
+    measure : function
+        Takes the results of the three methods from one start; returns named numbers.
+    holds : function
+        Takes these numbers; whether the claim holds for that start.
+    criterion : str
+        What `holds` asks for, in words.
+    """
+
+    text: str
+    measure: Callable[[Mapping[str, Result]], dict[str, float]]
+    holds: Callable[[dict[str, float]], bool]
+    criterion: str
+
+
+def mean_error(result: Result) -> float:
+    return float(np.abs(result.error).mean())
+
+
+def spread(result: Result) -> float:
+    """Ratio of the 95th to the 5th percentile of the cells' sizes, 1 for a uniform mesh."""
+    low, high = np.quantile(result.diagram.volumes ** (1 / result.points.shape[1]), [0.05, 0.95])
+    return float(high / low)
+
+
+def steps_until(result: Result, error: float) -> float:
+    """First step whose mean error is at most `error`; infinite if there is none."""
+    reached = np.flatnonzero(result.history["mean_error"] <= error)
+    return float(reached[0]) if len(reached) else np.inf
+
+
+def uniform(r: Mapping[str, Result]) -> dict[str, float]:
+    return {
+        "mean Q": float(r["lloyd"].quality.mean()),
+        "size ratio p95/p5": spread(r["lloyd"]),
+        "mean |e|": mean_error(r["lloyd"]),
+    }
+
+
+def poor(r: Mapping[str, Result]) -> dict[str, float]:
+    return {
+        "mean |e| at the start": float(r["poisson"].history["mean_error"][0]),
+        "mean |e|": mean_error(r["poisson"]),
+        "mean Q": float(r["poisson"].quality.mean()),
+        "min Q": float(r["poisson"].quality.min()),
+        "mean Q of lloyd": float(r["lloyd"].quality.mean()),
+    }
+
+
+def both(r: Mapping[str, Result]) -> dict[str, float]:
+    return {
+        "mean |e|": mean_error(r["coupled"]),
+        "max |e|": float(np.abs(r["coupled"].error).max()),
+        "mean Q": float(r["coupled"].quality.mean()),
+        "min Q": float(r["coupled"].quality.min()),
+        "mean |e| of poisson": mean_error(r["poisson"]),
+        "mean Q of poisson": float(r["poisson"].quality.mean()),
+    }
+
+
+def drop(r: Mapping[str, Result]) -> dict[str, float]:
+    """Fall of the mean error in the first step, and in the median step of the first half."""
+    history = r["coupled"].history["mean_error"]
+    falls = -np.diff(history)
+    return {
+        "before": float(history[0]),
+        "after 1 step": float(history[1]),
+        "after 5 steps": float(history[min(5, len(history) - 1)]),
+        "fall of step 1": float(falls[0]),
+        "median fall of a step": float(np.median(falls[: max(len(falls) // 2, 1)])),
+    }
+
+
+def faster(r: Mapping[str, Result]) -> dict[str, float]:
+    level = 1.05 * mean_error(r["poisson"])
+    return {
+        "mean |e| to reach": level,
+        "steps of coupled": steps_until(r["coupled"], level),
+        "steps of poisson": steps_until(r["poisson"], level),
+    }
+
+
+def under(r: Mapping[str, Result]) -> dict[str, float]:
+    return {
+        "mean Q of lloyd": float(r["lloyd"].quality.mean()),
+        "mean Q of coupled": float(r["coupled"].quality.mean()),
+    }
+
+
+def balance(r: Mapping[str, Result]) -> dict[str, float]:
+    """How far Lloyd's and Poisson's displacements cancel: lengths over h, and their direction."""
+    last, h = r["coupled"].final, r["coupled"].size[:, None]
+    lloyd, poisson = last.lloyd / h, last.poisson / h
+    return {
+        "mean |Lloyd|/h": float(np.linalg.norm(lloyd, axis=1).mean()),
+        "mean |Poisson|/h": float(np.linalg.norm(poisson, axis=1).mean()),
+        "mean |sum|/h": float(np.linalg.norm(lloyd + poisson, axis=1).mean()),
+        "correlation": float(
+            (lloyd * poisson).sum() / np.sqrt((lloyd**2).sum() * (poisson**2).sum())
+        ),
+    }
+
+
+def topology(r: Mapping[str, Result]) -> dict[str, float]:
+    return {"share of cells": float(r["coupled"].history["ever_changed"][-1])}
+
+
+CLAIMS = (
+    Claim(
+        "Lloyd only: excellent cell quality and nearly uniform cell sizes",
+        uniform,
+        lambda m: m["mean Q"] > 0.95 and m["size ratio p95/p5"] < 1.5 and m["mean |e|"] > 0.5,
+        "mean Q > 0.95, sizes within 1.5, the metric missed by more than 50 %",
+    ),
+    Claim(
+        "Poisson only: the target is reached, but with irregular, poorly shaped cells",
+        poor,
+        lambda m: (
+            m["mean |e|"] < 0.1 * m["mean |e| at the start"]
+            and m["mean Q"] < m["mean Q of lloyd"] - 0.1
+        ),
+        "less than a tenth of the initial error, mean Q more than 0.1 under Lloyd's",
+    ),
+    Claim(
+        "Coupled: conforms to the target with much better cells",
+        both,
+        lambda m: (
+            m["mean |e|"] <= m["mean |e| of poisson"] and m["mean Q"] > m["mean Q of poisson"] + 0.1
+        ),
+        "error no larger than Poisson's, mean Q more than 0.1 above its",
+    ),
+    Claim(
+        "Immediate sharp decrease of the error",
+        drop,
+        lambda m: m["fall of step 1"] > 3 * m["median fall of a step"],
+        "the first step takes off over 3 times what a step of the first half usually does",
+    ),
+    Claim(
+        "Coupled converges slightly faster than Poisson only",
+        faster,
+        lambda m: m["steps of coupled"] <= m["steps of poisson"],
+        "no more steps to Poisson's final error (within 5 %)",
+    ),
+    Claim(
+        "Coupled: quality slightly under that of Lloyd only",
+        under,
+        lambda m: -0.05 < m["mean Q of coupled"] - m["mean Q of lloyd"] < 0,
+        "less than 0.05 under",
+    ),
+    Claim(
+        "At the end Lloyd and Poisson displacements oppose and balance each other",
+        balance,
+        lambda m: m["correlation"] < -0.8 and m["mean |sum|/h"] < 0.5 * m["mean |Lloyd|/h"],
+        "correlation under -0.8, their sum less than half of either",
+    ),
+    Claim(
+        "Over 98 % of the cells change topology at some point",
+        topology,
+        lambda m: m["share of cells"] > 0.98,
+        "share above 0.98",
+    ),
+)
+
+
+def run_methods(adapter: clvoro.Adapter, seed: int, steps: int, k: float) -> dict[str, Result]:
+    case = load_case("paper")
+    return {
+        method: adapter.run(
+            case.domain, case.size_field(), method=method, start="uniform", max_steps=steps, tol=0,
+            k=k, seed=seed,
+        )
+        for method in METHODS
+    }  # fmt: skip
+
+
+def judge(runs: list[dict[str, Result]]) -> list[dict]:
+    """Measure every claim on every start."""
+    verdicts = []
+    for claim in CLAIMS:
+        measured = [claim.measure(results) for results in runs]
+        verdicts.append(
+            {
+                "claim": claim.text,
+                "criterion": claim.criterion,
+                "measured": measured,
+                "holds": [claim.holds(m) for m in measured],
+            }
+        )
+    return verdicts
+
+
+def print_table(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
+    print(f"{'start':>5} {'method':8} {'cells':>6} {'steps':>5} {'mean |e|':>9} {'max |e|':>8} "
+          f"{'mean Q':>7} {'min Q':>6} {'seconds':>8}")  # fmt: skip
+    for number, results in enumerate(runs, start=1):
+        for method, result in results.items():
+            s = summary(result)
+            print(
+                f"{number:5} {method:8} {s['cells']:6} {s['steps']:5} {s['mean_error']:9.4f} "
+                f"{s['max_error']:8.3f} {s['mean_quality']:7.4f} {s['min_quality']:6.3f} "
+                f"{s['seconds']:8.2f}"
+            )
+    for number, verdict in enumerate(verdicts, start=1):
+        good = sum(verdict["holds"])
+        word = "holds" if good == len(runs) else f"holds for {good} of {len(runs)} starts"
+        print(f"\n{number}. {verdict['claim']}: {word}\n   (asked: {verdict['criterion']})")
+        for name in verdict["measured"][0]:
+            values = [m[name] for m in verdict["measured"]]
+            print(f"   {name:24} " + "  ".join(f"{v:8.4g}" for v in values))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--device", help="as for clvoro run")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="random starts (3)")
+    parser.add_argument("--steps", type=int, default=100, help="steps per run (100)")
+    parser.add_argument("--k", type=float, default=0.5, help="the paper's k (0.5)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write the report here")
+    arguments = parser.parse_args()
+
+    adapter = clvoro.Adapter(clvoro.create_context(arguments.device))
+    runs = [
+        run_methods(adapter, FIRST_SEED + 17 * n, arguments.steps, arguments.k)
+        for n in range(arguments.seeds)
+    ]
+    verdicts = judge(runs)
+    if arguments.json:
+        figures = [{m: summary(r) for m, r in results.items()} for results in runs]
+        device = adapter.ctx.devices[0].name.strip()
+        print(json.dumps({"device": device, "runs": figures, "claims": verdicts}))
+    else:
+        print(f"{adapter.ctx.devices[0].name.strip()}, k = {arguments.k:g}")
+        print_table(runs, verdicts)
+    if arguments.pictures:
+        from clvoro.report import write_report
+
+        case = load_case("paper")
+        points = runs[0]["coupled"].initial.points
+        initial = adapter.run(case.domain, case.size_field(), points=points, max_steps=0)
+        write_report(
+            runs[0], arguments.pictures, initial=initial, size=case.size_field(), title=case.title
+        )
+    return 0 if all(all(v["holds"]) for v in verdicts) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

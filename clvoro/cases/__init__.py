@@ -1,0 +1,165 @@
+"""Cases: a domain, a size field and a run, as a TOML file describes them; and the built-in ones."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ..domain import Box
+from ..errors import InputError
+from . import schema, toml
+from .fields import build_size, load_array, named_files
+from .naca import naca4
+
+__all__ = ["Case", "builtin_cases", "load_case", "naca4"]
+
+_FOLDER = Path(__file__).parent
+_RUN_ORDER = (
+    "method", "methods", "effort", "start", "points", "n_cells", "max_steps", "tol", "alpha", "k",
+    "seed", "dtype",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case file, checked.
+
+    Attributes
+    ----------
+    name, title : str
+    domain : Box
+    size : dict
+        The size field's tree of tables; `size_field` builds it.
+    run : dict
+        The keys of the file's `[run]` table.
+    folder : Path
+        Files that the case names are looked for here.
+    """
+
+    name: str
+    title: str
+    domain: Box
+    size: dict[str, Any]
+    run: dict[str, Any] = field(default_factory=dict)
+    folder: Path = Path()
+
+    @classmethod
+    def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
+        """Read a case from TOML text; `name` is what errors call it, and its name if it gives none.
+
+        Raises
+        ------
+        InputError
+            Naming the key, what it holds and what was expected.
+        """
+        place = f"{name}:"
+        try:
+            content = toml.read(text)
+        except ValueError as error:
+            raise InputError(f"{place} not a TOML file: {error}") from error
+        checked = schema.CASE(content, place)
+        run = checked.get("run", {})
+        if "method" in run and "methods" in run:
+            raise InputError(f"{place} run has both method and methods; keep one of them")
+        stem = str(checked.get("name", Path(name).stem))
+        box = checked["domain"]
+        return cls(
+            name=stem,
+            title=str(checked.get("title", stem)),
+            domain=Box(box["lower"], box["upper"]),
+            size=checked["size"],
+            run=run,
+            folder=folder,
+        )
+
+    @property
+    def methods(self) -> tuple[str | None, ...]:
+        """Methods to run in turn, all from the same start; the last one is the main one."""
+        return tuple(self.run.get("methods", [self.run.get("method")]))
+
+    def with_run(self, **changes: Any) -> Case:
+        """Return this case with other keys in `[run]`; those that are None stay as they are."""
+        changes = {key: value for key, value in changes.items() if value is not None}
+        dropped = {"method", "methods"} if {"method", "methods"} & set(changes) else set()
+        run = {key: value for key, value in self.run.items() if key not in dropped}
+        return replace(self, run=schema.RUN({**run, **changes}, f"{self.name}: run"))
+
+    def size_field(self) -> Any:
+        """Build the size field (an object of `clvoro.sizing`)."""
+        return build_size(self.size, self.folder, self.domain)
+
+    def run_arguments(self) -> dict[str, Any]:
+        """Return what the case sets of `Adapter.run`'s arguments, method and dtype apart."""
+        apart = ("method", "methods", "dtype")
+        arguments = {key: value for key, value in self.run.items() if key not in apart}
+        if "points" in arguments:
+            arguments["points"] = load_array(self.folder / arguments["points"], "run.points")
+        return arguments
+
+    def table(self) -> dict[str, Any]:
+        """Return the case as the table that its TOML file holds."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "domain": {"lower": list(self.domain.lower), "upper": list(self.domain.upper)},
+            "size": self.size,
+            "run": {key: self.run[key] for key in _RUN_ORDER if key in self.run},
+        }
+
+    def write(self, folder: Path, header: tuple[str, ...] = ()) -> Path:
+        """Write `case.toml` into `folder`, with copies of the files that it names; return its path.
+
+        Reading it gives this case again, wherever the folder is moved to.
+        """
+        moved = replace(self, size=copy.deepcopy(self.size), run=dict(self.run))
+        entries = [(node, "file") for node in named_files(moved.size)]
+        entries += [(moved.run, "points")] * ("points" in moved.run)
+        taken: dict[str, Path] = {}
+        for node, key in entries:
+            source = (self.folder / node[key]).resolve()
+            target = source.name
+            while taken.setdefault(target, source) != source:
+                target = f"other-{target}"
+            node[key] = target
+            if source != (folder / target).resolve():
+                shutil.copyfile(source, folder / target)
+        path = folder / "case.toml"
+        temporary = folder / ".case.toml.part"
+        temporary.write_text(toml.write(moved.table(), header), encoding="utf-8")
+        temporary.replace(path)
+        return path
+
+
+def builtin_cases() -> Mapping[str, str]:
+    """Return the TOML texts of the built-in cases by name."""
+    files = sorted(_FOLDER.glob("*.toml"))
+    return {path.stem: path.read_text(encoding="utf-8") for path in files}
+
+
+def load_case(name: str | Path) -> Case:
+    """Return the case of a built-in name or of a TOML file.
+
+    Raises
+    ------
+    InputError
+        If there is neither, or the file is not a case.
+    """
+    known = builtin_cases()
+    if str(name) in known:
+        return Case.from_toml(known[str(name)], str(name))
+    path = Path(name)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        near = difflib.get_close_matches(str(name), list(known), 1, 0.5)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(
+            f"case {str(name)!r} is neither a file that can be read ({error}) nor a built-in case "
+            f"({', '.join(known)}){hint}"
+        ) from error
+    return Case.from_toml(text, path.name, path.parent)

@@ -1,0 +1,95 @@
+"""Turn the checked size tree of a case into an object of `clvoro.sizing`."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..domain import Box
+from ..errors import InputError
+from .naca import naca4
+
+
+def build_size(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
+    """Return the size field that `node` describes.
+
+    Parameters
+    ----------
+    node : mapping
+        A tree that `schema.size` has passed.
+    folder : Path
+        Where the files that it names are looked for.
+    domain : Box
+        What a raster covers if it does not say so itself.
+    """
+    from .. import sizing
+
+    def inner(child: Mapping[str, Any]) -> Any:
+        return build_size(child, folder, domain)
+
+    kind = node["kind"]
+    if kind == "constant":
+        return sizing.Constant(node["value"])
+    if kind == "expression":
+        return sizing.Expression(node["expression"])
+    if kind == "raster":
+        values = load_array(folder / node["file"], "size.file")
+        corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
+        return sizing.Raster(values, *corners, at=node.get("at", "nodes"))
+    if kind == "distance":
+        options = {key: node[key] for key in ("growth", "slope", "h_max") if key in node}
+        return sizing.Distance([_shape(s) for s in node["shapes"]], node["h_min"], **options)
+    if kind == "min":
+        return sizing.minimum(*map(inner, node["fields"]))
+    if kind == "max":
+        return sizing.maximum(*map(inner, node["fields"]))
+    if kind == "sum":
+        return functools.reduce(operator.add, map(inner, node["fields"]))
+    if kind == "scale":
+        return node["factor"] * inner(node["field"])
+    raise AssertionError(f"the schema passed a size field of kind {kind!r}")
+
+
+def _shape(node: Mapping[str, Any]) -> Any:
+    from .. import sizing
+
+    kind = node["kind"]
+    if kind == "circle":
+        return sizing.Circle(node["centre"], node["radius"])
+    if kind == "segment":
+        return sizing.Segment(node["a"], node["b"])
+    if kind == "polyline":
+        return sizing.Polyline(node["points"])
+    if kind == "polygon":
+        return sizing.Polygon(node["points"])
+    return sizing.Polygon(naca4(**{key: value for key, value in node.items() if key != "kind"}))
+
+
+def load_array(path: Path, place: str) -> np.ndarray:
+    """Read an array from a `.npy` file, or the array `points` from a `.npz` file.
+
+    Raises
+    ------
+    InputError
+        If there is no such file or it holds no such array.
+    """
+    try:
+        content = np.load(path, allow_pickle=False)
+        return content if isinstance(content, np.ndarray) else content["points"]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{place} names {str(path)!r}, which cannot be read as an array ({error}); "
+            "give a .npy file beside the case file"
+        ) from error
+
+
+def named_files(node: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return every table of the tree that names a file, so that the files can be copied along."""
+    children = [*node.get("fields", []), *([node["field"]] if "field" in node else [])]
+    own = [node] if node["kind"] == "raster" else []
+    return own + [found for child in children for found in named_files(child)]  # type: ignore[return-value]

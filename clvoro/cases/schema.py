@@ -1,0 +1,228 @@
+"""What a case file may contain; errors name the key and the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ..errors import InputError
+
+Check = Callable[[object, str], object]
+"""Takes a value and its place in the file; returns it in its final type or raises InputError."""
+
+
+def refuse(place: str, got: object, expected: str) -> InputError:
+    """Return the error for one value."""
+    return InputError(f"{place} is {got!r}, expected {expected}")
+
+
+def text(value: object, place: str) -> str:
+    """Check for a string that is not empty."""
+    if not isinstance(value, str) or not value.strip():
+        raise refuse(place, value, "a text in quotes")
+    return value
+
+
+def number(value: object, place: str) -> float:
+    """Check for a finite number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise refuse(place, value, "a finite number")
+    return float(value)
+
+
+def positive(value: object, place: str) -> float:
+    """Check for a number above zero."""
+    if number(value, place) <= 0:
+        raise refuse(place, value, "a number above 0")
+    return float(value)  # type: ignore[arg-type]
+
+
+def not_negative(value: object, place: str) -> float:
+    """Check for a number that is zero or more."""
+    if number(value, place) < 0:
+        raise refuse(place, value, "a number not below 0")
+    return float(value)  # type: ignore[arg-type]
+
+
+def whole(least: int) -> Check:
+    """Return the check for a whole number of at least `least`."""
+
+    def check(value: object, place: str) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise refuse(place, value, f"a whole number, {least} or more")
+        return value
+
+    return check
+
+
+def one_of(*names: str) -> Check:
+    """Return the check for one of a few words."""
+
+    def check(value: object, place: str) -> str:
+        if value not in names:
+            raise InputError(
+                f"{place} is {value!r}{_nearest(value, names)}; expected one of {_join(names)}"
+            )
+        return str(value)
+
+    return check
+
+
+def vector(*lengths: int) -> Check:
+    """Return the check for a list of numbers of one of these lengths."""
+
+    def check(value: object, place: str) -> list[float]:
+        if not isinstance(value, (list, tuple)) or len(value) not in lengths:
+            raise refuse(place, value, f"a list of {' or '.join(map(str, lengths))} numbers")
+        return [number(v, f"{place}[{i}]") for i, v in enumerate(value)]
+
+    return check
+
+
+def vectors(least: int) -> Check:
+    """Return the check for a list of at least `least` points."""
+
+    def check(value: object, place: str) -> list[list[float]]:
+        if not isinstance(value, (list, tuple)) or len(value) < least:
+            raise refuse(place, value, f"a list of {least} or more points, [x, y] each")
+        return [vector(2, 3)(v, f"{place}[{i}]") for i, v in enumerate(value)]  # type: ignore[misc]
+
+    return check
+
+
+def list_of(check_item: Check, least: int = 1) -> Check:
+    """Return the check for a list, every item of which passes `check_item`."""
+
+    def check(value: object, place: str) -> list[object]:
+        if not isinstance(value, (list, tuple)) or len(value) < least:
+            raise refuse(place, value, f"a list with {least} or more entries")
+        return [check_item(v, f"{place}[{i}]") for i, v in enumerate(value)]
+
+    return check
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table's keys: those it must have, may have, and those of which exactly one is wanted."""
+
+    required: Mapping[str, Check]
+    optional: Mapping[str, Check]
+    choice: tuple[str, ...] = ()
+
+    def __call__(self, value: object, place: str) -> dict[str, object]:
+        """Return the checked table, its keys in the file's order."""
+        if not isinstance(value, Mapping):
+            raise refuse(place, value, "a table")
+        checks = {**self.required, **self.optional}
+        for key in value:
+            if key not in checks:
+                raise InputError(
+                    f"{place} has the unknown key {key!r}{_nearest(key, checks)}; "
+                    f"it takes {_join(checks)}"
+                )
+        missing = [key for key in self.required if key not in value]
+        if missing:
+            raise InputError(f"{place} lacks {_join(missing)}; it takes {_join(checks)}")
+        if self.choice and sum(key in value for key in self.choice) != 1:
+            raise InputError(
+                f"{place} has {_join([k for k in self.choice if k in value]) or 'none'} of "
+                f"{_join(self.choice)}, expected exactly one of them"
+            )
+        return {key: checks[key](item, _below(place, key)) for key, item in value.items()}
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """A table whose key `kind` says which other keys it has."""
+
+    tables: Mapping[str, Table]
+    default: str | None = None
+
+    def __call__(self, value: object, place: str) -> dict[str, object]:
+        """Return the checked table with its kind first."""
+        if not isinstance(value, Mapping):
+            raise refuse(place, value, "a table")
+        kind = one_of(*self.tables)(value.get("kind", self.default), _below(place, "kind"))
+        rest = {key: item for key, item in value.items() if key != "kind"}
+        return {"kind": kind, **self.tables[str(kind)](rest, place)}
+
+
+def _below(place: str, key: str) -> str:
+    """Name a key of the table at `place`; the file itself is the place "case.toml:"."""
+    return f"{place} {key}" if place.endswith(":") else f"{place}.{key}"
+
+
+def _join(names: object) -> str:
+    return ", ".join(map(str, names))  # type: ignore[call-overload]
+
+
+def _nearest(name: object, known: object) -> str:
+    near = difflib.get_close_matches(str(name), list(known), 1, 0.5)  # type: ignore[call-overload]
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+SHAPE = Kinds(
+    {
+        "circle": Table({"centre": vector(2, 3), "radius": not_negative}, {}),
+        "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
+        "polyline": Table({"points": vectors(2)}, {}),
+        "polygon": Table({"points": vectors(3)}, {}),
+        "naca4": Table(
+            {"digits": text},
+            {"chord": positive, "leading_edge": vector(2), "angle": number, "n_points": whole(3)},
+        ),
+    }
+)
+"""A shape that sizes are measured from."""
+
+
+def size(value: object, place: str) -> dict[str, object]:
+    """Check a size field: a number, or a tree of tables."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return {"kind": "constant", "value": positive(value, place)}
+    return _SIZE(value, place)
+
+
+_SIZE = Kinds(
+    {
+        "constant": Table({"value": positive}, {}),
+        "distance": Table(
+            {"shapes": list_of(SHAPE), "h_min": positive},
+            {"growth": positive, "slope": positive, "h_max": positive},
+            choice=("growth", "slope"),
+        ),
+        "expression": Table({"expression": text}, {}),
+        "raster": Table(
+            {"file": text},
+            {"lower": vector(2, 3), "upper": vector(2, 3), "at": one_of("nodes", "centres")},
+        ),
+        "min": Table({"fields": list_of(size)}, {}),
+        "max": Table({"fields": list_of(size)}, {}),
+        "sum": Table({"fields": list_of(size)}, {}),
+        "scale": Table({"factor": positive, "field": size}, {}),
+    }
+)
+
+DOMAIN = Kinds({"box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {})}, default="box")
+
+RUN = Table(
+    {},
+    {
+        "method": text,
+        "methods": list_of(text),
+        "start": one_of("density", "uniform"),
+        "points": text,
+        "n_cells": whole(1),
+        "max_steps": whole(0),
+        "tol": not_negative,
+        "alpha": positive,
+        "k": positive,
+        "seed": whole(0),
+        "dtype": one_of("float64", "float32"),
+        "effort": one_of("fast", "default", "best"),
+    },
+)
+
+CASE = Table({"domain": DOMAIN, "size": size}, {"name": text, "title": text, "run": RUN})

@@ -1,0 +1,162 @@
+"""The command `clvoro`: run a case, list devices and built-in cases."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from .errors import BuildError, ClvoroError, DeviceError, InputError, InputTypeError
+
+OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
+
+_EPILOG = """\
+exit codes: 0 done; 1 the run failed; 2 bad usage or input; 3 no usable device;
+130 interrupted (Ctrl-C; what there was has been written)
+
+examples:
+  clvoro run paper                      the paper's validation case, into out/paper
+  clvoro run airfoil --device gpu       a wing section on a GPU
+  clvoro cases paper > my.toml          a case file to start from
+  clvoro run my.toml --method coupled --steps 200 --out result
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="clvoro",
+        description="Adapt Voronoi meshes to a size field, with OpenCL on any CPU or GPU.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"clvoro {_version()}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    run = commands.add_parser(
+        "run",
+        help="run a case: mesh, history and report",
+        description="Run a case and write mesh.vtu, mesh.npz, history.csv, case.toml, report.html "
+        "and pictures/. Options override what the case says.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    run.add_argument("case", metavar="CASE", help="a TOML file, or a built-in case's name")
+    run.add_argument(
+        "--out", metavar="DIR", type=Path, help="where to write (default: out/NAME of the case)"
+    )
+    run.add_argument(
+        "--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices"
+    )
+    run.add_argument(
+        "--method", metavar="M", help="lloyd, poisson, coupled, ...; or several: lloyd,coupled"
+    )
+    run.add_argument(
+        "--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform"
+    )
+    run.add_argument("--cells", metavar="N", type=int, help="number of cells (default: from h)")
+    run.add_argument("--steps", metavar="N", type=int, help="largest number of steps")
+    run.add_argument("--tol", type=float, metavar="T", help="stop when gains fall below this share")
+    run.add_argument("--k", type=float, metavar="K", help="largest displacement over h in a step")
+    run.add_argument("--seed", type=int, metavar="S", help="of the random start")
+    run.add_argument("--dtype", choices=("float64", "float32"), help="precision on the device")
+    run.add_argument("--effort", choices=("fast", "default", "best"), help="work against quality")
+    run.add_argument("--no-report", action="store_true", help="no pictures and no page")
+    run.add_argument(
+        "--format",
+        metavar="KIND",
+        action="append",
+        choices=("png", "pdf", "svg"),
+        help="kind of picture files, may be repeated (default: png)",
+    )
+    run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
+    run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
+
+    commands.add_parser("devices", help="list the OpenCL devices and whether they work")
+    cases = commands.add_parser("cases", help="list the built-in cases, or print one")
+    cases.add_argument("case", metavar="NAME", nargs="?", help="print this case's TOML text")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = build_parser().parse_args(argv)
+    command = {"run": _run, "devices": _devices, "cases": _cases}[arguments.command]
+    try:
+        return command(arguments)
+    except (InputError, InputTypeError) as error:
+        return _complain(error, BAD_INPUT)
+    except BuildError as error:
+        return _complain(error, FAILED)
+    except DeviceError as error:
+        return _complain(error, NO_DEVICE)
+    except (ClvoroError, OSError) as error:
+        return _complain(error, FAILED)
+    except KeyboardInterrupt:
+        return _complain("interrupted, nothing more has been written", INTERRUPTED)
+
+
+def _complain(message: object, code: int) -> int:
+    print(f"clvoro: {message}", file=sys.stderr)
+    return code
+
+
+def _version() -> str:
+    from . import __version__
+
+    return __version__
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from .cases import load_case
+    from .jobs import Job
+
+    case = load_case(arguments.case)
+    methods = arguments.method.split(",") if arguments.method else []
+    case = case.with_run(
+        method=methods[0] if len(methods) == 1 else None,
+        methods=methods if len(methods) > 1 else None,
+        start=arguments.start,
+        n_cells=arguments.cells,
+        max_steps=arguments.steps,
+        tol=arguments.tol,
+        k=arguments.k,
+        seed=arguments.seed,
+        dtype=arguments.dtype,
+        effort=arguments.effort,
+    )
+    job = Job(
+        case,
+        arguments.out or Path("out") / case.name,
+        device=arguments.device,
+        report=not arguments.no_report,
+        formats=tuple(arguments.format or ["png"]),
+        quiet=arguments.quiet,
+        as_json=arguments.json,
+    )
+    return INTERRUPTED if job.run() else OK
+
+
+def _devices(_: argparse.Namespace) -> int:
+    from .device import format_devices, list_devices
+
+    devices = list_devices()
+    print(format_devices(devices))
+    return OK if any(device.works for device in devices) else NO_DEVICE
+
+
+def _cases(arguments: argparse.Namespace) -> int:
+    from .cases import builtin_cases, load_case
+
+    known = builtin_cases()
+    if arguments.case is None:
+        for name in known:
+            print(f"{name:10} {load_case(name).title}")
+    elif arguments.case in known:
+        print(known[arguments.case], end="")
+    else:
+        raise InputError(
+            f"case is {arguments.case!r}, expected one of the built-in cases {', '.join(known)}"
+        )
+    return OK

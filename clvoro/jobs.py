@@ -1,0 +1,270 @@
+"""What `clvoro run` does: run a case's methods from one start and write everything down."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .cases import Case
+from .errors import ClvoroError, InputError
+from .results import Result
+from .summary import summary
+
+_REPEATED = ("start", "n_cells", "max_steps", "tol", "alpha", "k", "seed", "dtype")
+"""Settings that a run reports and that its `case.toml` fixes, whatever later defaults are."""
+
+
+@dataclass
+class Job:
+    """One call of `clvoro run`.
+
+    Attributes
+    ----------
+    case : Case
+    out : Path
+        Folder for the files; made if it does not exist.
+    device : str or None
+        As `clvoro.create_context` takes it.
+    report : bool
+        Whether to draw pictures and write `report.html`.
+    formats : tuple of str
+        Kinds of picture files.
+    quiet, as_json : bool
+        No progress and no summary; one JSON object per finished run on the standard output.
+    """
+
+    case: Case
+    out: Path
+    device: str | None = None
+    report: bool = True
+    formats: tuple[str, ...] = ("png",)
+    quiet: bool = False
+    as_json: bool = False
+    interrupted: bool = field(default=False, init=False)
+
+    def run(self) -> bool:
+        """Run all methods, write the files, print the summary; tell whether it was interrupted.
+
+        Raises
+        ------
+        ClvoroError
+            If the input is bad, there is no device, or a run fails.
+        OSError
+            If the output cannot be written.
+        """
+        from . import Adapter, create_context
+
+        arguments, size = self.case.run_arguments(), self.case.size_field()
+        self._refuse_unknown(arguments, Adapter.run)
+        check_folder(self.out)
+        if self.report:
+            _require_plots()
+        dtype = self.case.run.get("dtype", "float64")
+        adapter = Adapter(create_context(self.device, fp64=dtype == "float64"), dtype=dtype)
+        device = adapter.ctx.devices[0]
+        where = f"{device.platform.name.strip()} / {device.name.strip()}"
+        results: dict[str, Result] = {}
+        with self._stopping_cleanly():
+            for method in self.case.methods:  # the same seed gives all the same start
+                result = self._run_one(adapter, size, method, dict(arguments))
+                name = str(method or result.settings.get("method", "default"))
+                results[name] = result
+                self._announce(name, result, where)
+                if self.interrupted:
+                    break
+            self._write(adapter, size, results, where)
+        self._summarise(results, where)
+        return self.interrupted
+
+    def _run_one(
+        self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
+    ) -> Result:
+        from .progress import Progress
+
+        if method is not None:
+            arguments["method"] = method
+        most = arguments.get("max_steps", _default(type(adapter).run, "max_steps"))
+        title = f"{self.case.name} {method or ''}".strip()
+        progress: Any = nullcontext() if self.quiet else Progress(title, most)
+        with progress as shown:
+
+            def callback(row: np.void) -> bool:
+                if shown is not None:
+                    shown(row)
+                return self.interrupted
+
+            result: Result = adapter.run(self.case.domain, size, callback=callback, **arguments)
+        if result.stop_reason == "interrupted":
+            self.interrupted = True
+        return replace(result, stop_reason="interrupted") if self.interrupted else result
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        """Undo what the change of units may have rounded across a wall."""
+        return np.clip(points, self.case.domain.lower, self.case.domain.upper)
+
+    def _refuse_unknown(self, arguments: dict[str, Any], run: Callable[..., Any]) -> None:
+        known = inspect.signature(run).parameters
+        for name in arguments:
+            if name not in known:
+                raise InputError(
+                    f"{self.case.name}: run.{name} is not a setting of this version of clvoro; "
+                    "leave it out"
+                )
+
+    @contextmanager
+    def _stopping_cleanly(self) -> Iterator[None]:
+        """Let the first Ctrl-C (or SIGTERM) end the run after its step, and the second at once."""
+
+        def stop(number: int, _: object) -> None:
+            if self.interrupted:
+                raise KeyboardInterrupt
+            self.interrupted = True
+            print(
+                "\nclvoro: stopping after this step; once more to quit without writing",
+                file=sys.stderr,
+            )
+
+        previous = {}
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                previous[number] = signal.signal(number, stop)
+        except ValueError:  # not the main thread: signals are someone else's
+            pass
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
+        from . import __version__
+        from .io import save, write_history
+
+        *others, (_, main) = results.items()
+        save(main, self.out / "mesh.vtu")
+        save(main, self.out / "mesh.npz")
+        write_history(main, self.out / "history.csv")
+        for other, result in others:
+            save(result, self.out / f"mesh-{other}.npz")
+            write_history(result, self.out / f"history-{other}.csv")
+        note = "; interrupted: the mesh beside it is that of an earlier step" * self.interrupted
+        header = (
+            f"Written by clvoro {__version__} on {where}{note}.",
+            "Repeat it with: clvoro run case.toml",
+        )
+        path = self._repeatable(main).write(self.out, header)
+        if self.report:
+            from .report import write_report
+
+            write_report(
+                results,
+                self.out,
+                initial=self._initial(adapter, size, main),
+                size=size,
+                title=self.case.title,
+                case=path.read_text(encoding="utf-8"),
+                facts={"device": where, "precision": str(adapter.dtype)},
+                formats=self.formats,
+            )
+
+    def _repeatable(self, main: Result) -> Case:
+        """Return the case with all settings that took their default values written out."""
+        known = {key: main.settings.get(key) for key in _REPEATED}
+        if "points" in self.case.run or known["start"] not in ("density", "uniform"):
+            known["start"] = self.case.run.get("start")
+        known["n_cells"] = None if "points" in self.case.run else known["n_cells"]
+        if len(self.case.methods) == 1:
+            known["method"] = main.settings.get("method")
+        return self.case.with_run(**known)
+
+    def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
+        """Return the mesh before the first step."""
+        if main.initial is None:
+            return None
+        return adapter.run(
+            self.case.domain, size, points=self._inside(main.initial.points), max_steps=0
+        )
+
+    def _announce(self, name: str, result: Result, where: str) -> None:
+        """Print the run as JSON if that was asked for."""
+        if self.as_json:
+            entry = {
+                "case": self.case.name,
+                "method": name,
+                "device": where,
+                "out": str(self.out),
+                **summary(result),
+                "settings": result.settings,
+            }
+            print(json.dumps(entry, default=_plain), flush=True)
+
+    def _summarise(self, results: dict[str, Result], where: str) -> None:
+        """Print a table for people."""
+        if self.quiet or self.as_json:
+            return
+        print(f"{self.case.title} on {where}")
+        print(
+            f"{'method':10}{'cells':>9}{'steps':>7}{'mean |e|':>10}{'max |e|':>10}"
+            f"{'mean Q':>9}{'min Q':>8}{'seconds':>9}  stopped"
+        )
+        for name, result in results.items():
+            s = summary(result)
+            print(
+                f"{name:10}{s['cells']:9d}{s['steps']:7d}{s['mean_error']:10.4f}"
+                f"{s['max_error']:10.3f}{s['mean_quality']:9.4f}{s['min_quality']:8.3f}"
+                f"{s['seconds']:9.2f}  {s['stop_reason']}"
+            )
+        first = "report.html" if self.report else "mesh.vtu"
+        print(f"written: {self.out / first} and what lies beside it")
+
+
+def check_folder(folder: Path) -> None:
+    """Make `folder` if need be and check that a file can be written there.
+
+    Raises
+    ------
+    InputError
+        Before any work is done that would then be lost.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=".clvoro-", dir=folder)
+        os.close(handle)
+        os.unlink(name)
+    except OSError as error:
+        raise InputError(
+            f"out is {str(folder)!r}, where nothing can be written ({error}); "
+            "give a folder of your own with --out"
+        ) from error
+
+
+def _require_plots() -> None:
+    """Say before the run that the report cannot be drawn."""
+    try:
+        import matplotlib  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ClvoroError(
+            "the report needs Matplotlib, which is not installed; pip install 'clvoro[plot]', "
+            "or run with --no-report"
+        ) from error
+
+
+def _default(function: Callable[..., Any], name: str) -> Any:
+    parameter = inspect.signature(function).parameters.get(name)
+    return None if parameter is None or parameter.default is parameter.empty else parameter.default
+
+
+def _plain(value: Any) -> Any:
+    """Turn NumPy's numbers and arrays, and whatever else, into what JSON has."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)

@@ -1,0 +1,134 @@
+"""The live progress of a run, for people: one line that changes, or now and then a new one."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any, TextIO
+
+import numpy as np
+
+EVERY = 5.0
+"""Seconds between lines where the line cannot change in place (a file, a pipe)."""
+REFRESH = 0.1
+"""Seconds between changes of a line that can."""
+
+
+class Progress:
+    """Shows the rows of a run's history as they come; call it with each row.
+
+    Parameters
+    ----------
+    title : str
+        What runs: the case and its method.
+    max_steps : int or None
+        For the share done and the time left (at most: a run may stop earlier); None if unknown.
+    stream : text stream
+        Usually the standard error.
+    """
+
+    def __init__(self, title: str, max_steps: int | None, stream: TextIO | None = None) -> None:
+        self.title, self.max_steps = title, max_steps
+        self.stream = sys.stderr if stream is None else stream
+        self.steps = -1
+        self._shown, self._began = 0.0, time.monotonic()
+        self._status = _rich_status(self.stream)
+        self._live = self._status is not None or self.stream.isatty()
+
+    def __enter__(self) -> Progress:
+        if self._status is not None:
+            self._status.start()
+            self._status.update(f"{self.title}: preparing")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._status is not None:
+            self._status.stop()
+        elif self._live and self._shown:
+            self.stream.write("\r\x1b[K")
+            self.stream.flush()
+
+    def __call__(self, row: np.void) -> None:
+        """Show `row`, a row of `HISTORY_DTYPE`, if the last one was shown long enough ago."""
+        self.steps += 1
+        now = time.monotonic()
+        if now - self._shown < (REFRESH if self._live else EVERY):
+            return
+        if not self._live and now - self._began < EVERY:
+            return  # a short run needs no lines of progress in a log
+        self._shown = now
+        text = self.line(row)
+        if self._status is not None:
+            self._status.update(text)
+        elif self._live:
+            self.stream.write(f"\r{text}\x1b[K")
+        else:
+            self.stream.write(text + "\n")
+        self.stream.flush()
+
+    def line(self, row: np.void) -> str:
+        """Return the text for `row`: step, errors, quality, cells per second, time left."""
+        seconds, n = float(row["seconds"]), int(row["cells"])
+        level = f" level {row['level']}" if row["level"] else ""
+        of = "" if self.max_steps is None else f"/{self.max_steps}"
+        parts = [
+            f"{self.title}{level}: step {self.steps}{of}",
+            f"{n} cells",
+            f"|e| mean {row['mean_error']:.4f} max {row['max_error']:.3g}",
+            f"Q mean {row['mean_quality']:.4f} min {row['min_quality']:.3f}",
+        ]
+        if self.steps > 0 and seconds > 0:
+            parts.append(f"{_short(n * self.steps / seconds)} cells/s")
+            if self.max_steps is not None:
+                left = seconds / self.steps * max(self.max_steps - self.steps, 0)
+                parts.append(f"{_duration(left)} left at most")
+        return " | ".join(parts)
+
+
+class _Status:
+    """A line drawn by rich: fits any terminal's width and survives other output."""
+
+    def __init__(self, stream: TextIO) -> None:
+        from rich.console import Console
+        from rich.live import Live
+        from rich.text import Text
+
+        self._text: Any = Text
+        console = Console(file=stream)
+        self._live = Live("", console=console, transient=True, auto_refresh=False)
+
+    def start(self) -> None:
+        self._live.start()
+
+    def stop(self) -> None:
+        self._live.stop()
+
+    def update(self, text: str) -> None:
+        line = self._text(text, no_wrap=True, overflow="ellipsis")
+        self._live.update(line, refresh=True)
+
+
+def _rich_status(stream: TextIO) -> _Status | None:
+    """Return rich's line if there is a terminal and rich is installed."""
+    if not stream.isatty():
+        return None
+    try:
+        return _Status(stream)
+    except ModuleNotFoundError:
+        return None
+
+
+def _short(number: float) -> str:
+    """Write a number with three figures and k or M."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if number >= size:
+            return f"{number / size:.3g} {unit}"
+    return f"{number:.3g}"
+
+
+def _duration(seconds: float) -> str:
+    """Write a time as people say it."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes / 60:.1f} h"

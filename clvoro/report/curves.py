@@ -1,0 +1,155 @@
+"""Error and quality against steps (the paper's Figures 4, 5), and displacements (its Figure 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from scipy.spatial import cKDTree
+
+from ..results import Displacements, Result
+from .style import METHOD_COLOURS, WIDTH, frame_domain, interactive_figure, nice, styled
+
+_PANELS = {
+    "error": ("metric error $|e|$ [–]", ("mean_error", "mean"), ("max_error", "largest")),
+    "quality": ("cell quality $Q$ [–]", ("mean_quality", "mean"), ("min_quality", "worst cell")),
+}
+MOST_ARROWS = 2500
+
+
+def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
+    """Draw error (log scale) and quality against the step, one colour per method.
+
+    Parameters
+    ----------
+    results : mapping
+        Results by the method's name.
+    figure : matplotlib figure, optional
+        An empty one to draw into.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    with styled():
+        figure = interactive_figure(WIDTH, 3.1) if figure is None else figure
+        for ax, quantity in zip(figure.subplots(1, 2), _PANELS, strict=True):
+            _history_panel(ax, results, quantity)
+        colours = dict(zip(results, METHOD_COLOURS * len(results), strict=False))
+        handles = [Line2D([], [], color=colour, label=name) for name, colour in colours.items()]
+        handles += [
+            Line2D([], [], color="#444444", label="mean"),
+            Line2D([], [], color="#444444", lw=0.9, ls=(0, (4, 2)), label="worst cell"),
+        ]
+        figure.legend(
+            handles=handles, loc="outside upper center", ncols=len(handles), frameon=False
+        )
+    return figure
+
+
+def _history_panel(ax: Any, results: Mapping[str, Result], quantity: str) -> None:
+    label, (mean, _), (worst, _) = _PANELS[quantity]
+    longest = 1
+    for (_, result), colour in zip(results.items(), METHOD_COLOURS * len(results), strict=False):
+        history = result.history
+        steps = np.arange(len(history))  # counts on where the levels' own step numbers start anew
+        longest = max(longest, len(steps) - 1)
+        dots = "o" if len(steps) == 1 else None
+        ax.plot(steps, _drawable(history[mean], quantity), color=colour, lw=1.5, marker=dots)
+        ax.plot(steps, _drawable(history[worst], quantity), color=colour, lw=0.9, ls=(0, (4, 2)))
+    ax.set_xlim(0, longest)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("step")
+    ax.set_ylabel(label)
+    ax.grid(True, which="major", color="#DDDDDD", lw=0.5)
+    ax.set_axisbelow(True)
+    if quantity == "error":
+        ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    else:
+        ax.set_ylim(min(0.0, ax.get_ylim()[0]), 1.0)
+
+
+def _drawable(values: np.ndarray, quantity: str) -> np.ndarray:
+    """Leave gaps where a logarithmic axis has no place for a value."""
+    return np.where(values > 0, values, np.nan) if quantity == "error" else values
+
+
+def plot_displacements(result: Result, figure: Any = None) -> Any:
+    """Draw the Lloyd and the Poisson displacements of the first and of the last step.
+
+    Arrows have the length of the displacement times the factor in the panel's title. Of more
+    than 2500 generators an evenly spread part is shown.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or None
+        None if the run recorded no displacements.
+    """
+    rows = [(n, d) for n, d in (("first", result.initial), ("last", result.final)) if d is not None]
+    if not rows:
+        return None
+    domain = result.diagram.domain
+    with styled():
+        if figure is None:
+            figure = interactive_figure(WIDTH, displacements_height(result))
+        axes = figure.subplots(len(rows), 2, squeeze=False)
+        for axes_row, (when, field) in zip(axes, rows, strict=True):
+            factors = _magnifications(field)
+            halves = (
+                ("Lloyd", field.lloyd, METHOD_COLOURS[0]),
+                ("Poisson", field.poisson, "#B34700"),
+            )
+            for ax, factor, (name, arrows, colour) in zip(axes_row, factors, halves, strict=True):
+                note = "to scale" if factor == 1 else f"magnified × {factor:g}"
+                ax.set_title(f"{name} displacement, {when} step ({note})")
+                _draw_arrows(ax, field.points, arrows * factor, colour)
+                frame_domain(ax, domain.lower, domain.upper, ticks=False)
+    return figure
+
+
+def displacements_height(result: Result) -> float:
+    """Height in inches that suits `plot_displacements`."""
+    extent = result.diagram.domain.extent
+    rows = (result.initial is not None) + (result.final is not None)
+    return rows * (WIDTH / 2 * float(extent[1] / extent[0]) + 0.22)
+
+
+def _magnifications(field: Displacements) -> tuple[float, float]:
+    """Round factors that bring the long arrows of each half to about one spacing of the generators.
+
+    The halves share the smaller factor where theirs are close, so that they can be compared.
+    """
+    if len(field.points) < 2:
+        return 1.0, 1.0
+    nearest = min(7, len(field.points))
+    spacing = cKDTree(field.points).query(field.points, k=nearest)[0][:, 1:].mean(axis=1)
+    factors = []
+    for arrows in (field.lloyd, field.poisson):
+        reach = float(np.quantile(np.hypot(*arrows.T) / spacing, 0.9))
+        # Rounding noise of a half that vanishes is not worth showing.
+        factors.append(max(1.0, nice(1.0 / reach, up=False)) if reach > 1e-6 else 1.0)
+    if max(factors) <= 2.5 * min(factors):
+        factors = [min(factors)] * 2
+    return factors[0], factors[1]
+
+
+def _draw_arrows(ax: Any, points: np.ndarray, arrows: np.ndarray, colour: str) -> None:
+    step = -(-len(points) // MOST_ARROWS)
+    ax.quiver(
+        *points[::step].T,
+        *arrows[::step].T,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.0026,
+        headwidth=3.5,
+        headlength=4.5,
+        headaxislength=4,
+        minshaft=1.2,
+        minlength=0.3,
+        color=colour,
+    )

@@ -1,0 +1,169 @@
+"""The pictures of a report, each a figure made from finished runs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..results import Result
+from . import cells as draw
+from .curves import displacements_height, plot_displacements, plot_history
+from .style import WIDTH, grid_height, new_figure, styled
+
+Picture = tuple[str, str, Callable[[], Any]]
+"""Name of its file, caption, and the function that draws it."""
+
+FINE_MESH = 10_000
+"""From so many cells on the mesh itself shows the size field."""
+
+
+def pictures_of(
+    results: Mapping[str, Result],
+    initial: Result | None = None,
+    size: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> list[Picture]:
+    """List the pictures that `results` allow; nothing is drawn yet.
+
+    Parameters
+    ----------
+    results : mapping
+        Results by the method's name, all from one start; the last is the main one.
+    initial : Result, optional
+        The mesh before the first step.
+    size : callable, optional
+        The size field h(points (n, 2)); without it the sizes at the generators are shown.
+    """
+    name, main = list(results.items())[-1]
+    history: Picture = (
+        "history",
+        "Metric error and cell quality against the step: mean (full) and worst cell (dashed).",
+        lambda: plot_history(results, new_figure(WIDTH, 3.1)),
+    )
+    if main.diagram.domain.dim != 2:
+        return [history]
+    panels = {**({"initial": initial} if initial is not None else {}), **results}
+    pictures: list[Picture] = [
+        ("size", "Target size h.", lambda: _size(main, size)),
+        ("cells", f"The mesh ({name}), coloured by metric error.", lambda: _one(main, "error")),
+        (
+            "diagrams_error",
+            "Metric error e, one scale for all: red cells are too large, blue ones too small.",
+            lambda: _grid(panels, "error"),
+        ),
+        (
+            "diagrams_quality",
+            "Cell quality Q, one scale for all: 1 is a regular polygon.",
+            lambda: _grid(panels, "quality"),
+        ),
+        history,
+    ]
+    if main.initial is not None or main.final is not None:
+        height = displacements_height(main)
+        pictures.append(
+            (
+                "displacements",
+                f"The two halves of a step ({name}): Lloyd's and the Poisson correction's.",
+                lambda: plot_displacements(main, new_figure(WIDTH, height)),
+            )
+        )
+    pictures.append(
+        ("sides", f"Cells by number of sides ({name}).", lambda: _one(main, "sides", extra=0.5))
+    )
+    if len(main.points) > 3000:
+        pictures.append(
+            ("closer", f"Where the cells are smallest ({name}).", lambda: _closer(main))
+        )
+    return pictures
+
+
+def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
+    """Return a figure as the bytes of a PNG, PDF or SVG file."""
+    with styled(), io.BytesIO() as buffer:
+        # No date or version inside: the same run gives the same file.
+        metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+        figure.savefig(
+            buffer,
+            format=kind,
+            dpi=dpi,
+            bbox_inches="tight",
+            pad_inches=0.04,
+            metadata=metadata[kind],
+        )
+        return buffer.getvalue()
+
+
+def _one(result: Result, colour: str, extra: float = 0.25, **options: Any) -> Any:
+    """Draw one large picture of the whole domain."""
+    with styled():
+        box = result.diagram.domain
+        figure = new_figure(WIDTH, grid_height(box.lower, box.upper, 1, 1, extra, 0) * 0.92)
+        return draw.plot_cells(result, colour, figure.add_subplot(), **options)
+
+
+def _size(result: Result, size: Callable[[np.ndarray], np.ndarray] | None) -> Any:
+    """Show the target size: the field, or the cells' where they resolve it better than a raster."""
+    if size is None or len(result.points) > FINE_MESH:
+        return _one(result, "size", edges=False)
+    with styled():
+        box = result.diagram.domain
+        figure = new_figure(WIDTH, grid_height(box.lower, box.upper, 1, 1, 0.25, 0) * 0.92)
+        return draw.plot_size(size, box, figure.add_subplot())
+
+
+def _grid(panels: Mapping[str, Result], colour: str) -> Any:
+    """Draw the meshes side by side with one scale."""
+    results = list(panels.values())
+    scheme, limits = draw.colouring(colour), draw.shared_limits(results, colour)
+    if (
+        colour == "error"
+    ):  # beyond this all is equally wrong, and what is nearly right shows no more
+        limits = (max(limits[0], -1.0), min(limits[1], 1.0))
+    box = results[0].diagram.domain
+    columns = 1 if len(results) == 1 else 2
+    rows = -(-len(results) // columns)
+    with styled():
+        figure = new_figure(WIDTH, grid_height(box.lower, box.upper, rows, columns, 0.6, 0.28))
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for letter, ax, (name, result) in zip("abcdefghij", axes, panels.items(), strict=False):
+            e, q = np.abs(result.error).mean(), result.quality.mean()
+            title = f"({letter}) {name}: mean $|e|$ {e:.3f}, mean $Q$ {q:.3f}"
+            draw.plot_cells(result, colour, ax, limits=limits, key=False, title=title)
+            ax.set_xticks([])
+            ax.set_yticks([])
+        for ax in axes[len(results) :]:
+            ax.set_axis_off()
+        values = np.concatenate([scheme.values(r) for r in results])
+        collection = next(c for c in axes[0].collections if c.get_array() is not None)
+        draw.add_colour_bar(
+            collection, axes, scheme, values, limits, location="bottom", shrink=0.6, aspect=45
+        )
+    return figure
+
+
+def _closer(result: Result) -> Any:
+    """Draw two windows around the smallest cell, the second four times closer."""
+    box = result.diagram.domain
+    lower, upper, extent = np.array(box.lower), np.array(box.upper), box.extent
+    smallest = int(np.argmin(result.size))
+    centre, size = result.points[smallest], float(result.size[smallest])
+    with styled():
+        figure = new_figure(WIDTH, WIDTH / 2 * 0.8 + 0.75)
+        axes = figure.subplots(1, 2)
+        limits = draw.shared_limits([result], "quality")
+        for ax, across in zip(axes, (160, 40), strict=True):
+            span = np.minimum(np.array([across, 0.8 * across]) * size, extent)
+            corner = np.clip(centre - span / 2, lower, upper - span)
+            draw.plot_cells(
+                result, "quality", ax, limits=limits, window=(corner, corner + span), key=False
+            )
+            ax.locator_params(nbins=4)
+            ax.set_title(f"{span[0]:.2g} × {span[1]:.2g} around ({centre[0]:.4g}, {centre[1]:.4g})")
+        scheme = draw.colouring("quality")
+        draw.add_colour_bar(
+            axes[0].collections[0], axes, scheme, result.quality, limits,
+            location="bottom", shrink=0.6, aspect=45,
+        )  # fmt: skip
+    return figure

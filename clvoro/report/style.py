@@ -1,0 +1,90 @@
+"""Colours, fonts and small helpers that all pictures share."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..errors import ClvoroError
+
+try:
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+except ModuleNotFoundError as error:
+    raise ClvoroError(
+        "pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'"
+    ) from error
+
+WIDTH = 7.0
+"""Width of a full-width picture, inches."""
+
+METHOD_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#555555")
+"""Okabe and Ito's palette: told apart by colour-blind readers too."""
+
+SETTINGS: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "savefig.facecolor": "white",
+    "figure.facecolor": "white",
+}
+
+
+def styled() -> Any:
+    """Return the context in which every picture is drawn and saved."""
+    return rc_context(SETTINGS)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure, in inches, that no global state knows of."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def interactive_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that `matplotlib.pyplot.show` shows."""
+    from matplotlib import pyplot
+
+    return pyplot.figure(figsize=(width, height), layout="constrained")
+
+
+def nice(value: float, up: bool = True) -> float:
+    """Round to 1, 2 or 5 times a power of ten."""
+    if not (value > 0 and math.isfinite(value)):
+        return 1.0
+    steps = [m * 10.0**p for p in range(-12, 13) for m in (1, 2, 5)]
+    if up:
+        return next((s for s in steps if s >= value * (1 - 1e-9)), value)
+    return next((s for s in reversed(steps) if s <= value * (1 + 1e-9)), value)
+
+
+def frame_domain(ax: Any, lower: Any, upper: Any, ticks: bool = True) -> None:
+    """Show the rectangle from `lower` to `upper` to scale, framed."""
+    ax.set_aspect("equal")
+    ax.set_xlim(lower[0], upper[0])
+    ax.set_ylim(lower[1], upper[1])
+    for spine in ax.spines.values():
+        spine.set_visible(True)
+    if not ticks:
+        ax.set_xticks([])
+        ax.set_yticks([])
+
+
+def grid_height(
+    lower: Any, upper: Any, rows: int, columns: int, extra: float, each: float
+) -> float:
+    """Height of a picture of `rows` x `columns` domains: `each` inches more per row."""
+    extent = np.subtract(upper, lower)
+    return float(rows * (WIDTH / columns * extent[1] / extent[0] * 0.96 + each) + extra)

@@ -1,0 +1,26 @@
+"""The figures that describe a run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .results import Result
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Return cells, steps, error, quality, share of changed cells, why it stopped, seconds."""
+    error, history = np.abs(result.error), result.history
+    return {
+        "cells": len(result.points),
+        "steps": max(len(history) - 1, 0),
+        "mean_error": float(error.mean()),
+        "max_error": float(error.max()),
+        "mean_quality": float(result.quality.mean()),
+        "min_quality": float(result.quality.min()),
+        "ever_changed": float(history["ever_changed"][-1]) if len(history) else 0.0,
+        "converged": bool(result.converged),
+        "stop_reason": result.stop_reason,
+        "seconds": float(history["seconds"][-1]) if len(history) else 0.0,
+    }
