@@ -1,0 +1,219 @@
+/* Preconditioned conjugate gradients:
+
+       u = M^-1 r    gamma = (r, u)    beta = gamma / gamma_old    p = u + beta p
+       q = A p       alpha = gamma / (p, q)    x += alpha p    r -= alpha q
+
+   A work-group owns a block of the vectors and leaves one partial sum per quantity; in the next kernel all groups add the
+   same partial sums, so the scalars never leave the device and no kernel of one work-item is needed.
+   Vectors are scaled by a power of two to max |b| ~ 1, lest squares of a small right side underflow.
+
+   With `centre` the null space is the constants: whatever rounding puts into the mean of r is taken out one iteration later,
+   or the residual could not fall below it.
+
+   partial: 11 rows of one value per group, see the names below; residual norms and gammas and sums of r alternate between two rows. */
+#include "common/real.h"
+#include "common/blocks.h"
+#include "common/reduce.h"
+
+#if IS_DOUBLE
+#define EXPONENT_LIMIT (DBL_MAX_EXP - 4)
+#else
+#define EXPONENT_LIMIT (FLT_MAX_EXP - 4)
+#endif
+
+#define ROW(q) (partial + (q) * get_num_groups(0))
+#define SUM_B 0
+#define MAX_B 1
+#define NORM_B 2
+#define CURVATURE 3
+#define NORM_R(k) (4 + ((k) & 1))
+#define GAMMA(k) (6 + ((k) & 1))
+#define SUM_R(k) (8 + ((k) & 1))
+#define START 10
+
+/* One row of the record per iteration. */
+#define RECORD_NORM 0
+#define RECORD_GAMMA 1
+#define RECORD_RUNNING 2
+#define RECORD_CURVATURE 3
+
+#define PUT(q, sum)                                              \
+    {                                                            \
+        const REAL put_ = group_sum((sum), scratch);             \
+        if (get_local_id(0) == 0) ROW(q)[get_group_id(0)] = put_; \
+    }
+
+/* r = b - w, and what is needed to centre and scale it. */
+kernel void residual(int n, global const REAL *b, global const REAL *w, global REAL *r, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum sum_b = SUM_ZERO, sum_r = SUM_ZERO;
+    REAL max_b = 0;
+    for (BLOCK_LOOP(i, n)) {
+        const REAL bi = b[i], ri = bi - w[i];
+        r[i] = ri;
+        sum_add(&sum_b, bi);
+        sum_add(&sum_r, ri);
+        max_b = fmax(max_b, fabs(bi));
+    }
+    PUT(SUM_B, sum_b.value);
+    PUT(START, sum_r.value);
+    max_b = group_max(max_b, scratch);
+    if (get_local_id(0) == 0) ROW(MAX_B)[get_group_id(0)] = max_b;
+}
+
+/* r = 2^e (r - mean r) if `centre`, else 2^e r; norms of r and of the right side treated alike; p = 0.
+   state[1] = 2^-e, state[2] = the part of the squared norm of b that was taken away. */
+kernel void begin(
+    int n, int centre, global const REAL *b, global REAL *r, global REAL *p, global REAL *partial, global REAL *state)
+{
+    local REAL scratch[GROUP_SIZE];
+    const REAL mean_b = centre ? total_sum(ROW(SUM_B), scratch) / n : 0;
+    const REAL mean_r = centre ? total_sum(ROW(START), scratch) / n : 0;
+    const REAL max_b = total_max(ROW(MAX_B), scratch);
+    const int exponent = max_b > 0 && max_b <= REAL_MAX ? clamp(-ilogb(max_b), -EXPONENT_LIMIT, EXPONENT_LIMIT) : 0;
+    Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        const REAL bi = ldexp(b[i] - mean_b, exponent), ri = ldexp(r[i] - mean_r, exponent);
+        r[i] = ri;
+        p[i] = 0;
+        sum_add(&norm_b, bi * bi);
+        sum_add(&norm_r, ri * ri);
+        sum_add(&sum_r, ri);
+    }
+    PUT(NORM_B, norm_b.value);
+    PUT(NORM_R(0), norm_r.value);
+    PUT(SUM_R(0), sum_r.value);
+    if (get_global_id(0) == 0) {
+        const REAL taken = ldexp(mean_b, exponent);
+        state[1] = ldexp(R(1), -exponent);
+        state[2] = n * taken * taken;
+    }
+}
+
+/* u = D^-1 r and gamma: Jacobi's method, for the first iteration. */
+kernel void jacobi(
+    int n, global const REAL *inverse_diagonal, global const REAL *r, global REAL *u, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum gamma = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        const REAL ui = inverse_diagonal[i] * r[i];
+        u[i] = ui;
+        sum_add(&gamma, r[i] * ui);
+    }
+    PUT(GAMMA(0), gamma.value);
+}
+
+/* partial row q = (a, b). */
+kernel void dot_product(int n, int q, global const REAL *a, global const REAL *b, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum sum = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) sum_add(&sum, a[i] * b[i]);
+    PUT(q, sum.value);
+}
+
+/* p = u + beta p. From the iteration on that finds the residual at its target (or anything out of order, NaN included)
+   record[k].running is 0 and nothing changes any more, so that the host may run ahead without changing the result. */
+kernel void direction(
+    int k, int n, REAL tolerance, global const REAL *u, global REAL *p, global const REAL *partial, global REAL *state,
+    global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    const int first = get_global_id(0) == 0;
+    global REAL *now = record + 4 * k;
+    global const REAL *last = now - 4;
+    if (k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0)) {
+        if (first) now[RECORD_RUNNING] = 0;
+        return;
+    }
+    const REAL norm = total_sum(ROW(NORM_R(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
+    REAL target = state[0], beta = 0;
+    if (k > 0)
+        beta = gamma / last[RECORD_GAMMA];
+    else
+        target = tolerance * tolerance * total_sum(ROW(NORM_B), scratch);
+    const int running = norm > target && norm <= REAL_MAX && gamma > 0;
+    if (first) {
+        now[RECORD_NORM] = norm;
+        now[RECORD_GAMMA] = gamma;
+        now[RECORD_RUNNING] = running;
+        if (k == 0) state[3] = target;
+    }
+    if (!running) return;
+    for (BLOCK_LOOP(i, n)) p[i] = u[i] + beta * p[i];
+}
+
+/* x += alpha p, r -= alpha q. */
+kernel void update(
+    int k, int n, int centre, global const REAL *p, global const REAL *q, global REAL *x, global REAL *r, global REAL *partial,
+    global REAL *state, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    global REAL *now = record + 4 * k;
+    if (now[RECORD_RUNNING] == 0) return;
+    const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
+    if (get_global_id(0) == 0) {
+        now[RECORD_CURVATURE] = curvature;
+        if (k == 0) state[0] = state[3];
+    }
+    if (!(curvature > 0)) return;
+    const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
+    Sum norm = SUM_ZERO, sum = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        const REAL ri = r[i] - mean - alpha * q[i];
+        x[i] += alpha_x * p[i];
+        r[i] = ri;
+        sum_add(&norm, ri * ri);
+        sum_add(&sum, ri);
+    }
+    PUT(NORM_R(k + 1), norm.value);
+    PUT(SUM_R(k + 1), sum.value);
+}
+
+/* The same with u = D^-1 r and gamma for the next iteration. */
+kernel void update_jacobi(
+    int k, int n, int centre, global const REAL *inverse_diagonal, global const REAL *p, global const REAL *q,
+    global REAL *x, global REAL *r, global REAL *u, global REAL *partial, global REAL *state, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    global REAL *now = record + 4 * k;
+    if (now[RECORD_RUNNING] == 0) return;
+    const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
+    if (get_global_id(0) == 0) {
+        now[RECORD_CURVATURE] = curvature;
+        if (k == 0) state[0] = state[3];
+    }
+    if (!(curvature > 0)) return;
+    const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
+    Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        const REAL ri = r[i] - mean - alpha * q[i], ui = inverse_diagonal[i] * ri;
+        x[i] += alpha_x * p[i];
+        r[i] = ri;
+        u[i] = ui;
+        sum_add(&norm, ri * ri);
+        sum_add(&sum, ri);
+        sum_add(&gamma, ri * ui);
+    }
+    PUT(NORM_R(k + 1), norm.value);
+    PUT(SUM_R(k + 1), sum.value);
+    PUT(GAMMA(k + 1), gamma.value);
+}
+
+/* Leave the partial sums of x, then (next kernel) take its mean away. */
+kernel void add_up(int n, global const REAL *x, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum sum = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) sum_add(&sum, x[i]);
+    PUT(SUM_B, sum.value);
+}
+
+kernel void remove_mean(int n, global REAL *x, global const REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    const REAL mean = total_sum(ROW(SUM_B), scratch) / n;
+    for (BLOCK_LOOP(i, n)) x[i] -= mean;
+}

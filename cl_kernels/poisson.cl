@@ -1,0 +1,89 @@
+/* The two-point Laplacian on the neighbour graph, zero flux through walls:
+
+       (A phi)_i = sum_j w_ij (phi_i - phi_j)        w_ij = rho_ij l_ij / |x_i - x_j|
+
+   One work-item per cell in `assemble`, a block of cells per group elsewhere. */
+#include "common/real.h"
+#include "common/blocks.h"
+#include "common/reduce.h"
+
+/* Weights, diagonal and its inverse (0 where there is no neighbour). The two cells of a face have measured it each for
+   itself, with roundings of their own: both take the mean of the two, so that A is symmetric to the last bit. A face that
+   only one of them has seen is shorter than rounding, and gets the weight 0. A wall becomes the cell itself with
+   weight 0. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho is smooth. */
+kernel void assemble(
+    int n, int weighted, global const int *starts, global const int *neighbours, global const REAL *face_measures,
+    global const REAL *points, global const REAL *density, global int *columns, global REAL *weights,
+    global REAL *diagonal, global REAL *inverse_diagonal)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    const REAL root_i = weighted ? sqrt(density[i]) : R(1);
+    REAL sum = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        REAL weight = 0;
+        if (j >= 0 && j != i) {
+            REAL square = 0, other = -1;
+            for (int a = 0; a < DIM; ++a) {
+                const REAL d = points[i * DIM + a] - points[j * DIM + a];
+                square += d * d;
+            }
+            for (int l = starts[j]; l < starts[j + 1]; ++l)
+                if (neighbours[l] == i) other = face_measures[l];
+            if (other >= 0) {
+                weight = R(0.5) * (face_measures[k] + other) / sqrt(square);
+                if (weighted) weight *= root_i * sqrt(density[j]);
+            }
+        }
+        columns[k] = weight == 0 ? i : j;
+        weights[k] = weight;
+        sum += weight;
+    }
+    diagonal[i] = sum;
+    inverse_diagonal[i] = sum == 0 ? 0 : 1 / sum;
+}
+
+/* y = A x, and row `q` of partial = (x, y). */
+kernel void apply(
+    int n, int q, global const int *starts, global const int *columns, global const REAL *weights, global const REAL *x,
+    global REAL *y, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum product = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        const REAL xi = x[i];
+        REAL yi = 0;
+        const int end = starts[i + 1];
+        for (int k = starts[i]; k < end; ++k) yi += weights[k] * (xi - x[columns[k]]);
+        y[i] = yi;
+        sum_add(&product, xi * yi);
+    }
+    const REAL put = group_sum(product.value, scratch);
+    if (get_local_id(0) == 0) partial[q * get_num_groups(0) + get_group_id(0)] = put;
+}
+
+/* The right side V_i (s_i - mean s), mean = sum V s / sum V, whose sum vanishes: partial sums, then the values. */
+kernel void source_sums(int n, global const REAL *source, global const REAL *volumes, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum moment = SUM_ZERO, volume = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        sum_add(&moment, volumes[i] * source[i]);
+        sum_add(&volume, volumes[i]);
+    }
+    const REAL put_moment = group_sum(moment.value, scratch), put_volume = group_sum(volume.value, scratch);
+    if (get_local_id(0) == 0) {
+        partial[get_group_id(0)] = put_moment;
+        partial[get_num_groups(0) + get_group_id(0)] = put_volume;
+    }
+}
+
+kernel void compatible(
+    int n, global const REAL *source, global const REAL *volumes, global REAL *rhs, global const REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    const REAL moment = total_sum(partial, scratch), volume = total_sum(partial + get_num_groups(0), scratch);
+    const REAL mean = moment / volume;
+    for (BLOCK_LOOP(i, n)) rhs[i] = volumes[i] * (source[i] - mean);
+}

@@ -1,0 +1,270 @@
+"""Preconditioned conjugate gradients on the device, for any operator that can enqueue itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ._program import Engine
+from .errors import SolverError
+
+Apply = Callable[[cla.Array, cla.Array], object]
+
+# Rows of the array of partial sums, and columns of the record: as in cl_kernels/krylov.cl.
+_NORM_B, CURVATURE, _NORM_R, _GAMMA, _ROWS = 2, 3, 4, 6, 11
+_NORM, _RUNNING, _CURVATURE = 0, 2, 3
+
+
+@dataclass(frozen=True)
+class Solution:
+    """How an iterative solve went.
+
+    Attributes
+    ----------
+    iterations : int
+    residual : float
+        True relative residual ||b - A x|| / ||b|| (2-norm), evaluated from x at the end.
+    residuals : (iterations + 1,) float64
+        The relative residual before each iteration, as the recurrence tracks it, and the last one.
+    converged : bool
+        Whether `residual` is within the tolerance.
+    reason : str
+        ``"converged"``, ``"zero right side"``, ``"stagnated"`` (the precision allows no less) or
+        ``"max_iterations"``.
+    """
+
+    iterations: int
+    residual: float
+    residuals: np.ndarray
+    converged: bool
+    reason: str
+
+
+class ConjugateGradient:
+    """Conjugate gradients for a symmetric positive (semi-)definite operator.
+
+    All vectors and scalars stay on the device. The host enqueues iterations ahead, as many as the
+    convergence so far lets it expect, and then reads one row of scalars for each; the iterate is
+    frozen on the device when the tolerance is met, so the result does not depend on when the host
+    looks.
+
+    Parameters
+    ----------
+    engine : Engine
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("krylov")
+        self.partial = engine.zeros(_ROWS * engine.groups)
+        """Partial sums; a fused operator leaves those of (x, A x) in row `CURVATURE`."""
+        self._state = engine.zeros(4)
+        self._capacity = 0
+        self._record_capacity = 0
+
+    def solve(
+        self,
+        apply: Apply,
+        rhs: cla.Array,
+        x: cla.Array,
+        *,
+        precondition: cla.Array | Apply,
+        tolerance: float,
+        max_iterations: int,
+        fused: bool = False,
+        centre: bool = False,
+        lookahead: int = 64,
+    ) -> Solution:
+        """Solve A x = b from the start `x`, in place.
+
+        Parameters
+        ----------
+        apply : callable (x, y)
+            Enqueues y = A x on the engine's queue. The operator must be symmetric.
+        rhs, x : (n,) real, device
+        precondition : (n,) real or callable (r, u)
+            The inverse of a diagonal, or what enqueues u = M^-1 r, M symmetric positive definite.
+        tolerance : float
+            Of the relative residual in the 2-norm.
+        max_iterations : int
+        fused : bool
+            `apply` leaves the partial sums of (x, y) in row `CURVATURE` of `partial` itself.
+        centre : bool
+            The operator's null space is the constants: take the mean of the right side away first
+            and that of x at the end.
+        lookahead : int
+            The most iterations to enqueue before the host looks.
+
+        Returns
+        -------
+        Solution
+
+        Raises
+        ------
+        SolverError
+            If a number is not finite, or the operator or preconditioner is not positive definite.
+        """
+        n = len(rhs)
+        self._reserve(n, max_iterations)
+        kernels, launch = self._kernels, self.engine.run_blocks
+        r, u, p, q = (v[:n] for v in self._vectors)
+        size, zero, mean = np.int32(n), np.int32(0), np.int32(centre)
+        diagonal = isinstance(precondition, cla.Array)
+        # The recurrence stops a little lower, so that the true residual is within the tolerance.
+        limit = self.engine.real.type(0.95 * tolerance)
+        tail = (self.partial, self._state, self._record)
+        direction = Launch(self.engine, kernels.direction, zero, size, limit, u, p, *tail)
+        if diagonal:
+            update = Launch(
+                self.engine,
+                kernels.update_jacobi,
+                zero,
+                size,
+                mean,
+                precondition,
+                p,
+                q,
+                x,
+                r,
+                u,
+                *tail,
+            )
+        else:
+            update = Launch(self.engine, kernels.update, zero, size, mean, p, q, x, r, *tail)
+
+        def measure() -> float:
+            """Set r to the true residual and return its relative norm; negative: b is zero."""
+            apply(x, q)
+            launch(kernels.residual, size, rhs, q, r, self.partial)
+            launch(
+                kernels.begin, size, mean, rhs, r, p, self.partial, self._state
+            )  # fmt: skip
+            rows = self.partial.get().reshape(_ROWS, -1).sum(axis=1, dtype=np.float64)
+            taken = float(self._state.get()[2])
+            norm_b, norm_r = rows[_NORM_B], rows[_NORM_R]
+            if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
+                raise SolverError(
+                    f"the linear solve got a right side, start or operator that is not finite: "
+                    f"|b|^2 = {norm_b}, |b - A x|^2 = {norm_r} after scaling; check the input"
+                )
+            # What is left of a constant right side is rounding.
+            if norm_b <= (8 * np.finfo(self.engine.real).eps) ** 2 * taken:
+                return -1.0
+            self._norm_b = norm_b
+            return math.sqrt(norm_r / norm_b)
+
+        def iterate(k: int) -> None:
+            if not diagonal:
+                precondition(r, u)
+                launch(kernels.dot_product, size, np.int32(_GAMMA + (k & 1)), r, u, self.partial)
+            direction.set_first(k)
+            direction()
+            apply(p, q)
+            if not fused:
+                launch(kernels.dot_product, size, np.int32(CURVATURE), p, q, self.partial)
+            update.set_first(k)
+            update()
+
+        iterations, history, reason = 0, [], "max_iterations"
+        residual = measure()
+        if residual < 0:
+            x.fill(0)
+            return Solution(0, 0.0, np.zeros(1), True, "zero right side")
+        while True:
+            if residual <= tolerance:
+                reason = "converged"
+                break
+            if iterations >= max_iterations:
+                break
+            if diagonal:
+                launch(kernels.jacobi, size, precondition, r, u, self.partial)
+            most = max_iterations - iterations
+            iterations += self._cycle(iterate, most, tolerance, residual, lookahead, history)
+            before, residual = residual, measure()
+            # A restart gains digits as long as the recurrence, not x's precision, was the limit.
+            if residual > max(tolerance, 0.5 * before) and iterations < max_iterations:
+                reason = "stagnated"
+                break
+        if centre:
+            launch(kernels.add_up, size, x, self.partial)
+            launch(kernels.remove_mean, size, x, self.partial)
+        residuals = np.array([*history, residual])
+        return Solution(iterations, residual, residuals, residual <= tolerance, reason)
+
+    def _cycle(
+        self,
+        iterate: Callable[[int], None],
+        most: int,
+        tolerance: float,
+        residual: float,
+        lookahead: int,
+        history: list[float],
+    ) -> int:
+        """Iterate from the residual in place until it stops, or `most` times; return how often."""
+        done, ahead, first = 0, min(8, lookahead), residual
+        while done < most:
+            end = min(done + ahead, most)
+            for k in range(done, end):
+                iterate(k)
+            rows = self._record[4 * done : 4 * end].get().reshape(-1, 4).astype(np.float64)
+            for k, row in enumerate(rows, start=done):
+                residual = math.sqrt(row[_NORM] / self._norm_b)
+                if row[_RUNNING] == 0 or not row[_CURVATURE] > 0:
+                    self._judge(k, row, residual, tolerance)
+                    return k
+                history.append(residual)
+            done = end
+            rate = math.log(first / residual) / done if residual < first else 0.0
+            left = 1 + math.log(residual / tolerance) / rate if rate > 0 else lookahead
+            ahead = int(min(max(left, 2), lookahead))
+        return done
+
+    def _judge(self, k: int, row: np.ndarray, residual: float, tolerance: float) -> None:
+        """Tell a stop at the tolerance, or at the precision's limit, from a breakdown at k."""
+        if residual <= tolerance:
+            return
+        # Far down, rounding may take the sign of these; the true residual then decides what to do.
+        if k > 0 and residual < 1e-3:
+            return
+        curvature = row[_CURVATURE] if row[_RUNNING] else math.nan
+        raise SolverError(
+            f"conjugate gradients broke down at iteration {k}: (r, M^-1 r) = {row[1]:.3g}, "
+            f"curvature (p, A p) = {curvature:.3g}, relative residual {residual:.3g}; the first "
+            "two must be positive and finite: the operator or its preconditioner is not "
+            "positive definite"
+        )
+
+    def _reserve(self, n: int, max_iterations: int) -> None:
+        if n > self._capacity:
+            self._capacity = n
+            self._vectors = [self.engine.empty(n) for _ in range(4)]
+        if max_iterations > self._record_capacity:
+            self._record_capacity = max_iterations
+            self._record = self.engine.zeros(4 * max_iterations)
+
+
+class Launch:
+    """A block-wise kernel with its arguments set: calling it costs no more than the enqueueing.
+
+    The kernel must not be used elsewhere meanwhile, as it has but one set of arguments.
+    """
+
+    def __init__(self, engine: Engine, kernel: cl.Kernel, *args: object) -> None:
+        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+        self._kernel = kernel
+        self._queue = engine.queue
+        self._size = (engine.groups * engine.group_size,)
+        self._group = (engine.group_size,)
+
+    def set_first(self, value: int) -> None:
+        """Set the kernel's first argument, an int."""
+        self._kernel.set_arg(0, np.int32(value))
+
+    def __call__(self) -> None:
+        """Enqueue the kernel."""
+        cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, self._group)

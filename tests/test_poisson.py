@@ -1,0 +1,331 @@
+"""The Poisson solve against SciPy and a dense conjugate gradient method in NumPy."""
+
+import graphs
+import numpy as np
+import pyopencl as cl
+import pytest
+import scipy.sparse as sp
+import scipy.sparse.linalg as sla
+
+from clvoro import create_context
+from clvoro._program import Engine
+from clvoro.errors import InputError, SolverError
+from clvoro.krylov import ConjugateGradient
+from clvoro.poisson import Poisson
+
+REALS = [np.float64, np.float32]
+
+
+@pytest.fixture(scope="module")
+def make():
+    """Engines of the default device, by dimension and precision."""
+    ctx = create_context()
+    queue = cl.CommandQueue(ctx)
+    return lambda dim=2, real=np.float64: Engine(ctx, queue, dim, np.dtype(real))
+
+
+def assembled(engine, graph, density=None):
+    points, starts, neighbours, measures, _ = graph
+    poisson = Poisson(engine)
+    laplacian = poisson.assemble(
+        engine.upload(starts, np.int32),
+        engine.upload(neighbours, np.int32),
+        engine.upload(measures),
+        engine.upload(points),
+        None if density is None else engine.upload(density),
+    )
+    return poisson, laplacian
+
+
+def as_matrix(laplacian):
+    """The device's operator as a SciPy matrix."""
+    n = len(laplacian)
+    off = sp.csr_matrix(
+        (laplacian.weights.get(), laplacian.neighbours.get(), laplacian.starts.get()), (n, n)
+    )
+    return sp.csr_matrix(sp.diags(laplacian.diagonal.get()) - off)
+
+
+def dense_cg(A, b, iterations):
+    """Relative residuals of the textbook's Jacobi-preconditioned conjugate gradients."""
+    x, r, D = np.zeros(len(b)), b.copy(), A.diagonal()
+    u = r / D
+    p, gamma, norms = u.copy(), r @ u, [1.0]
+    for _ in range(iterations):
+        q = A @ p
+        alpha = gamma / (p @ q)
+        x += alpha * p
+        r -= alpha * q
+        u = r / D
+        gamma, old = r @ u, gamma
+        p = u + gamma / old * p
+        norms.append(np.linalg.norm(r) / np.linalg.norm(b))
+    return np.array(norms)
+
+
+def direct(A, b):
+    """Solution of mean zero of the singular system: sparse direct, one value fixed."""
+    x = np.zeros(len(b))
+    x[1:] = sla.spsolve(sp.csc_matrix(A[1:, 1:]), b[1:])
+    return x - x.mean()
+
+
+def density_of(points):
+    """A smooth density over two decades, h^-2 of h growing from 0.1 to 1."""
+    return (0.1 + 0.9 * points[:, 0]) ** -2.0
+
+
+@pytest.mark.parametrize("real", REALS)
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_matrix(make, dim, real, weighted):
+    graph = graphs.random_graph(700 if dim == 2 else 300, dim, seed=915)
+    density = density_of(graph[0]) if weighted else None
+    _, laplacian = assembled(make(dim, real), graph, density)
+    A = as_matrix(laplacian)
+    assert (A != A.T).nnz == 0
+    reference = graphs.laplacian_matrix(*graph[:4], density)
+    # Short distances lose digits in the difference of coordinates: 1e-3 of the box loses three.
+    eps = 1e4 * np.finfo(real).eps
+    assert abs(A - reference).max() <= eps * abs(reference).max()
+    # Walls: nothing beside the graph's own edges, and rows sum to zero.
+    assert np.abs(A.sum(axis=1)).max() <= 8 * np.finfo(real).eps * A.diagonal().max()
+
+
+def test_one_sided_face_has_no_weight(make):
+    """Faces shorter than rounding may be seen from one side only."""
+    engine = make()
+    points = np.array([[0.1, 0.5], [0.5, 0.5], [0.9, 0.5]])
+    starts, neighbours = np.array([0, 2, 3, 4]), np.array([1, 2, 0, 1])
+    _, laplacian = assembled(engine, (points, starts, neighbours, np.ones(4), None))
+    A = as_matrix(laplacian).toarray()
+    assert np.array_equal(A, A.T)
+    assert A[0, 2] == 0
+    assert A[1, 2] == 0
+    assert A[0, 1] == -2.5
+
+
+def test_faces_measured_differently_are_averaged(make):
+    points = np.array([[0.25, 0.5], [0.75, 0.5]])
+    graph = (
+        points,
+        np.array([0, 2, 4]),
+        np.array([1, -1, 0, -2]),
+        np.array([1.0, 1, 1.5, 1]),
+        None,
+    )
+    A = as_matrix(assembled(make(), graph)[1]).toarray()
+    assert np.array_equal(A, [[2.5, -2.5], [-2.5, 2.5]])
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_solution(make, dim, weighted):
+    engine = make(dim)
+    graph = graphs.random_graph(500, dim, seed=77)
+    density = density_of(graph[0]) if weighted else None
+    poisson, laplacian = assembled(engine, graph, density)
+    b = np.random.default_rng(78).standard_normal(500)
+    phi = engine.zeros(500)
+    solution = poisson.solve(laplacian, engine.upload(b), phi, tolerance=1e-11)
+    A = graphs.laplacian_matrix(*graph[:4], density)
+    expected = direct(A, b - b.mean())
+    assert solution.converged
+    assert solution.reason == "converged"
+    assert solution.residual <= 1e-11
+    assert len(solution.residuals) == solution.iterations + 1
+    # Condition number about 1e4.
+    assert np.abs(phi.get() - expected).max() <= 1e-7 * np.abs(expected).max()
+    assert abs(phi.get().mean()) <= 1e-14 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("real", REALS)
+def test_residuals_are_those_of_the_textbook(make, real):
+    engine = make(real=real)
+    graph = graphs.random_graph(900, seed=361)
+    poisson, laplacian = assembled(engine, graph)
+    b = np.random.default_rng(5).standard_normal(900)
+    tolerance = 1e-8 if real is np.float64 else 1e-4
+    solution = poisson.solve(laplacian, engine.upload(b), engine.zeros(900), tolerance=tolerance)
+    expected = dense_cg(graphs.laplacian_matrix(*graph[:4]).toarray(), b - b.mean(), 40)
+    # Roundings grow from step to step; over forty steps they stay in the last third of the digits.
+    rtol = 1e-9 if real is np.float64 else 2e-2
+    assert np.allclose(solution.residuals[:40], expected[:40], rtol=rtol, atol=0)
+    true = as_matrix(laplacian).astype(float)
+    phi = engine.zeros(900)
+    solution = poisson.solve(laplacian, engine.upload(b), phi, tolerance=tolerance)
+    residual = np.linalg.norm(b - b.mean() - true @ phi.get()) / np.linalg.norm(b - b.mean())
+    assert residual == pytest.approx(solution.residual, rel=0.5)
+
+
+def test_float32_says_that_it_stagnates(make):
+    engine = make(real=np.float32)
+    poisson, laplacian = assembled(engine, graphs.random_graph(900, seed=361))
+    b = engine.upload(np.random.default_rng(6).standard_normal(900))
+    solution = poisson.solve(laplacian, b, engine.zeros(900), tolerance=1e-12)
+    assert not solution.converged
+    assert solution.reason == "stagnated"
+    assert solution.residual < 1e-5
+
+
+@pytest.mark.parametrize("real", REALS)
+@pytest.mark.parametrize("scale", [1e-30, 1e25])
+def test_tiny_and_huge_right_sides(make, real, scale):
+    """Squares of these leave the range of float32."""
+    engine = make(real=real)
+    poisson, laplacian = assembled(engine, graphs.random_graph(300, seed=19))
+    b = np.random.default_rng(20).standard_normal(300)
+    small, plain = engine.zeros(300), engine.zeros(300)
+    first = poisson.solve(laplacian, engine.upload(b), plain, tolerance=1e-4)
+    second = poisson.solve(laplacian, engine.upload(b * scale), small, tolerance=1e-4)
+    assert first.converged
+    assert second.converged
+    difference = small.get().astype(float) / scale - plain.get()
+    assert np.abs(difference).max() <= 1e-2 * np.abs(plain.get()).max()
+
+
+def test_compatible(make):
+    engine = make()
+    points, *_, volumes = graph = graphs.random_graph(400, seed=33)
+    poisson, _ = assembled(engine, graph)
+    source = np.sin(5 * points[:, 0]) + 3
+    rhs = engine.empty(400)
+    poisson.compatible(engine.upload(source), engine.upload(volumes), rhs)
+    expected = volumes * (source - (volumes @ source) / volumes.sum())
+    assert np.allclose(rhs.get(), expected, rtol=0, atol=1e-15)
+    assert abs(rhs.get().sum()) < 1e-14
+
+
+@pytest.mark.parametrize("b", [np.zeros(50), np.full(50, 0.1)])
+def test_nothing_to_solve(make, b):
+    """Zero, and zero once its mean is gone: the start is forgotten."""
+    engine = make()
+    poisson, laplacian = assembled(engine, graphs.random_graph(50, seed=4))
+    phi = engine.upload(np.arange(50.0))
+    solution = poisson.solve(laplacian, engine.upload(b), phi)
+    assert solution.iterations == 0
+    assert solution.converged
+    assert not phi.get().any()
+
+
+@pytest.mark.parametrize("real", REALS)
+def test_one_and_two_cells(make, real):
+    engine = make(real=real)
+    poisson, laplacian = assembled(engine, graphs.random_graph(1, seed=9))
+    phi = engine.upload([3.0])
+    assert poisson.solve(laplacian, engine.upload([2.0]), phi).iterations == 0
+    assert phi.get() == 0
+    points = np.array([[0.25, 0.5], [0.75, 0.5]])
+    poisson, laplacian = assembled(engine, (points, *graphs.voronoi_graph(points)))
+    phi = engine.zeros(2)
+    solution = poisson.solve(laplacian, engine.upload([1.0, -1.0]), phi, tolerance=1e-6)
+    assert solution.converged
+    # w = 1 / 0.5, so 2 (phi_0 - phi_1) = 1.
+    assert np.allclose(phi.get(), [0.25, -0.25], rtol=1e-6)
+
+
+def test_warm_start(make):
+    engine = make()
+    poisson, laplacian = assembled(engine, graphs.random_graph(600, seed=12))
+    b = engine.upload(np.random.default_rng(13).standard_normal(600))
+    phi = engine.zeros(600)
+    cold = poisson.solve(laplacian, b, phi)
+    again = poisson.solve(laplacian, b, phi)
+    assert cold.iterations > 50
+    assert again.iterations == 0
+    assert again.residual <= 1e-8
+
+
+@pytest.mark.parametrize("real", REALS)
+def test_repeats_bit_by_bit(make, real):
+    engine = make(real=real)
+    poisson, laplacian = assembled(engine, graphs.random_graph(3000, seed=55))
+    b = engine.upload(np.random.default_rng(56).standard_normal(3000))
+    first, second = engine.zeros(3000), engine.zeros(3000)
+    one = poisson.solve(laplacian, b, first, tolerance=1e-5)
+    two = Poisson(engine).solve(laplacian, b, second, tolerance=1e-5)
+    assert np.array_equal(one.residuals, two.residuals)
+    assert np.array_equal(first.get(), second.get())
+
+
+def test_result_does_not_depend_on_when_the_host_looks(make):
+    engine = make()
+    _, laplacian = assembled(engine, graphs.random_graph(800, seed=57))
+    poisson = Poisson(engine)
+    b = engine.upload(np.random.default_rng(58).standard_normal(800))
+    results = []
+    for lookahead in (1, 7, 200):
+        x = engine.zeros(800)
+        solution = ConjugateGradient(engine).solve(
+            lambda p, q: poisson.apply(laplacian, p, q), b, x, tolerance=1e-6, max_iterations=500,
+            precondition=laplacian.inverse_diagonal, centre=True, lookahead=lookahead,
+        )  # fmt: skip
+        results.append((solution.iterations, x.get()))
+    assert len({iterations for iterations, _ in results}) == 1
+    assert all(np.array_equal(x, results[0][1]) for _, x in results)
+
+
+def test_callable_preconditioner(make):
+    """Jacobi's as a callable gives the same iterates as the built-in one."""
+    engine = make()
+    poisson, laplacian = assembled(engine, graphs.random_graph(800, seed=57))
+    b = engine.upload(np.random.default_rng(58).standard_normal(800))
+
+    def jacobi(r, u):
+        u[:] = laplacian.inverse_diagonal * r
+
+    x, y = engine.zeros(800), engine.zeros(800)
+    solution = ConjugateGradient(engine).solve(
+        lambda p, q: poisson.apply(laplacian, p, q), b, x, tolerance=1e-8, max_iterations=500,
+        precondition=jacobi, centre=True,
+    )  # fmt: skip
+    expected = poisson.solve(laplacian, b, y)
+    assert abs(solution.iterations - expected.iterations) <= 2
+    assert np.abs(x.get() - y.get()).max() <= 1e-5 * np.abs(y.get()).max()
+
+
+def test_breakdown_is_reported(make):
+    """An indefinite operator, and numbers that are not finite."""
+    engine = make()
+    poisson, laplacian = assembled(engine, graphs.random_graph(100, seed=21))
+    b = np.random.default_rng(22).standard_normal(100)
+    solver = ConjugateGradient(engine)
+    negative = engine.zeros(100)
+
+    def apply(p, q):
+        poisson.apply(laplacian, p, q)
+        q[:] = -q
+
+    with pytest.raises(SolverError, match="positive definite"):
+        solver.solve(
+            apply, engine.upload(b), negative, tolerance=1e-8, max_iterations=50,
+            precondition=laplacian.inverse_diagonal, centre=True,
+        )  # fmt: skip
+    b[7] = np.nan
+    with pytest.raises(SolverError, match="not finite"):
+        poisson.solve(laplacian, engine.upload(b), engine.zeros(100))
+
+
+def test_disconnected_graph_ends(make):
+    """Two parts whose sources do not cancel each for itself: no solution, and no endless loop."""
+    engine = make()
+    points = np.array([[0.1, 0.1], [0.2, 0.1], [0.8, 0.9], [0.9, 0.9]])
+    graph = (points, np.arange(5), np.array([1, 0, 3, 2]), np.ones(4), None)
+    poisson, laplacian = assembled(engine, graph)
+    try:
+        solution = poisson.solve(laplacian, engine.upload([1.0, 0, 0, 0]), engine.zeros(4))
+    except SolverError:
+        return
+    assert not solution.converged
+
+
+def test_bad_input(make):
+    engine = make()
+    poisson, laplacian = assembled(engine, graphs.random_graph(60, seed=91))
+    b, phi = engine.zeros(60), engine.zeros(60)
+    with pytest.raises(InputError, match="rhs got shape"):
+        poisson.solve(laplacian, engine.zeros(59), phi)
+    with pytest.raises(InputError, match="preconditioner got 'ilu'"):
+        poisson.solve(laplacian, b, phi, preconditioner="ilu")
+    with pytest.raises(InputError, match="tolerance got"):
+        poisson.solve(laplacian, b, phi, tolerance=0)
