@@ -233,7 +233,7 @@ def require_fp64(where: cl.Context | cl.Device, dtype: object = np.float64) -> N
     """
     if np.dtype(dtype) != np.float64:
         return
-    device = where.devices[0] if isinstance(where, cl.Context) else where
+    device = getattr(where, "devices", [where])[0]  # a context, or the device itself
     if not has_fp64(device):
         raise DeviceError(
             f"dtype='float64' was asked for, but the device {device.name.strip()} has no double "
