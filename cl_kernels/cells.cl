@@ -35,7 +35,7 @@ inline range_t covered(const REAL *x, REAL w, FRAME frame, int side)
 
 /* Clip the cell at place p by every generator in the bins that the square of half-width w covers and the square of
    half-width `inner` does not (inner < 0: no bin was opened before). Returns FLAG_* or 0. */
-inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, bool warm, global const REAL *binned,
+inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, bool warm, global const REAL *points, global const REAL *binned,
                         global const int *items, global const int2 *bins, global const FRAME *grid_frames,
                         global const int2 *grid_shapes)
 {
@@ -93,7 +93,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, 
                         continue;
                     if (d2 == 0)
                         return FLAG_COINCIDE;
-                    if (!clip_cell(cell, d, d2, j, warm))
+                    if (!clip_cell(cell, d, d2, j, warm, points))
                         return FLAG_FULL;
                 }
             }
@@ -124,7 +124,7 @@ kernel void clip_cells(global const REAL *binned, global const int *items, globa
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     cell_t cell;
-    start_cell(&cell, x, lower, upper);
+    start_cell(&cell, i, x, lower, upper);
     int flag = 0;
     REAL w = reach[p], inner = -1;
     if (warm) {
@@ -137,13 +137,13 @@ kernel void clip_cells(global const REAL *binned, global const int *items, globa
             const REAL d2 = d[0] * d[0] + d[1] * d[1];
             if (d2 == 0)
                 flag = FLAG_COINCIDE;
-            else if (!clip_cell(&cell, d, d2, j, false))
+            else if (!clip_cell(&cell, d, d2, j, false, points))
                 flag = FLAG_FULL;
         }
         w = 2 * sqrt(cell.reach2);
     }
     while (flag == 0) {
-        flag = clip_by_bins(&cell, x, i, w, inner, warm, binned, items, bins, grid_frames, grid_shapes);
+        flag = clip_by_bins(&cell, x, i, w, inner, warm, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
         if (need <= w)
             break;
@@ -164,9 +164,12 @@ kernel void clip_cells(global const REAL *binned, global const int *items, globa
     row_counts[i] = cell.n;
 }
 
-/* Per generator i: bit k of keep[i * KEEP_WORDS ...] marks a neighbour that also lists i. Rounding may let one of two cells see a face of no
-   length that the other does not see; such a face is dropped, so that the graph is symmetric. */
-kernel void match_faces(global const int *rows, global const int *row_counts, global uint *keep, global int *counts,
+/* Per generator i: bit k of keep[i * KEEP_WORDS ...] marks a neighbour that also lists i. Rounding may let one of two
+   cells see a face of no length that the other does not see; such a face is dropped, so that the graph is symmetric. If
+   what it cuts off is more than rounding, generators are too close to tell apart (from far away, two an ulp apart have
+   the same bisector), and that is flagged. */
+kernel void match_faces(global const int *rows, global const int *row_counts, global const REAL *points,
+                        const REAL4 box_lower, const REAL4 box_upper, global uint *keep, global int *counts,
                         global int *flags)
 {
     const int i = get_global_id(0);
@@ -184,6 +187,17 @@ kernel void match_faces(global const int *rows, global const int *row_counts, gl
         if (mutual) {
             word |= 1u << (k % 32);
             ++count;
+        } else {
+            const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+            const REAL lower[2] = {box_lower.s0, box_lower.s1};
+            const REAL upper[2] = {box_upper.s0, box_upper.s1};
+            const int a = rows[i * ROW_CAPACITY + (k == 0 ? n - 1 : k - 1)];
+            const int b = rows[i * ROW_CAPACITY + (k == n - 1 ? 0 : k + 1)];
+            const REAL2 tip = corner(i, x, a, b, points, lower, upper);
+            const REAL2 u = corner(i, x, a, j, points, lower, upper) - tip;
+            const REAL2 v = corner(i, x, j, b, points, lower, upper) - tip;
+            if (!(fabs(u.s0 * v.s1 - u.s1 * v.s0) < 512 * REAL_EPS))
+                raise_flag(flags, FLAG_COLLAPSED, i);
         }
         if (k % 32 == 31 || k == n - 1) {
             keep[i * KEEP_WORDS + k / 32] = word;

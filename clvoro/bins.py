@@ -129,10 +129,11 @@ class Bins:
             if new_grids == 0:
                 break
             new_bins = int(self._sizes[size].get())
+            grid_ids, child_firsts = self._flags, self._sizes  # _reserve may replace them
             self._reserve(n, end + new_bins)
             engine.run(
                 k.make_grids, size, self._bins, np.int32(begin), np.int32(end), np.int32(grids),
-                self._flags, self._sizes, self._grid_of, self._frames, self._shapes,
+                grid_ids, child_firsts, self._grid_of, self._frames, self._shapes,
                 self._grid_items,
             )  # fmt: skip
             engine.run(

@@ -143,8 +143,8 @@ class Cells:
                 *old, self._rows, self._row_counts, self._flags,
             )  # fmt: skip
             engine.run(
-                k.match_faces, n, self._rows, self._row_counts, self._keep, arrays["starts"],
-                self._flags,
+                k.match_faces, n, self._rows, self._row_counts, points, lower, upper, self._keep,
+                arrays["starts"], self._flags,
             )  # fmt: skip
             flags, generator = (int(v) for v in self._flags.get())
             if not flags & FULL:

@@ -6,13 +6,20 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
                     const REAL *upper)
 {
     if (a >= 0 && b >= 0) {
-        /* Circumcentre of the triangle o, p, q relative to o. */
-        const int o = min(i, min(a, b)), q = max(i, max(a, b));
-        const int p = i + a + b - o - q;
-        const REAL ox = points[2 * o], oy = points[2 * o + 1];
-        const REAL ux = points[2 * p] - ox, uy = points[2 * p + 1] - oy;
-        const REAL vx = points[2 * q] - ox, vy = points[2 * q + 1] - oy;
-        const REAL u2 = ux * ux + uy * uy, v2 = vx * vx + vy * vy;
+        /* Circumcentre of the triangle, relative to the generator o opposite its longest side: then neither the
+           differences nor the squares below cancel, also if two of the three are an ulp apart. */
+        const int r = min(i, min(a, b)), t = max(i, max(a, b)), s = i + a + b - r - t;
+        const REAL2 xr = (REAL2)(points[2 * r], points[2 * r + 1]);
+        const REAL2 xs = (REAL2)(points[2 * s], points[2 * s + 1]);
+        const REAL2 xt = (REAL2)(points[2 * t], points[2 * t + 1]);
+        const REAL rs = dot(xs - xr, xs - xr), rt = dot(xt - xr, xt - xr), st = dot(xt - xs, xt - xs);
+        const bool at_r = st >= rs && st >= rt;
+        const bool at_s = !at_r && rt >= rs;
+        const REAL2 xo = at_r ? xr : (at_s ? xs : xt);
+        const REAL2 u = (at_r ? xs : xr) - xo;
+        const REAL2 v = (at_r || at_s ? xt : xs) - xo;
+        const REAL ox = xo.s0, oy = xo.s1, ux = u.s0, uy = u.s1, vx = v.s0, vy = v.s1;
+        const REAL u2 = dot(u, u), v2 = dot(v, v);
         const REAL twice = 2 * difference_of_products(ux, vy, uy, vx);
         return (REAL2)(difference_of_products(u2, vy, v2, uy) / twice + (ox - x[0]),
                        difference_of_products(v2, ux, u2, vx) / twice + (oy - x[1]));

@@ -1,6 +1,7 @@
 /* A convex polygon around its generator, and its clip by the half-plane nearer to the generator than to a neighbour.
    Coordinates are relative to the generator: differences of close positions are exact, so cells stay accurate
    whatever their size. */
+#include "common/corner.h"
 #include "common/real.h"
 
 #ifndef CELL_CAPACITY
@@ -14,11 +15,20 @@ typedef struct {
     REAL y[CELL_CAPACITY];
     int faces[CELL_CAPACITY];
     REAL reach2; /* largest squared distance of a corner from the generator */
+    /* Whose cell it is, and where. */
+    int generator;
+    REAL position[2], lower[2], upper[2];
 } cell_t;
 
 /* The whole box around generator x. */
-inline void start_cell(cell_t *cell, const REAL *x, const REAL *lower, const REAL *upper)
+inline void start_cell(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
 {
+    cell->generator = i;
+    for (int a = 0; a < 2; ++a) {
+        cell->position[a] = x[a];
+        cell->lower[a] = lower[a];
+        cell->upper[a] = upper[a];
+    }
     cell->n = 4;
     cell->x[0] = cell->x[3] = lower[0] - x[0];
     cell->x[1] = cell->x[2] = upper[0] - x[0];
@@ -33,9 +43,23 @@ inline void start_cell(cell_t *cell, const REAL *x, const REAL *lower, const REA
     cell->reach2 = rx * rx + ry * ry;
 }
 
+/* Where face k of the cell meets the bisector that cuts it between corners `in` and `out`, which lie at the signed
+   distances s_in <= 0 < s_out of it. Interpolation rounds by eps of the face's length; where that is much beside the
+   distance of the generators (near-duplicates), the corner is computed from the generators instead. */
+inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out, int face, int neighbour, REAL d2,
+                      global const REAL *points)
+{
+    const REAL2 a = (REAL2)(cell->x[in], cell->y[in]);
+    const REAL2 ab = (REAL2)(cell->x[out], cell->y[out]) - a;
+    if (d2 < R(1e-10) * dot(ab, ab))
+        return corner(cell->generator, cell->position, face, neighbour, points, cell->lower, cell->upper);
+    return a + ab * (fmax(-s_in, R(0)) / (s_out - fmin(s_in, R(0))));
+}
+
 /* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2. False if the cell is full.
    A cut shallower than rounding is none, so that cocircular generators do not shred a corner. */
-inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool seen_before)
+inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool seen_before,
+                      global const REAL *points)
 {
     const int n = cell->n;
     const REAL level = d2 / 2;
@@ -68,12 +92,8 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
         after = last == n - 1 ? 0 : last + 1;
     }
     /* Where the bisector meets the faces before -> first and last -> after. */
-    const REAL ta = fmax(-s[before], R(0)) / (s[first] - fmin(s[before], R(0)));
-    const REAL ax = cell->x[before] + ta * (cell->x[first] - cell->x[before]);
-    const REAL ay = cell->y[before] + ta * (cell->y[first] - cell->y[before]);
-    const REAL tb = fmax(-s[after], R(0)) / (s[last] - fmin(s[after], R(0)));
-    const REAL bx = cell->x[after] + tb * (cell->x[last] - cell->x[after]);
-    const REAL by = cell->y[after] + tb * (cell->y[last] - cell->y[after]);
+    const REAL2 va = cut_face(cell, before, first, s[before], s[first], cell->faces[before], neighbour, d2, points);
+    const REAL2 vb = cut_face(cell, after, last, s[after], s[last], cell->faces[last], neighbour, d2, points);
     const int last_face = cell->faces[last];
 
     int a; /* where the new corners go: a and a + 1 */
@@ -111,11 +131,11 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
         cell->n = kept + 2;
         a = kept;
     }
-    cell->x[a] = ax;
-    cell->y[a] = ay;
+    cell->x[a] = va.s0;
+    cell->y[a] = va.s1;
     cell->faces[a] = neighbour;
-    cell->x[a + 1] = bx;
-    cell->y[a + 1] = by;
+    cell->x[a + 1] = vb.s0;
+    cell->y[a + 1] = vb.s1;
     cell->faces[a + 1] = last_face;
 
     REAL reach2 = 0;
