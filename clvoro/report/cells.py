@@ -214,7 +214,9 @@ def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, extent: np.ndarray)
     owner = np.repeat(np.arange(len(diagram)), np.diff(starts))
     inside = np.zeros(len(diagram), bool)
     inside[shown] = True
-    thin = np.minimum(thickness[owner], np.where(neighbours >= 0, thickness[neighbours], np.inf))
+    # A wall has no thickness of its own: there the cell counts twice.
+    beyond = np.where(neighbours >= 0, neighbours, owner)
+    thin = np.minimum(thickness[owner], thickness[beyond])
     once = np.flatnonzero((neighbours < owner) & inside[owner] & (thin > 0.06))
     following = np.arange(len(owner)) + 1
     following[starts[1:] - 1] = starts[:-1]

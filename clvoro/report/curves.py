@@ -11,13 +11,22 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.spatial import cKDTree
 
 from ..results import Displacements, Result
-from .style import METHOD_COLOURS, WIDTH, frame_domain, interactive_figure, nice, styled
+from .style import (
+    METHOD_COLOURS,
+    WIDTH,
+    frame_domain,
+    interactive_figure,
+    nice,
+    styled,
+    window_around_smallest,
+)
 
 _PANELS = {
     "error": ("metric error $|e|$ [–]", ("mean_error", "mean"), ("max_error", "largest")),
     "quality": ("cell quality $Q$ [–]", ("mean_quality", "mean"), ("min_quality", "worst cell")),
 }
 MOST_ARROWS = 2500
+"""Of a mesh with more generators, the displacements are shown where the cells are smallest."""
 
 
 def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
@@ -81,8 +90,9 @@ def _drawable(values: np.ndarray, quantity: str) -> np.ndarray:
 def plot_displacements(result: Result, figure: Any = None) -> Any:
     """Draw the Lloyd and the Poisson displacements of the first and of the last step.
 
-    Arrows have the length of the displacement times the factor in the panel's title. Of more
-    than 2500 generators an evenly spread part is shown.
+    Arrows have the length of the displacement times the factor in the panel's title. Of a mesh
+    with more than 2500 generators only a window around the smallest cells is shown: over all of
+    it no arrow could be seen.
 
     Returns
     -------
@@ -92,12 +102,13 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
     rows = [(n, d) for n, d in (("first", result.initial), ("last", result.final)) if d is not None]
     if not rows:
         return None
-    domain = result.diagram.domain
+    lower, upper = _shown_part(result)
     with styled():
         if figure is None:
             figure = interactive_figure(WIDTH, displacements_height(result))
         axes = figure.subplots(len(rows), 2, squeeze=False)
         for axes_row, (when, field) in zip(axes, rows, strict=True):
+            field = _inside(field, lower, upper)
             factors = _magnifications(field)
             halves = (
                 ("Lloyd", field.lloyd, METHOD_COLOURS[0]),
@@ -107,15 +118,30 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
                 note = "to scale" if factor == 1 else f"magnified × {factor:g}"
                 ax.set_title(f"{name} displacement, {when} step ({note})")
                 _draw_arrows(ax, field.points, arrows * factor, colour)
-                frame_domain(ax, domain.lower, domain.upper, ticks=False)
+                frame_domain(ax, lower, upper, ticks=len(result.points) > MOST_ARROWS)
+                ax.locator_params(nbins=4)
     return figure
 
 
 def displacements_height(result: Result) -> float:
     """Height in inches that suits `plot_displacements`."""
-    extent = result.diagram.domain.extent
+    extent = np.subtract(*_shown_part(result)[::-1])
     rows = (result.initial is not None) + (result.final is not None)
     return rows * (WIDTH / 2 * float(extent[1] / extent[0]) + 0.22)
+
+
+def _shown_part(result: Result) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the domain, or of a window around the smallest cells."""
+    if len(result.points) <= MOST_ARROWS:
+        box = result.diagram.domain
+        return np.array(box.lower), np.array(box.upper)
+    return window_around_smallest(result, 50)
+
+
+def _inside(field: Displacements, lower: np.ndarray, upper: np.ndarray) -> Displacements:
+    """Return the part of `field` whose generators lie between two corners."""
+    here = ((field.points >= lower) & (field.points <= upper)).all(axis=1)
+    return Displacements(field.points[here], field.lloyd[here], field.poisson[here])
 
 
 def _magnifications(field: Displacements) -> tuple[float, float]:
@@ -138,10 +164,9 @@ def _magnifications(field: Displacements) -> tuple[float, float]:
 
 
 def _draw_arrows(ax: Any, points: np.ndarray, arrows: np.ndarray, colour: str) -> None:
-    step = -(-len(points) // MOST_ARROWS)
     ax.quiver(
-        *points[::step].T,
-        *arrows[::step].T,
+        *points.T,
+        *arrows.T,
         angles="xy",
         scale_units="xy",
         scale=1.0,

@@ -11,7 +11,7 @@ import numpy as np
 from ..results import Result
 from . import cells as draw
 from .curves import displacements_height, plot_displacements, plot_history
-from .style import WIDTH, grid_height, new_figure, styled
+from .style import WIDTH, grid_height, new_figure, styled, window_around_smallest
 
 Picture = tuple[str, str, Callable[[], Any]]
 """Name of its file, caption, and the function that draws it."""
@@ -144,23 +144,16 @@ def _grid(panels: Mapping[str, Result], colour: str) -> Any:
 
 
 def _closer(result: Result) -> Any:
-    """Draw two windows around the smallest cell, the second four times closer."""
-    box = result.diagram.domain
-    lower, upper, extent = np.array(box.lower), np.array(box.upper), box.extent
-    smallest = int(np.argmin(result.size))
-    centre, size = result.points[smallest], float(result.size[smallest])
+    """Draw two windows around the smallest cells, the second four times closer."""
     with styled():
         figure = new_figure(WIDTH, WIDTH / 2 * 0.8 + 0.75)
         axes = figure.subplots(1, 2)
         limits = draw.shared_limits([result], "quality")
         for ax, across in zip(axes, (160, 40), strict=True):
-            span = np.minimum(np.array([across, 0.8 * across]) * size, extent)
-            corner = np.clip(centre - span / 2, lower, upper - span)
-            draw.plot_cells(
-                result, "quality", ax, limits=limits, window=(corner, corner + span), key=False
-            )
+            lower, upper = window_around_smallest(result, across)
+            draw.plot_cells(result, "quality", ax, limits=limits, window=(lower, upper), key=False)
             ax.locator_params(nbins=4)
-            ax.set_title(f"{span[0]:.2g} × {span[1]:.2g} around ({centre[0]:.4g}, {centre[1]:.4g})")
+            ax.set_title(f"{across} $h_{{min}}$ across, where $h$ is smallest")
         scheme = draw.colouring("quality")
         draw.add_colour_bar(
             axes[0].collections[0], axes, scheme, result.quality, limits,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ClvoroError
+from ..results import Result
 
 try:
     from matplotlib import rc_context
@@ -88,3 +89,18 @@ def grid_height(
     """Height of a picture of `rows` x `columns` domains: `each` inches more per row."""
     extent = np.subtract(upper, lower)
     return float(rows * (WIDTH / columns * extent[1] / extent[0] * 0.96 + each) + extra)
+
+
+def window_around_smallest(result: Result, across: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a window `across` times as wide as the smallest target size.
+
+    It is four fifths as high as wide, lies in the domain, and has in its middle the leftmost of the
+    cells whose target size is within a tenth of the smallest: the nose of a wing section.
+    """
+    box = result.diagram.domain
+    lower, upper, extent = np.array(box.lower), np.array(box.upper), box.extent
+    smallest = np.flatnonzero(result.size <= 1.1 * result.size.min())
+    centre = result.points[smallest[np.argmin(result.points[smallest, 0])]]
+    span = np.minimum(np.array([across, 0.8 * across]) * float(result.size.min()), extent)
+    corner = np.clip(centre - span / 2, lower, upper - span)
+    return corner, corner + span
