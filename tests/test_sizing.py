@@ -168,7 +168,7 @@ def test_gradient(make_engine, domain, field):
 
 
 def test_gradient_of_a_cone_is_exact_enough(make_engine):
-    """Grad log h of h = h0 + slope r is slope / h along r, for cells of 1/1000 of the domain too."""
+    """Grad log h of h = h0 + slope r is slope / h along r, for cells of 1/1000 of the box too."""
     engine = make_engine(2)
     domain = Box((0, 0), (1, 1))
     field = sizing.Distance(sizing.Circle((0.4, 0.4), 0), 1e-3, slope=0.3)

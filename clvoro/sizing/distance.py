@@ -14,10 +14,12 @@ from ..errors import InputError, InputTypeError
 from .field import Field, positive
 
 if TYPE_CHECKING:
+    from ..domain import Box
     from .bind import Binder
 
 _FEW = 8  # up to so many items are faster looked at one by one than through a tree
 _LEAF = 4  # items per leaf at most
+_LANDMARKS = 1 << 14  # about so many landmarks at most, beside one per piece
 _BLOCK = 1 << 20  # distances computed at once by the host
 
 
@@ -184,6 +186,28 @@ class Distance(Field):
             raise InputError("Distance got shapes of 2 and of 3 coordinates, expected one kind")
         self.dim = dims.pop()
         self._begin, self._end, self._radius = (np.concatenate(p) for p in zip(*parts, strict=True))
+
+    def landmarks(self, domain: Box) -> np.ndarray:
+        """Return points on the curves, 1/64 of the domain's shorter side apart or so."""
+        spacing = domain.extent.min() / 64
+        length = np.linalg.norm(self._end - self._begin, axis=1)
+        around = 2 * np.pi * self._radius
+        counts = np.maximum(np.maximum(length, around) / spacing, 1)
+        if self.dim == 3:
+            counts = np.maximum(counts, 4 * np.pi * (self._radius / spacing) ** 2)
+        counts *= min(1.0, _LANDMARKS / counts.sum())
+        counts = np.ceil(counts).astype(int)
+        item = np.repeat(np.arange(len(counts)), counts)
+        t = (np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[item]
+        points = self._begin[item] + t[:, None] * (self._end - self._begin)[item]
+        if self.dim == 2:
+            offset = np.column_stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
+        else:  # a spiral from pole to pole, in golden angles, for spheres
+            z = 1 - 2 * (t + 0.5 / counts[item])
+            turn = np.pi * (3 - math.sqrt(5)) * t * counts[item]
+            flat = np.sqrt(1 - z**2)
+            offset = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+        return np.concatenate([points + self._radius[item, None] * offset, self._end])
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of `points` (n, d) to the nearest curve, (n,) float64."""

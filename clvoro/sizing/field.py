@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
+    from ..domain import Box
     from .bind import Binder
 
 
@@ -73,6 +74,13 @@ class Field:
                 f"the size field {self!r} is for {self.dim} dimensions, got a domain or points "
                 f"of {dim}; build it with {dim} coordinates"
             )
+
+    def landmarks(self, domain: Box) -> np.ndarray:
+        """Return points (m, d) at which h is likely to be least, for those who must see it.
+
+        They may lie outside `domain`, whose size tells how dense they should be. By default none.
+        """
+        return np.zeros((0, domain.dim))
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         raise NotImplementedError
@@ -179,6 +187,9 @@ class Scaled(Field):
     def check_dim(self, dim: int) -> None:  # noqa: D102
         self.field.check_dim(dim)
 
+    def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
+        return self.field.landmarks(domain)
+
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self.factor * self.field._evaluate(points)
 
@@ -214,6 +225,9 @@ class Combined(Field):
     def check_dim(self, dim: int) -> None:  # noqa: D102
         for f in self.fields:
             f.check_dim(dim)
+
+    def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
+        return np.concatenate([f.landmarks(domain) for f in self.fields])
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         combine = _COMBINE[self.operation][0]

@@ -12,6 +12,7 @@ from ..errors import InputError, InputTypeError
 from .field import Field
 
 if TYPE_CHECKING:
+    from ..domain import Box
     from .bind import Binder
 
 
@@ -91,6 +92,26 @@ class Raster(Field):
             return (self._counts - 1) / (self.upper - self.lower), self.lower
         pixel = (self.upper - self.lower) / self._counts
         return 1.0 / pixel, self.lower + 0.5 * pixel
+
+    def landmarks(self, domain: Box) -> np.ndarray:
+        """Return the places of the least value in each of at most 64 tiles per axis."""
+        low, where = self.values, np.arange(self.values.size).reshape(self.values.shape)
+        for axis, count in enumerate(low.shape):
+            # Take the least along one axis after the other, and carry along where it was.
+            tile = -(-count // 64)
+            pad = [(0, 0)] * low.ndim
+            pad[axis] = (0, -count % tile)
+            low, where = (np.pad(a, pad, mode="edge") for a in (low, where))
+            shape = (*low.shape[:axis], -1, tile, *low.shape[axis + 1 :])
+            low, where = low.reshape(shape), where.reshape(shape)
+            least = np.expand_dims(low.argmin(axis=axis + 1), axis + 1)
+            low, where = (
+                np.take_along_axis(a, least, axis + 1).squeeze(axis + 1) for a in (low, where)
+            )
+        gain, origin = self._index_map()
+        index = np.stack(np.unravel_index(where.ravel(), self.values.shape)[::-1], axis=1)
+        points = origin + np.divide(index, gain, out=np.zeros(index.shape), where=gain > 0)
+        return np.clip(points, self.lower, self.upper)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         gain, origin = self._index_map()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyopencl as cl
 
 from ..errors import SizeFieldError
 from .bind import bind
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from .._program import Engine
     from ..domain import Box
 
+_GROUP = 64
 _NONE_BAD = np.iinfo(np.int32).max
 
 # Central differences of step s = c h: rounding of h, about eps, shows as eps / (2 c h) in dh/dx,
@@ -69,6 +71,15 @@ class Sizing:
                 "sizing", defines={"GRADIENT_STEP": repr(step)}, prelude=self.prelude
             )
 
+    @property
+    def real(self) -> np.dtype:
+        """The device's precision."""
+        return self.engine.real
+
+    def landmarks(self, domain: Box) -> np.ndarray:
+        """Return the field's landmarks (see `Field.landmarks`)."""
+        return self.field.landmarks(domain)
+
     def evaluate(self, points: cla.Array, n: int, h_out: cla.Array) -> None:
         """Write h' at the first `n` of `points` (>= n, d) into `h_out` (>= n,).
 
@@ -79,8 +90,7 @@ class Sizing:
             h = self._on_host(points[:n].get()) / self._scale
             h_out[:n].set(h.astype(self.engine.real))
             return
-        kernel = self._kernels.evaluate
-        self.engine.run(kernel, n, np.int32(n), points, self.data, h_out, self._bad)
+        self._launch("evaluate", n, points, self.data, h_out, self._bad)
 
     def evaluate_with_gradient(
         self, points: cla.Array, n: int, h_out: cla.Array, grad_out: cla.Array
@@ -105,9 +115,15 @@ class Sizing:
             h_out[:n].set(h.astype(self.engine.real))
             grad_out[:n].set(gradient.astype(self.engine.real))
             return
-        kernel = self._kernels.evaluate_with_gradient
-        self.engine.run(
-            kernel, n, np.int32(n), points, self.data, self._box, h_out, grad_out, self._bad
+        self._launch(
+            "evaluate_with_gradient",
+            n,
+            points,
+            self.data,
+            self._box,
+            h_out,
+            grad_out,
+            self._bad,
         )
 
     def check(self, points: cla.Array, h: cla.Array) -> None:
@@ -147,6 +163,13 @@ class Sizing:
         self.evaluate(x, len(normalised), h)
         self.check(x, h)
         return h.get().astype(float) * self._scale
+
+    def _launch(self, name: str, n: int, *arrays: cla.Array) -> None:
+        """Run a kernel over `n` points in groups of 64: drivers may compile anew for each size."""
+        kernel = getattr(self._kernels, name)
+        kernel.set_args(np.int32(n), *(a.data for a in arrays))
+        size = max(-(-n // _GROUP), 1) * _GROUP
+        cl.enqueue_nd_range_kernel(self.engine.queue, kernel, (size,), (_GROUP,))
 
     def _physical(self, normalised: np.ndarray) -> np.ndarray:
         """Return physical coordinates, kept inside the domain's bounding box against rounding."""

@@ -1,0 +1,220 @@
+"""How many cells, and where they start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Integral, Real
+
+import numpy as np
+
+from .domain import Box
+from .errors import InputError, InputTypeError
+from .quadrature import DensityTree
+from .sizing import as_field
+
+_TRIES = 40
+_SHARE = 1.0  # most points that a box of the sampling may expect
+
+
+def count_cells(
+    field: Callable[[np.ndarray], np.ndarray] | float, domain: Box, tolerance: float = 1e-4
+) -> float:
+    """Return the number of cells that `field` asks for: the integral of h^-d over the domain.
+
+    Parameters
+    ----------
+    field : Field, Sizing, callable or number
+        A `Sizing` is evaluated on its device, anything else on the host.
+    domain : Box
+    tolerance : float
+        Relative error aimed at; see `clvoro.quadrature.DensityTree` for what is guaranteed.
+
+    Returns
+    -------
+    float
+        May be less than 1 (h larger than the domain), and may be more than any memory holds.
+
+    Raises
+    ------
+    SizeFieldError
+        If h is not positive and finite somewhere; names the place.
+    """
+    if not isinstance(tolerance, Real) or not 0 < tolerance < 1:
+        raise InputError(f"tolerance is {tolerance!r}, expected a number between 0 and 1")
+    return DensityTree(_evaluator(field), domain, float(tolerance)).integral
+
+
+def sample_density(
+    field: Callable[[np.ndarray], np.ndarray] | float,
+    domain: Box,
+    n: int,
+    seed: int,
+    real: object = None,
+) -> np.ndarray:
+    """Return `n` points distributed as h^-d.
+
+    The domain is cut into boxes that expect at most one point each, in the order of a Hilbert
+    curve; points are dealt out along the curve at equal steps of the cumulated expectation
+    (systematic sampling). So every box of the tree, large or small, gets its share rounded up or
+    down. Within its box a point is drawn from the log-linear density that fits there.
+
+    Parameters
+    ----------
+    field : Field, Sizing, callable or number
+    domain : Box
+    n : int
+        At least 1.
+    seed : int
+        Of numpy's PCG64; the same seed gives the same points.
+    real : dtype, optional
+        Precision in which the points are told apart, in the device's coordinates; by default the
+        field's (`Sizing.real`), else float64.
+
+    Returns
+    -------
+    (n, d) float64
+        Physical coordinates, distinct and strictly inside, in the order of the curve.
+
+    Raises
+    ------
+    SizeFieldError
+        If h is not positive and finite somewhere; names the place.
+    InputError
+        If `n` points cannot be told apart in the precision.
+    """
+    n, seed = _checked(n, seed)
+    field = _evaluator(field)
+    tree = DensityTree(field, domain, tolerance=1e-3)
+    boxes, slopes = tree.boxes, tree.slopes
+    share = tree.cells * (n / tree.integral)
+    while (chosen := (share > _SHARE) & (boxes.level < 45)).any():
+        share, slopes = _halve(tree, chosen, share, slopes)
+    reached = np.cumsum(share)
+    rng = np.random.Generator(np.random.PCG64(seed))
+    marks = (np.arange(n) + rng.random()) * (reached[-1] / n)
+    box = np.minimum(np.searchsorted(reached, marks, side="right"), len(boxes) - 1)
+
+    def draw(rows: np.ndarray) -> np.ndarray:
+        at = _log_linear(rng.random((len(rows), domain.dim)), slopes[box[rows]])
+        return boxes.points(at[:, None, :], box[rows])[:, 0]
+
+    precision = getattr(field, "real", np.float64) if real is None else real
+    return _distinct(draw, domain, n, np.dtype(precision))
+
+
+def sample_uniform(domain: Box, n: int, seed: int, real: object = np.float64) -> np.ndarray:
+    """Return `n` independent uniform random points, the paper's start.
+
+    Parameters
+    ----------
+    domain : Box
+    n : int
+        At least 1.
+    seed : int
+        Of numpy's PCG64; the same seed gives the same points.
+    real : dtype
+        Precision in which the points are told apart, in the device's coordinates.
+
+    Returns
+    -------
+    (n, d) float64
+        Physical coordinates, distinct and strictly inside.
+
+    Raises
+    ------
+    InputError
+        If `n` points cannot be told apart in the precision.
+    """
+    n, seed = _checked(n, seed)
+    rng = np.random.Generator(np.random.PCG64(seed))
+
+    def draw(rows: np.ndarray) -> np.ndarray:
+        return domain.lower + domain.extent * rng.random((len(rows), domain.dim))
+
+    return _distinct(draw, domain, n, np.dtype(real))
+
+
+def _evaluator(field: object) -> Callable[[np.ndarray], np.ndarray]:
+    """Return `field` if it has a precision of its own (a stage), else as a `Field`."""
+    return field if hasattr(field, "real") and callable(field) else as_field(field)
+
+
+def _checked(n: object, seed: object) -> tuple[int, int]:
+    for name, value, least in (("n", n, 1), ("seed", seed, 0)):
+        if not isinstance(value, Integral) or isinstance(value, bool):
+            raise InputTypeError(f"{name} is {value!r}, expected an integer")
+        if value < least:
+            raise InputError(f"{name} is {value}, expected at least {least}")
+    return int(n), int(seed)
+
+
+def _halve(
+    tree: DensityTree, chosen: np.ndarray, share: np.ndarray, slopes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Split boxes of the tree; deal their shares out to the children as h^-d at the centres.
+
+    Returns the new shares, and slopes: for a child, those between the centres of its siblings.
+    """
+    boxes, dim = tree.boxes, tree.boxes.dim
+    parent, child = boxes.split(chosen)
+    new = child >= 0
+    share, slopes = share[parent], slopes[parent]
+    centres = boxes.points(np.full((1, dim), 0.5), new)[:, 0]
+    log_density = (-dim * np.log(tree.sizes(centres))).reshape(-1, 1 << dim)
+    weight = np.exp(log_density - log_density.max(axis=1, keepdims=True))
+    weight /= weight.sum(axis=1, keepdims=True)
+    share[new] *= weight.ravel()
+    # Which side of its parent each child is on, -1 or 1 per axis.
+    middle = centres.reshape(-1, 1 << dim, dim)
+    side = np.sign(middle - middle.mean(axis=1, keepdims=True))
+    slope = np.einsum("pkd,pk->pd", side, log_density) / (1 << (dim - 1))
+    slopes[new] = np.repeat(slope, 1 << dim, axis=0)
+    return share, slopes
+
+
+def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Turn uniform `u` into numbers in [0, 1] of density proportional to exp(slope x)."""
+    slope = np.clip(slope, -30, 30)
+    flat = np.abs(slope) < 1e-6
+    safe = np.where(flat, 1.0, slope)
+    return np.where(flat, u, np.log1p(u * np.expm1(safe)) / safe)
+
+
+def _distinct(
+    draw: Callable[[np.ndarray], np.ndarray], domain: Box, n: int, real: np.dtype
+) -> np.ndarray:
+    """Draw points; draw again those that coincide or lie on a wall in precision `real`."""
+    origin, scale = domain.frame
+    lower, upper = (
+        ((np.array(c) - origin) / scale).astype(real) for c in (domain.lower, domain.upper)
+    )
+    points = np.empty((n, domain.dim))
+    rows = np.arange(n)
+    for _ in range(_TRIES):
+        points[rows] = draw(rows)
+        working = ((points - origin) / scale).astype(real)
+        bad = ((working <= lower) | (working >= upper)).any(axis=1)
+        bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
+        bad |= _repeated(working)
+        rows = np.flatnonzero(bad)
+        if not rows.size:
+            return points
+    raise InputError(
+        f"n is {n}: that many distinct points do not fit the size field in {real.name}; "
+        + ("use dtype='float64' or " if real != np.float64 else "")
+        + "ask for fewer cells"
+    )
+
+
+def _repeated(points: np.ndarray) -> np.ndarray:
+    """Tell for each of `points` (n, d) whether an earlier one is the same."""
+    repeated = np.zeros(len(points), bool)
+    # Only points whose first coordinate occurs twice can coincide: in double precision hardly any.
+    order = np.argsort(points[:, 0], kind="stable")
+    first = points[order, 0]
+    twin = np.flatnonzero(first[1:] == first[:-1])
+    candidates = np.unique(order[np.concatenate([twin, twin + 1])])
+    if candidates.size:
+        _, keep = np.unique(points[candidates], axis=0, return_index=True)
+        repeated[np.delete(candidates, keep)] = True
+    return repeated
