@@ -7,15 +7,15 @@ device and cannot build anything for it.
 from __future__ import annotations
 
 import os
-import threading
-import warnings
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
 
-from . import _runtimes
+from . import _probe, _runtimes
+from ._probe import has_fp64, one_line
 from .errors import DeviceError, InputTypeError
 
 _runtimes.prepare()
@@ -25,25 +25,6 @@ INSTALL_HINT = (
     'Linux `pip install "clvoro[cpu]"`) or your GPU\'s OpenCL driver'
 )
 """The remedy in every message about a missing device."""
-
-_PROBE = """
-#if PROBE_FP64
-#pragma OPENCL EXTENSION cl_khr_fp64 : enable
-typedef double probe_real;
-#else
-typedef float probe_real;
-#endif
-__kernel void clvoro_probe(__global const int *in, __global int *out)
-{
-    int i = (int)get_global_id(0);
-    probe_real x = (probe_real)in[i] / (probe_real)4;
-    out[i] = (int)(sqrt(x * x) * (probe_real)12) + i;   /* 3 in[i] + i, exact in both precisions */
-}
-"""
-_PROBE_SIZE = 64
-
-_lock = threading.Lock()
-_verdicts: dict[int, str] = {}
 
 
 @dataclass(frozen=True)
@@ -109,14 +90,6 @@ class _Candidate:
         return (3, 0)
 
 
-def has_fp64(device: cl.Device) -> bool:
-    """Tell whether `device` computes in float64."""
-    try:
-        return bool(device.double_fp_config) or "cl_khr_fp64" in device.extensions.split()
-    except cl.Error:  # the query is unknown to runtimes without the extension
-        return False
-
-
 def create_context(device: str | cl.Device | None = None, *, fp64: bool = False) -> cl.Context:
     """Return a context on the best working device.
 
@@ -148,7 +121,9 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     if device is None and os.environ.get("PYOPENCL_CTX"):
         return _checked_context(_from_environment(), fp64)
 
-    found, broken = _candidates()
+    # Indices ask that platform alone: the way around one that crashes.
+    index = re.fullmatch(r"\s*(\d+)\s*:\s*\d+\s*", device or "")
+    found, broken = _candidates(only=int(index[1]) if index else None)
     if device is None or not device.strip():
         wanted = [c for c in found if c.kind != "simulator"]
         subject = "no working OpenCL device"
@@ -165,10 +140,15 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Try every OpenCL device and return one entry for each, in the order of the platforms."""
-    found, broken = _candidates()
-    reasons = {c.index: _verdict(c.device) for c in found}
-    best = _default_index(found, reasons)
+    """Try every OpenCL device and return one entry for each, in the order of the platforms.
+
+    A child process tries them first, so that a runtime that crashes is listed with its reason. That
+    takes about a second.
+    """
+    crashed = _probe.crashing_platforms()
+    found, broken = _candidates(skip=crashed)
+    reasons = {c.index: _probe.verdict(c.device) for c in found}
+    best = _default_index(found, reasons, [title for index, title, _ in broken if crashed])
     entries = [
         DeviceInfo(
             index=c.index,
@@ -213,7 +193,7 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
     for row, entry in zip([header, *rows], [None, *devices], strict=True):
         lines.append("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
         if entry is not None and entry.reason:
-            lines.append(f"       {_one_line(entry.reason, 300)}")
+            lines.append(f"       {one_line(entry.reason, 300)}")
     if any(d.default for d in devices):
         lines.append("* is used when nothing is asked for.")
     elif os.environ.get("PYOPENCL_CTX"):
@@ -255,20 +235,33 @@ def _describe(device: cl.Device, index: str) -> _Candidate:
     return _Candidate(index, device, platform, name, kind)
 
 
-def _candidates() -> tuple[list[_Candidate], list[tuple[str, str, str]]]:
-    """Return all devices, and (index, platform, reason) of each platform that lists none."""
+def _candidates(
+    only: int | None = None, skip: Mapping[int, str] | None = None
+) -> tuple[list[_Candidate], list[tuple[str, str, str]]]:
+    """Return all devices, and (index, platform, reason) of each platform that lists none.
+
+    With `only`, no other platform is asked; neither are those in `skip`, which gives their reasons.
+    """
     try:
         platforms = cl.get_platforms()
     except cl.Error:  # the loader's way of saying that there is no platform
         return [], []
+    if only is not None and only >= len(platforms):
+        only = None  # the message shall list what there is
     found: list[_Candidate] = []
     broken: list[tuple[str, str, str]] = []
     for p, platform in enumerate(platforms):
-        try:
-            devices = platform.get_devices()
-            reason = "it lists no device"
-        except cl.Error as error:
-            devices, reason = [], f"it lists no device: {_one_line(str(error), 300)}"
+        devices: Collection[cl.Device] = []
+        reason = "it lists no device"
+        if only not in (None, p):
+            continue
+        if skip and p in skip:
+            reason = skip[p]
+        else:
+            try:
+                devices = platform.get_devices()
+            except cl.Error as error:
+                reason += f": {one_line(str(error), 300)}"
         found += [_describe(device, f"{p}:{d}") for d, device in enumerate(devices)]
         if not devices:
             broken.append((f"{p}:-", platform.name.strip(), reason))
@@ -297,7 +290,7 @@ def _from_environment() -> _Candidate:
         device = cl.create_some_context(interactive=False).devices[0]
     except Exception as error:
         raise DeviceError(
-            f"PYOPENCL_CTX={value!r} chooses no OpenCL device ({_one_line(str(error), 200)}); "
+            f"PYOPENCL_CTX={value!r} chooses no OpenCL device ({one_line(str(error), 200)}); "
             "unset it, or set it to indices that `clvoro devices` shows"
         ) from error
     return _describe(device, f"PYOPENCL_CTX={value!r}")
@@ -317,12 +310,23 @@ def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
 def _reason_against(device: cl.Device, fp64: bool) -> str:
     if fp64 and not has_fp64(device):
         return "it has no double precision (use dtype='float32')"
-    return _verdict(device)
+    return _probe.verdict(device)
 
 
-def _default_index(found: Iterable[_Candidate], reasons: dict[str, str]) -> str | None:
-    """Return the index of the device that `create_context()` takes."""
-    if os.environ.get("PYOPENCL_CTX"):
+def _default_index(
+    found: Iterable[_Candidate], reasons: dict[str, str], avoid: Iterable[str]
+) -> str | None:
+    """Return the index of the device that `create_context()` takes.
+
+    `avoid` are names of platforms that must not be asked.
+    """
+    wish = os.environ.get("PYOPENCL_CTX")
+    if wish:
+        first = wish.split(":")[0].strip().lower()
+        if first.isdigit() and not any(c.index.startswith(f"{first}:") for c in found):
+            return None
+        if any(first in name.lower() for name in avoid):
+            return None
         try:
             chosen = _from_environment().device
         except DeviceError:
@@ -330,41 +334,6 @@ def _default_index(found: Iterable[_Candidate], reasons: dict[str, str]) -> str 
         return next((c.index for c in found if c.device == chosen and not reasons[c.index]), None)
     usable = [c for c in found if c.kind != "simulator" and not reasons[c.index]]
     return min(usable, key=lambda c: c.rank).index if usable else None
-
-
-def _verdict(device: cl.Device) -> str:
-    """Return why `device` does not work, or an empty string; a device is tried once."""
-    key = device.int_ptr
-    with _lock:
-        if key not in _verdicts:
-            _verdicts[key] = _probe(device)
-        return _verdicts[key]
-
-
-def _probe(device: cl.Device) -> str:
-    """Build and run a small kernel on `device`; return what went wrong, or an empty string."""
-    try:
-        if not device.available or not device.compiler_available:
-            return "the runtime says that it is not available"
-        values = np.arange(_PROBE_SIZE, dtype=np.int32)
-        got = np.full_like(values, -1)
-        ctx = cl.Context([device])
-        queue = cl.CommandQueue(ctx)
-        flags = cl.mem_flags
-        given = cl.Buffer(ctx, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=values)
-        out = cl.Buffer(ctx, flags.WRITE_ONLY | flags.COPY_HOST_PTR, hostbuf=got)
-        with warnings.catch_warnings():
-            # Some compilers greet on every build; real messages arrive as errors.
-            warnings.simplefilter("ignore", cl.CompilerWarning)
-            program = cl.Program(ctx, _PROBE).build([f"-DPROBE_FP64={int(has_fp64(device))}"])
-        program.clvoro_probe(queue, (_PROBE_SIZE,), None, given, out)
-        cl.enqueue_copy(queue, got, out)
-        queue.finish()
-    except Exception as error:  # whatever a broken runtime does, it is that device's verdict
-        return f"it cannot build and run a kernel: {_one_line(str(error) or repr(error), 300)}"
-    if not np.array_equal(got, 4 * values):
-        return "it computes wrong results"
-    return ""
 
 
 def _complaint(
@@ -383,9 +352,3 @@ def _complaint(
         lines.append("  the OpenCL loader knows no platform")
     lines.append(f"  remedy: {INSTALL_HINT}; `clvoro devices` shows the verdict on each device")
     return "\n".join(lines)
-
-
-def _one_line(text: str, limit: int) -> str:
-    """Fold a message, often a compiler's log, into one line of at most `limit` characters."""
-    folded = " ".join(text.split())
-    return folded if len(folded) <= limit else folded[: limit - 3] + "..."

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from clvoro import _runtimes, device
+from clvoro import _probe, _runtimes, device
 from clvoro.errors import DeviceError, InputTypeError
 
 ROOT = Path(__file__).parent.parent
@@ -41,8 +41,9 @@ def machine(monkeypatch):
     def install(*devices, broken=()):
         monkeypatch.delenv("PYOPENCL_CTX", raising=False)
         found = [device._describe(d, f"{i}:0") for i, d in enumerate(devices)]
-        monkeypatch.setattr(device, "_candidates", lambda: (found, []))
-        monkeypatch.setattr(device, "_verdict", lambda d: "it cannot build" if d in broken else "")
+        monkeypatch.setattr(device, "_candidates", lambda **_: (found, []))
+        monkeypatch.setattr(_probe, "crashing_platforms", dict)
+        monkeypatch.setattr(_probe, "verdict", lambda d: "it cannot build" if d in broken else "")
         monkeypatch.setattr(device.cl, "Context", lambda devices: devices)
 
     return install
@@ -136,6 +137,8 @@ def test_environment_variable_chooses(ctx, monkeypatch):
     with pytest.raises(DeviceError, match="PYOPENCL_CTX='987:654'"):
         device.create_context()
     assert not any(d.default for d in device.list_devices())
+    with pytest.raises(DeviceError, match=f"there is {entry.index}"):
+        device.create_context("987:654")
     # What the caller passes comes first.
     assert device.create_context(entry.index).devices[0].name.strip() == entry.name
 
@@ -159,15 +162,35 @@ def test_real_devices_are_listed_with_their_verdict(ctx):
     ],
 )
 def test_probe_sees_what_is_broken(ctx, monkeypatch, good, bad, verdict):
-    assert device._probe(ctx.devices[0]) == ""
-    assert good in device._PROBE
-    monkeypatch.setattr(device, "_PROBE", device._PROBE.replace(good, bad))
-    reason = device._probe(ctx.devices[0])
+    assert _probe.probe(ctx.devices[0]) == ""
+    assert good in _probe._PROBE
+    monkeypatch.setattr(_probe, "_PROBE", _probe._PROBE.replace(good, bad))
+    reason = _probe.probe(ctx.devices[0])
     assert verdict in reason
     assert "\n" not in reason
-    monkeypatch.setattr(device, "_verdicts", {})
+    monkeypatch.setattr(_probe, "_verdicts", {})
     with pytest.raises(DeviceError, match=verdict):
         device.create_context(ctx.devices[0])
+
+
+def test_runtime_that_crashes_is_listed(ctx, tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "import pyopencl as cl\n"
+        "def crash(platform):\n"
+        "    print('no memory', file=sys.stderr, flush=True)\n"
+        "    os.abort()\n"
+        "cl.Platform.get_devices = crash\n"
+    )
+    assert _probe.crashing_platforms() == {}
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    entries = device.list_devices()
+    assert len(entries) == len(cl.get_platforms())
+    for entry in entries:
+        assert not entry.works
+        assert not entry.default
+        assert entry.reason == "it ends the process (SIGABRT): no memory"
+        assert entry.reason in device.format_devices(entries)
 
 
 # --- what the runtimes need ---
