@@ -216,12 +216,12 @@ kernel void match_faces(global const int *rows, global const int *row_counts, gl
    face_centroids (m, 2)
    volumes (n,)              A_i
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
-   moments (n,)              integral of |y - x_i|^2 over the cell (the paper's 2.3) */
+   covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area */
 kernel void measure_cells(global const int *rows, global const int *row_counts, global const uint *keep,
                           global const int *starts, global const REAL *points, const REAL4 box_lower,
                           const REAL4 box_upper, global int *neighbours, global REAL *face_measures,
                           global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
-                          global REAL *moments)
+                          global REAL *covariances)
 {
     const int i = get_global_id(0);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
@@ -234,7 +234,7 @@ kernel void measure_cells(global const int *rows, global const int *row_counts, 
         if ((keep[i * KEEP_WORDS + k / 32] >> (k % 32)) & 1u)
             faces[n++] = rows[i * ROW_CAPACITY + k];
     const int start = starts[i];
-    REAL area = 0, cx = 0, cy = 0, moment = 0;
+    REAL area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
     if (n >= 3) {
         const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
         REAL2 v = origin;
@@ -242,12 +242,15 @@ kernel void measure_cells(global const int *rows, global const int *row_counts, 
             const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
             const REAL2 e = w - v;
             const REAL2 sum = v + w;
-            /* The triangle x_i, v, w: area cross / 2, centroid (v + w) / 3, second moment area (v.v + w.w + v.w) / 6. */
+            /* The triangle x_i, v, w: area cross / 2, centroid (v + w) / 3, second moments
+               area (v v + w w + (v + w) (v + w)) / 12. */
             const REAL cross = difference_of_products(v.s0, w.s1, v.s1, w.s0);
             area += cross;
             cx += cross * sum.s0;
             cy += cross * sum.s1;
-            moment += cross * (dot(v, v) + dot(w, w) + dot(v, w));
+            xx += cross * (v.s0 * v.s0 + w.s0 * w.s0 + sum.s0 * sum.s0);
+            xy += cross * (v.s0 * v.s1 + w.s0 * w.s1 + sum.s0 * sum.s1);
+            yy += cross * (v.s1 * v.s1 + w.s1 * w.s1 + sum.s1 * sum.s1);
             neighbours[start + k] = faces[k];
             face_measures[start + k] = sqrt(dot(e, e));
             face_centroids[2 * (start + k)] = sum.s0 / 2;
@@ -256,7 +259,16 @@ kernel void measure_cells(global const int *rows, global const int *row_counts, 
         }
     }
     volumes[i] = area / 2;
-    offsets[2 * i] = area > 0 ? cx / (3 * area) : 0;
-    offsets[2 * i + 1] = area > 0 ? cy / (3 * area) : 0;
-    moments[i] = moment / 12;
+    if (area > 0) {
+        cx /= 3 * area;
+        cy /= 3 * area;
+        xx = xx / (12 * area) - cx * cx;
+        xy = xy / (12 * area) - cx * cy;
+        yy = yy / (12 * area) - cy * cy;
+    }
+    offsets[2 * i] = cx;
+    offsets[2 * i + 1] = cy;
+    covariances[3 * i] = xx;
+    covariances[3 * i + 1] = xy;
+    covariances[3 * i + 2] = yy;
 }

@@ -3,10 +3,12 @@
 /* Per generator i: metric error and quality of its cell.
 
    error    e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
+   energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
    quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
 kernel void evaluate_metric(global const REAL *volumes, global const int *starts, global const REAL *face_measures,
-                            global const REAL *h, global REAL *error, global REAL *quality)
+                            global const REAL *offsets, global const REAL *covariances, global const REAL *h,
+                            global REAL *error, global REAL *quality, global REAL *energy)
 {
     const int i = get_global_id(0);
     const REAL volume = volumes[i];
@@ -22,6 +24,12 @@ kernel void evaluate_metric(global const REAL *volumes, global const int *starts
     const REAL length = cbrt(volume);
     quality[i] = R(113.09733552923255) * volume * volume / (surface * surface * surface);
 #endif
+    REAL square = 0;
+    for (int a = 0, diagonal = 0; a < DIM; ++a) {
+        square += offsets[DIM * i + a] * offsets[DIM * i + a] + covariances[DIM * (DIM + 1) / 2 * i + diagonal];
+        diagonal += DIM - a;
+    }
+    energy[i] = volume * square;
     const REAL size = h[i];
     error[i] = (length - size) / fmin(length, size);
 }
@@ -50,4 +58,11 @@ kernel void compare_neighbours(global const int *starts, global const int *neigh
     signatures[i] = signature;
     changed[i] = differs;
     ever[i] = first ? 0 : fmax(ever[i], (REAL)differs);
+}
+
+/* Per generator i: h times a factor: the size on a coarser level. */
+kernel void scale_sizes(const REAL factor, global REAL *h)
+{
+    const int i = get_global_id(0);
+    h[i] *= factor;
 }

@@ -57,10 +57,10 @@ kernel void measure_displacement(global const REAL *u, global const REAL *h, glo
 }
 
 /* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the box: what
-   would leave is reflected, so that no two generators meet on a wall. */
+   would leave is reflected, so that no two generators meet on a wall. velocity is the displacement that came of it. */
 kernel void move_generators(global const REAL *lloyd, const REAL a, global const REAL *correction, const REAL b,
                             global const REAL *h, const REAL clip, const REAL4 box_lower, const REAL4 box_upper,
-                            global REAL *points)
+                            global REAL *points, global REAL *velocity)
 {
     const int i = get_global_id(0);
     const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
@@ -74,11 +74,22 @@ kernel void move_generators(global const REAL *lloyd, const REAL a, global const
     const REAL longest = clip * h[i];
     const REAL scale = clip > 0 && d2 > longest * longest ? longest / sqrt(d2) : 1;
     for (int c = 0; c < DIM; ++c) {
-        REAL y = points[DIM * i + c] + scale * d[c];
+        const REAL x = points[DIM * i + c];
+        REAL y = x + scale * d[c];
         if (y < lower[c])
             y = 2 * lower[c] - y;
         if (y > upper[c])
             y = 2 * upper[c] - y;
-        points[DIM * i + c] = clamp(y, lower[c], upper[c]);
+        y = clamp(y, lower[c], upper[c]);
+        points[DIM * i + c] = y;
+        velocity[DIM * i + c] = y - x;
     }
+}
+
+/* Per generator i: lloyd += share * velocity. */
+kernel void add_momentum(global const REAL *velocity, const REAL share, global REAL *lloyd)
+{
+    const int i = get_global_id(0);
+    for (int a = 0; a < DIM; ++a)
+        lloyd[DIM * i + a] += share * velocity[DIM * i + a];
 }

@@ -103,3 +103,12 @@ kernel void combine_blocks(global const summary_t *partials, const int groups, c
     out[4 * slot + 2] = all.least;
     out[4 * slot + 3] = all.largest;
 }
+
+/* Row p of `out` is row items[p] of `rows`; a row is `words` 32-bit words, whatever they mean. */
+kernel void gather_rows(global const int *items, global const uint *rows, const int words, global uint *out)
+{
+    const int p = get_global_id(0);
+    const int i = items[p];
+    for (int w = 0; w < words; ++w)
+        out[words * p + w] = rows[words * i + w];
+}

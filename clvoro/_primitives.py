@@ -82,3 +82,19 @@ class Summaries:
         """Fetch every slot: the one transfer of a step."""
         host = self.values.get()
         return {name: Summary(*map(float, host[slot])) for name, slot in self.slots.items()}
+
+
+class Gather:
+    """Reorder the rows of arrays of any type."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernel = engine.kernels("primitives").gather_rows
+
+    def rows(self, items: cla.Array, array: cla.Array) -> cla.Array:
+        """Return a new array whose row p is ``array[items[p]]``."""
+        shape = (items.shape[0], *array.shape[1:])
+        out = self.engine.empty(shape, array.dtype)
+        words = int(np.prod(array.shape[1:], dtype=int)) * array.dtype.itemsize // 4
+        self.engine.run(self._kernel, shape[0], items, array, np.int32(words), out)
+        return out

@@ -51,13 +51,13 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._engines: dict[int, tuple[Engine, Stages]] = {}
+        self._stages: dict[int, Stages] = {}
 
-    def _engine(self, dim: int) -> tuple[Engine, Stages]:
-        if dim not in self._engines:
-            engine = Engine(self.ctx, self.queue, dim, self.dtype)
-            self._engines[dim] = (engine, Stages.of(engine))
-        return self._engines[dim]
+    def _stages_for(self, domain: Box) -> Stages:
+        if domain.dim not in self._stages:
+            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype)
+            self._stages[domain.dim] = Stages(engine)
+        return self._stages[domain.dim]
 
     def diagram(self, domain: Box, points: np.ndarray) -> Diagram:
         """Tessellate `domain` by `points`.
@@ -79,14 +79,14 @@ class Adapter:
             If the points are not as expected, or too close together for the precision.
         """
         host = check_points(points, domain)
-        engine, stages = self._engine(domain.dim)
+        stages, n = self._stages_for(domain), len(host)
+        engine = stages.engine
         origin, scale = domain.frame
-        unsorted = engine.upload((host - origin) / scale)
-        binned = stages.bins.build(unsorted, len(host))
-        labels, sorted_points = binned.items[: len(host)].copy(), binned.points[: len(host)].copy()
-        binned = stages.bins.build(sorted_points, len(host))
+        binned = stages.bins.build(engine.upload((host - origin) / scale), n)
+        labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
+        binned = stages.bins.build(sorted_points, n)
         with _Naming(host, origin, scale, self.dtype):
-            t = stages.cells.tessellate(domain, sorted_points, len(host), binned)
+            t = stages.cells.tessellate(domain, sorted_points, n, binned)
         return fetch_diagram(engine, domain, t, labels)
 
     def run(
@@ -114,7 +114,8 @@ class Adapter:
             (n,), and is evaluated on the host: each step then moves all points there and back.
         points : (n, d) array, optional
             Generators to start from.
-        method : "lloyd", "poisson" or "coupled"
+        method : "lloyd", "poisson", "coupled", "weighted-lloyd" or "weighted"
+            See `clvoro.methods`.
         n_cells : int, optional
             Number of generators; by default the integral of h^-d over the domain.
         start : "density" or "uniform"
@@ -155,8 +156,8 @@ class Adapter:
             None if alpha is None else check_number("alpha", alpha, above=0),
             check_number("k", k, above=0),
         )
-        engine, stages = self._engine(domain.dim)
-        sizing = Sizing(engine, domain, as_field(size))
+        stages = self._stages_for(domain)
+        sizing = Sizing(stages.engine, domain, as_field(size))
         if points is None:
             host = self._start(domain, sizing, n_cells, start, check_integer("seed", seed, 0))
         else:
@@ -166,9 +167,10 @@ class Adapter:
             "max_steps": max_steps, "tol": tol, "alpha": alpha, "k": k, "seed": seed,
             "dtype": self.dtype.name,
         }  # fmt: skip
-        with _Naming(host, *domain.frame, self.dtype):
-            mesh = Mesh(engine, stages, domain, sizing, host)
-        loop = _Loop(mesh, make_method(method, engine, relaxation), max_steps, tol, callback)
+        origin, scale = domain.frame
+        with _Naming(host, origin, scale, self.dtype):
+            mesh = Mesh(stages, domain, sizing, stages.engine.upload((host - origin) / scale))
+        loop = _Loop(mesh, make_method(method, relaxation), max_steps, tol, callback)
         return loop.run(settings)
 
     def _start(
@@ -183,7 +185,7 @@ class Adapter:
         check_memory(sizing.engine, n)
         if start == "uniform":
             return sample_uniform(domain, n, seed)
-        return sample_density(sizing, domain, n, seed)
+        return sample_density(sizing, domain, n, seed, self.dtype)
 
 
 class _Loop:
@@ -249,7 +251,7 @@ class _Loop:
         row["step"], row["cells"] = step, n
         row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
         row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
-        row["energy"] = s["moments"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
+        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
         row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever"].sum / n
         if solution is not None:
             row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n

@@ -35,8 +35,8 @@ class Tessellation:
     volumes : (n,) real
     offsets : (n, d) real
         Centroid minus generator: the Lloyd displacement.
-    moments : (n,) real
-        Integral of the squared distance from the generator over the cell.
+    covariances : (n, d (d + 1) / 2) real
+        Second moments about the centroid per unit volume: xx, xy, yy in 2D.
     """
 
     n: int
@@ -47,7 +47,7 @@ class Tessellation:
     face_centroids: cla.Array
     volumes: cla.Array
     offsets: cla.Array
-    moments: cla.Array
+    covariances: cla.Array
 
 
 class Cells:
@@ -86,7 +86,7 @@ class Cells:
                 "face_centroids": engine.empty((m, d)),
                 "volumes": engine.empty(n),
                 "offsets": engine.empty((n, d)),
-                "moments": engine.empty(n),
+                "covariances": engine.empty((n, d * (d + 1) // 2)),
             }
             for _ in range(2)
         ]
@@ -95,7 +95,7 @@ class Cells:
 
     def _views_for(self, n: int) -> None:
         """Cut the buffers to `n` cells (the faces' keep their spare room: their number is only known on the device)."""
-        lengths = {"starts": n + 1, "volumes": n, "offsets": n, "moments": n}
+        lengths = {"starts": n + 1, "volumes": n, "offsets": n, "covariances": n}
         self._views = [
             {name: a[: lengths[name]] if name in lengths else a for name, a in arrays.items()}
             for arrays in self._sets
@@ -157,7 +157,7 @@ class Cells:
         engine.run(
             k.measure_cells, n, self._rows, self._row_counts, self._keep, arrays["starts"], points,
             lower, upper, arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
-            arrays["volumes"], arrays["offsets"], arrays["moments"],
+            arrays["volumes"], arrays["offsets"], arrays["covariances"],
         )  # fmt: skip
         return Tessellation(n=n, points=points, **arrays)
 

@@ -38,7 +38,7 @@ class _Fetched:
             face_centroids=t.face_centroids[:m].copy(),
             volumes=t.volumes.copy(),
             offsets=t.offsets.copy(),
-            moments=t.moments,
+            covariances=t.covariances,
         )
 
     @cached_property

@@ -2,37 +2,76 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pyopencl.array as cla
 
-from ._primitives import Summaries, Summary
+from ._primitives import Gather, Summaries, Summary
 from ._program import Engine
 from .bins import Bins
 from .cells import Cells, Tessellation
+from .density import Density
 from .domain import Box
 from .errors import MemoryLimitError
 from .fetch import fetch_diagram
 from .metric import Metric
+from .motion import Motion
+from .poisson import Poisson
+from .projection import Projection
+from .refinement import Refinement
 from .results import Diagram
+from .shape import Shape
 from .sizing import Sizing
 
-SUMMARIES = ("error", "quality", "moments", "lloyd", "correction", "changed", "ever")
+SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess")
 
 
-@dataclass(frozen=True)
 class Stages:
-    """The stages that every mesh of one engine shares: compiled once, their buffers reused."""
+    """The stages of one engine, compiled when first used, their buffers reused by every mesh."""
 
-    bins: Bins
-    cells: Cells
-    metric: Metric
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
 
-    @classmethod
-    def of(cls, engine: Engine) -> Stages:
-        """Compile them."""
-        return cls(Bins(engine), Cells(engine), Metric(engine))
+    @cached_property
+    def bins(self) -> Bins:
+        return Bins(self.engine)
+
+    @cached_property
+    def cells(self) -> Cells:
+        return Cells(self.engine)
+
+    @cached_property
+    def metric(self) -> Metric:
+        return Metric(self.engine)
+
+    @cached_property
+    def density(self) -> Density:
+        return Density(self.engine)
+
+    @cached_property
+    def poisson(self) -> Poisson:
+        return Poisson(self.engine)
+
+    @cached_property
+    def projection(self) -> Projection:
+        return Projection(self.engine)
+
+    @cached_property
+    def shape(self) -> Shape:
+        return Shape(self.engine)
+
+    @cached_property
+    def motion(self) -> Motion:
+        return Motion(self.engine)
+
+    @cached_property
+    def refinement(self) -> Refinement:
+        return Refinement(self.engine)
+
+    @cached_property
+    def gather(self) -> Gather:
+        return Gather(self.engine)
 
 
 def check_memory(engine: Engine, n: float) -> None:
@@ -58,42 +97,75 @@ def check_memory(engine: Engine, n: float) -> None:
 class Mesh:
     """Generators of one level, their diagram, sizes, error and quality, all on the device.
 
+    Parameters
+    ----------
+    points : (n, d) real, device
+        Generators in any order, normalised coordinates.
+    labels : (n,) int32, device, optional
+        Names that stay with them; by default 0, 1, ...
+    coarsening : float
+        Factor on the size field: 2^k on level k above the finest.
+
     Attributes
     ----------
     n : int
     points : (n, d) real
-        Normalised coordinates, in an order of the device's own.
+        In an order of the device's own: along its bins.
     labels : (n,) int32
-        The caller's index of each generator.
     tessellation : Tessellation
-    h, error, quality : (n,) real
+    h, error, quality, energy : (n,) real
     source, potential : (n,) real
         Right side of the latest Poisson solve, and its solution: the next one's start.
-    lloyd, correction : (n, d) real
-        The two halves of the latest step, and their lengths over h: `lloyd_speed`, `correction_speed` (n,).
+    lloyd, correction, velocity : (n, d) real
+        The two halves of the latest step, and the step itself. Lengths of the halves over h:
+        `lloyd_speed`, `correction_speed` (n,).
     """
 
     def __init__(
-        self, engine: Engine, stages: Stages, domain: Box, sizing: Sizing, points: np.ndarray
+        self,
+        stages: Stages,
+        domain: Box,
+        sizing: Sizing,
+        points: cla.Array,
+        labels: cla.Array | None = None,
+        coarsening: float = 1.0,
     ) -> None:
-        self.engine, self.stages, self.domain, self.sizing = engine, stages, domain, sizing
-        origin, scale = domain.frame
-        n, d = points.shape
-        self.n = n
-        # Sort the generators by bin once, so that neighbours are near in memory.
-        unsorted = engine.upload((points - origin) / scale)
-        binned = stages.bins.build(unsorted, n)
-        self.labels = binned.items[:n].copy()
-        self.points = binned.points[:n].copy()
-        self.h, self.error, self.quality = (engine.empty(n) for _ in range(3))
-        self.lloyd_speed, self.correction_speed = engine.zeros(n), engine.zeros(n)
-        self.correction = engine.zeros((n, d))
+        self.engine = stages.engine
+        self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
+        self.summaries = Summaries(self.engine, SUMMARIES)
+        n = len(points)
+        if labels is None:
+            labels = self.engine.upload(np.arange(n), np.int32)
+        self.adopt(
+            points, labels, self.engine.zeros(points.shape), self.engine.zeros(n, np.uint64),
+            self.engine.zeros(n),
+        )  # fmt: skip
+
+    def adopt(
+        self,
+        points: cla.Array,
+        labels: cla.Array,
+        velocity: cla.Array,
+        signatures: cla.Array,
+        ever: cla.Array,
+    ) -> None:
+        """Take other generators for the present ones, sort them by bin so that neighbours are near in memory."""
+        engine, stages = self.engine, self.stages
+        first = not hasattr(self, "tessellation")
+        self.n = n = len(points)
+        items = stages.bins.build(points, n).items[:n].copy()
+        rows = stages.gather.rows
+        self.points, self.labels = rows(items, points), rows(items, labels)
+        self.velocity, self.signatures = rows(items, velocity), rows(items, signatures)
+        self.ever = rows(items, ever)
+        shape = points.shape
+        self.h, self.error, self.quality, self.energy = (engine.empty(n) for _ in range(4))
         self.source, self.potential = engine.empty(n), engine.zeros(n)
-        self.changed, self.ever = engine.empty(n), engine.empty(n)
-        self.signatures = engine.empty(n, np.uint64)
-        self.summaries = Summaries(engine, SUMMARIES)
+        self.lloyd, self.correction = engine.zeros(shape), engine.zeros(shape)
+        self.lloyd_speed, self.correction_speed = engine.zeros(n), engine.zeros(n)
+        self.changed = engine.empty(n)
         self.tessellation: Tessellation | None = None
-        self.update()
+        self.update(first)
 
     @property
     def t(self) -> Tessellation:
@@ -101,20 +173,17 @@ class Mesh:
         assert self.tessellation is not None
         return self.tessellation
 
-    @property
-    def lloyd(self) -> cla.Array:
-        """Centroid minus generator (n, d)."""
-        return self.t.offsets
-
-    def update(self) -> None:
+    def update(self, first: bool = False) -> None:
         """Tessellate the generators where they are now, and evaluate size, error and quality."""
-        stages, first = self.stages, self.tessellation is None
+        stages = self.stages
         binned = stages.bins.build(self.points, self.n)
         self.tessellation = stages.cells.tessellate(
             self.domain, self.points, self.n, binned, self.tessellation
         )
         self.sizing.evaluate(self.points, self.n, self.h)
-        stages.metric.evaluate(self.t, self.h, self.error, self.quality)
+        if self.coarsening != 1:
+            stages.metric.scale_sizes(self.coarsening, self.h)
+        stages.metric.evaluate(self.t, self.h, self.error, self.quality, self.energy)
         stages.metric.compare_neighbours(
             self.t, self.labels, first, self.signatures, self.changed, self.ever
         )
@@ -124,23 +193,28 @@ class Mesh:
         s, n = self.summaries, self.n
         s.collect("error", self.error, n)
         s.collect("quality", self.quality, n)
-        s.collect("moments", self.t.moments, n)
+        s.collect("energy", self.energy, n)
         s.collect("lloyd", self.lloyd_speed, n)
         s.collect("correction", self.correction_speed, n)
         s.collect("changed", self.changed, n)
         s.collect("ever", self.ever, n)
         return s.read()
 
-    # Results: physical units, the caller's order.
+    def refine(self) -> Mesh:
+        """Return the mesh of the next finer level; the present generators keep their labels."""
+        finer = self.coarsening / 2
+        self.stages.metric.scale_sizes(0.5, self.h)
+        points = self.stages.refinement.refine(self.domain, self.t, self.h)
+        labels = self.engine.upload(np.arange(len(points)), np.int32)
+        labels[: self.n] = self.labels
+        return Mesh(self.stages, self.domain, self.sizing, points, labels, finer)
 
-    def order(self) -> np.ndarray:
-        """Device index of each generator in the order of labels, (n,)."""
-        return np.argsort(self.labels.get(), kind="stable")
+    # Results: physical units, the caller's order.
 
     def values(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
         """Fetch per-generator `array` (n, ...) in the order of labels, times `factor`."""
-        host = array.get()[: self.n][self.order()]
-        return host.astype(np.float64) * factor if factor != 1.0 else host.astype(np.float64)
+        order = np.argsort(self.labels.get(), kind="stable")
+        return array.get()[order].astype(np.float64) * factor
 
     def diagram(self) -> Diagram:
         """Return the present diagram; its arrays are kept on the device and fetched when asked for."""

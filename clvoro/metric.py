@@ -16,11 +16,18 @@ class Metric:
         self.engine = engine
         self._kernels = engine.kernels("metric")
 
-    def evaluate(self, t: Tessellation, h: cla.Array, error: cla.Array, quality: cla.Array) -> None:
-        """Write the paper's (3.1), signed, to `error` (n,) and its (4.1) to `quality` (n,)."""
+    def evaluate(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        error: cla.Array,
+        quality: cla.Array,
+        energy: cla.Array,
+    ) -> None:
+        """Write the paper's (3.1), signed, its (4.1) and each cell's part of its (2.3); all (n,)."""
         self.engine.run(
-            self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, h, error,
-            quality,
+            self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
+            t.covariances, h, error, quality, energy,
         )  # fmt: skip
 
     def compare_neighbours(
@@ -40,3 +47,7 @@ class Metric:
             self._kernels.compare_neighbours, t.n, t.starts, t.neighbours, labels, np.int32(first),
             signatures, changed, ever,
         )  # fmt: skip
+
+    def scale_sizes(self, factor: float, h: cla.Array) -> None:
+        """Multiply `h` (n,) by `factor`."""
+        self.engine.run(self._kernels.scale_sizes, len(h), self.engine.real.type(factor), h)

@@ -60,11 +60,21 @@ class Motion:
         correction: cla.Array,
         b: float,
         h: cla.Array,
+        velocity: cla.Array,
         clip: float = 0.0,
     ) -> None:
-        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `box`."""
+        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `box`.
+
+        `velocity` (n, d) becomes the displacement.
+        """
         real = self.engine.real.type
         self.engine.run(
             self._kernels.move_generators, h.shape[0], lloyd, real(a), correction, real(b), h,
             real(clip), *box.device_corners(self.engine.real), points,
+            velocity,
         )  # fmt: skip
+
+    def add_momentum(self, velocity: cla.Array, share: float, lloyd: cla.Array) -> None:
+        """Add ``share * velocity`` to `lloyd` (n, d)."""
+        n = lloyd.shape[0]
+        self.engine.run(self._kernels.add_momentum, n, velocity, self.engine.real.type(share), lloyd)

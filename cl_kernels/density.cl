@@ -1,0 +1,111 @@
+#include "common/real.h"
+
+/* The size field as a density of generators, rho = h^-d, and what follows from it. */
+
+/* Per generator i:
+   density  rho = h^-d
+   weight   V rho, the number of generators that the cell should hold
+   excess   r = log(V / h^d) = d log(L / h): the cell is too large by this share of its volume */
+kernel void evaluate_density(global const REAL *volumes, global const REAL *h, global REAL *density,
+                             global REAL *weight, global REAL *excess, global REAL *log_h)
+{
+    const int i = get_global_id(0);
+    const REAL size = h[i];
+    const REAL rho = 1 / (DIM == 2 ? size * size : size * size * size);
+    density[i] = rho;
+    weight[i] = volumes[i] * rho;
+    excess[i] = log(volumes[i] * rho);
+    log_h[i] = log(size);
+}
+
+/* Per generator i: grad log h by least squares over the neighbours, weighted by 1 / distance^2. One evaluation of h per
+   generator serves all that needs its gradient, and the fit averages over kinks of h at the scale of the cells. */
+kernel void fit_gradient(global const int *starts, global const int *neighbours, global const REAL *points,
+                         global const REAL *log_h, global REAL *gradient)
+{
+    const int i = get_global_id(0);
+    REAL m[DIM][DIM], b[DIM], g[DIM];
+    for (int p = 0; p < DIM; ++p) {
+        b[p] = g[p] = 0;
+        for (int q = 0; q < DIM; ++q)
+            m[p][q] = 0;
+    }
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        REAL d[DIM], d2 = 0;
+        for (int a = 0; a < DIM; ++a) {
+            d[a] = points[DIM * j + a] - points[DIM * i + a];
+            d2 += d[a] * d[a];
+        }
+        const REAL rise = log_h[j] - log_h[i];
+        for (int p = 0; p < DIM; ++p) {
+            b[p] += d[p] * rise / d2;
+            for (int q = 0; q < DIM; ++q)
+                m[p][q] += d[p] * d[q] / d2;
+        }
+    }
+    /* Too few or collinear neighbours leave the gradient undetermined: take none. */
+    const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);
+    const REAL least = sqrt(REAL_EPS);
+#if DIM == 2
+    const REAL det = m[0][0] * m[1][1] - m[0][1] * m[1][0];
+    if (det > least * trace * trace) {
+        g[0] = (b[0] * m[1][1] - b[1] * m[0][1]) / det;
+        g[1] = (m[0][0] * b[1] - m[1][0] * b[0]) / det;
+    }
+#else
+    const REAL c0 = m[1][1] * m[2][2] - m[1][2] * m[2][1];
+    const REAL c1 = m[1][2] * m[2][0] - m[1][0] * m[2][2];
+    const REAL c2 = m[1][0] * m[2][1] - m[1][1] * m[2][0];
+    const REAL det = m[0][0] * c0 + m[0][1] * c1 + m[0][2] * c2;
+    if (det > least * trace * trace * trace) {
+        g[0] = (b[0] * c0 + b[1] * (m[0][2] * m[2][1] - m[0][1] * m[2][2]) +
+                b[2] * (m[0][1] * m[1][2] - m[0][2] * m[1][1])) / det;
+        g[1] = (b[0] * c1 + b[1] * (m[0][0] * m[2][2] - m[0][2] * m[2][0]) +
+                b[2] * (m[0][2] * m[1][0] - m[0][0] * m[1][2])) / det;
+        g[2] = (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) +
+                b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) / det;
+    }
+#endif
+    for (int a = 0; a < DIM; ++a)
+        gradient[DIM * i + a] = g[a];
+}
+
+/* Per generator i: displacement to the centroid weighted by h^-(d + 2) (the paper's 2.4; the density whose centroidal
+   diagrams have cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell that is
+   c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
+   nothing. */
+kernel void weight_offsets(global const REAL *offsets, global const REAL *covariances, global const REAL *gradient,
+                           global REAL *lloyd)
+{
+    const int i = get_global_id(0);
+    REAL g[DIM];
+    for (int a = 0; a < DIM; ++a)
+        g[a] = -(DIM + 2) * gradient[DIM * i + a];
+#if DIM == 2
+    const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
+    lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
+    lloyd[2 * i + 1] = offsets[2 * i + 1] + xy * g[0] + yy * g[1];
+#else
+    global const REAL *c = covariances + 6 * i;
+    lloyd[3 * i] = offsets[3 * i] + c[0] * g[0] + c[1] * g[1] + c[2] * g[2];
+    lloyd[3 * i + 1] = offsets[3 * i + 1] + c[1] * g[0] + c[3] * g[1] + c[4] * g[2];
+    lloyd[3 * i + 2] = offsets[3 * i + 2] + c[2] * g[0] + c[4] * g[1] + c[5] * g[2];
+#endif
+}
+
+/* Per generator i: the product V rho r, to be summed. */
+kernel void weigh_excess(global const REAL *weight, global const REAL *excess, global REAL *weighed)
+{
+    const int i = get_global_id(0);
+    weighed[i] = weight[i] * excess[i];
+}
+
+/* Per generator i: r -= mean r, weighted by V rho; summaries hold the sums of V rho r and of V rho. A wrong count of
+   generators shows as the mean: strain cannot mend it, insertion and deletion can. */
+kernel void remove_mean(global const REAL *summaries, global REAL *excess)
+{
+    excess[get_global_id(0)] -= summaries[0] / summaries[4];
+}

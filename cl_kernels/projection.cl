@@ -1,0 +1,110 @@
+#include "common/real.h"
+
+/* The exact derivative of the cells' volumes by the generators,
+
+     dV_i/dx_j = w_ij (x_j - m_ij),   dV_i/dx_i = sum_j w_ij (m_ij - x_i),   w_ij = l_ij / d_ij,
+
+   as the operator J = d r / d x of the excess r_i = log V_i - d log h(x_i), and its transpose. m_ij is stored relative
+   to x_i. A wall is fixed: its faces contribute nothing. */
+
+inline REAL squared_distance(global const REAL *points, int i, int j)
+{
+    REAL d2 = 0;
+    for (int a = 0; a < DIM; ++a) {
+        const REAL d = points[DIM * j + a] - points[DIM * i + a];
+        d2 += d * d;
+    }
+    return d2;
+}
+
+/* Per generator i: own[i] = dr_i/dx_i, weights w_ij, and the inverse of the diagonal of J W J^T + eps, W = h^2, which
+   preconditions the solve. */
+kernel void assemble_derivative(global const int *starts, global const int *neighbours,
+                                global const REAL *face_measures, global const REAL *face_centroids,
+                                global const REAL *volumes, global const REAL *points, global const REAL *gradient,
+                                global const REAL *h, const REAL eps, global REAL *weights, global REAL *own,
+                                global REAL *inverse_diagonal)
+{
+    const int i = get_global_id(0);
+    REAL self[DIM];
+    for (int a = 0; a < DIM; ++a)
+        self[a] = 0;
+    REAL diagonal = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        REAL w = 0;
+        if (j >= 0) {
+            w = face_measures[k] / sqrt(squared_distance(points, i, j));
+            REAL square = 0;
+            for (int a = 0; a < DIM; ++a) {
+                const REAL m = face_centroids[DIM * k + a];
+                const REAL other = points[DIM * j + a] - points[DIM * i + a] - m;
+                square += other * other;
+                self[a] += w * m;
+            }
+            diagonal += w * w * square * h[j] * h[j];
+        }
+        weights[k] = w;
+    }
+    const REAL volume = volumes[i];
+    diagonal /= volume * volume;
+    REAL square = 0;
+    for (int a = 0; a < DIM; ++a) {
+        const REAL s = self[a] / volume - DIM * gradient[DIM * i + a];
+        own[DIM * i + a] = s;
+        square += s * s;
+    }
+    inverse_diagonal[i] = 1 / (diagonal + square * h[i] * h[i] + eps);
+}
+
+/* Per generator i: u = W J^T y, u_i = h_i^2 (own_i y_i - sum_j w_ij m_ij y_j / V_j). */
+kernel void apply_transpose(global const int *starts, global const int *neighbours, global const REAL *weights,
+                            global const REAL *face_centroids, global const REAL *volumes, global const REAL *own,
+                            global const REAL *h, global const REAL *y, global REAL *u)
+{
+    const int i = get_global_id(0);
+    REAL sum[DIM];
+    for (int a = 0; a < DIM; ++a)
+        sum[a] = own[DIM * i + a] * y[i];
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL f = weights[k] * y[j] / volumes[j];
+        for (int a = 0; a < DIM; ++a)
+            sum[a] -= f * face_centroids[DIM * k + a];
+    }
+    for (int a = 0; a < DIM; ++a)
+        u[DIM * i + a] = h[i] * h[i] * sum[a];
+}
+
+/* Per generator i: out = J u + eps y + r. */
+kernel void apply_derivative(global const int *starts, global const int *neighbours, global const REAL *weights,
+                             global const REAL *face_centroids, global const REAL *volumes,
+                             global const REAL *points, global const REAL *own, global const REAL *u, const REAL eps,
+                             global const REAL *y, const REAL b, global const REAL *r, global REAL *out)
+{
+    const int i = get_global_id(0);
+    REAL sum = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        REAL product = 0;
+        for (int a = 0; a < DIM; ++a)
+            product += (points[DIM * j + a] - points[DIM * i + a] - face_centroids[DIM * k + a]) * u[DIM * j + a];
+        sum += weights[k] * product;
+    }
+    sum /= volumes[i];
+    for (int a = 0; a < DIM; ++a)
+        sum += own[DIM * i + a] * u[DIM * i + a];
+    out[i] = sum + eps * y[i] + b * r[i];
+}
+
+/* Per generator i: what the projection takes from the displacement, correction = -W J^T y. */
+kernel void negate(global REAL *u)
+{
+    const int i = get_global_id(0);
+    for (int a = 0; a < DIM; ++a)
+        u[DIM * i + a] = -u[DIM * i + a];
+}

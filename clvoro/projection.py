@@ -1,0 +1,95 @@
+"""Exact projection: the least displacement that gives every cell its volume, to first order (`projection.cl`).
+
+The paper's Poisson step approximates this, as an approximate projection does in incompressible flow.
+"""
+
+from __future__ import annotations
+
+import pyopencl.array as cla
+
+from ._program import Engine
+from .cells import Tessellation
+from .krylov import ConjugateGradient, Solution
+
+
+class Projection:
+    """Solve for the correction u' in ``u = Ld + u'``, ``u' = -W J^T y``, ``(J W J^T + eps) y = r + J Ld``.
+
+    J is the derivative of the excess r (see `Density`) by the generators, W = diag(h^2). With eps = 0 the excess would
+    vanish to first order; eps > 0 is a penalty that trades it for a shorter displacement, and damps the modes which J
+    hardly sees.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("projection")
+        self._krylov = ConjugateGradient(engine)
+        self._n = self._m = -1
+
+    def _reserve(self, n: int, m: int) -> None:
+        if n != self._n:
+            self._n = n
+            engine = self.engine
+            self._own, self._u = engine.empty((n, engine.dim)), engine.empty((n, engine.dim))
+            self._inverse, self._rhs, self._y = (engine.empty(n) for _ in range(3))
+        if m > self._m:
+            self._m = m
+            self._weights = self.engine.empty(m)
+
+    def project(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        gradient: cla.Array,
+        excess: cla.Array,
+        displacement: cla.Array,
+        correction: cla.Array,
+        *,
+        eps: float,
+        max_iterations: int,
+        tolerance: float = 1e-6,
+    ) -> Solution:
+        """Write the correction of `displacement` (n, d) to `correction` (n, d).
+
+        Parameters
+        ----------
+        h, excess : (n,) real
+        gradient : (n, d) real
+            grad log h.
+        eps : float
+        max_iterations : int
+            Of Jacobi-preconditioned CG. Forty do: the high modes that are left weigh nothing.
+        """
+        engine, k, n = self.engine, self._kernels, t.n
+        real = engine.real.type
+        self._reserve(n, t.neighbours.shape[0])
+        engine.run(
+            k.assemble_derivative, n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
+            t.volumes, t.points, gradient, h, real(eps), self._weights, self._own, self._inverse,
+        )  # fmt: skip
+
+        def derivative(u: cla.Array, eps: float, y: cla.Array, b: float, out: cla.Array) -> None:
+            engine.run(
+                k.apply_derivative, n, t.starts, t.neighbours, self._weights, t.face_centroids,
+                t.volumes, t.points, self._own, u, real(eps), y, real(b), excess, out,
+            )  # fmt: skip
+
+        def transpose(y: cla.Array, u: cla.Array) -> None:
+            engine.run(
+                k.apply_transpose, n, t.starts, t.neighbours, self._weights, t.face_centroids,
+                t.volumes, self._own, h, y, u,
+            )  # fmt: skip
+
+        def apply(y: cla.Array, out: cla.Array) -> None:
+            transpose(y, self._u)
+            derivative(self._u, eps, y, 0.0, out)
+
+        derivative(displacement, 0.0, excess, 1.0, self._rhs)
+        self._y.fill(0)
+        solution = self._krylov.solve(
+            apply, self._rhs, self._y, precondition=self._inverse, tolerance=tolerance,
+            max_iterations=max_iterations,
+        )  # fmt: skip
+        transpose(self._y, correction)
+        engine.run(k.negate, n, correction)
+        return solution

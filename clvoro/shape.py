@@ -1,0 +1,51 @@
+"""Descent of cell quality itself (`shape.cl`): for the last steps, where Lloyd's centroids no longer tell good from best."""
+
+from __future__ import annotations
+
+import pyopencl.array as cla
+
+from ._program import Engine
+from .cells import Tessellation
+
+
+class Shape:
+    """The kernels of `shape.cl`."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("shape")
+        self._n = -1
+
+    def descend(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        quality: cla.Array,
+        lloyd: cla.Array,
+        *,
+        emphasis: float = 5.0,
+        rate: float = 0.1,
+        longest: float = 0.2,
+    ) -> None:
+        """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 2), in the place of Lloyd's.
+
+        Parameters
+        ----------
+        h, quality : (n,) real
+        emphasis : float
+            Weight of bad cells: omega = 1 + emphasis (-log Q).
+        longest : float
+            Bound of the displacement over h.
+        """
+        engine, k, real = self.engine, self._kernels, self.engine.real.type
+        if t.n != self._n:
+            self._n = t.n
+            self._tension, self._pressure = engine.empty(t.n), engine.empty(t.n)
+        engine.run(
+            k.load_cells, t.n, t.starts, t.face_measures, t.volumes, quality, real(emphasis),
+            self._tension, self._pressure,
+        )  # fmt: skip
+        engine.run(
+            k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
+            t.points, self._tension, self._pressure, h, real(rate), real(longest), lloyd,
+        )  # fmt: skip
