@@ -1,4 +1,4 @@
-"""Adaptive quadrature of the cell density h^-d: a quadtree (octree) of boxes in Hilbert order."""
+"""Adaptive quadrature of the cell density h^-d over a quadtree (octree)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .boxes import Boxes, hilbert_tables
 from .errors import InputTypeError, SizeFieldError
 
 if TYPE_CHECKING:
@@ -17,169 +18,43 @@ if TYPE_CHECKING:
 
 _BASE = {2: 1024, 3: 4096}  # boxes that are looked at in any case
 _MOST = {2: 1 << 17, 3: 1 << 17}  # boxes after which refinement ends, whatever the error
-_BITS = {2: 31, 3: 21}  # of a place per axis in a Morton key of 64 bits
-_HALVED = 0.5 ** np.arange(64)
 _BATCH = 1 << 19  # points evaluated at once
 
 # Refinement below the error estimate's demand: see `DensityTree`.
 _STEEP = 2.0
+_JUMP = 4.0
 
 
 @lru_cache
-def hilbert_tables(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tables of the Hilbert curve in `dim` dimensions.
-
-    A state is an entry corner e and a direction a. The curve visits the children of a box in
-    Gray-code order, turned by a and reflected by e.
-
-    Returns
-    -------
-    place : (states, 2^d, d) int
-        Which half of the box, 0 or 1 per axis, is the k-th child on the curve.
-    after : (states, 2^d) int
-        State of that child.
-    rank : (states, 2^d) int
-        The inverse of `place`: k of the child whose halves are the bits of the index (axis 0 the
-        lowest).
-    """
-    full, states = 1 << dim, dim << dim
-
-    def rotate(bits: int, by: int) -> int:
-        by %= dim
-        return ((bits << by) | (bits >> (dim - by))) & (full - 1)
-
-    def gray(i: int) -> int:
-        return i ^ (i >> 1)
-
-    def trailing_ones(i: int) -> int:
-        return (~i & (i + 1)).bit_length() - 1
-
-    place = np.zeros((states, full, dim), np.int64)
-    after, rank = np.zeros((2, states, full), np.int8)
-    for entry, axis, k in product(range(full), range(dim), range(full)):
-        state = entry * dim + axis
-        bits = rotate(gray(k), axis + 1) ^ entry
-        place[state, k] = [(bits >> a) & 1 for a in range(dim)]
-        rank[state, bits] = k
-        corner = gray(2 * ((k - 1) // 2)) if k else 0
-        turn = 0 if k == 0 else trailing_ones(k - 1 if k % 2 == 0 else k)
-        next_entry, next_axis = entry ^ rotate(corner, axis + 1), (axis + turn + 1) % dim
-        after[state, k] = next_entry * dim + next_axis
-    return place, after, rank
-
-
-class Boxes:
-    """Boxes that tile the domain, in the order of a Hilbert curve.
-
-    Attributes
-    ----------
-    corner : (m, d) float
-        Lower corners in units of the root boxes' edges: multiples of powers of two, hence exact.
-    level : (m,) int8
-        The edges are 2^-level root edges.
-    state : (m,) int8
-        State of the curve in each box.
-    """
-
-    def __init__(self, domain: Box):
-        self.origin = np.array(domain.lower)
-        # As many roots per axis as make them nearly cubes; a needle's stay long.
-        shape = np.clip(np.rint(domain.extent / domain.extent.min()), 1, 64).astype(int)
-        self.root = domain.extent / shape
-        self.upper = np.array(domain.upper)
-        self.corner = _snake(shape).astype(float)
-        self.level = np.zeros(len(self.corner), np.int8)
-        self.state = np.zeros(len(self.corner), np.int8)
-
-    @property
-    def dim(self) -> int:
-        """2 or 3."""
-        return self.corner.shape[1]
-
-    def __len__(self) -> int:
-        return len(self.level)
-
-    def edges(self, chosen: object = slice(None)) -> np.ndarray:
-        """Return the physical edge lengths (m, d)."""
-        return self.root * _HALVED[self.level[chosen]][:, None]
-
-    def points(self, at: np.ndarray, chosen: object = slice(None)) -> np.ndarray:
-        """Return the points (m, p, d) at relative positions `at` (p, d) or (m, p, d) in [0, 1]."""
-        step = _HALVED[self.level[chosen]][:, None, None]
-        x = self.origin + self.root * (self.corner[chosen][:, None, :] + step * at)
-        return np.clip(x, self.origin, self.upper)
-
-    def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Replace the boxes where `chosen` (m,) is true by their children, in place on the curve.
-
-        Returns
-        -------
-        parent : (m',) int
-            For each box now, the index before of itself or of its parent.
-        child : (m',) int8
-            Rank among the siblings, -1 for boxes that were not split.
-        """
-        place, after, _ = hilbert_tables(self.dim)
-        counts = np.where(chosen, 1 << self.dim, 1)
-        parent = np.repeat(np.arange(len(self)), counts)
-        child = np.full(len(parent), -1, np.int8)
-        new = np.flatnonzero(chosen[parent])
-        child[new] = np.tile(np.arange(1 << self.dim, dtype=np.int8), len(new) >> self.dim)
-        # The children of the split boxes, each family together: (families, 2^d, ...).
-        corner, level, state = self.corner[parent], self.level[parent], self.state[parent]
-        level[new] += 1
-        half = _HALVED[self.level[chosen] + 1][:, None, None] * place[self.state[chosen]]
-        corner[new] += half.reshape(-1, self.dim)
-        state[new] = after[self.state[chosen]].ravel()
-        self.corner, self.level, self.state = corner, level, state
-        return parent, child
-
-
-def _snake(shape: np.ndarray) -> np.ndarray:
-    """Order the boxes of a grid so that each touches the one before: (m, d) int."""
-    rows = np.zeros((1, 0), np.int64)
-    for count in shape[::-1]:
-        line = np.arange(count)
-        lines = [line if i % 2 == 0 else line[::-1] for i in range(len(rows))]
-        rows = np.column_stack([np.concatenate(lines), np.repeat(rows, count, axis=0)])
-    return rows
-
-
-@lru_cache
-def _rule(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (p, d) in [0, 1] and the weights of the Gauss rules of degrees 5 and 3.
-
-    The first is the product rule; the second, inside it, takes the centre and the outermost points.
-    All weights are positive.
-    """
+def _rule(dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (3^d, d) in [0, 1] and weights of the product Gauss rule of degree 5."""
     far = math.sqrt(0.6)
     nodes = np.array(list(product((-far, 0.0, far), repeat=dim)))
     weight = np.prod(np.where(nodes == 0, 4 / 9, 5 / 18), axis=1)
-    corner, centre = (nodes != 0).all(axis=1), (nodes == 0).all(axis=1)
-    inner = corner * (5 / 9 / 2**dim) + centre * (4 / 9)
-    return 0.5 + 0.5 * nodes, weight, inner
+    return 0.5 + 0.5 * nodes, weight
 
 
 class DensityTree:
     """The number of cells h^-d dV in each box of an adaptive tree over the domain.
 
     A box is split
-    (a) while it has one of the largest error estimates (difference of two embedded Gauss rules,
-    degrees 5 and 3)
-        whose sum exceeds `tolerance` times the integral;
-    (b) while it is longer than the least h known in it and h varies in it by more than a factor of
-    2: so a dip of which
-        one sample has been seen is resolved down to its own h;
-    (c) while it is more than twice as large as a neighbour: so a thin dip along a curve is followed
-    from box
-        to box.
+
+    (a) while it has one of the largest error estimates whose sum exceeds `tolerance` times the
+        integral: half of what the last split changed, or, where h jumps by more than a factor of 4
+        between the box and its neighbours, what may be hidden between the last sample and the wall;
+    (b) while it is longer than the least h known in it and its neighbours, and h varies by more
+        than a factor of 2 among these: so a dip of which one sample has been seen is resolved down
+        to its own h;
+    (c) while it is more than twice as large as a neighbour. By (b) and (c) a thin dip along a curve
+        is followed from box to box.
+
     Known values are those at the 3^d Gauss points of each box, at a grid of 33 x 33 nodes or more
     (17^3 in 3D), walls included, and at the `landmarks` that the field names (on the curves of a
     `Distance`, at the lowest values of a `Raster`). A dip is found for certain if it holds a
     landmark or is wider than about 1/40 of the domain's shorter side (1/25 in 3D); a thinner one in
     a formula or a callable may be missed.
 
-    Work is bounded: refinement ends at 2^17 boxes or 30 levels (20), and `error` then
+    Work is bounded: refinement ends at 2^17 boxes or about 30 levels (20 in 3D), and `error` then
     tells what was reached.
 
     Parameters
@@ -216,11 +91,14 @@ class DensityTree:
             )
         self.field, self.boxes = field, Boxes(domain)
         dim = domain.dim
-        while len(self.boxes) < _BASE[dim]:
+        while len(self.boxes) << dim < _BASE[dim]:
             self.boxes.split(np.ones(len(self.boxes), bool))
-        self._deepest = _BITS[dim] - int((domain.extent / self.boxes.root).max()).bit_length()
-        self._integrate_all()
+        m = len(self.boxes)
+        self.cells, self._differences, self._low, self._high = np.zeros((4, m))
+        self.slopes = np.zeros((m, dim))
+        self._integrate(np.ones(m, bool))
         self._mark(domain)
+        self._refine(np.ones(m, bool))
         while True:
             chosen = self._to_split(tolerance)
             if not chosen.any():
@@ -254,16 +132,9 @@ class DensityTree:
             found[first : first + _BATCH] = h
         return found
 
-    def _integrate_all(self) -> None:
-        m, dim = len(self.boxes), self.boxes.dim
-        self.cells, self._errors, self._low, self._high = np.empty((4, m))
-        self.slopes = np.empty((m, dim))
-        self._fresh = np.ones(m, bool)
-        self._integrate(self._fresh)
-
     def _integrate(self, chosen: np.ndarray) -> None:
         """Apply the rules to the boxes where `chosen` is true."""
-        at, weight, inner = _rule(self.boxes.dim)
+        at, weight = _rule(self.boxes.dim)
         points = self.boxes.points(at, chosen)
         m, p, dim = points.shape
         h = self.sizes(points.reshape(-1, dim)).reshape(m, p)
@@ -280,16 +151,14 @@ class DensityTree:
             )
         offset = at - 0.5
         self.cells[chosen] = density @ weight
-        self._errors[chosen] = np.abs(density @ (weight - inner))
         self._low[chosen], self._high[chosen] = h.min(axis=1), h.max(axis=1)
         self.slopes[chosen] = -dim * (np.log(h) @ offset) / (offset[:, 0] ** 2).sum()
 
     def _mark(self, domain: Box) -> None:
-        """Evaluate the landmarks: the base boxes' corners and what the field names."""
+        """Evaluate the landmarks: a grid of corners of base boxes and what the field names."""
         boxes, dim = self.boxes, self.boxes.dim
-        step = _HALVED[boxes.level[0]]
-        counts = np.rint(domain.extent / boxes.root / step).astype(int)
-        axes = [np.arange(c + 1) * step for c in counts]
+        step = 0.5 ** (1 + int(boxes.level[0]))
+        axes = [np.arange(round(end / step) + 1) * step for end in boxes.end]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
         named = getattr(self.field, "landmarks", None)
         if named is not None:
@@ -299,46 +168,40 @@ class DensityTree:
         points = np.clip(boxes.origin + boxes.root * grid, boxes.origin, boxes.upper)
         sizes = self.sizes(points)
         # A landmark on the upper walls belongs to the last box.
-        end = domain.extent / boxes.root
-        self._landmarks = np.clip(grid, 0, end - 2.0 ** -(_BITS[dim] + 2))
+        self._landmarks = np.clip(grid, 0, boxes.end - 2.0 ** -(boxes.deepest + 1))
         self._landmark_sizes = sizes
-        self._landmark_box = self._find(self._landmarks)
+        self._landmark_box = boxes.find(self._landmarks)
         self._lower_by_landmarks()
 
     def _lower_by_landmarks(self) -> None:
         np.minimum.at(self._low, self._landmark_box, self._landmark_sizes)
         np.maximum.at(self._high, self._landmark_box, self._landmark_sizes)
 
-    def _keys(self, places: np.ndarray) -> np.ndarray:
-        """Interleave the bits of `places` (n, d), in root units, to Morton keys."""
-        dim = self.boxes.dim
-        whole = np.floor(places * 2.0**self._deepest).astype(np.uint64)
-        key = np.zeros(len(places), np.uint64)
-        for a in range(dim):
-            key |= _spread(whole[:, a], dim) << np.uint64(a)
-        return key
-
-    def _find(self, places: np.ndarray) -> np.ndarray:
-        """Return the index of the box that holds each of `places` (n, d), in root units."""
-        starts = self._keys(self.boxes.corner)
-        order = np.argsort(starts)
-        at = np.searchsorted(starts[order], self._keys(places), side="right") - 1
-        return order[at]
-
     def _to_split(self, tolerance: float) -> np.ndarray:
         boxes, dim = self.boxes, self.boxes.dim
-        open_ = boxes.level < self._deepest
-        # (a) All but the small errors whose sum is within the tolerance.
+        here, there = boxes.neighbours()
+        low, high = self._low.copy(), self._high.copy()
+        for i, j in ((here, there), (there, here)):
+            np.minimum.at(low, i, self._low[j])
+            np.maximum.at(high, i, self._high[j])
+
+        # (a) All but the small errors whose sum is within the tolerance. What a jump cuts off
+        # between two samples goes unseen by the rule; up to 0.056 of the box lies beyond the last
+        # sample.
+        volumes = np.prod(boxes.edges(), axis=1)
+        sliver = 0.056 * volumes * (low**-dim - high**-dim)
+        self._errors = np.maximum(self._differences, np.where(high > _JUMP * low, sliver, 0.0))
         by_error = np.argsort(self._errors, kind="stable")
         within = np.cumsum(self._errors[by_error]) <= tolerance * self.integral
         chosen = np.zeros(len(boxes), bool)
-        chosen[by_error[~within]] = self._errors.sum() > tolerance * self.integral
+        chosen[by_error[~within]] = True
         # (b) Dips that are not resolved.
         longest = boxes.edges().max(axis=1)
-        chosen |= (longest > self._low) & (self._high > _STEEP * self._low)
+        chosen |= (longest > low) & (high > _STEEP * low)
         # (c) Neighbours of much smaller boxes.
-        chosen |= self._too_large()
-        chosen &= open_
+        chosen[there[boxes.level[there] < boxes.level[here] - 1]] = True
+        chosen &= boxes.level < boxes.deepest
+
         room = (_MOST[dim] - len(boxes)) // ((1 << dim) - 1)
         if np.count_nonzero(chosen) > room:
             worst = np.argsort(np.where(chosen, -self._errors, 1.0), kind="stable")[: max(room, 0)]
@@ -346,50 +209,26 @@ class DensityTree:
             chosen[worst] = True
         return chosen
 
-    def _too_large(self) -> np.ndarray:
-        """Tell which boxes are more than twice as large as a neighbour among the fresh ones."""
-        boxes = self.boxes
-        large = np.zeros(len(boxes), bool)
-        fresh = np.flatnonzero(self._fresh & (boxes.level > boxes.level.min() + 1))
-        if not fresh.size:
-            return large
-        step = _HALVED[boxes.level[fresh]][:, None]
-        middle = boxes.corner[fresh] + 0.5 * step
-        level = np.tile(boxes.level[fresh], 2 * boxes.dim)
-        out = np.concatenate([s * e for s in (-1, 1) for e in np.eye(boxes.dim)[:, None, :]])
-        places = (middle + step * out[:, None, :]).reshape(-1, boxes.dim)
-        end = np.rint((boxes.upper - boxes.origin) / boxes.root)
-        inside = ((places > 0) & (places < end)).all(axis=1)
-        there = self._find(places[inside])
-        large[there[boxes.level[there] < level[inside] - 1]] = True
-        return large
-
     def _refine(self, chosen: np.ndarray) -> None:
         boxes = self.boxes
         _, _, rank = hilbert_tables(boxes.dim)
         # Which child of its box each landmark falls into.
         box = self._landmark_box
-        half = _HALVED[boxes.level[box] + 1][:, None]
+        half = 0.5 ** (boxes.level[box] + 1.0)[:, None]
         bits = (self._landmarks >= boxes.corner[box] + half) @ (1 << np.arange(boxes.dim))
         child_rank = np.where(chosen[box], rank[boxes.state[box], bits], 0)
         parent, child = boxes.split(chosen)
         first = np.searchsorted(parent, np.arange(len(chosen)))
         self._landmark_box = first[box] + child_rank
-        self._fresh = child >= 0
-        for name in ("cells", "_errors", "_low", "_high", "slopes"):
+        fresh = child >= 0
+        before = self.cells[chosen]
+        for name in ("cells", "_differences", "_low", "_high", "slopes"):
             setattr(self, name, getattr(self, name)[parent])
-        self._integrate(self._fresh)
+        self._integrate(fresh)
         self._lower_by_landmarks()
-
-
-def _spread(bits: np.ndarray, dim: int) -> np.ndarray:
-    """Put dim - 1 zeros between the bits of `bits` (uint64, up to 31 bits in 2D, 21 in 3D)."""
-    steps = {
-        2: ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
-            (2, 0x3333333333333333), (1, 0x5555555555555555)),
-        3: ((32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F),
-            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)),
-    }  # fmt: skip
-    for shift, mask in steps[dim]:
-        bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
-    return bits
+        # What the split has changed is the parents' error, nearly. Their children's is in sum 1/4
+        # of it at a kink of h, 1/64 where h is smooth; half is said, as a change may be small by
+        # chance.
+        family = self.cells[fresh].reshape(-1, 1 << boxes.dim)
+        change = np.abs(family.sum(axis=1) - before) / 2
+        self._differences[fresh] = np.repeat(change, 1 << boxes.dim) / (1 << boxes.dim)
