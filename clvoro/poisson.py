@@ -12,8 +12,9 @@ import pyopencl.array as cla
 from ._program import Engine
 from .errors import InputError
 from .krylov import CURVATURE, ConjugateGradient, Launch, Solution
+from .multigrid import Multigrid
 
-_PRECONDITIONERS = ("jacobi",)
+_PRECONDITIONERS = ("jacobi", "multigrid")
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class Poisson:
         self.engine = engine
         self._kernels = engine.kernels("poisson")
         self._krylov = ConjugateGradient(engine)
+        self._multigrid: Multigrid | None = None
+        self._prepared: Laplacian | None = None
 
     def assemble(
         self,
@@ -115,6 +118,15 @@ class Poisson:
         """Enqueue y = A x."""
         self.engine.run_blocks(self._kernels.apply, *self._arguments(laplacian, x, y))
 
+    def set_up_multigrid(self, laplacian: Laplacian) -> Multigrid:
+        """Make the preconditioner for `laplacian` unless it was made last; `solve` does so."""
+        if self._multigrid is None:
+            self._multigrid = Multigrid(self.engine)
+        if self._prepared is not laplacian:
+            self._multigrid.set_up(laplacian.starts, laplacian.neighbours, laplacian.weights)
+            self._prepared = laplacian
+        return self._multigrid
+
     def solve(
         self,
         laplacian: Laplacian,
@@ -138,7 +150,7 @@ class Poisson:
             Of the relative residual. In float32 about 1e-5 can be had, less on large meshes with a
             smooth right side: the solve then ends as ``"stagnated"``, with the residual reached.
         max_iterations : int, optional
-        preconditioner : ``"jacobi"``
+        preconditioner : ``"jacobi"`` or ``"multigrid"``
 
         Returns
         -------
@@ -160,17 +172,21 @@ class Poisson:
             )
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        if max_iterations is None:
-            max_iterations = 500 + 30 * math.isqrt(n)
+        if preconditioner == "multigrid":
+            multigrid = self.set_up_multigrid(laplacian)
+            precondition, lookahead, most = multigrid.apply, 4, 200
+        else:
+            precondition, lookahead, most = laplacian.inverse_diagonal, 64, 500 + 30 * math.isqrt(n)
         return self._krylov.solve(
             self._operator(laplacian),
             rhs,
             potential,
-            precondition=laplacian.inverse_diagonal,
+            precondition=precondition,
             tolerance=tolerance,
-            max_iterations=max_iterations,
+            max_iterations=most if max_iterations is None else max_iterations,
             fused=True,
             centre=True,
+            lookahead=lookahead,
         )
 
     def _operator(self, laplacian: Laplacian) -> Callable[[cla.Array, cla.Array], None]:

@@ -18,6 +18,12 @@ def morton_order(points):
     return np.argsort(key, kind="stable")
 
 
+def polygon_area(corners):
+    """Area of a plane polygon in space, corners (k, 3) in order."""
+    fan = np.cross(corners[1:-1] - corners[0], corners[2:] - corners[0])
+    return 0.5 * np.linalg.norm(fan.sum(axis=0))
+
+
 def voronoi_graph(points):
     """CSR graph of the diagram of `points` (n, d): starts, neighbours, face measures, volumes.
 
@@ -31,24 +37,22 @@ def voronoi_graph(points):
             image[:, a] = 2 * wall - image[:, a]
             mirrored.append(image)
     diagram = Voronoi(np.concatenate(mirrored))
-    pairs, measures, heights = [], [], []
-    for (i, j), corners in zip(diagram.ridge_points, diagram.ridge_vertices, strict=True):
-        if min(i, j) >= n:
-            continue
-        # The cells' own images lie behind walls; faces to other images have no measure.
-        if max(i, j) >= n and max(i, j) % n != min(i, j):
-            continue
-        v = diagram.vertices[corners]
-        if dim == 2:
-            measure = np.linalg.norm(v[1] - v[0])
-        else:
-            fan = np.cross(v[1:-1] - v[0], v[2:] - v[0])
-            measure = 0.5 * np.linalg.norm(fan.sum(axis=0))
-        distance = np.linalg.norm(diagram.points[i] - diagram.points[j])
-        pairs.append((i, j))
-        measures.append(measure)
-        heights.append(distance / 2)
-    pairs, measures, heights = np.array(pairs), np.array(measures), np.array(heights)
+    pairs = diagram.ridge_points
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    # A cell's own images lie behind the walls; faces to images of others have no measure.
+    kept = (low < n) & ((high < n) | (high % n == low))
+    pairs = pairs[kept]
+    if dim == 2:
+        ends = diagram.vertices[np.array(diagram.ridge_vertices)[kept]]
+        measures = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    else:
+        measures = np.array(
+            [
+                polygon_area(diagram.vertices[diagram.ridge_vertices[f]])
+                for f in np.flatnonzero(kept)
+            ]
+        )
+    heights = 0.5 * np.linalg.norm(np.diff(diagram.points[pairs], axis=1)[:, 0], axis=1)
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
     columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
     both, high = np.tile(measures, 2), np.tile(heights, 2)

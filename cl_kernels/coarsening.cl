@@ -1,0 +1,228 @@
+/* Coarse graphs by matching, for multigrid: cells joined by a heavy weight become one. Rows of a graph are
+   columns[starts[i] .. starts[i + 1]) with weights > 0; an entry with weight 0 or naming its own row counts for nothing.
+
+   Everything is decided by each cell or group for itself from the last kernel's result, so there is one outcome. */
+#include "common/real.h"
+
+#define NONE (-1)
+
+/* Weights in the multigrid's precision, which may be less than the operator's. */
+kernel void convert(int m, global const SOURCE *weights, global REAL *out)
+{
+    const int k = get_global_id(0);
+    if (k < m) out[k] = (REAL)weights[k];
+}
+
+/* A weight times 1 + less than a thousandth, by chance but the same from both sides: it breaks the ties of regular
+   meshes, where else all cells would look the same way and few would find a partner. */
+inline REAL preference(REAL weight, int i, int j)
+{
+    uint key = (uint)min(i, j) * 0x9E3779B1u ^ (uint)max(i, j) * 0x85EBCA77u;
+    key ^= key >> 15;
+    key *= 0x2C1B3C6Du;
+    key ^= key >> 13;
+    return weight * (1 + (key & 0xFFFFu) * R(1.5e-8));
+}
+
+/* Cell i without a mate looks at its heaviest neighbour, among those without a mate (`mated` 0) or with one (1). */
+kernel void propose(
+    int n, int mated, global const int *starts, global const int *columns, global const REAL *weights,
+    global const int *mate, global int *choice)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    int best = NONE;
+    if (mate[i] == NONE) {
+        REAL most = 0;
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            const int j = columns[k];
+            if (j == i || (mate[j] != NONE) != mated) continue;
+            const REAL p = preference(weights[k], i, j);
+            if (p > most) {
+                most = p;
+                best = j;
+            }
+        }
+    }
+    choice[i] = best;
+}
+
+/* Two cells that look at each other are mates. */
+kernel void marry(int n, global const int *choice, global int *mate)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    const int j = choice[i];
+    if (j != NONE && choice[j] == i) mate[i] = j;
+}
+
+/* The lower one of two mates stands for their group. Who has found no mate joins that of its heaviest neighbour with one
+   (its choice now), and stands alone if there is none. root[i] = who stands for i's group, is_root[i] = whether i does. */
+kernel void join(int n, global const int *mate, global const int *choice, global int *root, global int *is_root)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    const int to = mate[i] != NONE ? i : choice[i];
+    const int r = to == NONE ? i : min(to, mate[to]);
+    root[i] = r;
+    is_root[i] = r == i;
+}
+
+/* group[i] = number of i's group, members counted in the order of who stands for them; standing[g] = who stands for g. */
+kernel void number_groups(
+    int n, global const int *root, global const int *numbers, global int *group, global int *standing)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    const int r = root[i];
+    group[i] = numbers[r];
+    if (r == i) standing[numbers[r]] = i;
+}
+
+/* Whether row entry k of i is the first to name its column: a cell may meet another twice around a periodic box. */
+inline int is_first(int i, int k, global const int *starts, global const int *columns)
+{
+    int l = starts[i];
+    while (columns[l] != columns[k]) ++l;
+    return l == k;
+}
+
+/* Members of a group: the two mates, then those who have joined the one, then the other. With `fill` they are listed at
+   members[member_starts[g]], else counted, with the lengths of their rows, which bound the group's. */
+kernel void list_members(
+    int groups, int fill, global const int *starts, global const int *columns, global const int *mate,
+    global const int *choice, global const int *standing, global int *member_starts, global int *bounds,
+    global int *members)
+{
+    const int g = get_global_id(0);
+    if (g >= groups) return;
+    const int pair[2] = {standing[g], mate[standing[g]]};
+    int at = fill ? member_starts[g] : 0, bound = 0;
+    for (int s = 0; s < 2; ++s) {
+        if (pair[s] == NONE) continue;
+        if (fill) members[at] = pair[s];
+        ++at;
+        bound += starts[pair[s] + 1] - starts[pair[s]];
+    }
+    for (int s = 0; s < 2; ++s) {
+        const int i = pair[s];
+        if (i == NONE) continue;
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            const int j = columns[k];
+            if (j == i || mate[j] != NONE || choice[j] != i) continue;
+            if (!is_first(i, k, starts, columns)) continue;
+            if (fill) members[at] = j;
+            ++at;
+            bound += starts[j + 1] - starts[j];
+        }
+    }
+    if (!fill) {
+        member_starts[g] = at;
+        bounds[g] = bound;
+    }
+}
+
+/* Row of group g: the weights between its members and those of each other group added up. It is built at
+   loose_columns[bounds[g]], where there is room for all entries of its members, and its length left in lengths[g]. */
+kernel void merge_rows(
+    int groups, global const int *starts, global const int *columns, global const REAL *weights,
+    global const int *group, global const int *member_starts, global const int *members, global const int *bounds,
+    global int *lengths, global int *loose_columns, global REAL *loose_weights)
+{
+    const int g = get_global_id(0);
+    if (g >= groups) return;
+    const int begin = bounds[g];
+    int end = begin;
+    for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
+        const int i = members[s];
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            const int h = group[columns[k]];
+            const REAL w = weights[k];
+            if (h == g || w <= 0) continue;
+            int at = begin;
+            while (at < end && loose_columns[at] != h) ++at;
+            if (at == end) {
+                loose_columns[at] = h;
+                loose_weights[at] = w;
+                ++end;
+            } else
+                loose_weights[at] += w;
+        }
+    }
+    lengths[g] = end - begin;
+}
+
+/* The rows one behind the other, times a factor. */
+kernel void pack_rows(
+    int groups, REAL factor, global const int *bounds, global const int *starts, global const int *loose_columns,
+    global const REAL *loose_weights, global int *columns, global REAL *weights)
+{
+    const int g = get_global_id(0);
+    if (g >= groups) return;
+    const int shift = bounds[g] - starts[g];
+    for (int k = starts[g]; k < starts[g + 1]; ++k) {
+        columns[k] = loose_columns[k + shift];
+        weights[k] = factor * loose_weights[k + shift];
+    }
+}
+
+/* Groups of groups: their members among the first, at most 2 passes deep (counts first, as above). */
+kernel void compose_members(
+    int groups, int fill, global const int *outer_starts, global const int *outer, global const int *inner_starts,
+    global const int *inner, global int *member_starts, global int *members)
+{
+    const int g = get_global_id(0);
+    if (g >= groups) return;
+    int at = fill ? member_starts[g] : 0;
+    for (int s = outer_starts[g]; s < outer_starts[g + 1]; ++s)
+        for (int k = inner_starts[outer[s]]; k < inner_starts[outer[s] + 1]; ++k) {
+            if (fill) members[at] = inner[k];
+            ++at;
+        }
+    if (!fill) member_starts[g] = at;
+}
+
+kernel void compose_groups(int n, global const int *inner, global const int *outer, global int *group)
+{
+    const int i = get_global_id(0);
+    if (i < n) group[i] = outer[inner[i]];
+}
+
+/* Pairwise Jacobi: u = B^-1 r, B the operator's diagonal, with its 2 x 2 blocks for cells that are each other's heaviest
+   neighbours. A tight pair moves as one against the others, which the diagonal alone would take many steps to see.
+   u_i = same[i] r_i + other[i] r_partner[i]; no eigenvalue of B^-1 A is above 2, as 2 B - A is a sum of squares. */
+kernel void pair_inverse(
+    int n, global const int *starts, global const int *columns, global const REAL *weights, global const int *mate,
+    global int *partner, global REAL *same, global REAL *other)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    const int j = mate[i];
+    REAL mine = 0, theirs = 0, between = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        if (columns[k] == i) continue;
+        if (columns[k] == j)
+            between += weights[k];
+        else
+            mine += weights[k];
+    }
+    if (j != NONE)
+        for (int k = starts[j]; k < starts[j + 1]; ++k)
+            if (columns[k] != j && columns[k] != i) theirs += weights[k];
+    /* The block is [mine + between, -between; -between, theirs + between]; without neighbours outside it is singular,
+       and half the difference is the answer. */
+    REAL a = 0, c = 0;
+    if (j == NONE || between <= 0)
+        a = mine > 0 ? 1 / mine : 0;
+    else if (mine + theirs <= 0) {
+        a = R(0.25) / between;
+        c = -a;
+    } else {
+        const REAL share = between / (mine + theirs + (mine / between) * theirs);
+        c = share / between;
+        a = c * (1 + theirs / between);
+    }
+    partner[i] = j == NONE ? i : j;
+    same[i] = a;
+    other[i] = c;
+}

@@ -1,0 +1,229 @@
+"""Coarse graphs for multigrid: cells joined by heavy weights become one, on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ._primitives import Scan
+from ._program import Engine
+
+ROUNDS = 3
+"""Rounds of matching; the third still pairs off every fifth cell, a fourth would not pay."""
+
+
+_GROUP = 64
+
+
+def whole_groups(size: int) -> int:
+    """Return `size` rounded up, lest the driver split a prime number of work-items one by one."""
+    return max(1, -(-size // _GROUP)) * _GROUP
+
+
+@dataclass(frozen=True)
+class Graph:
+    """A weighted graph on the device, one row per cell.
+
+    Attributes
+    ----------
+    starts : (n + 1,) int32
+    columns : (m,) int32
+        An entry that names its own row counts for nothing.
+    weights : (m,) real
+        Symmetric, >= 0.
+    """
+
+    starts: cla.Array
+    columns: cla.Array
+    weights: cla.Array
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+
+@dataclass(frozen=True)
+class Groups:
+    """A partition of a graph's cells.
+
+    Attributes
+    ----------
+    group : (n,) int32
+        Number of each cell's group.
+    starts : (groups + 1,) int32
+    members : (n,) int32
+        Group g has the cells ``members[starts[g]:starts[g + 1]]``.
+    """
+
+    group: cla.Array
+    starts: cla.Array
+    members: cla.Array
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+
+@dataclass(frozen=True)
+class PairInverse:
+    """Inverse of diagonal and 2 x 2 blocks: u_i = same_i r_i + other_i r_partner_i, each (n,)."""
+
+    partner: cla.Array
+    same: cla.Array
+    other: cla.Array
+
+
+class Room:
+    """Device arrays by name that grow when needed and else are handed out again."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._arrays: dict[tuple, cla.Array] = {}
+
+    def __call__(self, *name: object, size: int, dtype: object = None) -> cla.Array:
+        """Return the first `size` items of the array called `name`; its content is arbitrary."""
+        array = self._arrays.get(name)
+        if array is None or len(array) < size:
+            array = self._arrays[name] = self._engine.empty(max(size, 1), dtype)
+        return array[:size]
+
+
+class Coarsening:
+    """Makes a graph a few times smaller by two passes of matching.
+
+    In a pass each cell looks at its heaviest free neighbour, and two that look at each other are
+    joined; after `ROUNDS` rounds the rest joins its heaviest neighbour's pair. Two passes make
+    groups of between four and five.
+
+    Parameters
+    ----------
+    engine : Engine
+        Of the multigrid's precision.
+    """
+
+    def __init__(self, engine: Engine, source: str) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("coarsening", {"SOURCE": source})
+        self._scan = Scan(engine)
+        self._room = Room(engine)
+
+    def _run(self, kernel: cl.Kernel, size: int, *args: object) -> None:
+        self.engine.run(kernel, whole_groups(size), *args)
+
+    def convert(self, graph: Graph, level: int) -> Graph:
+        """Return `graph` with its weights in this engine's precision."""
+        m = len(graph.weights)
+        weights = self._room(level, "weights", size=m)
+        self._run(self._kernels.convert, m, np.int32(m), graph.weights, weights)
+        return Graph(graph.starts, graph.columns, weights)
+
+    def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Groups, Graph]:
+        """Return the smoother's blocks of `graph`, its groups, and the graph of the groups.
+
+        Weights between groups are the sums of those between their members, times the ratio of
+        lengths (groups / cells)^(1/d): groups are that much farther apart than cells.
+        """
+        n, dim = len(graph), self.engine.dim
+        inverse, first, middle = self._match(graph, (level, 0), 1.0, pairs=True)
+        _, second, coarse = self._match(
+            middle, (level, 1), lambda groups: (groups / n) ** (1 / dim), pairs=False
+        )
+        return inverse, self._compose(first, second, level), coarse
+
+    def pairs(self, graph: Graph, level: int) -> PairInverse:
+        """Return the smoother's blocks alone, for the coarsest graph."""
+        n, room = len(graph), self._room
+        mate = room("mate", size=n, dtype=np.int32).fill(-1)
+        self._round(graph, mate, room("choice", size=n, dtype=np.int32))
+        return self._pair_inverse(graph, mate, level)
+
+    def _round(self, graph: Graph, mate: cla.Array, choice: cla.Array) -> None:
+        run, k, n = self._run, self._kernels, len(graph)
+        size = np.int32(n)
+        run(
+            k.propose, n, size, np.int32(0), graph.starts, graph.columns, graph.weights, mate,
+            choice,
+        )  # fmt: skip
+        run(k.marry, n, size, choice, mate)
+
+    def _pair_inverse(self, graph: Graph, mate: cla.Array, level: int) -> PairInverse:
+        n, room = len(graph), self._room
+        pairs = PairInverse(
+            room(level, "partner", size=n, dtype=np.int32),
+            room(level, "same", size=n),
+            room(level, "other", size=n),
+        )
+        self._run(
+            self._kernels.pair_inverse, n, np.int32(n), graph.starts, graph.columns, graph.weights,
+            mate, pairs.partner, pairs.same, pairs.other,
+        )  # fmt: skip
+        return pairs
+
+    def _match(self, graph: Graph, name: tuple, factor, *, pairs: bool):
+        """One pass: mates, groups, and the graph of the groups with its weights times `factor`."""
+        run, k, n, m = self._run, self._kernels, len(graph), len(graph.columns)
+        size, zero, one = np.int32(n), np.int32(0), np.int32(1)
+
+        def ints(*key: object, count: int) -> cla.Array:
+            return self._room(*key, size=count, dtype=np.int32)
+
+        mate, choice = ints("mate", count=n), ints("choice", count=n)
+        mate.fill(-1)
+        inverse = None
+        for turn in range(ROUNDS):
+            self._round(graph, mate, choice)
+            if turn == 0 and pairs:
+                inverse = self._pair_inverse(graph, mate, name[0])
+        rows = (graph.starts, graph.columns, graph.weights)
+        run(k.propose, n, size, one, *rows, mate, choice)
+
+        root, numbers = ints("root", count=n), ints("numbers", count=n + 1)
+        run(k.join, n, size, mate, choice, root, numbers)
+        self._scan.exclusive(numbers, numbers, n)
+        count = int(numbers[n : n + 1].get()[0])
+        groups = Groups(
+            ints(name, "group", count=n), ints(name, "starts", count=count + 1),
+            ints(name, "members", count=n),
+        )  # fmt: skip
+        standing, bounds = ints("standing", count=count), ints("bounds", count=count + 1)
+        number = np.int32(count)
+        run(k.number_groups, n, size, root, numbers, groups.group, standing)
+        listing = (graph.starts, graph.columns, mate, choice, standing, groups.starts, bounds)
+        run(k.list_members, count, number, zero, *listing, groups.members)
+        self._scan.exclusive(groups.starts, groups.starts, count)
+        self._scan.exclusive(bounds, bounds, count)
+        run(k.list_members, count, number, one, *listing, groups.members)
+
+        loose_columns, loose_weights = ints("loose columns", count=m), self._room("loose", size=m)
+        starts = ints(name, "row starts", count=count + 1)
+        run(
+            k.merge_rows, count, number, *rows, groups.group, groups.starts, groups.members, bounds,
+            starts, loose_columns, loose_weights,
+        )  # fmt: skip
+        self._scan.exclusive(starts, starts, count)
+        entries = int(starts[count : count + 1].get()[0])
+        columns = ints(name, "columns", count=entries)
+        weights = self._room(name, "row weights", size=entries)
+        scale = self.engine.real.type(factor(count) if callable(factor) else factor)
+        run(
+            k.pack_rows, count, number, scale, bounds, starts, loose_columns, loose_weights,
+            columns, weights,
+        )  # fmt: skip
+        return inverse, groups, Graph(starts, columns, weights)
+
+    def _compose(self, inner: Groups, outer: Groups, level: int) -> Groups:
+        run, k, room = self._run, self._kernels, self._room
+        n, count = len(inner.group), len(outer)
+        groups = Groups(
+            room(level, "group", size=n, dtype=np.int32),
+            room(level, "starts", size=count + 1, dtype=np.int32),
+            room(level, "members", size=n, dtype=np.int32),
+        )
+        run(k.compose_groups, n, np.int32(n), inner.group, outer.group, groups.group)
+        lists = (outer.starts, outer.members, inner.starts, inner.members, groups.starts)
+        number = np.int32(count)
+        run(k.compose_members, count, number, np.int32(0), *lists, groups.members)
+        self._scan.exclusive(groups.starts, groups.starts, count)
+        run(k.compose_members, count, number, np.int32(1), *lists, groups.members)
+        return groups
