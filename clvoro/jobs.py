@@ -76,13 +76,18 @@ class Job:
         where = f"{device.platform.name.strip()} / {device.name.strip()}"
         results: dict[str, Result] = {}
         with self._stopping_cleanly():
-            for method in self.case.methods:  # the same seed gives all the same start
-                result = self._run_one(adapter, size, method, dict(arguments))
-                name = str(method or result.settings.get("method", "default"))
-                results[name] = result
-                self._announce(name, result, where)
-                if self.interrupted:
-                    break
+            try:
+                for method in self.case.methods:  # the same seed gives all the same start
+                    result = self._run_one(adapter, size, method, dict(arguments))
+                    name = str(method or result.settings.get("method", "default"))
+                    results[name] = result
+                    self._announce(name, result, where)
+                    if self.interrupted:
+                        break
+            except ClvoroError:
+                if results:  # a later method's failure does not cost the earlier ones' meshes
+                    self._write(adapter, size, results, where)
+                raise
             self._write(adapter, size, results, where)
         self._summarise(results, where)
         return self.interrupted

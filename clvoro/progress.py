@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from typing import Any, TextIO
@@ -61,7 +62,8 @@ class Progress:
         if self._status is not None:
             self._status.update(text)
         elif self._live:
-            self.stream.write(f"\r{text}\x1b[K")
+            columns = shutil.get_terminal_size().columns
+            self.stream.write(f"\r{text[: columns - 1]}\x1b[K")
         else:
             self.stream.write(text + "\n")
         self.stream.flush()
@@ -71,18 +73,18 @@ class Progress:
         seconds, n = float(row["seconds"]), int(row["cells"])
         level = f" level {row['level']}" if row["level"] else ""
         of = "" if self.max_steps is None else f"/{self.max_steps}"
+        # Short enough for 80 columns with a title of some 15.
         parts = [
-            f"{self.title}{level}: step {self.steps}{of}",
-            f"{n} cells",
-            f"|e| mean {row['mean_error']:.4f} max {row['max_error']:.3g}",
-            f"Q mean {row['mean_quality']:.4f} min {row['min_quality']:.3f}",
+            f"{self.title}{level} {self.steps}{of}",
+            f"|e| {row['mean_error']:.4f} max {row['max_error']:.2g}",
+            f"Q {row['mean_quality']:.3f} min {row['min_quality']:.2f}",
         ]
         if self.steps > 0 and seconds > 0:
             parts.append(f"{_short(n * self.steps / seconds)} cells/s")
             if self.max_steps is not None:
                 left = seconds / self.steps * max(self.max_steps - self.steps, 0)
-                parts.append(f"{_duration(left)} left at most")
-        return " | ".join(parts)
+                parts.append(f"{_duration(left)} left")
+        return "  ".join(parts)
 
 
 class _Status:
@@ -122,7 +124,7 @@ def _short(number: float) -> str:
     """Write a number with three figures and k or M."""
     for unit, size in (("M", 1e6), ("k", 1e3)):
         if number >= size:
-            return f"{number / size:.3g} {unit}"
+            return f"{number / size:.3g}{unit}"
     return f"{number:.3g}"
 
 

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 import clvoro
@@ -80,10 +81,18 @@ def test_every_face_is_drawn_once(result):
     faces = result.diagram.face_measures
     total = faces[neighbours < 0].sum() + faces[neighbours >= 0].sum() / 2
     assert length == pytest.approx(total)
-    # Thinner where the cells are smaller, never thicker than the cap.
+
+
+def test_faces_are_as_thin_as_their_cells_are_small(result):
+    small = Figure(figsize=(1.0, 0.6)).add_subplot()
+    plot_cells(result, "quality", small, key=False)
+    (lines,) = [c for c in small.collections if isinstance(c, LineCollection)]
     widths = np.array(lines.get_linewidths())
-    assert widths.min() < 0.7 * widths.max()
+    sizes = np.sqrt(result.diagram.volumes)
     assert widths.max() <= 0.7
+    assert widths.max() / widths.min() > 0.5 * sizes.max() / sizes.min()
+    # Both in the unit of the paper: a face takes a twentieth of its cell's size at most.
+    assert widths.max() <= 0.05 * sizes.max() * 72 / BOX.extent[0]
 
 
 def test_error_scale_is_the_same_on_both_sides_of_zero(result):

@@ -88,8 +88,8 @@ def load_array(path: Path, place: str) -> np.ndarray:
         ) from error
 
 
-def named_files(node: Mapping[str, Any]) -> list[dict[str, Any]]:
+def named_files(node: dict[str, Any]) -> list[dict[str, Any]]:
     """Return every table of the tree that names a file, so that the files can be copied along."""
     children = [*node.get("fields", []), *([node["field"]] if "field" in node else [])]
     own = [node] if node["kind"] == "raster" else []
-    return own + [found for child in children for found in named_files(child)]  # type: ignore[return-value]
+    return own + [found for child in children for found in named_files(child)]

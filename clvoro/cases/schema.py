@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from ..errors import InputError
 
-Check = Callable[[object, str], object]
+Check = Callable[[object, str], Any]
 """Takes a value and its place in the file; returns it in its final type or raises InputError."""
 
 
@@ -34,16 +35,18 @@ def number(value: object, place: str) -> float:
 
 def positive(value: object, place: str) -> float:
     """Check for a number above zero."""
-    if number(value, place) <= 0:
+    checked = number(value, place)
+    if checked <= 0:
         raise refuse(place, value, "a number above 0")
-    return float(value)  # type: ignore[arg-type]
+    return checked
 
 
 def not_negative(value: object, place: str) -> float:
     """Check for a number that is zero or more."""
-    if number(value, place) < 0:
+    checked = number(value, place)
+    if checked < 0:
         raise refuse(place, value, "a number not below 0")
-    return float(value)  # type: ignore[arg-type]
+    return checked
 
 
 def whole(least: int) -> Check:
@@ -87,7 +90,7 @@ def vectors(least: int) -> Check:
     def check(value: object, place: str) -> list[list[float]]:
         if not isinstance(value, (list, tuple)) or len(value) < least:
             raise refuse(place, value, f"a list of {least} or more points, [x, y] each")
-        return [vector(2, 3)(v, f"{place}[{i}]") for i, v in enumerate(value)]  # type: ignore[misc]
+        return [vector(2, 3)(v, f"{place}[{i}]") for i, v in enumerate(value)]
 
     return check
 
@@ -111,7 +114,7 @@ class Table:
     optional: Mapping[str, Check]
     choice: tuple[str, ...] = ()
 
-    def __call__(self, value: object, place: str) -> dict[str, object]:
+    def __call__(self, value: object, place: str) -> dict[str, Any]:
         """Return the checked table, its keys in the file's order."""
         if not isinstance(value, Mapping):
             raise refuse(place, value, "a table")
@@ -140,7 +143,7 @@ class Kinds:
     tables: Mapping[str, Table]
     default: str | None = None
 
-    def __call__(self, value: object, place: str) -> dict[str, object]:
+    def __call__(self, value: object, place: str) -> dict[str, Any]:
         """Return the checked table with its kind first."""
         if not isinstance(value, Mapping):
             raise refuse(place, value, "a table")
@@ -154,12 +157,12 @@ def _below(place: str, key: str) -> str:
     return f"{place} {key}" if place.endswith(":") else f"{place}.{key}"
 
 
-def _join(names: object) -> str:
-    return ", ".join(map(str, names))  # type: ignore[call-overload]
+def _join(names: Iterable[object]) -> str:
+    return ", ".join(map(str, names))
 
 
-def _nearest(name: object, known: object) -> str:
-    near = difflib.get_close_matches(str(name), list(known), 1, 0.5)  # type: ignore[call-overload]
+def _nearest(name: object, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(name), list(known), 1, 0.5)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
@@ -178,7 +181,7 @@ SHAPE = Kinds(
 """A shape that sizes are measured from."""
 
 
-def size(value: object, place: str) -> dict[str, object]:
+def size(value: object, place: str) -> dict[str, Any]:
     """Check a size field: a number, or a tree of tables."""
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return {"kind": "constant", "value": positive(value, place)}

@@ -18,6 +18,7 @@ from matplotlib.colors import (
 )
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullLocator
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..results import Diagram, Result
@@ -123,7 +124,7 @@ def plot_cells(
     ax: Any = None,
     *,
     limits: tuple[float, float] | None = None,
-    window: tuple[Sequence[float], Sequence[float]] | None = None,
+    window: tuple[ArrayLike, ArrayLike] | None = None,
     edges: bool = True,
     key: bool = True,
     title: str | None = None,
@@ -158,12 +159,13 @@ def plot_cells(
     """
     scheme, diagram = colouring(colour), result.diagram
     require_plane(diagram)
-    lower, upper = window if window is not None else (diagram.domain.lower, diagram.domain.upper)
+    corners = (diagram.domain.lower, diagram.domain.upper) if window is None else window
+    lower, upper = (np.asarray(corner, float) for corner in corners)
     with styled():
         if ax is None:
             height = grid_height(lower, upper, 1, 1, 0.55, 0.25 * (title is not None))
             ax = interactive_figure(WIDTH, height).add_subplot()
-        shown = _cells_in(diagram, np.asarray(lower), np.asarray(upper))
+        shown = _cells_in(diagram, lower, upper)
         values = scheme.values(result)
         low, high = scheme.limits(values) if limits is None else limits
         cells = draw_cells(ax, diagram, shown, values, scheme, (low, high))
@@ -218,12 +220,15 @@ def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, extent: np.ndarray)
     beyond = np.where(neighbours >= 0, neighbours, owner)
     thin = np.minimum(thickness[owner], thickness[beyond])
     once = np.flatnonzero((neighbours < owner) & inside[owner] & (thin > 0.06))
+    # The thinnest fade out: a sudden end of all lines would look like a feature of the mesh.
+    colours = np.full((len(once), 4), 0.1)
+    colours[:, 3] = np.clip((thin[once] - 0.06) / 0.14, 0, 1)
     following = np.arange(len(owner)) + 1
     following[starts[1:] - 1] = starts[:-1]
     corners = diagram.vertices[diagram.cell_vertices]
     lines = LineCollection(
-        np.stack([corners[once], corners[following[once]]], axis=1),  # type: ignore[arg-type]
-        colors="#1A1A1A",
+        list(np.stack([corners[once], corners[following[once]]], axis=1)),
+        colors=colours,
         linewidths=thin[once],
         capstyle="round",
         rasterized=len(once) > 9000,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..results import Displacements, Result
 from .style import (
@@ -152,7 +152,7 @@ def _magnifications(field: Displacements) -> tuple[float, float]:
     if len(field.points) < 2:
         return 1.0, 1.0
     nearest = min(7, len(field.points))
-    spacing = cKDTree(field.points).query(field.points, k=nearest)[0][:, 1:].mean(axis=1)
+    spacing = KDTree(field.points).query(field.points, k=nearest)[0][:, 1:].mean(axis=1)
     factors = []
     for arrows in (field.lloyd, field.poisson):
         reach = float(np.quantile(np.hypot(*arrows.T) / spacing, 0.9))

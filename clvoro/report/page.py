@@ -20,15 +20,16 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; background: #fff; m
        margin: 2rem auto; padding: 0 1.2rem; }
 h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
 p.what { color: #555; margin-top: .2rem; }
-dl { display: grid; grid-template-columns: repeat(auto-fit, minmax(8rem, 1fr)); gap: .7rem; }
-dl div { border: 1px solid #ddd; border-radius: .4rem; padding: .5rem .8rem; }
+dl { display: flex; flex-wrap: wrap; gap: .7rem; }
+dl div { flex: 1 1 6rem; border: 1px solid #ddd; border-radius: .4rem; padding: .5rem .8rem; }
 dt { color: #555; font-size: .8rem; } dd { margin: 0; font-size: 1.25rem;
      font-variant-numeric: tabular-nums; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
 th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child, th:last-child, td:last-child { text-align: left; }
 thead th { color: #555; font-weight: 600; font-size: .85rem; } tr.main td { font-weight: 600; }
-figure { margin: 1.5rem 0; } img { max-width: 100%; height: auto; }
+th { white-space: nowrap; }
+figure { margin: 1.5rem 0; break-inside: avoid; } img { max-width: 100%; height: auto; }
 figcaption { color: #444; font-size: .9rem; }
 pre { background: #f6f6f6; padding: .8rem 1rem; overflow-x: auto; font-size: .85rem; }
 """

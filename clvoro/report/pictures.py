@@ -153,7 +153,7 @@ def _closer(result: Result) -> Any:
             lower, upper = window_around_smallest(result, across)
             draw.plot_cells(result, "quality", ax, limits=limits, window=(lower, upper), key=False)
             ax.locator_params(nbins=4)
-            ax.set_title(f"{across} $h_{{min}}$ across, where $h$ is smallest")
+            ax.set_title(f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest")
         scheme = draw.colouring("quality")
         draw.add_colour_bar(
             axes[0].collections[0], axes, scheme, result.quality, limits,
