@@ -230,6 +230,29 @@ def test_callable_goes_through_the_host(make_engine):
         assert PLANE.contains(x).all()
 
 
+def test_parts_of_a_mixed_field_run_on_the_device(make_engine, monkeypatch):
+    """Beside a callable the rest is still evaluated on the device, also where it is negative."""
+    engine = make_engine(2)
+    polygon = PLANE_FIELDS["polygon"]
+    field = 0.5 * sizing.maximum(
+        sizing.minimum(lambda x: 0.05 + 0.1 * np.abs(x[:, 0]), polygon),
+        sizing.Expression("0.02*(x - 0.5)"),
+    )
+    points = _within(PLANE, 500)
+    expected = field(points)
+    stage = sizing.Sizing(engine, PLANE, field)
+    monkeypatch.setattr(sizing.Distance, "distance", None)
+    assert stage.prelude is None
+    assert np.abs(stage(points) - expected).max() < _tolerance(engine, PLANE, field)
+    x, h, slope = _device_points(engine, PLANE, points), engine.empty(500), engine.empty((500, 2))
+    stage.evaluate_with_gradient(x, 500, h, slope)
+    stage.check(x, h)
+    assert np.abs(h.get() * PLANE.frame[1] - expected).max() < _tolerance(engine, PLANE, field)
+    # |grad h| is at most the largest slope, ln 1.1 or 0.1, halved; the rest is rounding.
+    bound = 0.055 + (1e-6 if engine.real == np.float64 else 0.05)
+    assert np.abs(slope.get() * h.get()[:, None]).max() < bound
+
+
 def test_distance_to_simple_shapes():
     """Figures that can be checked in the head."""
     points = [(0, 0), (3, 4), (5, 0), (-1, 2)]

@@ -51,29 +51,45 @@ REAL size_raster(const REAL *x, __global const REAL *data, int nx, int ny, int n
    Stored as a (DIM), d (DIM), 1/|d|^2 (0 for a point), r. The distance is to the curve, from both sides. */
 #define SIZE_ITEM (2 * DIM + 2)
 
-REAL size_item_distance(const REAL *x, __global const REAL *item)
+/* Squared distance to the segment alone: no square root as long as all r are 0. */
+REAL size_segment_distance2(const REAL *x, __global const REAL *item)
 {
     REAL v[DIM], t = 0, sum = 0;
     for (int a = 0; a < DIM; ++a) {
         v[a] = x[a] - item[a];
         t += v[a] * item[DIM + a];
     }
-    t = clamp(t * item[2 * DIM], (REAL)0, (REAL)1);
+    t = fmin(fmax(t * item[2 * DIM], (REAL)0), (REAL)1);
     for (int a = 0; a < DIM; ++a) {
         v[a] -= t * item[DIM + a];
         sum += v[a] * v[a];
     }
-    return fabs(sqrt(sum) - item[2 * DIM + 1]);
+    return sum;
 }
 
-/* h = min(h_min + slope * distance, h_max) to the nearest of n items, by looking at all.
-   data: h_min, slope, h_max, the items. */
-REAL size_distance_few(const REAL *x, __global const REAL *data, int n)
+REAL size_item_distance2(const REAL *x, __global const REAL *item, int round)
 {
-    REAL best = size_item_distance(x, data + 3);
+    const REAL d2 = size_segment_distance2(x, item);
+    if (!round)
+        return d2;
+    const REAL d = sqrt(d2) - item[2 * DIM + 1];
+    return d * d;
+}
+
+/* h = min(h_min + slope * distance, h_max), the law all distances end in. law: h_min, slope, h_max. */
+REAL size_law(REAL distance2, __global const REAL *law)
+{
+    return fmin(law[0] + law[1] * sqrt(distance2), law[2]);
+}
+
+/* The distance to the nearest of n items, by looking at all. `round` tells whether some have r > 0.
+   data: the law, the items. */
+REAL size_distance_few(const REAL *x, __global const REAL *data, int n, int round)
+{
+    REAL best2 = size_item_distance2(x, data + 3, round);
     for (int i = 1; i < n; ++i)
-        best = fmin(best, size_item_distance(x, data + 3 + i * SIZE_ITEM));
-    return fmin(data[0] + data[1] * best, data[2]);
+        best2 = fmin(best2, size_item_distance2(x, data + 3 + i * SIZE_ITEM, round));
+    return size_law(best2, data);
 }
 
 REAL size_box_distance2(const REAL *x, __global const REAL *box)
@@ -87,18 +103,18 @@ REAL size_box_distance2(const REAL *x, __global const REAL *box)
 }
 
 /* The same through a binary tree of bounding boxes with 2^levels leaves: leaf l holds the items
-   [l n / 2^levels, (l + 1) n / 2^levels), node k the children 2 k + 1 and 2 k + 2. The nearer child is visited
+   [l n / 2^levels, (l + 1) n / 2^levels), node k has the children 2 k + 1 and 2 k + 2. The nearer child is visited
    first; a box that is farther than the best item found so far is skipped, and so is everything beyond the
    distance at which h_max takes over.
-   data: h_min, slope, h_max, reach, the boxes (lower, upper) of 2^(levels + 1) - 1 nodes, the items. */
-REAL size_distance_tree(const REAL *x, __global const REAL *data, int n, int levels)
+   data: the law, the square of that distance, the boxes (lower, upper) of 2^(levels + 1) - 1 nodes, the items. */
+REAL size_distance_tree(const REAL *x, __global const REAL *data, int n, int levels, int round)
 {
     __global const REAL *boxes = data + 4;
     const int first_leaf = (1 << levels) - 1;
     __global const REAL *items = boxes + (2 * first_leaf + 1) * 2 * DIM;
     int waiting[24], top = 0, node = 0;
-    REAL bound[24];
-    REAL best = data[3];
+    REAL bound2[24];
+    REAL best2 = data[3];
     for (;;) {
         if (node < first_leaf) {
             int near = 2 * node + 1, far = near + 1;
@@ -108,14 +124,14 @@ REAL size_distance_tree(const REAL *x, __global const REAL *data, int n, int lev
                 const REAL swap = near2;
                 near2 = far2;
                 far2 = swap;
-                near = far;
-                far = 4 * node + 3 - near;
+                far = near;
+                near = far + 1;
             }
-            if (far2 < best * best) {
+            if (far2 < best2) {
                 waiting[top] = far;
-                bound[top++] = far2;
+                bound2[top++] = far2;
             }
-            if (near2 < best * best) {
+            if (near2 < best2) {
                 node = near;
                 continue;
             }
@@ -123,13 +139,13 @@ REAL size_distance_tree(const REAL *x, __global const REAL *data, int n, int lev
             const long leaf = node - first_leaf;
             const int end = (int)(((leaf + 1) * n) >> levels);
             for (int i = (int)((leaf * n) >> levels); i < end; ++i)
-                best = fmin(best, size_item_distance(x, items + i * SIZE_ITEM));
+                best2 = fmin(best2, size_item_distance2(x, items + i * SIZE_ITEM, round));
         }
         do {
             if (top == 0)
-                return fmin(data[0] + data[1] * best, data[2]);
+                return size_law(best2, data);
             --top;
-        } while (!(bound[top] < best * best));
+        } while (!(bound2[top] < best2));
         node = waiting[top];
     }
 }

@@ -232,18 +232,18 @@ class Distance(Field):
         begin, end = (binder.normalise(p).astype(binder.real) for p in (self._begin, self._end))
         radius = (self._radius / binder.scale).astype(binder.real)
         law = (self.h_min / binder.scale, self.slope, self.h_max / binder.scale)
-        n = len(begin)
+        n, rounded = len(begin), int(radius.any())
         if n <= _FEW:
             at = binder.store(*law, _pack(begin, end, radius))
-            return binder.variable(f"size_distance_few(x, data + {at}, {n})")
+            return binder.variable(f"size_distance_few(x, data + {at}, {n}, {rounded})")
         levels = max(0, math.ceil(math.log2(n / _LEAF)))
         order = _tree_order(0.5 * (begin + end), levels)
         begin, end, radius = begin[order], end[order], radius[order]
         boxes = _tree_boxes(begin, end, radius, levels)
         # Beyond this distance h is h_max whatever the curve; the margin covers rounding.
         reach = 1.01 * (law[2] - law[0]) / law[1] if law[1] > 0 else math.inf
-        at = binder.store(*law, reach, boxes, _pack(begin, end, radius))
-        return binder.variable(f"size_distance_tree(x, data + {at}, {n}, {levels})")
+        at = binder.store(*law, reach * reach, boxes, _pack(begin, end, radius))
+        return binder.variable(f"size_distance_tree(x, data + {at}, {n}, {levels}, {rounded})")
 
     def __repr__(self) -> str:
         return (

@@ -75,6 +75,10 @@ class Field:
                 f"of {dim}; build it with {dim} coordinates"
             )
 
+    def with_parts(self, change: Callable[[Field], Field]) -> Field:
+        """Return the field with `change` applied to each of the fields that it combines, if any."""
+        return self
+
     def landmarks(self, domain: Box) -> np.ndarray:
         """Return points (m, d) at which h is likely to be least, for those who must see it.
 
@@ -135,10 +139,10 @@ class Function(Field):
     """A vectorised Python callable ``h(points (n, d)) -> (n,)``, evaluated on the host.
 
     Each evaluation brings the points to the host and takes the sizes back (8 to 16 bytes per
-    coordinate both ways, and the queue waits meanwhile), and runs at the speed of the callable, (1
-    + 2 d) times where the gradient of h is needed too. Any field combined with a `Function` is
-    evaluated on the host as a whole. Where a `Raster`, `Distance` or `Expression` can say the same,
-    it is much faster.
+    coordinate both ways, and the queue waits meanwhile), and runs at the speed of the callable,
+    1 + 2 d times where the gradient of h is needed too. A field combined with a `Function` is
+    combined on the host. Where a `Raster`, `Distance` or `Expression` can say the same, it is much
+    faster.
 
     The callable gets C-contiguous float64 points in physical coordinates, inside the domain or on
     its walls.
@@ -187,6 +191,9 @@ class Scaled(Field):
     def check_dim(self, dim: int) -> None:  # noqa: D102
         self.field.check_dim(dim)
 
+    def with_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
+        return Scaled(change(self.field), self.factor)
+
     def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
         return self.field.landmarks(domain)
 
@@ -225,6 +232,9 @@ class Combined(Field):
     def check_dim(self, dim: int) -> None:  # noqa: D102
         for f in self.fields:
             f.check_dim(dim)
+
+    def with_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
+        return Combined(self.operation, *map(change, self.fields))
 
     def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
         return np.concatenate([f.landmarks(domain) for f in self.fields])

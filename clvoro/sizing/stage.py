@@ -9,7 +9,7 @@ import pyopencl as cl
 
 from ..errors import SizeFieldError
 from .bind import bind
-from .field import as_field
+from .field import Constant, Field, as_field
 
 if TYPE_CHECKING:
     import pyopencl.array as cla
@@ -38,8 +38,8 @@ class Sizing:
     engine : Engine
     domain : Box
     field : Field, number or callable
-        A callable, and any field combined with one, is evaluated on the host: each evaluation then
-        moves the points to the host and the sizes back.
+        A callable is evaluated on the host, and so is the combination of a callable with other
+        fields: each evaluation then moves the points to the host and the sizes back.
 
     Attributes
     ----------
@@ -70,6 +70,10 @@ class Sizing:
             self._kernels = engine.kernels(
                 "sizing", defines={"GRADIENT_STEP": repr(step)}, prelude=self.prelude
             )
+        else:
+            # The callable itself is exact in float64; its fellows are not, if the device is not.
+            self._host_step = _GRADIENT_STEP[np.dtype(np.float64)]
+            self._host_field = self._with_device_parts(self.field)
 
     @property
     def real(self) -> np.dtype:
@@ -87,7 +91,7 @@ class Sizing:
         host at once.
         """
         if self._kernels is None:
-            h = self._on_host(points[:n].get()) / self._scale
+            h = self._on_host(self._physical(points[:n].get())) / self._scale
             h_out[:n].set(h.astype(self.engine.real))
             return
         self._launch("evaluate", n, points, self.data, h_out, self._bad)
@@ -102,14 +106,15 @@ class Sizing:
         """
         if self._kernels is None:
             x = points[:n].get().astype(float)
-            h = self._on_host(x) / self._scale
-            step = _GRADIENT_STEP[np.dtype(np.float64)] * h
+            h = self._on_host(self._physical(x)) / self._scale
+            step = self._host_step * h
             gradient = np.zeros_like(x)
             for a in range(x.shape[1]):
                 ahead, behind = x.copy(), x.copy()
                 ahead[:, a] = np.minimum(x[:, a] + step, self._walls[1, a])
                 behind[:, a] = np.maximum(x[:, a] - step, self._walls[0, a])
-                rise = (self._on_host(ahead) - self._on_host(behind)) / self._scale
+                rise = self._on_host(self._physical(ahead)) - self._on_host(self._physical(behind))
+                rise /= self._scale
                 run = ahead[:, a] - behind[:, a]
                 np.divide(rise, run * h, out=gradient[:, a], where=run > 0)
             h_out[:n].set(h.astype(self.engine.real))
@@ -154,9 +159,7 @@ class Sizing:
             If a value is not positive and finite.
         """
         if self._kernels is None:
-            sizes = self.field(points)
-            self._refuse(points, sizes)
-            return sizes
+            return self._on_host(np.asarray(points, dtype=float))
         normalised = (np.asarray(points, dtype=float) - self._origin) / self._scale
         x = self.engine.upload(normalised)
         h = self.engine.empty(len(normalised))
@@ -176,9 +179,24 @@ class Sizing:
         x = normalised.astype(float) * self._scale + self._origin
         return np.clip(x, self.domain.lower, self.domain.upper)
 
-    def _on_host(self, normalised: np.ndarray) -> np.ndarray:
-        points = self._physical(normalised)
-        sizes = self.field(points)
+    def _with_device_parts(self, field: Field) -> Field:
+        """Return a field of the host with the parts that have a device form on the device."""
+        if isinstance(field, Constant):
+            return field
+        if field.on_device:
+            self._host_step = _GRADIENT_STEP[np.dtype(self.engine.real)]
+            return _DevicePart(Sizing(self.engine, self.domain, field))
+        return field.with_parts(self._with_device_parts)
+
+    def _values(self, points: np.ndarray) -> np.ndarray:
+        """Return h at physical `points` by the device, unchecked."""
+        normalised = (points - self._origin) / self._scale
+        h = self.engine.empty(len(points))
+        self.evaluate(self.engine.upload(normalised), len(points), h)
+        return h.get().astype(float) * self._scale
+
+    def _on_host(self, points: np.ndarray) -> np.ndarray:
+        sizes = self._host_field(points)
         self._refuse(points, sizes)
         return sizes
 
@@ -195,3 +213,13 @@ class Sizing:
             f"the size field {self.field!r} is {value:g} at ({where}), expected a positive, finite "
             "size on the whole domain; bound it, for instance by maximum(field, 1e-3)"
         )
+
+
+class _DevicePart(Field):
+    """A part of a field of the host that is evaluated on the device; it need not be positive."""
+
+    def __init__(self, stage: Sizing):
+        self._stage, self.dim = stage, stage.field.dim
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        return self._stage._values(points)
