@@ -1,0 +1,48 @@
+"""Files: save and load results, write meshes for other programs.
+
+Every writer works on a temporary file beside the target and puts it in place when it is complete.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from ..errors import InputTypeError
+from ..results import Result
+from .atomic import check_writable
+from .formats import write_foreign
+from .history import write_history
+from .npz import load, write_npz
+from .vtu import write_vtu
+
+__all__ = ["check_writable", "load", "save", "write_history"]
+
+_WRITERS = {".npz": write_npz, ".vtu": write_vtu}
+
+
+def save(result: Result, path: str | PathLike[str]) -> None:
+    """Write `result` to `path`; the suffix chooses the format.
+
+    Parameters
+    ----------
+    result : Result
+    path : str or path
+        ``.npz`` holds everything and is read back by `load`; ``.vtu`` is for ParaView and other VTK
+        programs (polygons with h, error, quality and more as cell data); ``.vtk``, ``.ply`` and
+        ``.obj`` are written through meshio (``pip install "clvoro[formats]"``), the latter two
+        without cell data.
+
+    Raises
+    ------
+    InputError
+        If the format is unknown or cannot hold polygons, or the file cannot be written. An existing
+        file is then as before.
+    """
+    if not isinstance(result, Result):
+        raise InputTypeError(
+            f"result is a {type(result).__name__}, expected a clvoro.Result; pass what "
+            "Adapter.run returned"
+        )
+    path = Path(path)
+    _WRITERS.get(path.suffix.lower(), write_foreign)(result, path)

@@ -1,0 +1,136 @@
+"""VTK's XML format for unstructured grids, for ParaView and its kin.
+
+The arrays follow the XML as raw bytes ("appended" data): exact, compact, and read in one go. Each
+is preceded by its length, or, compressed, by a table of its blocks.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import zlib
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ..errors import InputError
+from ..results import Result
+from .atomic import atomic_file
+
+_POLYGON = 7  # VTK_POLYGON
+_BLOCK = 1 << 20
+_TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
+
+
+def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
+    """Write the cells as polygons with their data; the settings go along in a comment.
+
+    Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides`, and the
+    vector `generator`, from the origin to the cell's generator.
+    """
+    diagram = result.diagram
+    if diagram.domain.dim != 2:
+        raise InputError(
+            f"cannot write {path}: the mesh has {diagram.domain.dim} dimensions, and only 2 are "
+            "written to .vtu; save it as .npz"
+        )
+    starts = diagram.cell_vertex_starts
+    n = len(diagram)
+    appended = _Appended(compress)
+    points = appended.add(None, in_space(diagram.vertices))
+    cells = [
+        appended.add("connectivity", diagram.cell_vertices),
+        appended.add("offsets", starts[1:]),
+        appended.add("types", np.full(n, _POLYGON, np.uint8)),
+    ]
+    data = [appended.add(name, values) for name, values in cell_data(result).items()]
+    compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
+    head = f"""<?xml version="1.0"?>
+<VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
+header_type="UInt64"{compressor}>
+{_comment("clvoro settings: " + json.dumps(result.settings, default=repr))}
+<UnstructuredGrid>
+<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
+<Points>
+{points}
+</Points>
+<Cells>
+{_lines(cells)}
+</Cells>
+<CellData Scalars="error" Vectors="generator">
+{_lines(data)}
+</CellData>
+</Piece>
+</UnstructuredGrid>
+<AppendedData encoding="raw">
+_"""
+    with atomic_file(path) as file:
+        file.write(head.encode())
+        for chunk in appended.chunks:
+            file.write(chunk)
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def cell_data(result: Result) -> dict[str, np.ndarray]:
+    """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
+    return {
+        "size": result.size,
+        "error": result.error,
+        "quality": result.quality,
+        "volume": result.diagram.volumes,
+        "sides": np.diff(result.diagram.cell_vertex_starts).astype(np.int32),
+        "generator": in_space(result.points),
+    }
+
+
+def in_space(points: np.ndarray) -> np.ndarray:
+    """Return points (n, 2) as (n, 3) with z = 0."""
+    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+
+
+class _Appended:
+    """The bytes after the XML, and where each array begins in them."""
+
+    def __init__(self, compress: bool) -> None:
+        self.chunks: list[bytes] = []
+        self.compress = compress
+        self._offset = 0
+
+    def add(self, name: str | None, array: np.ndarray) -> str:
+        """Append `array` and return the XML element that refers to it."""
+        data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("="), copy=False)
+        components = f' NumberOfComponents="{data.shape[1]}"' if data.ndim == 2 else ""
+        label = "" if name is None else f" Name={quoteattr(name)}"
+        kind = _TYPES[data.dtype.str[1:]]
+        element = (
+            f'<DataArray type="{kind}"{label}{components} format="appended" '
+            f'offset="{self._offset}"/>'
+        )
+        chunk = _packed(data.tobytes()) if self.compress else _measured(data.tobytes())
+        self.chunks.append(chunk)
+        self._offset += len(chunk)
+        return element
+
+
+def _measured(raw: bytes) -> bytes:
+    return struct.pack("=Q", len(raw)) + raw
+
+
+def _packed(raw: bytes) -> bytes:
+    """Compress `raw` in blocks: their number, their size, the last one's, each one's compressed."""
+    blocks = [raw[i : i + _BLOCK] for i in range(0, len(raw), _BLOCK)]
+    packed = [zlib.compress(block, 1) for block in blocks]
+    partial = len(raw) % _BLOCK  # 0 if the last block is a full one
+    table = struct.pack(f"={3 + len(packed)}Q", len(packed), _BLOCK, partial, *map(len, packed))
+    return table + b"".join(packed)
+
+
+def _comment(text: str) -> str:
+    # A field of type String would show up in ParaView, but meshio cannot read such a file.
+    return f"<!-- {text.replace('--', '- -')} -->"
+
+
+def _lines(elements: list[str]) -> str:
+    return "\n".join(elements)
