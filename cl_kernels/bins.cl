@@ -4,10 +4,10 @@
    only decides ranks within a bin, and the last pass sorts each bin by generator index: the result is deterministic. */
 
 /* Per generator i: keys[i] = its bin in grid 0, ranks[i] = its place in the bin. counts must be zero. */
-kernel void count_root(global const REAL *points, const FRAME frame, const int side, global int *keys,
+kernel void count_root(const int size, global const REAL *points, const FRAME frame, const int side, global int *keys,
                        global int *ranks, global int *counts)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const int key = bin_in_grid(points + DIM * i, frame, (int2)(0, side));
     keys[i] = key;
     ranks[i] = atomic_inc(counts + key);
@@ -25,9 +25,9 @@ inline int child_side(int count)
 }
 
 /* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins? */
-kernel void plan_children(global const int *counts, const int begin, global int *grid_flags, global int *child_bins)
+kernel void plan_children(const int size, global const int *counts, const int begin, global int *grid_flags, global int *child_bins)
 {
-    const int b = get_global_id(0);
+    WORK_ITEM(b);
     const int side = child_side(counts[begin + b]);
     grid_flags[b] = side > 0;
     child_bins[b] = DIM == 2 ? side * side : side * side * side;
@@ -36,10 +36,10 @@ kernel void plan_children(global const int *counts, const int begin, global int 
 /* Per bin b of the newest level: bins[b] = (first item, count). starts are the prefix sums of this level's counts. A
    bin below level 0 starts where its parent starts: `parents[b]` names its grid, whose first bin and first item are
    known. */
-kernel void place_bins(global const int *counts, global const int *starts, const int begin, global const int *bin_grid,
+kernel void place_bins(const int size, global const int *counts, global const int *starts, const int begin, global const int *bin_grid,
                        global const int2 *grid_shapes, global const int *grid_items, global int2 *bins)
 {
-    const int b = get_global_id(0);
+    WORK_ITEM(b);
     int start = starts[b];
     if (begin > 0) {
         const int g = bin_grid[begin + b];
@@ -49,11 +49,11 @@ kernel void place_bins(global const int *counts, global const int *starts, const
 }
 
 /* Per divided bin b: create grid g over its box, and note in each of the new bins which grid it belongs to. */
-kernel void make_grids(global int2 *bins, const int begin, const int next_begin, const int first_grid,
+kernel void make_grids(const int size, global int2 *bins, const int begin, const int next_begin, const int first_grid,
                        global const int *grid_ids, global const int *child_firsts, global int *bin_grid,
                        global FRAME *grid_frames, global int2 *grid_shapes, global int *grid_items)
 {
-    const int b = get_global_id(0);
+    WORK_ITEM(b);
     const int2 bin = bins[begin + b];
     const int side = child_side(bin.s1);
     if (side == 0)
@@ -90,10 +90,10 @@ kernel void make_grids(global int2 *bins, const int begin, const int next_begin,
 }
 
 /* Per generator i whose bin was divided: count it into its new bin. */
-kernel void count_children(global const REAL *points, global const int2 *bins, global const FRAME *grid_frames,
+kernel void count_children(const int size, global const REAL *points, global const int2 *bins, global const FRAME *grid_frames,
                            global const int2 *grid_shapes, global int *keys, global int *ranks, global int *counts)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const int g = -1 - bins[keys[i]].s0;
     if (g < 0)
         return;
@@ -103,16 +103,17 @@ kernel void count_children(global const REAL *points, global const int2 *bins, g
 }
 
 /* Per generator i: its place in the order of bins. */
-kernel void place_items(global const int *keys, global const int *ranks, global const int2 *bins, global int *items)
+kernel void place_items(const int size, global const int *keys, global const int *ranks, global const int2 *bins, global int *items)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     items[bins[keys[i]].s0 + ranks[i]] = i;
 }
 
 /* Per bin: sort its items by generator index (Shell's sort: a leaf holds a handful, but duplicates may pile up). */
-kernel void sort_bins(global const int2 *bins, global int *items)
+kernel void sort_bins(const int size, global const int2 *bins, global int *items)
 {
-    const int2 bin = bins[get_global_id(0)];
+    WORK_ITEM(b);
+    const int2 bin = bins[b];
     if (bin.s0 < 0)
         return;
     global int *list = items + bin.s0;
@@ -130,11 +131,11 @@ kernel void sort_bins(global const int2 *bins, global int *items)
 }
 
 /* Per place p: the generator's position, and the edge of the leaf that it lies in. */
-kernel void gather_items(global const int *items, global const REAL *points, global const int *keys,
+kernel void gather_items(const int size, global const int *items, global const REAL *points, global const int *keys,
                          global const int *bin_grid, global const FRAME *grid_frames, global REAL *binned,
                          global float *reach)
 {
-    const int p = get_global_id(0);
+    WORK_ITEM(p);
     const int i = items[p];
     for (int a = 0; a < DIM; ++a)
         binned[DIM * p + a] = points[DIM * i + a];

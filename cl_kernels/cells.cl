@@ -112,13 +112,13 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, 
    clipped first, and the search only has to confirm them.
 
    rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; row_counts[i] of them */
-kernel void clip_cells(global const REAL *binned, global const int *items, global const float *reach,
+kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int2 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
                        global const int *old_starts, global const int *old_neighbours, global int *rows,
                        global int *row_counts, global int *flags)
 {
-    const int p = get_global_id(0);
+    WORK_ITEM(p);
     const int i = items[p];
     const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -168,11 +168,11 @@ kernel void clip_cells(global const REAL *binned, global const int *items, globa
    cells see a face of no length that the other does not see; such a face is dropped, so that the graph is symmetric. If
    what it cuts off is more than rounding, generators are too close to tell apart (from far away, two an ulp apart have
    the same bisector), and that is flagged. */
-kernel void match_faces(global const int *rows, global const int *row_counts, global const REAL *points,
+kernel void match_faces(const int size, global const int *rows, global const int *row_counts, global const REAL *points,
                         const REAL4 box_lower, const REAL4 box_upper, global uint *keep, global int *counts,
                         global int *flags)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const int n = row_counts[i];
     uint word = 0;
     int count = 0;
@@ -217,13 +217,13 @@ kernel void match_faces(global const int *rows, global const int *row_counts, gl
    volumes (n,)              A_i
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
    covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area */
-kernel void measure_cells(global const int *rows, global const int *row_counts, global const uint *keep,
+kernel void measure_cells(const int size, global const int *rows, global const int *row_counts, global const uint *keep,
                           global const int *starts, global const REAL *points, const REAL4 box_lower,
                           const REAL4 box_upper, global int *neighbours, global REAL *face_measures,
                           global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
                           global REAL *covariances)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};

@@ -109,8 +109,7 @@ kernel void list_members(
         if (i == NONE) continue;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (j == i || mate[j] != NONE || choice[j] != i) continue;
-            if (!is_first(i, k, starts, columns)) continue;
+            if (choice[j] != i || !is_first(i, k, starts, columns)) continue;
             if (fill) members[at] = j;
             ++at;
             bound += starts[j + 1] - starts[j];

@@ -6,24 +6,24 @@
    density  rho = h^-d
    weight   V rho, the number of generators that the cell should hold
    excess   r = log(V / h^d) = d log(L / h): the cell is too large by this share of its volume */
-kernel void evaluate_density(global const REAL *volumes, global const REAL *h, global REAL *density,
+kernel void evaluate_density(const int size, global const REAL *volumes, global const REAL *h, global REAL *density,
                              global REAL *weight, global REAL *excess, global REAL *log_h)
 {
-    const int i = get_global_id(0);
-    const REAL size = h[i];
-    const REAL rho = 1 / (DIM == 2 ? size * size : size * size * size);
+    WORK_ITEM(i);
+    const REAL target = h[i];
+    const REAL rho = 1 / (DIM == 2 ? target * target : target * target * target);
     density[i] = rho;
     weight[i] = volumes[i] * rho;
     excess[i] = log(volumes[i] * rho);
-    log_h[i] = log(size);
+    log_h[i] = log(target);
 }
 
 /* Per generator i: grad log h by least squares over the neighbours, weighted by 1 / distance^2. One evaluation of h per
    generator serves all that needs its gradient, and the fit averages over kinks of h at the scale of the cells. */
-kernel void fit_gradient(global const int *starts, global const int *neighbours, global const REAL *points,
+kernel void fit_gradient(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
                          global const REAL *log_h, global REAL *gradient)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL m[DIM][DIM], b[DIM], g[DIM];
     for (int p = 0; p < DIM; ++p) {
         b[p] = g[p] = 0;
@@ -77,10 +77,10 @@ kernel void fit_gradient(global const int *starts, global const int *neighbours,
    diagrams have cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell that is
    c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
    nothing. */
-kernel void weight_offsets(global const REAL *offsets, global const REAL *covariances, global const REAL *gradient,
+kernel void weight_offsets(const int size, global const REAL *offsets, global const REAL *covariances, global const REAL *gradient,
                            global REAL *lloyd)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL g[DIM];
     for (int a = 0; a < DIM; ++a)
         g[a] = -(DIM + 2) * gradient[DIM * i + a];
@@ -97,15 +97,16 @@ kernel void weight_offsets(global const REAL *offsets, global const REAL *covari
 }
 
 /* Per generator i: the product V rho r, to be summed. */
-kernel void weigh_excess(global const REAL *weight, global const REAL *excess, global REAL *weighed)
+kernel void weigh_excess(const int size, global const REAL *weight, global const REAL *excess, global REAL *weighed)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     weighed[i] = weight[i] * excess[i];
 }
 
 /* Per generator i: r -= mean r, weighted by V rho; summaries hold the sums of V rho r and of V rho. A wrong count of
    generators shows as the mean: strain cannot mend it, insertion and deletion can. */
-kernel void remove_mean(global const REAL *summaries, global REAL *excess)
+kernel void remove_mean(const int size, global const REAL *summaries, global REAL *excess)
 {
-    excess[get_global_id(0)] -= summaries[0] / summaries[4];
+    WORK_ITEM(i);
+    excess[i] -= summaries[0] / summaries[4];
 }

@@ -6,11 +6,11 @@
    energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
    quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
-kernel void evaluate_metric(global const REAL *volumes, global const int *starts, global const REAL *face_measures,
+kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts, global const REAL *face_measures,
                             global const REAL *offsets, global const REAL *covariances, global const REAL *h,
                             global REAL *error, global REAL *quality, global REAL *energy)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL volume = volumes[i];
     const int begin = starts[i], end = starts[i + 1];
     REAL surface = 0;
@@ -30,8 +30,8 @@ kernel void evaluate_metric(global const REAL *volumes, global const int *starts
         diagonal += DIM - a;
     }
     energy[i] = volume * square;
-    const REAL size = h[i];
-    error[i] = (length - size) / fmin(length, size);
+    const REAL target = h[i];
+    error[i] = (length - target) / fmin(length, target);
 }
 
 /* A well-mixed word per neighbour; their sum does not depend on the order of the faces. */
@@ -45,10 +45,10 @@ inline ulong mixed(ulong v)
 
 /* Per generator i: has its set of neighbours changed since the signature was taken? signatures[i] is renewed, and
    ever[i] remembers. Walls count as neighbours. labels name generators for good, whatever their present index. */
-kernel void compare_neighbours(global const int *starts, global const int *neighbours, global const int *labels,
+kernel void compare_neighbours(const int size, global const int *starts, global const int *neighbours, global const int *labels,
                                const int first, global ulong *signatures, global REAL *changed, global REAL *ever)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     ulong signature = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
@@ -61,8 +61,8 @@ kernel void compare_neighbours(global const int *starts, global const int *neigh
 }
 
 /* Per generator i: h times a factor: the size on a coarser level. */
-kernel void scale_sizes(const REAL factor, global REAL *h)
+kernel void scale_sizes(const int size, const REAL factor, global REAL *h)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     h[i] *= factor;
 }

@@ -4,12 +4,12 @@
    u = grad psi, with
    grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i),
    which is exact for linear psi in a closed cell; walls carry no flux. speed[i] = |u| / h. */
-kernel void follow_potential(global const int *starts, global const int *neighbours,
+kernel void follow_potential(const int size, global const int *starts, global const int *neighbours,
                               global const REAL *face_measures, global const REAL *face_centroids,
                               global const REAL *volumes, global const REAL *points, global const REAL *psi,
                               global const REAL *h, global REAL *u, global REAL *speed)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL sum[DIM] = {0};
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
@@ -35,10 +35,10 @@ kernel void follow_potential(global const int *starts, global const int *neighbo
 
 /* Per generator i: correction = alpha u with one alpha for all, alpha = min(limit, k / max_i(|u_i| / h_i)) (the paper's
    3.5); summaries[4 slot + 3] is that maximum. */
-kernel void relax_globally(global const REAL *summaries, const int slot, const REAL limit, const REAL k, global REAL *u,
+kernel void relax_globally(const int size, global const REAL *summaries, const int slot, const REAL limit, const REAL k, global REAL *u,
                            global REAL *speed)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL fastest = summaries[4 * slot + 3];
     const REAL alpha = fastest * limit > k ? k / fastest : limit;
     for (int a = 0; a < DIM; ++a)
@@ -47,9 +47,9 @@ kernel void relax_globally(global const REAL *summaries, const int slot, const R
 }
 
 /* Per generator i: length of a displacement over h. */
-kernel void measure_displacement(global const REAL *u, global const REAL *h, global REAL *speed)
+kernel void measure_displacement(const int size, global const REAL *u, global const REAL *h, global REAL *speed)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL u2 = 0;
     for (int a = 0; a < DIM; ++a)
         u2 += u[DIM * i + a] * u[DIM * i + a];
@@ -58,11 +58,11 @@ kernel void measure_displacement(global const REAL *u, global const REAL *h, glo
 
 /* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the box: what
    would leave is reflected, so that no two generators meet on a wall. velocity is the displacement that came of it. */
-kernel void move_generators(global const REAL *lloyd, const REAL a, global const REAL *correction, const REAL b,
+kernel void move_generators(const int size, global const REAL *lloyd, const REAL a, global const REAL *correction, const REAL b,
                             global const REAL *h, const REAL clip, const REAL4 box_lower, const REAL4 box_upper,
                             global REAL *points, global REAL *velocity)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
     const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
     REAL d[DIM];
@@ -86,10 +86,11 @@ kernel void move_generators(global const REAL *lloyd, const REAL a, global const
     }
 }
 
-/* Per generator i: lloyd += share * velocity. */
-kernel void add_momentum(global const REAL *velocity, const REAL share, global REAL *lloyd)
+/* Per generator i: lloyd = factor * lloyd + share * velocity. */
+kernel void add_momentum(const int size, const REAL factor, global const REAL *velocity, const REAL share,
+                         global REAL *lloyd)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     for (int a = 0; a < DIM; ++a)
-        lloyd[DIM * i + a] += share * velocity[DIM * i + a];
+        lloyd[DIM * i + a] = factor * lloyd[DIM * i + a] + share * velocity[DIM * i + a];
 }

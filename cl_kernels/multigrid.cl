@@ -4,6 +4,7 @@
    Smoothing is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], as two damped pairwise-Jacobi steps. */
 #include "common/real.h"
 #include "common/blocks.h"
+#include "common/rows.h"
 
 /* b = r, x = omega B^-1 b: the first step from a start of zero. On the finest level b is rounded from `r`. */
 kernel void first_rounded(
@@ -31,12 +32,7 @@ kernel void defect(
     global const REAL *x, global REAL *t)
 {
     const int i = get_global_id(0);
-    if (i >= n) return;
-    const REAL xi = x[i];
-    const int end = starts[i + 1];
-    REAL sum = 0;
-    for (int k = starts[i]; k < end; ++k) sum += weights[k] * (xi - x[columns[k]]);
-    t[i] = b[i] - sum;
+    if (i < n) t[i] = b[i] - row_difference(i, n, starts, columns, weights, x);
 }
 
 /* x += omega B^-1 t. */

@@ -6,6 +6,7 @@
 #include "common/real.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
+#include "common/rows.h"
 
 /* Weights, diagonal and its inverse (0 where there is no neighbour). The two cells of a face have measured it each for
    itself, with roundings of their own: both take the mean of the two, so that A is symmetric to the last bit. A face that
@@ -52,12 +53,9 @@ kernel void apply(
     local REAL scratch[GROUP_SIZE];
     Sum product = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
-        const REAL xi = x[i];
-        REAL yi = 0;
-        const int end = starts[i + 1];
-        for (int k = starts[i]; k < end; ++k) yi += weights[k] * (xi - x[columns[k]]);
+        const REAL yi = row_difference(i, n, starts, columns, weights, x);
         y[i] = yi;
-        sum_add(&product, xi * yi);
+        sum_add(&product, x[i] * yi);
     }
     const REAL put = group_sum(product.value, scratch);
     if (get_local_id(0) == 0) partial[q * get_num_groups(0) + get_group_id(0)] = put;

@@ -3,25 +3,27 @@
 
 /* Exclusive prefix sums in three passes. One work-item stands for one contiguous chunk of the array. */
 
-inline int chunk_begin(int n, int w)
+inline int chunk_begin(int n, int w, int width)
 {
-    return (int)(((long)n * w) / get_global_size(0));
+    return (int)(((long)n * w) / width);
 }
 
 /* sums[w] = sum of chunk w. */
-kernel void chunk_sums(global const int *values, const int first, global int *sums, const int n)
+kernel void chunk_sums(const int size, global const int *values, const int first, global int *sums, const int n)
 {
-    const int w = get_global_id(0);
-    const int end = chunk_begin(n, w + 1);
+    WORK_ITEM(w);
+    const int end = chunk_begin(n, w + 1, size);
     int sum = 0;
-    for (int i = chunk_begin(n, w); i < end; ++i)
+    for (int i = chunk_begin(n, w, size); i < end; ++i)
         sum += values[first + i];
     sums[w] = sum;
 }
 
 /* One work-item: sums becomes its own exclusive prefix sum, with the total at sums[width]. */
-kernel void scan_sums(global int *sums, const int width)
+kernel void scan_sums(const int size, global int *sums, const int width)
 {
+    WORK_ITEM(only);
+    (void)only;
     int total = 0;
     for (int w = 0; w < width; ++w) {
         const int sum = sums[w];
@@ -32,18 +34,18 @@ kernel void scan_sums(global int *sums, const int width)
 }
 
 /* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. */
-kernel void scan_chunks(global const int *values, const int first, global const int *sums, global int *out,
-                        const int n)
+kernel void scan_chunks(const int size, global const int *values, const int first, global const int *sums,
+                        global int *out, const int n)
 {
-    const int w = get_global_id(0);
-    const int end = chunk_begin(n, w + 1);
+    WORK_ITEM(w);
+    const int end = chunk_begin(n, w + 1, size);
     int total = sums[w];
-    for (int i = chunk_begin(n, w); i < end; ++i) {
+    for (int i = chunk_begin(n, w, size); i < end; ++i) {
         const int value = values[first + i];
         out[i] = total;
         total += value;
     }
-    if (end == n && w == get_global_size(0) - 1)
+    if (end == n && w == size - 1)
         out[n] = total;
 }
 
@@ -93,8 +95,11 @@ kernel void summarise_blocks(global const REAL *values, const int n, global summ
 }
 
 /* One work-item: out[4 slot ...] = sum, sum of magnitudes, least, largest. */
-kernel void combine_blocks(global const summary_t *partials, const int groups, const int slot, global REAL *out)
+kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int slot,
+                           global REAL *out)
 {
+    WORK_ITEM(only);
+    (void)only;
     summary_t all = partials[0];
     for (int g = 1; g < groups; ++g)
         merge_summary(&all, partials[g]);
@@ -105,9 +110,9 @@ kernel void combine_blocks(global const summary_t *partials, const int groups, c
 }
 
 /* Row p of `out` is row items[p] of `rows`; a row is `words` 32-bit words, whatever they mean. */
-kernel void gather_rows(global const int *items, global const uint *rows, const int words, global uint *out)
+kernel void gather_rows(const int size, global const int *items, global const uint *rows, const int words, global uint *out)
 {
-    const int p = get_global_id(0);
+    WORK_ITEM(p);
     const int i = items[p];
     for (int w = 0; w < words; ++w)
         out[words * p + w] = rows[words * i + w];

@@ -19,13 +19,13 @@ inline REAL squared_distance(global const REAL *points, int i, int j)
 
 /* Per generator i: own[i] = dr_i/dx_i, weights w_ij, and the inverse of the diagonal of J W J^T + eps, W = h^2, which
    preconditions the solve. */
-kernel void assemble_derivative(global const int *starts, global const int *neighbours,
+kernel void assemble_derivative(const int size, global const int *starts, global const int *neighbours,
                                 global const REAL *face_measures, global const REAL *face_centroids,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
-                                global const REAL *h, const REAL eps, global REAL *weights, global REAL *own,
+                                global const REAL *h, global const REAL *eps, global REAL *weights, global REAL *own,
                                 global REAL *inverse_diagonal)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL self[DIM];
     for (int a = 0; a < DIM; ++a)
         self[a] = 0;
@@ -54,15 +54,15 @@ kernel void assemble_derivative(global const int *starts, global const int *neig
         own[DIM * i + a] = s;
         square += s * s;
     }
-    inverse_diagonal[i] = 1 / (diagonal + square * h[i] * h[i] + eps);
+    inverse_diagonal[i] = 1 / (diagonal + square * h[i] * h[i] + eps[i]);
 }
 
 /* Per generator i: u = W J^T y, u_i = h_i^2 (own_i y_i - sum_j w_ij m_ij y_j / V_j). */
-kernel void apply_transpose(global const int *starts, global const int *neighbours, global const REAL *weights,
+kernel void apply_transpose(const int size, global const int *starts, global const int *neighbours, global const REAL *weights,
                             global const REAL *face_centroids, global const REAL *volumes, global const REAL *own,
                             global const REAL *h, global const REAL *y, global REAL *u)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL sum[DIM];
     for (int a = 0; a < DIM; ++a)
         sum[a] = own[DIM * i + a] * y[i];
@@ -78,13 +78,13 @@ kernel void apply_transpose(global const int *starts, global const int *neighbou
         u[DIM * i + a] = h[i] * h[i] * sum[a];
 }
 
-/* Per generator i: out = J u + eps y + r. */
-kernel void apply_derivative(global const int *starts, global const int *neighbours, global const REAL *weights,
+/* Per generator i: out = J u + eps y. */
+kernel void apply_derivative(const int size, global const int *starts, global const int *neighbours, global const REAL *weights,
                              global const REAL *face_centroids, global const REAL *volumes,
-                             global const REAL *points, global const REAL *own, global const REAL *u, const REAL eps,
-                             global const REAL *y, const REAL b, global const REAL *r, global REAL *out)
+                             global const REAL *points, global const REAL *own, global const REAL *u,
+                             global const REAL *eps, global const REAL *y, global REAL *out)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL sum = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
@@ -98,13 +98,30 @@ kernel void apply_derivative(global const int *starts, global const int *neighbo
     sum /= volumes[i];
     for (int a = 0; a < DIM; ++a)
         sum += own[DIM * i + a] * u[DIM * i + a];
-    out[i] = sum + eps * y[i] + b * r[i];
+    out[i] = sum + eps[i] * y[i];
+}
+
+/* Per generator i: eps[i] = penalty / (1 + (r / bound)^2): cells that are far off give way less than those that are
+   nearly right, which caps the largest error at little cost. bound = 0: eps = penalty everywhere. */
+kernel void set_penalty(const int size, global const REAL *excess, const REAL penalty, const REAL bound,
+                        global REAL *eps)
+{
+    WORK_ITEM(i);
+    const REAL r = bound > 0 ? excess[i] / bound : 0;
+    eps[i] = penalty / (1 + r * r);
 }
 
 /* Per generator i: what the projection takes from the displacement, correction = -W J^T y. */
-kernel void negate(global REAL *u)
+kernel void negate(const int size, global REAL *u)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     for (int a = 0; a < DIM; ++a)
         u[DIM * i + a] = -u[DIM * i + a];
+}
+
+/* Per generator i: b += r. */
+kernel void add_excess(const int size, global const REAL *excess, global REAL *b)
+{
+    WORK_ITEM(i);
+    b[i] += excess[i];
 }

@@ -12,10 +12,10 @@ inline bool has_middle(int i, int j, REAL measure, REAL volume)
 }
 
 /* Per generator i: how many new generators it brings. */
-kernel void count_children(global const int *starts, global const int *neighbours, global const REAL *face_measures,
+kernel void count_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                            global const REAL *volumes, global int *counts)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     int count = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
@@ -26,11 +26,11 @@ kernel void count_children(global const int *starts, global const int *neighbour
 
 /* Per generator i: write itself to row i of `finer` and its new generators behind row n. firsts are the prefix sums of
    the counts; h is the size on the new level. */
-kernel void place_children(global const int *starts, global const int *neighbours, global const REAL *face_measures,
+kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                            global const REAL *volumes, global const REAL *points, global const REAL *h, const int n,
                            const REAL4 box_lower, const REAL4 box_upper, global const int *firsts, global REAL *finer)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
     const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
     for (int a = 0; a < DIM; ++a)

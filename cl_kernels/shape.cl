@@ -8,10 +8,10 @@
    its faces outwards with the pressure omega / A. */
 
 /* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. */
-kernel void load_cells(global const int *starts, global const REAL *face_measures, global const REAL *volumes,
+kernel void load_cells(const int size, global const int *starts, global const REAL *face_measures, global const REAL *volumes,
                        global const REAL *quality, const REAL emphasis, global REAL *tension, global REAL *pressure)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     REAL perimeter = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k)
         perimeter += face_measures[k];
@@ -36,12 +36,12 @@ inline REAL2 face_tangent(int i, int label, global const REAL *points)
 
    The corner v between the faces to j and q obeys (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it moves
    along the wall. Its pull is the sum of its faces' tensions along them, each that of the two cells beside the face. */
-kernel void descend_shape(global const int *starts, global const int *neighbours, global const REAL *face_measures,
+kernel void descend_shape(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                           global const REAL *face_centroids, global const REAL *points, global const REAL *tension,
                           global const REAL *pressure, global const REAL *h, const REAL rate, const REAL longest,
                           global REAL *lloyd)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL2 x = (REAL2)(points[2 * i], points[2 * i + 1]);
     const int begin = starts[i], end = starts[i + 1];
     const REAL wi = tension[i];

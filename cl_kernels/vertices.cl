@@ -13,10 +13,10 @@ inline int find_face(global const int *starts, global const int *neighbours, int
 }
 
 /* Per generator i: owners[c] of each of its corners. */
-kernel void find_owners(global const int *starts, global const int *neighbours, global int *owners,
+kernel void find_owners(const int size, global const int *starts, global const int *neighbours, global int *owners,
                         global int *is_owner)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const int begin = starts[i], end = starts[i + 1];
     for (int c = begin; c < end; ++c) {
         int owner = c;
@@ -54,11 +54,11 @@ kernel void find_owners(global const int *starts, global const int *neighbours, 
 
 /* Per generator i: cell_vertices[c] = number of the vertex at corner c; the owner writes its position, relative to the
    box's frame. ids are the prefix sums of is_owner. */
-kernel void place_vertices(global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+kernel void place_vertices(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                            global const int *starts, global const int *neighbours, global const int *owners,
                            global const int *ids, global int *cell_vertices, global REAL *vertices)
 {
-    const int i = get_global_id(0);
+    WORK_ITEM(i);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};

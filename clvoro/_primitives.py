@@ -33,9 +33,9 @@ class Scan:
         """
         k, engine = self._kernels, self.engine
         first, n = np.int32(first), np.int32(n)
-        engine.run(k.chunk_sums, self.width, values, first, self._sums, n)
-        engine.run(k.scan_sums, 1, self._sums, np.int32(self.width))
-        engine.run(k.scan_chunks, self.width, values, first, self._sums, out, n)
+        engine.run_each(k.chunk_sums, self.width, values, first, self._sums, n, group=1)
+        engine.run_each(k.scan_sums, 1, self._sums, np.int32(self.width), group=1)
+        engine.run_each(k.scan_chunks, self.width, values, first, self._sums, out, n, group=1)
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,9 @@ class Summaries:
         """Summarise the first `n` of `array` into the slot `name`."""
         k, engine = self._kernels, self.engine
         engine.run_blocks(k.summarise_blocks, array, np.int32(n), self._partials)
-        engine.run(
+        engine.run_each(
             k.combine_blocks, 1, self._partials, np.int32(engine.groups),
-            np.int32(self.slots[name]), self.values,
+            np.int32(self.slots[name]), self.values, group=1,
         )  # fmt: skip
 
     def read(self) -> dict[str, Summary]:
@@ -96,5 +96,5 @@ class Gather:
         shape = (items.shape[0], *array.shape[1:])
         out = self.engine.empty(shape, array.dtype)
         words = int(np.prod(array.shape[1:], dtype=int)) * array.dtype.itemsize // 4
-        self.engine.run(self._kernel, shape[0], items, array, np.int32(words), out)
+        self.engine.run_each(self._kernel, shape[0], items, array, np.int32(words), out)
         return out

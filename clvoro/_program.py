@@ -91,12 +91,16 @@ class Engine:
     group_size: int = field(init=False)
     """Work-items per group of such a kernel: 1 on a CPU (a plain loop per core), 128 on a GPU."""
 
+    item_group: int = field(init=False)
+    """Work-items per group of a kernel that does one item each."""
+
     def __post_init__(self) -> None:
         device = self.queue.device
         cpu = bool(device.type & cl.device_type.CPU)
         units = device.max_compute_units
         object.__setattr__(self, "groups", min(512, units * (4 if cpu else 8)))
         object.__setattr__(self, "group_size", 1 if cpu else 128)
+        object.__setattr__(self, "item_group", 64)
 
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
@@ -107,10 +111,24 @@ class Engine:
         program = build_program(self.ctx, f"{stage}.cl", full, prelude)
         return SimpleNamespace(**{k.function_name: k for k in program.all_kernels()})
 
-    def run(self, kernel: cl.Kernel, size: int, *args: object) -> cl.Event:
-        """Enqueue `kernel` over `size` work-items; arrays pass as their buffers."""
+    def run(
+        self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
+    ) -> cl.Event:
+        """Enqueue `kernel` over at least `size` work-items; arrays pass as their buffers.
+
+        The number is rounded up to whole groups of `group` (by default the device's own choice of one fixed size), so
+        the kernel must leave out what lies beyond.
+        """
+        group = self.item_group if group is None else group
         kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
-        return cl.enqueue_nd_range_kernel(self.queue, kernel, (max(int(size), 1),), None)
+        whole = -(-max(int(size), 1) // group) * group
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, (whole,), (group,))
+
+    def run_each(
+        self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
+    ) -> cl.Event:
+        """Enqueue `kernel` over `size` work-items; `size` is its first argument (see WORK_ITEM in common/real.h)."""
+        return self.run(kernel, size, np.int32(size), *args, group=group)
 
     def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel`: `groups` work-groups of `group_size` (see common/blocks.h)."""

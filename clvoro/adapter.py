@@ -1,10 +1,8 @@
-"""The loop of the paper's Figure 1."""
+"""The entry: checks what the user gives, and runs the loop."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -15,15 +13,18 @@ from ._program import Engine
 from .domain import Box
 from .errors import InputError, InputTypeError
 from .fetch import fetch_diagram
+from .loop import Loop
 from .mesh import Mesh, Stages, check_memory
-from .methods import METHODS, Method, Relaxation, make_method
-from .results import HISTORY_DTYPE, Diagram, Displacements, Result
+from .methods import PUBLISHED, Relaxation, make_method
+from .plans import EFFORTS, Action, auto_levels, plan_adaptive, plan_steps
+from .results import Diagram, Result
 from .sizing import Sizing, as_field
 from .start import count_cells, sample_density, sample_uniform
 
+METHODS = ("adaptive", "exact", *PUBLISHED)
 STARTS = ("density", "uniform")
-WINDOW = 10
-"""Steps over which error and quality are watched for progress."""
+STEPS = 100
+"""Steps of a method that repeats one kind of step, unless the caller says otherwise."""
 
 
 class Adapter:
@@ -54,6 +55,8 @@ class Adapter:
         self._stages: dict[int, Stages] = {}
 
     def _stages_for(self, domain: Box) -> Stages:
+        if not isinstance(domain, Box):
+            raise InputTypeError(f"domain is a {type(domain).__name__}, expected a clvoro.Box")
         if domain.dim not in self._stages:
             engine = Engine(self.ctx, self.queue, domain.dim, self.dtype)
             self._stages[domain.dim] = Stages(engine)
@@ -78,14 +81,14 @@ class Adapter:
         InputError
             If the points are not as expected, or too close together for the precision.
         """
+        stages = self._stages_for(domain)
         host = check_points(points, domain)
-        stages, n = self._stages_for(domain), len(host)
-        engine = stages.engine
+        n, engine = len(host), stages.engine
         origin, scale = domain.frame
         binned = stages.bins.build(engine.upload((host - origin) / scale), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         binned = stages.bins.build(sorted_points, n)
-        with _Naming(host, origin, scale, self.dtype):
+        with _Naming(host, domain, self.dtype):
             t = stages.cells.tessellate(domain, sorted_points, n, binned)
         return fetch_diagram(engine, domain, t, labels)
 
@@ -94,17 +97,21 @@ class Adapter:
         domain: Box,
         size: object,
         points: np.ndarray | None = None,
-        method: str = "coupled",
+        method: str = "adaptive",
         n_cells: int | None = None,
         start: str = "density",
-        max_steps: int = 100,
+        max_steps: int | None = None,
         tol: float = 1e-3,
         alpha: float | None = None,
         k: float = 0.5,
         seed: int = 0,
         callback: Callable[[np.void], object] | None = None,
+        *,
+        effort: str = "default",
+        levels: int | str = "auto",
+        error_target: float | None = None,
     ) -> Result:
-        """Adapt generators until their cells have the target size.
+        """Adapt generators until their cells have the target size and a good shape.
 
         Parameters
         ----------
@@ -114,24 +121,36 @@ class Adapter:
             (n,), and is evaluated on the host: each step then moves all points there and back.
         points : (n, d) array, optional
             Generators to start from.
-        method : "lloyd", "poisson", "coupled", "weighted-lloyd" or "weighted"
-            See `clvoro.methods`.
+        method : str
+            "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the
+            right size; "exact" lets every cell take the size asked for, to about 1e-4. The others repeat one kind of
+            step: "lloyd", "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density
+            h^-d (see `clvoro.methods`).
         n_cells : int, optional
-            Number of generators; by default the integral of h^-d over the domain.
+            Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" then scale
+            the size field by one factor so that the count fits, and report it as ``Result.size_factor``.
         start : "density" or "uniform"
             Random generators with density h^-d, or uniform (the paper's).
-        max_steps : int
+        max_steps : int, optional
+            Most steps, over all levels. By default 100, or what the plan of "adaptive" and "exact" takes.
         tol : float
             Stop when mean error and mean quality have improved by less than this share over ten steps;
-            0 takes all `max_steps`.
-        alpha : float, optional
-            Largest relaxation coefficient of the paper's (3.4); by default d.
-        k : float
-            Bound of the paper's (3.5): displacement over h of the fastest generator.
+            0 takes all steps. "adaptive" and "exact" end with their plan.
+        alpha, k : float
+            Of the paper's (3.4), (3.5): largest relaxation coefficient (by default d), and bound of the
+            displacement over h.
         seed : int
             Of the random start.
         callback : callable, optional
             Called with each new row of the history; the run stops when it returns True.
+        effort : "fast", "default" or "best"
+            Work that "adaptive" and "exact" take.
+        levels : int or "auto"
+            Coarser levels that "adaptive" and "exact" begin with: 2^levels h. From the caller's `points` it is the
+            number of refinements that lead from them to the finest level.
+        error_target : float, optional
+            Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0017 (.0035 for "fast", .0037 for
+            "best"). The larger, the better the cells' shape.
 
         Returns
         -------
@@ -146,154 +165,94 @@ class Adapter:
         MemoryLimitError
             If the run would need more memory than the device has.
         """
-        if not isinstance(domain, Box):
-            raise InputTypeError(f"domain is a {type(domain).__name__}, expected a clvoro.Box")
-        if method not in METHODS:
-            raise InputError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
-        max_steps = check_integer("max_steps", max_steps, 0)
+        stages = self._stages_for(domain)
+        engine = stages.engine
+        check_choice("method", method, METHODS)
+        check_choice("start", start, STARTS)
+        check_choice("effort", effort, tuple(EFFORTS))
+        seed = check_integer("seed", seed, 0)
         tol = check_number("tol", tol, least=0)
         relaxation = Relaxation(
             None if alpha is None else check_number("alpha", alpha, above=0),
             check_number("k", k, above=0),
         )
-        stages = self._stages_for(domain)
-        sizing = Sizing(stages.engine, domain, as_field(size))
-        if points is None:
-            host = self._start(domain, sizing, n_cells, start, check_integer("seed", seed, 0))
+        if error_target is not None:
+            error_target = check_number("error_target", error_target, above=0)
+        if max_steps is not None:
+            max_steps = check_integer("max_steps", max_steps, 0)
+        if n_cells is not None:
+            n_cells = check_integer("n_cells", n_cells, 1)
+        planned = method in ("adaptive", "exact")
+        host = None if points is None else check_points(points, domain)
+
+        sizing = Sizing(engine, domain, as_field(size))
+        asked = count_cells(sizing, domain) if host is None or planned else float(len(host))
+        target = n_cells if n_cells is not None else max(1, round(asked))
+        check_memory(engine, max(target, 0 if host is None else len(host)))
+        factor = (asked / n_cells) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
+
+        if not planned:
+            level_count = 0
+        elif levels != "auto":
+            level_count = check_integer("levels", levels, 0)
+        elif host is None:
+            level_count = auto_levels(target, domain.dim)
         else:
-            host = check_points(points, domain)
-        settings = {
-            "method": method, "n_cells": len(host), "start": start if points is None else "points",
-            "max_steps": max_steps, "tol": tol, "alpha": alpha, "k": k, "seed": seed,
-            "dtype": self.dtype.name,
-        }  # fmt: skip
+            level_count = max(0, round(np.log(target / len(host)) / np.log(2**domain.dim)))
+        if host is None:
+            n = max(1, round(target / 2 ** (domain.dim * level_count)))
+            if start == "uniform":
+                host = sample_uniform(domain, n, seed, self.dtype)
+            else:
+                host = sample_density(sizing, domain, n, seed, self.dtype)
+        plan: list[Action]
+        if planned:
+            plan = plan_adaptive(
+                EFFORTS[effort], level_count, method == "exact", error_target, points is not None
+            )
+        else:
+            plan = plan_steps(
+                make_method(method, relaxation), STEPS if max_steps is None else max_steps
+            )
         origin, scale = domain.frame
-        with _Naming(host, origin, scale, self.dtype):
-            mesh = Mesh(stages, domain, sizing, stages.engine.upload((host - origin) / scale))
-        loop = _Loop(mesh, make_method(method, relaxation), max_steps, tol, callback)
-        return loop.run(settings)
-
-    def _start(
-        self, domain: Box, sizing: Sizing, n_cells: int | None, start: str, seed: int
-    ) -> np.ndarray:
-        if start not in STARTS:
-            raise InputError(f"start is {start!r}, expected one of {', '.join(STARTS)}")
-        if n_cells is None:
-            n = max(1, round(count_cells(sizing, domain)))
-        else:
-            n = check_integer("n_cells", n_cells, 1)
-        check_memory(sizing.engine, n)
-        if start == "uniform":
-            return sample_uniform(domain, n, seed)
-        return sample_density(sizing, domain, n, seed, self.dtype)
+        with _Naming(host, domain, self.dtype):
+            mesh = Mesh(
+                stages, domain, sizing, engine.upload((host - origin) / scale),
+                coarsening=factor * 2.0**level_count,
+            )  # fmt: skip
+        settings = {
+            "method": method, "n_cells": n_cells, "start": "points" if points is not None else start,
+            "max_steps": max_steps, "tol": tol, "alpha": alpha, "k": k, "seed": seed,
+            "dtype": self.dtype.name, "effort": effort, "levels": level_count,
+            "error_target": error_target,
+        }  # fmt: skip
+        loop = Loop(mesh, plan, level_count, max_steps, 0.0 if planned else tol, callback)
+        return loop.run(n_cells if planned else None, factor, settings)
 
 
-class _Loop:
-    """One level's run: step, record, decide whether to go on."""
-
-    def __init__(
-        self,
-        mesh: Mesh,
-        method: Method,
-        max_steps: int,
-        tol: float,
-        callback: Callable[[np.void], object] | None,
-    ) -> None:
-        self.mesh, self.method = mesh, method
-        self.max_steps, self.tol, self.callback = max_steps, tol, callback
-        self.rows: list[np.ndarray] = []
-        self.began = time.perf_counter()
-
-    def run(self, settings: dict[str, Any]) -> Result:
-        mesh, method = self.mesh, self.method
-        initial, converged, reason = None, False, "max_steps reached"
-        stop = self.record(0, None)
-        try:
-            for step in range(1, self.max_steps + 1):
-                if stop:
-                    break
-                solution = method.displace(mesh)
-                if initial is None:
-                    initial = self.displacements()
-                method.move(mesh)
-                mesh.update()
-                stop = self.record(step, solution)
-                if not stop and self.stalled():
-                    converged, reason = True, "error and quality no longer improve"
-                    break
-            if stop:
-                reason = "stopped by the callback"
-        except KeyboardInterrupt:
-            reason = "interrupted"
-            mesh.update()
-        method.displace(mesh)
-        final = self.displacements()
-        return Result(
-            points=(diagram := mesh.diagram()).points,
-            diagram=diagram,
-            size=mesh.values(mesh.h, mesh.domain.frame[1]),
-            error=mesh.values(mesh.error),
-            quality=mesh.values(mesh.quality),
-            history=np.concatenate(self.rows),
-            converged=converged,
-            stop_reason=reason,
-            initial=initial,
-            final=final,
-            settings=settings,
-        )
-
-    def record(self, step: int, solution: Any) -> bool:
-        """Append a row of the history; True if the callback wants to stop."""
-        mesh = self.mesh
-        s, n = mesh.assess(), mesh.n
-        mesh.sizing.check(mesh.points, mesh.h)
-        row = np.zeros(1, HISTORY_DTYPE)
-        row["step"], row["cells"] = step, n
-        row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
-        row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
-        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
-        row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever"].sum / n
-        if solution is not None:
-            row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n
-            row["iterations"], row["residual"] = solution.iterations, solution.residual
-        row["seconds"] = time.perf_counter() - self.began
-        self.rows.append(row)
-        return bool(self.callback is not None and self.callback(row[0]))
-
-    def stalled(self) -> bool:
-        """Tell whether neither mean error nor mean quality has improved by `tol` over the last steps."""
-        if self.tol == 0 or len(self.rows) <= 2 * WINDOW:
-            return False
-        history = np.concatenate(self.rows)
-        old, new = history[-2 * WINDOW : -WINDOW], history[-WINDOW:]
-        better_error = 1 - new["mean_error"].mean() / max(old["mean_error"].mean(), 1e-300)
-        better_quality = new["mean_quality"].mean() / old["mean_quality"].mean() - 1
-        return bool(max(better_error, better_quality) < self.tol)
-
-    def displacements(self) -> Displacements:
-        mesh, (origin, scale) = self.mesh, self.mesh.domain.frame
-        return Displacements(
-            mesh.values(mesh.points, scale) + origin,
-            mesh.values(mesh.lloyd, scale),
-            mesh.values(mesh.correction, scale),
-        )
+def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    """Refuse `value` if it is none of `choices`."""
+    if value not in choices:
+        raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
 class _Naming:
     """Says which of the caller's points coincide, when the device has found that some do."""
 
-    def __init__(self, points: np.ndarray, origin: np.ndarray, scale: float, real: np.dtype):
-        self.working = ((points - origin) / scale).astype(real)
+    def __init__(self, points: np.ndarray, domain: Box, real: np.dtype) -> None:
+        self.points, self.domain, self.real = points, domain, real
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, InputError):
-            pair = coincident_pair(self.working)
-            if pair is not None:
-                raise InputError(
-                    f"points[{pair[0]}] and points[{pair[1]}] coincide in {self.working.dtype}, expected "
-                    "distinct generators; remove duplicates (numpy.unique(points, axis=0))"
-                    + ("" if self.working.dtype == np.float64 else " or use dtype='float64'")
-                ) from error
+        if not isinstance(error, InputError):
+            return
+        origin, scale = self.domain.frame
+        pair = coincident_pair(((self.points - origin) / scale).astype(self.real))
+        if pair is not None:
+            other = "" if self.real == np.float64 else " or use dtype='float64'"
+            raise InputError(
+                f"points[{pair[0]}] and points[{pair[1]}] coincide in {self.real}, expected distinct "
+                f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
+            ) from error

@@ -107,20 +107,20 @@ class Bins:
         self._frames[:4] = frame
         self._shapes[:2] = np.array([0, side], np.int32)
         self._grid_of[:root_bins].fill(0)
-        engine.run(
+        engine.run_each(
             k.count_root, n, points, frame, np.int32(side), self._keys, self._ranks, self._counts
         )
         begin, size, grids = 0, root_bins, 1
         for level in range(MAX_LEVELS):
             end = begin + size
             self._scan.exclusive(self._counts, self._starts, size, first=begin)
-            engine.run(
+            engine.run_each(
                 k.place_bins, size, self._counts, self._starts, np.int32(begin), self._grid_of,
                 self._shapes, self._grid_items, self._bins,
             )  # fmt: skip
             if level == MAX_LEVELS - 1:
                 break
-            engine.run(
+            engine.run_each(
                 k.plan_children, size, self._counts, np.int32(begin), self._flags, self._sizes
             )
             self._scan.exclusive(self._flags, self._flags, size)
@@ -131,20 +131,20 @@ class Bins:
             new_bins = int(self._sizes[size].get())
             grid_ids, child_firsts = self._flags, self._sizes  # _reserve may replace them
             self._reserve(n, end + new_bins)
-            engine.run(
+            engine.run_each(
                 k.make_grids, size, self._bins, np.int32(begin), np.int32(end), np.int32(grids),
                 grid_ids, child_firsts, self._grid_of, self._frames, self._shapes,
                 self._grid_items,
             )  # fmt: skip
-            engine.run(
+            engine.run_each(
                 k.count_children, n, points, self._bins, self._frames, self._shapes,
                 self._keys, self._ranks, self._counts,
             )  # fmt: skip
             begin, size, grids = end, new_bins, grids + new_grids
         total = begin + size
-        engine.run(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
-        engine.run(k.sort_bins, total, self._bins, self._items)
-        engine.run(
+        engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
+        engine.run_each(k.sort_bins, total, self._bins, self._items)
+        engine.run_each(
             k.gather_items, n, self._items, points, self._keys, self._grid_of, self._frames,
             self._points, self._reach,
         )  # fmt: skip

@@ -137,12 +137,12 @@ class Cells:
         )
         while True:
             self._flags.set(np.array([0, 2**31 - 1], np.int32))
-            engine.run(
+            engine.run_each(
                 k.clip_cells, n, binned.points, binned.items, binned.reach, binned.bins,
                 binned.grid_frames, binned.grid_shapes, points, lower, upper, np.int32(warm),
                 *old, self._rows, self._row_counts, self._flags,
             )  # fmt: skip
-            engine.run(
+            engine.run_each(
                 k.match_faces, n, self._rows, self._row_counts, points, lower, upper, self._keep,
                 arrays["starts"], self._flags,
             )  # fmt: skip
@@ -154,7 +154,7 @@ class Cells:
         if flags:
             self._refuse(flags, generator, points)
         self._scan.exclusive(arrays["starts"], arrays["starts"], n)
-        engine.run(
+        engine.run_each(
             k.measure_cells, n, self._rows, self._row_counts, self._keep, arrays["starts"], points,
             lower, upper, arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
             arrays["volumes"], arrays["offsets"], arrays["covariances"],

@@ -55,17 +55,17 @@ class Density:
                 *(engine.empty(n) for _ in range(3)), *(engine.empty((n, d)) for _ in range(2))
             )
         w = self._weighting
-        engine.run(k.evaluate_density, n, t.volumes, h, w.density, w.weight, w.excess, self._log_h)
-        engine.run(
+        engine.run_each(k.evaluate_density, n, t.volumes, h, w.density, w.weight, w.excess, self._log_h)
+        engine.run_each(
             k.fit_gradient, n, t.starts, t.neighbours, t.points, self._log_h, w.gradient
         )
-        engine.run(k.weight_offsets, n, t.offsets, t.covariances, w.gradient, w.lloyd)
+        engine.run_each(k.weight_offsets, n, t.offsets, t.covariances, w.gradient, w.lloyd)
         return w
 
     def remove_mean(self, w: Weighting) -> None:
         """Take the mean of ``w.excess``, weighted by ``w.weight``, away from it."""
         n = self._n
-        self.engine.run(self._kernels.weigh_excess, n, w.weight, w.excess, self._weighed)
+        self.engine.run_each(self._kernels.weigh_excess, n, w.weight, w.excess, self._weighed)
         self._sums.collect("weighed", self._weighed, n)
         self._sums.collect("weight", w.weight, n)
-        self.engine.run(self._kernels.remove_mean, n, self._sums.values, w.excess)
+        self.engine.run_each(self._kernels.remove_mean, n, self._sums.values, w.excess)

@@ -18,6 +18,7 @@ from .fetch import fetch_diagram
 from .metric import Metric
 from .motion import Motion
 from .poisson import Poisson
+from .population import Population, PopulationControl
 from .projection import Projection
 from .refinement import Refinement
 from .results import Diagram
@@ -68,6 +69,10 @@ class Stages:
     @cached_property
     def refinement(self) -> Refinement:
         return Refinement(self.engine)
+
+    @cached_property
+    def population(self) -> PopulationControl:
+        return PopulationControl(self.engine)
 
     @cached_property
     def gather(self) -> Gather:
@@ -134,6 +139,7 @@ class Mesh:
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
         self.summaries = Summaries(self.engine, SUMMARIES)
         n = len(points)
+        self.next_label = n
         if labels is None:
             labels = self.engine.upload(np.arange(n), np.int32)
         self.adopt(
@@ -188,6 +194,30 @@ class Mesh:
             self.t, self.labels, first, self.signatures, self.changed, self.ever
         )
 
+    def mean_log_error(self) -> float:
+        """Mean of |log(L / h)|."""
+        w = self.stages.density.evaluate(self.t, self.h)
+        self.summaries.collect("excess", w.excess, self.n)
+        return self.summaries.read()["excess"].magnitude / self.n / self.engine.dim
+
+    def reorganise(self, nuclei: int = 0, n_cells: int | None = None) -> tuple[int, int]:
+        """Insert and delete generators (see `PopulationControl.reorganise`); return how many of each.
+
+        The count goes to `n_cells` or, with None, to what the size field asks for.
+        """
+        w = self.stages.density.evaluate(self.t, self.h)
+        self.summaries.collect("excess", w.excess, self.n)
+        total = self.summaries.read()["excess"].sum if n_cells is None else float(n_cells - self.n)
+        rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
+        new = self.stages.population.reorganise(
+            self.domain, self.t, self.h, w.excess, rows, total, self.next_label, nuclei
+        )
+        if new is None:
+            return 0, 0
+        self.next_label += new.inserted
+        self.adopt(new.points, new.labels, new.velocity, new.signatures, new.ever)
+        return new.inserted, new.deleted
+
     def assess(self) -> dict[str, Summary]:
         """Summarise the mesh: the scalars that the host sees of a step."""
         s, n = self.summaries, self.n
@@ -205,9 +235,11 @@ class Mesh:
         finer = self.coarsening / 2
         self.stages.metric.scale_sizes(0.5, self.h)
         points = self.stages.refinement.refine(self.domain, self.t, self.h)
-        labels = self.engine.upload(np.arange(len(points)), np.int32)
+        labels = self.engine.upload(self.next_label + np.arange(len(points)) - self.n, np.int32)
         labels[: self.n] = self.labels
-        return Mesh(self.stages, self.domain, self.sizing, points, labels, finer)
+        mesh = Mesh(self.stages, self.domain, self.sizing, points, labels, finer)
+        mesh.next_label = self.next_label + len(points) - self.n
+        return mesh
 
     # Results: physical units, the caller's order.
 

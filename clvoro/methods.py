@@ -118,42 +118,61 @@ class WeightedMethod:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass
 class ProjectedMethod:
     """Lloyd or shape descent with momentum, projected so that every cell keeps or takes its size.
 
     Attributes
     ----------
     descent : "lloyd" or "shape"
-        Weighted centroids, while generators are still to find their neighbours, or the gradient of quality itself.
+        Weighted centroids, while defects are still to move (they glide and annihilate), or the gradient of quality
+        itself, which polishes but pins them.
+    relaxation : float
+        Factor on the descent.
     momentum : float
         Share of the last displacement that is added.
     eps : float
         Penalty of the projection: the smaller, the more exact the sizes.
-    mean : bool
-        Take the mean of the excess away first, if the count is not to be corrected by strain.
+    bound : float
+        Excess from which on a cell's penalty falls (0: never); see `Projection`.
+    iterations : int
+        Of CG in each projection.
+    k : float
+        Bound of the displacement over h.
+    emphasis : float
+        Weight of bad cells in the shape descent.
+    aim : float
+        Mean |log(L / h)| that `eps` is steered to; 0 leaves it.
     """
 
     descent: str = "lloyd"
-    momentum: float = 0.6
+    relaxation: float = 1.0
+    momentum: float = 0.7
     eps: float = 0.1
+    bound: float = 0.0
     iterations: int = 30
     k: float = 0.4
-    emphasis: float = 5.0
+    emphasis: float = 20.0
+    aim: float = 0.0
+    steps: int = 0
 
     def displace(self, mesh: Mesh) -> Solution:
         """Evaluate the descent, with momentum, and its projection."""
         stages, t = mesh.stages, mesh.t
+        if self.aim and self.steps > 2:
+            off = mesh.mean_log_error()
+            self.eps = min(3.0, max(1e-3, self.eps * min(1.33, max(0.75, self.aim / off))))
+        self.steps += 1
         w = stages.density.evaluate(t, mesh.h)
         mesh.lloyd = w.lloyd
         if self.descent == "shape":
             stages.shape.descend(t, mesh.h, mesh.quality, mesh.lloyd, emphasis=self.emphasis)
-        stages.motion.add_momentum(mesh.velocity, self.momentum, mesh.lloyd)
+        stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
         stages.motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         stages.density.remove_mean(w)
         solution = stages.projection.project(
             t, mesh.h, w.gradient, w.excess, mesh.lloyd, mesh.correction, eps=self.eps,
-            max_iterations=self.iterations,
+            bound=self.bound, max_iterations=self.iterations,
         )  # fmt: skip
         stages.motion.measure_displacement(mesh.correction, mesh.h, mesh.correction_speed)
         return solution
@@ -166,11 +185,12 @@ class ProjectedMethod:
         )  # fmt: skip
 
 
-METHODS = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
+PUBLISHED = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
+"""Methods that repeat one kind of step; see `clvoro.plans` for those that take several."""
 
 
 def make_method(name: str, relaxation: Relaxation) -> Method:
-    """Return the method called `name`."""
+    """Return the method called `name`, one of `PUBLISHED`."""
     if name.startswith("weighted"):
         return WeightedMethod(k=relaxation.k, poisson=name == "weighted")
     return PublishedMethod(relaxation, lloyd=name != "poisson", poisson=name != "lloyd")

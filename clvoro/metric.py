@@ -25,7 +25,7 @@ class Metric:
         energy: cla.Array,
     ) -> None:
         """Write the paper's (3.1), signed, its (4.1) and each cell's part of its (2.3); all (n,)."""
-        self.engine.run(
+        self.engine.run_each(
             self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
             t.covariances, h, error, quality, energy,
         )  # fmt: skip
@@ -43,11 +43,11 @@ class Metric:
 
         `signatures` (n,) uint64 carries what is compared; `first` only records it.
         """
-        self.engine.run(
+        self.engine.run_each(
             self._kernels.compare_neighbours, t.n, t.starts, t.neighbours, labels, np.int32(first),
             signatures, changed, ever,
         )  # fmt: skip
 
     def scale_sizes(self, factor: float, h: cla.Array) -> None:
         """Multiply `h` (n,) by `factor`."""
-        self.engine.run(self._kernels.scale_sizes, len(h), self.engine.real.type(factor), h)
+        self.engine.run_each(self._kernels.scale_sizes, len(h), self.engine.real.type(factor), h)

@@ -22,7 +22,7 @@ class Motion:
         self, t: Tessellation, psi: cla.Array, h: cla.Array, u: cla.Array, speed: cla.Array
     ) -> None:
         """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d) and |u| / h to `speed` (n,)."""
-        self.engine.run(
+        self.engine.run_each(
             self._kernels.follow_potential, t.n, t.starts, t.neighbours, t.face_measures,
             t.face_centroids, t.volumes, t.points, psi, h, u, speed,
         )  # fmt: skip
@@ -42,14 +42,14 @@ class Motion:
         """
         real = self.engine.real.type
         n = speed.shape[0]
-        self.engine.run(
+        self.engine.run_each(
             self._kernels.relax_globally, n, summaries.values, np.int32(summaries.slots[name]),
             real(limit), real(k), u, speed,
         )  # fmt: skip
 
     def measure_displacement(self, u: cla.Array, h: cla.Array, speed: cla.Array) -> None:
         """Write |u| / h to `speed` (n,)."""
-        self.engine.run(self._kernels.measure_displacement, speed.shape[0], u, h, speed)
+        self.engine.run_each(self._kernels.measure_displacement, speed.shape[0], u, h, speed)
 
     def move_generators(
         self,
@@ -68,13 +68,17 @@ class Motion:
         `velocity` (n, d) becomes the displacement.
         """
         real = self.engine.real.type
-        self.engine.run(
+        self.engine.run_each(
             self._kernels.move_generators, h.shape[0], lloyd, real(a), correction, real(b), h,
             real(clip), *box.device_corners(self.engine.real), points,
             velocity,
         )  # fmt: skip
 
-    def add_momentum(self, velocity: cla.Array, share: float, lloyd: cla.Array) -> None:
-        """Add ``share * velocity`` to `lloyd` (n, d)."""
-        n = lloyd.shape[0]
-        self.engine.run(self._kernels.add_momentum, n, velocity, self.engine.real.type(share), lloyd)
+    def add_momentum(
+        self, factor: float, lloyd: cla.Array, velocity: cla.Array, share: float
+    ) -> None:
+        """Set `lloyd` (n, d) to ``factor * lloyd + share * velocity``."""
+        real = self.engine.real.type
+        self.engine.run_each(
+            self._kernels.add_momentum, lloyd.shape[0], real(factor), velocity, real(share), lloyd
+        )

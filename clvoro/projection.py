@@ -31,7 +31,7 @@ class Projection:
             self._n = n
             engine = self.engine
             self._own, self._u = engine.empty((n, engine.dim)), engine.empty((n, engine.dim))
-            self._inverse, self._rhs, self._y = (engine.empty(n) for _ in range(3))
+            self._inverse, self._rhs, self._y, self._eps = (engine.empty(n) for _ in range(4))
         if m > self._m:
             self._m = m
             self._weights = self.engine.empty(m)
@@ -46,6 +46,7 @@ class Projection:
         correction: cla.Array,
         *,
         eps: float,
+        bound: float = 0.0,
         max_iterations: int,
         tolerance: float = 1e-6,
     ) -> Solution:
@@ -57,39 +58,43 @@ class Projection:
         gradient : (n, d) real
             grad log h.
         eps : float
+        bound : float
+            Excess at which a cell's eps is half; 0: the same eps for all.
         max_iterations : int
             Of Jacobi-preconditioned CG. Forty do: the high modes that are left weigh nothing.
         """
         engine, k, n = self.engine, self._kernels, t.n
         real = engine.real.type
         self._reserve(n, t.neighbours.shape[0])
-        engine.run(
+        engine.run_each(k.set_penalty, n, excess, real(eps), real(bound), self._eps)
+        engine.run_each(
             k.assemble_derivative, n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
-            t.volumes, t.points, gradient, h, real(eps), self._weights, self._own, self._inverse,
+            t.volumes, t.points, gradient, h, self._eps, self._weights, self._own, self._inverse,
         )  # fmt: skip
 
-        def derivative(u: cla.Array, eps: float, y: cla.Array, b: float, out: cla.Array) -> None:
-            engine.run(
+        def derivative(u: cla.Array, y: cla.Array, out: cla.Array) -> None:
+            engine.run_each(
                 k.apply_derivative, n, t.starts, t.neighbours, self._weights, t.face_centroids,
-                t.volumes, t.points, self._own, u, real(eps), y, real(b), excess, out,
+                t.volumes, t.points, self._own, u, self._eps, y, out,
             )  # fmt: skip
 
         def transpose(y: cla.Array, u: cla.Array) -> None:
-            engine.run(
+            engine.run_each(
                 k.apply_transpose, n, t.starts, t.neighbours, self._weights, t.face_centroids,
                 t.volumes, self._own, h, y, u,
             )  # fmt: skip
 
         def apply(y: cla.Array, out: cla.Array) -> None:
             transpose(y, self._u)
-            derivative(self._u, eps, y, 0.0, out)
+            derivative(self._u, y, out)
 
-        derivative(displacement, 0.0, excess, 1.0, self._rhs)
         self._y.fill(0)
+        derivative(displacement, self._y, self._rhs)
+        engine.run_each(k.add_excess, n, excess, self._rhs)
         solution = self._krylov.solve(
             apply, self._rhs, self._y, precondition=self._inverse, tolerance=tolerance,
             max_iterations=max_iterations,
         )  # fmt: skip
         transpose(self._y, correction)
-        engine.run(k.negate, n, correction)
+        engine.run_each(k.negate, n, correction)
         return solution

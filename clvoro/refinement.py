@@ -32,12 +32,12 @@ class Refinement:
         """
         engine, k, n = self.engine, self._kernels, t.n
         firsts = engine.empty(n + 1, np.int32)
-        engine.run(
+        engine.run_each(
             k.count_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, firsts
         )
         self._scan.exclusive(firsts, firsts, n)
         finer = engine.empty((n + int(firsts[n].get()), engine.dim))
-        engine.run(
+        engine.run_each(
             k.place_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points, h,
             np.int32(n), *box.device_corners(engine.real), firsts, finer,
         )  # fmt: skip

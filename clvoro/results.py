@@ -30,6 +30,7 @@ HISTORY_DTYPE = np.dtype(
         ("ever_changed", "f8"),  # share of cells whose set of neighbours has changed so far
         ("inserted", "i4"),
         ("deleted", "i4"),
+        ("progress", "f8"),  # share of the planned work that is done
         ("seconds", "f8"),  # wall time since the run began
     ]
 )
@@ -113,6 +114,9 @@ class Result:
     stop_reason : str
     initial, final : Displacements or None
         Lloyd and Poisson displacements of the first and of the last step.
+    size_factor : float
+        Where a count of cells was asked for, `size` is the size field times this common factor, which makes the count
+        fit (methods "adaptive" and "exact"); else 1.
     settings : dict
         What is needed to repeat the run.
     """
@@ -127,6 +131,7 @@ class Result:
     stop_reason: str
     initial: Displacements | None = None
     final: Displacements | None = None
+    size_factor: float = 1.0
     settings: dict[str, Any] = field(default_factory=dict)
 
     def save(self, path: str | PathLike[str]) -> None:

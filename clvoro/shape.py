@@ -41,11 +41,11 @@ class Shape:
         if t.n != self._n:
             self._n = t.n
             self._tension, self._pressure = engine.empty(t.n), engine.empty(t.n)
-        engine.run(
+        engine.run_each(
             k.load_cells, t.n, t.starts, t.face_measures, t.volumes, quality, real(emphasis),
             self._tension, self._pressure,
         )  # fmt: skip
-        engine.run(
+        engine.run_each(
             k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
             t.points, self._tension, self._pressure, h, real(rate), real(longest), lloyd,
         )  # fmt: skip

@@ -40,11 +40,11 @@ class VertexNumbering:
         engine, k = self.engine, self._kernels
         m = int(t.starts[t.n].get())
         owners, ids = engine.empty(m, np.int32), engine.empty(m + 1, np.int32)
-        engine.run(k.find_owners, t.n, t.starts, t.neighbours, owners, ids)
+        engine.run_each(k.find_owners, t.n, t.starts, t.neighbours, owners, ids)
         self._scan.exclusive(ids, ids, m)
         count = int(ids[m].get())
         cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, 2))
-        engine.run(
+        engine.run_each(
             k.place_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
             t.neighbours, owners, ids, cell_vertices, positions,
         )  # fmt: skip

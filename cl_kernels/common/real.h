@@ -29,6 +29,13 @@
 /* A literal in the working precision: R(0.5). */
 #define R(x) ((REAL)(x))
 
+/* The index of a work-item, one of `size`, the kernel's first argument; the rest of the last work-group is idle. Launches
+   are rounded up to whole groups of one fixed size: PoCL compiles a kernel anew for every group size it meets. */
+#define WORK_ITEM(i) \
+    const int i = get_global_id(0); \
+    if (i >= size) \
+    return
+
 /* Rounds to 1 ulp where a*b and c*d cancel (Kahan): the determinant of two short vectors. */
 inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)
 {

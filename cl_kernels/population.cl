@@ -1,0 +1,320 @@
+#include "common/real.h"
+
+/* Insertion and deletion of generators, in 2D: the paper's 2.3.1, where the lattice asks for it.
+
+   A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell. One that
+   sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the 5-sided one goes. The
+   same moves carry the count of generators to what the size field asks for. Sites act at the same time only if they are
+   RINGS rings of cells apart. */
+
+#define LATTICE_2 R(1.1547005383792515) /* (neighbour distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
+
+inline int is_inner(int i, global const int *starts, global const int *neighbours)
+{
+    int inner = 1;
+    for (int k = starts[i]; k < starts[i + 1]; ++k)
+        inner &= neighbours[k] >= 0;
+    return inner;
+}
+
+/* Per generator i: sides[i] = its number of neighbours, 0 at a wall; strain[i] = (xx, xy, yy, weight) of
+   S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an unstrained lattice. Only six-sided cells have weight. */
+kernel void measure_strain(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
+                           global const REAL *h, global int *sides, global REAL4 *strain)
+{
+    WORK_ITEM(i);
+    const int n = starts[i + 1] - starts[i];
+    const int inner = is_inner(i, starts, neighbours);
+    sides[i] = inner ? n : 0;
+    REAL4 s = 0;
+    int count = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL dx = points[2 * j] - points[2 * i], dy = points[2 * j + 1] - points[2 * i + 1];
+        s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(dx * dx, dx * dy, dy * dy, 0);
+        ++count;
+    }
+    s /= max(count, 1);
+    s.s3 = inner && n == 6;
+    strain[i] = s;
+}
+
+/* Per generator i: the weighted mean of the strain over itself and its neighbours, and the sum of the weights. */
+kernel void average_strain(const int size, global const int *starts, global const int *neighbours, global const REAL4 *strain,
+                           global REAL4 *mean)
+{
+    WORK_ITEM(i);
+    REAL4 own = strain[i];
+    REAL weight = own.s3;
+    REAL4 sum = own * own.s3;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL4 other = strain[j];
+        sum += other * other.s3;
+        weight += other.s3;
+    }
+    sum = weight > 0 ? sum / weight : (REAL4)(1, 0, 1, 0);
+    sum.s3 = weight;
+    mean[i] = sum;
+}
+
+/* A word that orders sites by magnitude, ties by index; 0 is no site. */
+inline ulong site_key(REAL magnitude, int i)
+{
+    return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
+}
+
+/* Per 5-sided cell i: the pull s = b.S.b - t.S.t on its pair with the 7-sided neighbour where |s| is largest, t from the
+   5 to the 7, b across. */
+kernel void score_pairs(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
+                        global const int *sides, global const REAL4 *strain, global int *partners, global REAL *pull,
+                        global ulong *keys)
+{
+    WORK_ITEM(i);
+    REAL best = 0;
+    int partner = -1;
+    if (sides[i] == 5)
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            const int j = neighbours[k];
+            if (sides[j] != 7)
+                continue;
+            const REAL2 d = (REAL2)(points[2 * j] - points[2 * i], points[2 * j + 1] - points[2 * i + 1]);
+            const REAL4 s = (strain[i] + strain[j]) / 2;
+            const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
+            const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
+            const REAL value = (across - along) / dot(d, d);
+            if (partner < 0 || fabs(value) > fabs(best)) {
+                best = value;
+                partner = j;
+            }
+        }
+    partners[i] = partner;
+    pull[i] = best;
+    keys[i] = partner < 0 ? 0 : site_key(fabs(best), i);
+}
+
+/* Per generator i: the largest key in itself and its neighbours. */
+kernel void spread_keys(const int size, global const int *starts, global const int *neighbours, global const ulong *keys,
+                        global ulong *spread)
+{
+    WORK_ITEM(i);
+    ulong key = keys[i];
+    for (int k = starts[i]; k < starts[i + 1]; ++k)
+        if (neighbours[k] >= 0)
+            key = max(key, keys[neighbours[k]]);
+    spread[i] = key;
+}
+
+/* Per generator i: a site whose key is the largest for rings around is chosen; `chosen` collects over several rounds. */
+kernel void choose_sites(const int size, global const ulong *keys, global const ulong *spread, global ulong *chosen,
+                         global ulong *latest)
+{
+    WORK_ITEM(i);
+    const ulong key = keys[i];
+    const ulong mine = key != 0 && spread[i] == key ? key : 0;
+    latest[i] = mine;
+    if (mine)
+        chosen[i] = mine;
+}
+
+/* Per generator i: a site near a chosen one (spread[i] != 0) is out. */
+kernel void drop_sites(const int size, global const ulong *spread, global ulong *keys)
+{
+    WORK_ITEM(i);
+    if (spread[i])
+        keys[i] = 0;
+}
+
+/* Per chosen site: count it in the histogram of the bits of its magnitude from `low` on, HISTOGRAM bins of `width`. */
+kernel void count_sites(const int size, global const ulong *chosen, const uint low, const uint width,
+                        global int *histogram)
+{
+    WORK_ITEM(i);
+    const uint bits = (uint)(chosen[i] >> 32);
+    if (chosen[i] && bits >= low && (bits - low) / width < HISTOGRAM)
+        atomic_inc(histogram + (bits - low) / width);
+}
+
+/* Per chosen site: drop it if the bits of its magnitude are below `least`. */
+kernel void limit_sites(const int size, const uint least, global ulong *chosen)
+{
+    WORK_ITEM(i);
+    if ((uint)(chosen[i] >> 32) < least)
+        chosen[i] = 0;
+}
+
+/* Per generator i: is it a chosen site? For ranks by prefix sums. */
+kernel void flag_sites(const int size, global const ulong *chosen, global int *flags)
+{
+    WORK_ITEM(i);
+    flags[i] = chosen[i] != 0;
+}
+
+/* Thresholds that the count may need: shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A site is split if
+   pull > theta - shift, and deleted if -pull > theta + shift. */
+inline bool is_split(REAL pull, REAL theta, REAL shift)
+{
+    return pull > theta - shift;
+}
+
+inline bool is_deleted(REAL pull, REAL theta, REAL shift)
+{
+    return !is_split(pull, theta, shift) && -pull > theta + shift;
+}
+
+/* Per chosen pair: tally[m] += what shift m would add to the count of generators. Integer sums: any order will do. */
+kernel void tally_pairs(const int size, global const ulong *chosen, global const REAL *pull, const REAL theta,
+                        global int *tally)
+{
+    WORK_ITEM(i);
+    if (chosen[i] == 0)
+        return;
+    for (int m = 0; m < SHIFTS; ++m) {
+        const REAL shift = (m - SHIFTS / 2) * R(SHIFT_STEP);
+        const int change = (int)is_split(pull[i], theta, shift) - (int)is_deleted(pull[i], theta, shift);
+        if (change)
+            atomic_add(tally + m, change);
+    }
+}
+
+inline REAL2 difference(global const REAL *points, int from, int to)
+{
+    return (REAL2)(points[2 * to] - points[2 * from], points[2 * to + 1] - points[2 * from + 1]);
+}
+
+/* Per chosen pair: split it at its 7, into two generators across the pair, or delete it at its 5. `busy` marks the sites
+   that act. */
+kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, const REAL theta,
+                       const REAL shift, global const int *partners, global const REAL *points, global const REAL *h,
+                       global int *kept, global REAL2 *shifts, global int *born, global REAL2 *births,
+                       global ulong *busy)
+{
+    WORK_ITEM(i);
+    if (chosen[i] == 0)
+        return;
+    const int j = partners[i];
+    if (is_split(pull[i], theta, shift)) {
+        const REAL2 d = difference(points, i, j);
+        const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
+        born[j] = 1;
+        shifts[j] = R(SPLIT_DISTANCE) * h[j] * across;
+        births[j] = -shifts[j];
+        busy[i] = 1;
+    } else if (is_deleted(pull[i], theta, shift)) {
+        kept[i] = 0;
+        busy[i] = 1;
+    }
+}
+
+/* Per six-sided cell i among six-sided cells: the anisotropy of the strain, the difference of its eigenvalues, as a site
+   where a pair may be made. */
+kernel void score_strain(const int size, global const int *starts, global const int *neighbours,
+                         global const int *sides, global const REAL4 *strain, const REAL threshold,
+                         global ulong *keys)
+{
+    WORK_ITEM(i);
+    bool clean = sides[i] == 6;
+    for (int k = starts[i]; k < starts[i + 1] && clean; ++k)
+        clean = sides[neighbours[k]] == 6;
+    const REAL4 s = strain[i];
+    const REAL anisotropy = sqrt((s.s0 - s.s2) * (s.s0 - s.s2) + 4 * s.s1 * s.s1);
+    keys[i] = clean && anisotropy > threshold ? site_key(anisotropy, i) : 0;
+}
+
+/* Per chosen site, by its rank in turn: a new generator in the middle of its longest edge, or itself and its nearest
+   neighbour merged. */
+kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, global const int *starts,
+                        global const int *neighbours, global const REAL *points, global int *kept,
+                        global REAL2 *shifts, global int *born, global REAL2 *births, global ulong *busy)
+{
+    WORK_ITEM(i);
+    if (chosen[i] == 0)
+        return;
+    const bool insert = ranks[i] % 2 == 0;
+    REAL best = 0;
+    int partner = -1;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const REAL2 d = difference(points, i, neighbours[k]);
+        const REAL d2 = dot(d, d);
+        if (partner < 0 || (insert ? d2 > best : d2 < best)) {
+            best = d2;
+            partner = neighbours[k];
+        }
+    }
+    const REAL2 half_way = difference(points, i, partner) / 2;
+    if (insert) {
+        born[i] = 1;
+        births[i] = half_way;
+    } else {
+        shifts[i] = half_way;
+        kept[partner] = 0;
+    }
+    busy[i] = 1;
+}
+
+/* Per generator i: the excess of its cell, in the sense of `sign`, as a site to split (sign > 0) or to delete. Cells of few
+   sides go, those of many are split, if their excess is alike. Above 4 all are alike. */
+kernel void score_excess(const int size, global const int *starts, global const REAL *excess, const REAL sign,
+                         global ulong *keys)
+{
+    WORK_ITEM(i);
+    const REAL sides = starts[i + 1] - starts[i];
+    const REAL magnitude = 2 + sign * (excess[i] + R(0.2) * (sides - 6));
+    keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), i) : 0;
+}
+
+/* Per chosen site: split the cell across its longest axis, or delete it. */
+kernel void mark_excess(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
+                        global const REAL *covariances, global const REAL *volumes, global int *kept,
+                        global REAL2 *shifts, global int *born, global REAL2 *births)
+{
+    WORK_ITEM(i);
+    if (chosen[i] == 0)
+        return;
+    if (sign < 0) {
+        kept[i] = 0;
+        return;
+    }
+    const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
+    const REAL angle = atan2(2 * xy, xx - yy) / 2;
+    const REAL2 axis = sqrt(volumes[i]) / 4 * (REAL2)(cos(angle), sin(angle));
+    const REAL2 centre = (REAL2)(offsets[2 * i], offsets[2 * i + 1]);
+    born[i] = 1;
+    shifts[i] = centre + axis;
+    births[i] = centre - axis;
+}
+
+/* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
+   generators go behind all kept rows, with new labels. */
+kernel void apply_changes(const int size, global const int *place, global const int *birth_place,
+                          const int next_label, const REAL4 box_lower, const REAL4 box_upper,
+                          global const REAL2 *points, global const int *labels, global const REAL2 *velocity,
+                          global const ulong *signatures, global const REAL *ever, global const REAL2 *shifts,
+                          global const REAL2 *births, global REAL2 *new_points, global int *new_labels,
+                          global REAL2 *new_velocity, global ulong *new_signatures, global REAL *new_ever)
+{
+    WORK_ITEM(i);
+    const REAL2 lower = (REAL2)(box_lower.s0, box_lower.s1), upper = (REAL2)(box_upper.s0, box_upper.s1);
+    if (place[i + 1] > place[i]) {
+        const int p = place[i];
+        const REAL2 shift = shifts[i];
+        const bool moved = shift.s0 != 0 || shift.s1 != 0;
+        new_points[p] = clamp(points[i] + shift, lower, upper);
+        new_labels[p] = labels[i];
+        new_velocity[p] = moved ? (REAL2)(0, 0) : velocity[i];
+        new_signatures[p] = signatures[i];
+        new_ever[p] = ever[i];
+    }
+    if (birth_place[i + 1] > birth_place[i]) {
+        const int q = place[size] + birth_place[i];
+        new_points[q] = clamp(points[i] + births[i], lower, upper);
+        new_labels[q] = next_label + birth_place[i];
+        new_velocity[q] = 0;
+        new_signatures[q] = 0;
+        new_ever[q] = 1;
+    }
+}

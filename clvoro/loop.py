@@ -1,0 +1,173 @@
+"""The loop of the paper's Figure 1: displace, move, tessellate anew, record, until the plan is done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .krylov import Solution
+from .mesh import Mesh
+from .plans import Action, Refine, Reorganise, Rest, Step, work_of
+from .results import HISTORY_DTYPE, Displacements, Result
+
+WINDOW = 10
+"""Steps over which error and quality are watched for progress."""
+
+
+class Loop:
+    """One run.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        On the coarsest level.
+    plan : list of Action
+    levels : int
+        Coarser levels that the plan begins with.
+    max_steps : int or None
+    tol : float
+        Share by which error or quality must improve over a window of steps; 0 takes all steps.
+    callback : callable or None
+        Takes the new row of the history; the run stops if it returns True.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        plan: list[Action],
+        levels: int,
+        max_steps: int | None,
+        tol: float,
+        callback: Callable[[np.void], object] | None,
+    ) -> None:
+        self.mesh, self.plan, self.level = mesh, plan, levels
+        self.done = work_of(plan, levels, mesh.engine.dim)
+        self.max_steps, self.tol, self.callback = max_steps, tol, callback
+        self.rows: list[np.ndarray] = []
+        self.steps, self.inserted, self.deleted = 0, 0, 0
+        self.solution: Solution | None = None
+        self.initial: Displacements | None = None
+        self.began = time.perf_counter()
+
+    def run(self, n_cells: int | None, factor: float, settings: dict[str, Any]) -> Result:
+        """Carry out the plan; `n_cells` holds the finest level's count, None lets the size field decide."""
+        converged, reason = False, "plan completed"
+        try:
+            stop = self.record(0.0)
+            for action, progress in zip(self.plan, [*self.done[1:], 1.0], strict=True):
+                if stop or (self.max_steps is not None and self.steps >= self.max_steps):
+                    reason = "stopped by the callback" if stop else "max_steps reached"
+                    break
+                if isinstance(action, Step):
+                    self.step(action)
+                    stop = self.record(progress)
+                elif isinstance(action, Reorganise):
+                    self.reorganise(action, n_cells)
+                elif isinstance(action, Refine):
+                    self.refine()
+                elif isinstance(action, Rest):
+                    self.mesh.velocity.fill(0)
+                if not stop and self.stalled():
+                    converged, reason = True, "error and quality no longer improve"
+                    break
+            else:
+                converged = self.tol == 0 and self.level == 0
+        except KeyboardInterrupt:
+            reason = "interrupted"
+            self.mesh.update()
+        # Whatever stopped the run, the mesh has the size that was asked for.
+        while self.level > 0:
+            self.refine()
+        return self.result(converged, reason, factor, settings)
+
+    def step(self, action: Step) -> None:
+        """Displace and move all generators, and tessellate anew."""
+        self.solution = action.method.displace(self.mesh)
+        if self.initial is None:
+            self.initial = self.displacements()
+        action.method.move(self.mesh)
+        self.mesh.update()
+        self.last = action.method
+        self.steps += 1
+
+    def reorganise(self, action: Reorganise, n_cells: int | None) -> None:
+        """Insert and delete generators."""
+        n = self.mesh.n
+        held = n_cells if self.level == 0 else None
+        inserted, deleted = self.mesh.reorganise(round(action.nuclei * n), held)
+        self.inserted += inserted
+        self.deleted += deleted
+
+    def refine(self) -> None:
+        """Go to the next finer level."""
+        before = self.mesh.n
+        self.mesh = self.mesh.refine()
+        self.inserted += self.mesh.n - before
+        self.level -= 1
+
+    def record(self, progress: float) -> bool:
+        """Append a row to the history; True if the callback wants to stop."""
+        mesh = self.mesh
+        s, n = mesh.assess(), mesh.n
+        mesh.sizing.check(mesh.points, mesh.h)
+        row = np.zeros(1, HISTORY_DTYPE)
+        row["step"], row["level"], row["cells"], row["progress"] = self.steps, self.level, n, progress
+        row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
+        row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
+        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
+        row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever"].sum / n
+        row["inserted"], row["deleted"] = self.inserted, self.deleted
+        self.inserted = self.deleted = 0
+        if self.solution is not None:
+            row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n
+            row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
+        row["seconds"] = time.perf_counter() - self.began
+        self.rows.append(row)
+        return bool(self.callback is not None and self.callback(row[0]))
+
+    def stalled(self) -> bool:
+        """Tell whether neither mean error nor mean quality has improved by `tol` over the last steps."""
+        if self.tol == 0 or len(self.rows) <= 2 * WINDOW:
+            return False
+        history = np.concatenate(self.rows[-2 * WINDOW :])
+        old, new = history[:WINDOW], history[WINDOW:]
+        better_error = 1 - new["mean_error"].mean() / max(old["mean_error"].mean(), 1e-300)
+        better_quality = new["mean_quality"].mean() / old["mean_quality"].mean() - 1
+        return bool(max(better_error, better_quality) < self.tol)
+
+    def displacements(self) -> Displacements:
+        """Fetch the two halves of the step."""
+        mesh, (origin, scale) = self.mesh, self.mesh.domain.frame
+        return Displacements(
+            mesh.values(mesh.points, scale) + origin,
+            mesh.values(mesh.lloyd, scale),
+            mesh.values(mesh.correction, scale),
+        )
+
+    def result(
+        self, converged: bool, reason: str, factor: float, settings: dict[str, Any]
+    ) -> Result:
+        """Fetch what the run has come to."""
+        mesh = self.mesh
+        final = None
+        if self.steps:
+            self.last.displace(mesh)
+            final = self.displacements()
+        diagram = mesh.diagram()
+        return Result(
+            points=diagram.points,
+            diagram=diagram,
+            size=mesh.values(mesh.h, mesh.domain.frame[1]),
+            error=mesh.values(mesh.error),
+            quality=mesh.values(mesh.quality),
+            history=np.concatenate(self.rows),
+            converged=converged,
+            stop_reason=reason,
+            initial=self.initial,
+            final=final,
+            size_factor=factor,
+            settings=settings,
+        )

@@ -1,0 +1,164 @@
+"""Plans: in which order a run takes its steps, from the coarsest level to the finest.
+
+    density start ─► couple ─► [ reorganise ─► glide ] x sweeps ─► refine ─► couple ─► [...] ... ─► polish (─► project)
+
+*couple*      weighted Lloyd and Poisson: from any start to nearly the right sizes
+*reorganise*  insert and delete generators: dislocations climb, the count meets the field
+*glide*       weighted Lloyd with momentum, softly projected: defects move and annihilate
+*polish*      descent of cell quality, projected; the penalty is steered to the error that is aimed at
+*project*     the same with next to no penalty: every cell the size that was asked for
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from .methods import Method, ProjectedMethod, WeightedMethod
+
+COARSEST = 700
+"""Cells of the coarsest level of a 2D run, roughly: enough to feel the field, few enough to be free."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work a run takes.
+
+    Attributes
+    ----------
+    start, couple, couple_finest : int
+        Coupled steps on the coarsest level, on those between, and on the finest.
+    sweeps : tuple of int
+        Sweeps (reorganise, then glide) on the finest level, on the next coarser one, ...; the last holds for all above.
+    glide : int
+        Steps in a sweep.
+    polish : int
+    aim : float
+        Mean |log(L / h)| that polishing aims at.
+    relaxation, momentum : float
+        Of the gliding.
+    nuclei : float
+        Share of the cells where pairs may be made, every third sweep.
+    """
+
+    start: int
+    couple: int
+    couple_finest: int
+    sweeps: tuple[int, ...]
+    glide: int
+    polish: int
+    aim: float
+    relaxation: float = 1.3
+    momentum: float = 0.7
+    eps: float = 0.3
+    nuclei: float = 0.0
+
+
+EFFORTS = {
+    "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0),
+    "default": Effort(60, 5, 3, (4, 18, 20, 20), glide=7, polish=18, aim=0.0017),
+    "best": Effort(
+        60, 5, 10, (60, 40, 30, 30), glide=7, polish=40, aim=0.0037, relaxation=1.5, momentum=0.8,
+        eps=0.7, nuclei=0.0018,
+    ),
+}  # fmt: skip
+
+EXACT_STEPS, EXACT_ITERATIONS = 6, 45
+
+
+@dataclass(frozen=True)
+class Step:
+    """Displace and move all generators, and tessellate anew."""
+
+    method: Method
+
+
+@dataclass(frozen=True)
+class Reorganise:
+    """Insert and delete generators; `nuclei` is the share of the cells where pairs may be made."""
+
+    nuclei: float = 0.0
+
+
+@dataclass(frozen=True)
+class Refine:
+    """Go to the next finer level."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Take the momentum away."""
+
+
+Action = Step | Reorganise | Refine | Rest
+
+
+def auto_levels(n: float, dim: int) -> int:
+    """Number of coarser levels for a mesh of `n` cells."""
+    return max(0, round(math.log(max(n, 1) / COARSEST, 2**dim)))
+
+
+def plan_steps(method: Method, steps: int) -> list[Action]:
+    """Return the plan of a method that repeats one kind of step."""
+    return [Step(method)] * steps
+
+
+def plan_adaptive(
+    effort: Effort, levels: int, exact: bool, aim: float | None = None, warm: bool = False
+) -> list[Action]:
+    """Return the plan that reaches the size field and good cells, over `levels` coarser levels.
+
+    Parameters
+    ----------
+    exact : bool
+        End with the exact projection.
+    aim : float, optional
+        In the place of the effort's own.
+    warm : bool
+        The start is a mesh already, not a random sample.
+    """
+    return list(_adaptive(effort, levels, exact, effort.aim if aim is None else aim, warm))
+
+
+def _adaptive(
+    effort: Effort, levels: int, exact: bool, aim: float, warm: bool
+) -> Iterator[Action]:
+    glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
+    for level in range(levels, -1, -1):
+        if level < levels:
+            yield Refine()
+            couple = effort.couple if level else effort.couple_finest
+        elif warm:
+            couple = effort.couple_finest
+        else:
+            couple = effort.start if level else effort.start // 2
+        yield from [Step(WeightedMethod())] * couple
+        sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
+        if levels == 0:
+            # The only level has no coarser one to have done the work.
+            sweeps = max(sweeps, effort.sweeps[-1])
+        for sweep in range(sweeps):
+            quiet = sweep % 3 or sweep >= sweeps - 8
+            yield Reorganise(0.0 if quiet else effort.nuclei)
+            yield from [Step(glide)] * effort.glide
+        if level == 0 and sweeps < 3:
+            yield Reorganise()
+    yield Rest()
+    polish = ProjectedMethod("shape", eps=effort.eps, bound=0.05, k=0.3, aim=aim)
+    yield from [Step(polish)] * effort.polish
+    if exact:
+        project = ProjectedMethod("shape", eps=1e-3, iterations=EXACT_ITERATIONS, k=0.3)
+        yield from [Step(project)] * EXACT_STEPS
+
+
+def work_of(plan: list[Action], levels: int, dim: int) -> list[float]:
+    """Return the work done before each action, as a share of the whole: a step costs as its level has cells."""
+    done, total, level = [], 0.0, levels
+    for action in plan:
+        done.append(total)
+        if isinstance(action, Refine):
+            level -= 1
+        elif isinstance(action, Step):
+            total += 2.0 ** (-dim * level)
+    return [w / max(total, 1e-300) for w in done]

@@ -1,0 +1,265 @@
+"""Insertion and deletion of generators: dislocations climb under strain, and the count meets the field (`population.cl`)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Scan
+from ._program import Engine
+from .cells import Tessellation
+from .domain import Box
+
+THETA = 0.06
+"""Strain across a pair of a 5-sided and a 7-sided cell at which it climbs."""
+NUCLEATION_STRAIN = 0.22
+"""Anisotropy of the lattice above which a pair may be made."""
+PAIR_RINGS, NUCLEUS_RINGS, EXCESS_RINGS = 4, 6, 3
+"""Rings of cells between sites that act in the same sweep: their displacements should not meet."""
+ROUNDS = 3
+"""Rounds of choosing sites; each takes the strongest that are left."""
+SHIFTS, SHIFT_STEP = 51, 0.01
+HISTOGRAM = 128  # a power of two: bins are cut finer by shifts
+SPLIT_DISTANCE = 0.3
+"""Half the distance over h at which the two halves of a split cell start."""
+LARGEST_CHANGE = 0.05
+"""Share of the generators that one call may insert or delete to correct the count."""
+
+
+@dataclass(frozen=True)
+class Population:
+    """Generators, on the device: points and velocity (n, 2), labels, signatures and ever (n,)."""
+
+    points: cla.Array
+    labels: cla.Array
+    velocity: cla.Array
+    signatures: cla.Array
+    ever: cla.Array
+    inserted: int = 0
+    deleted: int = 0
+
+
+class PopulationControl:
+    """Decide where generators are inserted and deleted, and do it. 2D."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._kernels = engine.kernels(
+            "population",
+            {
+                "SHIFTS": SHIFTS,
+                "SHIFT_STEP": SHIFT_STEP,
+                "SPLIT_DISTANCE": SPLIT_DISTANCE,
+                "HISTOGRAM": HISTOGRAM,
+            },
+        )
+
+    def reorganise(
+        self,
+        box: Box,
+        t: Tessellation,
+        h: cla.Array,
+        excess: cla.Array,
+        rows: Population,
+        total_excess: float,
+        next_label: int,
+        nuclei: int = 0,
+    ) -> Population | None:
+        """Make pairs (`nuclei` of each kind), let pairs climb, and bring the count to what the field asks for.
+
+        Parameters
+        ----------
+        h, excess : (n,) real
+        rows : Population
+            The present generators.
+        total_excess : float
+            Sum of the excess: how many generators are missing or, negative, too many.
+        next_label : int
+            First label for the new ones.
+        nuclei : int
+
+        Returns
+        -------
+        Population or None
+            None if nothing is to change.
+        """
+        n = t.n
+        # Less than 0.7 of a generator is left to strain; a large change is made in several calls.
+        need = math.trunc(total_excess + math.copysign(0.3, total_excess))
+        most = max(1, int(LARGEST_CHANGE * n))
+        need = max(-most, min(most, need))
+        marks = _Marks.clean(self.engine, n)
+        sides, strain_1, strain_2 = self._measure(t, h)
+        if nuclei:
+            self._nucleate(t, sides, strain_1, marks, nuclei)
+        gained = self._climb(t, h, sides, strain_2, marks, need)
+        rest = need - gained
+        if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
+            self._split_or_delete(t, excess, marks, rest)
+        return self._apply(box, t, rows, marks, next_label)
+
+    def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
+        """Return sides (n,), and the strain averaged over one ring and over two (n, 4)."""
+        engine, k, n = self.engine, self._kernels, t.n
+        sides = engine.empty(n, np.int32)
+        raw, once, twice = (engine.empty((n, 4)) for _ in range(3))
+        engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, sides, raw)
+        engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
+        engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, twice)
+        return sides, once, twice
+
+    def _nucleate(
+        self, t: Tessellation, sides: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int
+    ) -> None:
+        """Mark at most `nuclei` insertions and as many mergers where the clean lattice is strained most."""
+        engine, k, n = self.engine, self._kernels, t.n
+        keys = engine.empty(n, np.uint64)
+        engine.run_each(
+            k.score_strain, n, t.starts, t.neighbours, sides, strain,
+            engine.real.type(NUCLEATION_STRAIN), keys,
+        )  # fmt: skip
+        chosen = self._choose(t, keys, NUCLEUS_RINGS)
+        self._limit(chosen, n, 2 * nuclei)
+        ranks = engine.empty(n + 1, np.int32)
+        engine.run_each(k.flag_sites, n, chosen, ranks)
+        self._scan.exclusive(ranks, ranks, n)
+        engine.run_each(
+            k.mark_nuclei, n, chosen, ranks, t.starts, t.neighbours, t.points, *marks.arrays,
+            marks.busy,
+        )  # fmt: skip
+
+    def _climb(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        sides: cla.Array,
+        strain: cla.Array,
+        marks: _Marks,
+        need: int,
+    ) -> int:
+        """Mark the pairs that climb, with thresholds shifted to bring the count nearest to `need`; return the gain."""
+        engine, k, n = self.engine, self._kernels, t.n
+        theta = engine.real.type(THETA)
+        partners, pull = engine.empty(n, np.int32), engine.empty(n)
+        keys = engine.empty(n, np.uint64)
+        engine.run_each(
+            k.score_pairs, n, t.starts, t.neighbours, t.points, sides, strain, partners, pull, keys
+        )
+        engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
+        chosen = self._choose(t, keys, PAIR_RINGS)
+        tally = engine.zeros(SHIFTS, np.int32)
+        engine.run_each(k.tally_pairs, n, chosen, pull, theta, tally)
+        changes = tally.get()
+        # The shift of the threshold whose change is nearest to the need, the least among equals.
+        shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
+        order = np.argsort(np.abs(shifts), kind="stable")
+        best = order[np.argmin(np.abs(changes[order] - need))]
+        engine.run_each(
+            k.mark_pairs, n, chosen, pull, theta, engine.real.type(shifts[best]), partners,
+            t.points, h, *marks.arrays, marks.busy,
+        )  # fmt: skip
+        return int(changes[best])
+
+    def _split_or_delete(
+        self, t: Tessellation, excess: cla.Array, marks: _Marks, rest: int
+    ) -> None:
+        """Mark about `rest` cells to be split, or -rest to be deleted: those that are most too large or too small."""
+        engine, k, n = self.engine, self._kernels, t.n
+        sign = engine.real.type(math.copysign(1, rest))
+        keys = engine.empty(n, np.uint64)
+        engine.run_each(k.score_excess, n, t.starts, excess, sign, keys)
+        engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, EXCESS_RINGS), keys)
+        chosen = self._choose(t, keys, EXCESS_RINGS)
+        self._limit(chosen, n, min(abs(rest), n - 1))
+        engine.run_each(
+            k.mark_excess, n, chosen, sign, t.offsets, t.covariances, t.volumes, *marks.arrays
+        )
+
+    def _spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
+        """Return the largest key within `rings` rings of each generator."""
+        engine, n = self.engine, t.n
+        into, other = engine.empty(n, np.uint64), engine.empty(n, np.uint64)
+        for _ in range(rings):
+            engine.run_each(
+                self._kernels.spread_keys, n, t.starts, t.neighbours, source, into
+            )
+            source, into, other = into, other, into
+        return source
+
+    def _choose(self, t: Tessellation, keys: cla.Array, rings: int) -> cla.Array:
+        """Return the keys of sites that are `rings` rings apart, the strongest first; `keys` is used up."""
+        engine, k, n = self.engine, self._kernels, t.n
+        chosen, latest = engine.zeros(n, np.uint64), engine.empty(n, np.uint64)
+        for _ in range(ROUNDS):
+            spread = self._spread(t, keys, rings)
+            engine.run_each(k.choose_sites, n, keys, spread, chosen, latest)
+            engine.run_each(k.drop_sites, n, self._spread(t, latest, rings), keys)
+        return chosen
+
+    def _limit(self, chosen: cla.Array, n: int, most: int) -> None:
+        """Keep the `most` strongest of the sites (fewer where several tie for the last place)."""
+        engine, k = self.engine, self._kernels
+        low, width = 0, 2**32 // HISTOGRAM
+        while True:
+            histogram = engine.zeros(HISTOGRAM, np.int32)
+            engine.run_each(k.count_sites, n, chosen, np.uint32(low), np.uint32(width), histogram)
+            from_top = np.cumsum(histogram.get()[::-1])
+            whole = int(np.searchsorted(from_top, most, side="right"))
+            least = low + (HISTOGRAM - whole) * width
+            if whole == HISTOGRAM or width == 1:
+                break
+            # Look closer at the bin in which the count is passed.
+            most -= int(from_top[whole - 1]) if whole else 0
+            low, width = least - width, max(1, width // HISTOGRAM)
+        engine.run_each(k.limit_sites, n, np.uint32(min(least, 2**32 - 1)), chosen)
+
+    def _apply(
+        self, box: Box, t: Tessellation, rows: Population, marks: _Marks, next_label: int
+    ) -> Population | None:
+        """Carry out what is marked."""
+        engine, n = self.engine, t.n
+        self._scan.exclusive(marks.kept, marks.kept, n)
+        self._scan.exclusive(marks.born, marks.born, n)
+        deleted, inserted = n - int(marks.kept[n].get()), int(marks.born[n].get())
+        m = n - deleted + inserted
+        if m == 0 or (deleted == 0 and inserted == 0):
+            return None
+        new = Population(
+            engine.empty((m, 2)), engine.empty(m, np.int32), engine.empty((m, 2)),
+            engine.empty(m, np.uint64), engine.empty(m), inserted, deleted,
+        )  # fmt: skip
+        engine.run_each(
+            self._kernels.apply_changes, n, marks.kept, marks.born, np.int32(next_label),
+            *box.device_corners(engine.real), t.points, rows.labels, rows.velocity,
+            rows.signatures, rows.ever, marks.shifts, marks.births, new.points, new.labels,
+            new.velocity, new.signatures, new.ever,
+        )  # fmt: skip
+        return new
+
+
+@dataclass(frozen=True)
+class _Marks:
+    """What is to change: see population.cl."""
+
+    kept: cla.Array
+    shifts: cla.Array
+    born: cla.Array
+    births: cla.Array
+    busy: cla.Array
+
+    @classmethod
+    def clean(cls, engine: Engine, n: int) -> _Marks:
+        kept = engine.zeros(n + 1, np.int32)
+        kept.fill(1)
+        return cls(
+            kept, engine.zeros((n, 2)), engine.zeros(n + 1, np.int32), engine.zeros((n, 2)),
+            engine.zeros(n, np.uint64),
+        )  # fmt: skip
+
+    @property
+    def arrays(self) -> tuple[cla.Array, ...]:
+        return self.kept, self.shifts, self.born, self.births
