@@ -5,6 +5,7 @@ from .adapter import Adapter
 from .device import create_context, list_devices
 from .domain import Box
 from .errors import ClvoroError
+from .io import load
 from .results import Diagram, Displacements, Result
 
 __version__ = "0.1.0"
@@ -18,5 +19,6 @@ __all__ = [
     "Result",
     "create_context",
     "list_devices",
+    "load",
     "sizing",
 ]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
 import signal
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -18,6 +16,7 @@ import numpy as np
 
 from .cases import Case
 from .errors import ClvoroError, InputError
+from .io import check_writable, save, write_history
 from .results import Result
 from .summary import summary
 
@@ -154,7 +153,6 @@ class Job:
 
     def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
         from . import __version__
-        from .io import save, write_history
 
         *others, (_, main) = results.items()
         save(main, self.out / "mesh.vtu")
@@ -244,14 +242,12 @@ def check_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=".clvoro-", dir=folder)
-        os.close(handle)
-        os.unlink(name)
     except OSError as error:
         raise InputError(
-            f"out is {str(folder)!r}, where nothing can be written ({error}); "
+            f"out is {str(folder)!r}, where no folder can be made ({error.strerror}); "
             "give a folder of your own with --out"
         ) from error
+    check_writable(folder)
 
 
 def _require_plots() -> None:

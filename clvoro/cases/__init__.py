@@ -12,6 +12,7 @@ from typing import Any
 
 from ..domain import Box
 from ..errors import InputError
+from ..io.atomic import atomic_file
 from . import schema, toml
 from .fields import build_size, load_array, named_files
 from .naca import naca4
@@ -129,9 +130,8 @@ class Case:
             if source != (folder / target).resolve():
                 shutil.copyfile(source, folder / target)
         path = folder / "case.toml"
-        temporary = folder / ".case.toml.part"
-        temporary.write_text(toml.write(moved.table(), header), encoding="utf-8")
-        temporary.replace(path)
+        with atomic_file(path) as file:
+            file.write(toml.write(moved.table(), header).encode())
         return path
 
 

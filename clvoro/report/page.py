@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..io.atomic import atomic_file
 from ..results import Result
 from ..summary import summary
 from .pictures import pictures_of, render
@@ -84,19 +85,17 @@ def write_report(
         png = render(figure, "png", dpi)
         for kind in formats:
             path = target / "pictures" / f"{name}.{kind}"
-            _replace(path, png if kind == "png" else render(figure, kind, dpi))
+            _write(path, png if kind == "png" else render(figure, kind, dpi))
             written.append(path)
         figures.append((caption, png))
     page = target / "report.html"
-    _replace(page, _page(results, title, case, facts or {}, figures).encode())
+    _write(page, _page(results, title, case, facts or {}, figures).encode())
     return [page, *written]
 
 
-def _replace(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_bytes(content)
-    temporary.replace(path)
+def _write(path: Path, content: bytes) -> None:
+    with atomic_file(path) as file:
+        file.write(content)
 
 
 def _page(
