@@ -15,12 +15,13 @@ ROUNDS = 3
 """Rounds of matching; the third still pairs off every fifth cell, a fourth would not pay."""
 
 
-_GROUP = 64
+GROUP = 64
+"""Work-items per work-group, always the same: PoCL compiles a kernel for every size it meets."""
 
 
 def whole_groups(size: int) -> int:
-    """Return `size` rounded up, lest the driver split a prime number of work-items one by one."""
-    return max(1, -(-size // _GROUP)) * _GROUP
+    """Return `size` rounded up to whole work-groups."""
+    return max(1, -(-size // GROUP)) * GROUP
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ._program import Engine
-from .coarsening import Coarsening, Graph, Groups, PairInverse, Room, whole_groups
+from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, Room, whole_groups
 
 _COARSEST = 64
 _MOST_LEVELS = 30
@@ -41,7 +41,7 @@ class _Bound:
         kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
 
     def __call__(self) -> None:
-        cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, None)
+        cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, (GROUP,))
 
 
 class Multigrid:

@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
+from .coarsening import Room
 from .errors import InputError
 from .krylov import CURVATURE, ConjugateGradient, Launch, Solution
 from .multigrid import Multigrid
@@ -59,6 +60,7 @@ class Poisson:
         self._krylov = ConjugateGradient(engine)
         self._multigrid: Multigrid | None = None
         self._prepared: Laplacian | None = None
+        self._room = Room(engine)
 
     def assemble(
         self,
@@ -84,6 +86,7 @@ class Poisson:
         Returns
         -------
         Laplacian
+            Its arrays are used again by the next call.
         """
         engine = self.engine
         n = len(starts) - 1
@@ -91,8 +94,9 @@ class Poisson:
         _check("face_measures", face_measures, neighbours.shape)
         if density is not None:
             _check("density", density, (n,))
-        columns, weights = engine.empty(len(neighbours), np.int32), engine.empty(len(neighbours))
-        diagonal, inverse = engine.empty(n), engine.empty(n)
+        m, room = len(neighbours), self._room
+        columns, weights = room("columns", size=m, dtype=np.int32), room("weights", size=m)
+        diagonal, inverse = room("diagonal", size=n), room("inverse", size=n)
         engine.run(
             self._kernels.assemble, n, np.int32(n), np.int32(density is not None), starts,
             neighbours, face_measures, points, points if density is None else density, columns,
