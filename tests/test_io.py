@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from clvoro import io
 from clvoro.domain import Box
 from clvoro.errors import InputError, InputTypeError
-from clvoro.io import formats
+from clvoro.io import formats, npz
 from clvoro.io.vtu import write_vtu
 from clvoro.results import HISTORY_DTYPE, Diagram, Displacements, Result
 
@@ -65,6 +65,7 @@ def make_result(n=40, seed=60211):
         history=history,
         converged=True,
         stop_reason="tol — reached",
+        size_factor=1.25,
         initial=Displacements(points, rng.random((n, 2)), rng.random((n, 2))),
         settings={"method": "coupled", "alpha": None, "k": 0.5, "seed": 7, "name": "a--b é <&>"},
     )
@@ -106,6 +107,11 @@ def test_npz_returns_what_was_saved(tmp_path_factory, n, seed):
     saved = make_result(n, seed)
     io.save(saved, path)
     assert_equal_results(saved, io.load(path))
+
+
+def test_npz_knows_every_array_of_a_diagram():
+    # Whoever adds an array to a Diagram says here what shape a file must give it.
+    assert {f"diagram.{name}" for name in Diagram._NAMES} <= set(npz._SHAPES)
 
 
 def test_npz_of_a_device_run(tmp_path):
@@ -181,6 +187,7 @@ def huge_array():
         ({"history": np.zeros(3)}, "history has shape"),
         ({"about": np.array("{not json")}, "description is damaged"),
         ({"about": np.array('{"domain": {"kind": "Torus"}}')}, "'Torus'"),
+        ({"about": np.array("7")}, "description is damaged"),
         ({"about": np.array("[" * 100000)}, "description is damaged"),
         ({"diagram.neighbours": None}, "lacks diagram.neighbours"),
         ({"diagram.neighbour_starts": np.arange(41)}, "does not cut"),

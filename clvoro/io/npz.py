@@ -1,8 +1,9 @@
 """The format that loses nothing: NumPy arrays in a zip file, read back without trusting it.
 
-Members, each one array (`.npy`): `format`, `version`, `about` (JSON: domain, settings, how it
-ended), `points`, `size`, `error`, `quality`, `history`, `diagram.<name>` for the arrays of a
-`Diagram`, and `initial.<name>`, `final.<name>` for `Displacements`. `numpy.load` reads it, too.
+Members, each one array (`.npy`): `format`, `version`, `about` (JSON: domain, settings, and what of
+a `Result` is a single value), the arrays of a `Result` under their names, `diagram.<name>` for
+those of its `Diagram`, and `initial.<name>`, `final.<name>` for `Displacements`. `numpy.load` reads
+it, too.
 """
 
 from __future__ import annotations
@@ -27,7 +28,13 @@ from .atomic import atomic_file
 FORMAT, VERSION = "clvoro-result", 1
 
 _DOMAINS = {"Box": Box}
-_FIELDS = ("points", "size", "error", "quality", "history")
+_NEEDED = ("about", "points", "size", "error", "quality", "history", "diagram.points")
+_FIELDS = tuple(field.name for field in dataclasses.fields(Result))
+_PARTS = {
+    "diagram": Diagram._NAMES,
+    "initial": tuple(field.name for field in dataclasses.fields(Displacements)),
+    "final": tuple(field.name for field in dataclasses.fields(Displacements)),
+}
 
 # What each array must look like: sizes named by a letter are the same everywhere (d: dimension).
 _SHAPES = {
@@ -45,26 +52,23 @@ def write_npz(result: Result, path: Path) -> None:
     """Write all of `result` to `path`; the same result gives the same bytes."""
     diagram = result.diagram
     kind = type(diagram.domain).__name__
-    about = {
+    about: dict[str, Any] = {
         "domain": {"kind": kind, **dataclasses.asdict(diagram.domain)},
-        "converged": bool(result.converged),
-        "stop_reason": result.stop_reason,
         "settings": result.settings,
+        "values": {},
     }
-    arrays: dict[str, object] = {
-        "format": FORMAT,
-        "version": VERSION,
-        "about": json.dumps(about, default=_plain),
-    }
-    arrays |= {name: getattr(result, name) for name in _FIELDS}
-    for name in Diagram._NAMES:
-        if name in diagram._arrays:
-            arrays[f"diagram.{name}"] = getattr(diagram, name)
-    for prefix in ("initial", "final"):
-        part = getattr(result, prefix)
-        if part is not None:
-            names = (field.name for field in dataclasses.fields(part))
-            arrays |= {f"{prefix}.{name}": getattr(part, name) for name in names}
+    arrays: dict[str, object] = {}
+    for name in _FIELDS:
+        value = getattr(result, name)
+        if name in _PARTS:
+            # A diagram knows which of its arrays it has; they are fetched here.
+            names = getattr(value, "_arrays", _PARTS[name]) if value is not None else ()
+            arrays |= {f"{name}.{k}": getattr(value, k) for k in _PARTS[name] if k in names}
+        elif isinstance(value, np.ndarray):
+            arrays[name] = value
+        elif name != "settings":
+            about["values"][name] = value
+    arrays |= {"format": FORMAT, "version": VERSION, "about": json.dumps(about, default=_plain)}
     with (
         atomic_file(path) as file,
         # Coordinates hardly compress; the graphs do, at any level.
@@ -131,10 +135,11 @@ def _read_all(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
         raise _FileError(
             f"its version is {version.item()}, expected at most {VERSION}; install a newer clvoro"
         )
-    missing = [name for name in ("about", *_FIELDS, "diagram.points") if name not in members]
+    missing = [name for name in _NEEDED if name not in members]
     if missing:
         raise _FileError(f"it lacks {', '.join(missing)}")
-    known = ("about", *_SHAPES)
+    parts = (f"{part}.{name}" for part, names in _PARTS.items() for name in names)
+    known = ("about", *_FIELDS, *parts)
     return {name: _read(archive, members[name]) for name in known if name in members}
 
 
@@ -218,9 +223,11 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         if kind not in _DOMAINS:
             raise _FileError(f"its domain is a {kind!r:.40}, which this version of clvoro lacks")
         domain = _DOMAINS[kind](**description)
-        converged, reason = bool(facts["converged"]), str(facts["stop_reason"])
         settings = dict(facts["settings"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        values = {name: value for name, value in facts["values"].items() if name in _FIELDS}
+        if {"converged", "stop_reason"} - set(values) or set(values) & (set(arrays) | set(_PARTS)):
+            raise KeyError("values")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise _FileError(f"its description is damaged ({error})") from error
     if arrays["points"].shape[1] != domain.dim:
         raise _FileError(f"its points have {arrays['points'].shape[1]} coordinates in {domain}")
@@ -228,28 +235,25 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
     history = np.zeros(len(stored), HISTORY_DTYPE)
     for column in set(stored.dtype.names or ()) & set(HISTORY_DTYPE.names or ()):
         history[column] = stored[column]
-    prefix = "diagram."
-    parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
     return Result(
-        points=arrays["points"],
-        diagram=Diagram(domain, parts),
-        size=arrays["size"],
-        error=arrays["error"],
-        quality=arrays["quality"],
+        **values,
+        **{name: arrays[name] for name in _FIELDS if name in arrays and name != "history"},
+        diagram=Diagram(domain, _part(arrays, "diagram")),
         history=history,
-        converged=converged,
-        stop_reason=reason,
         initial=_displacements(arrays, "initial"),
         final=_displacements(arrays, "final"),
         settings=settings,
     )
 
 
-def _displacements(arrays: Mapping[str, np.ndarray], prefix: str) -> Displacements | None:
-    names = [field.name for field in dataclasses.fields(Displacements)]
-    if not all(f"{prefix}.{name}" in arrays for name in names):
-        return None
-    return Displacements(**{name: arrays[f"{prefix}.{name}"] for name in names})
+def _part(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:
+    prefix = f"{part}."
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _displacements(arrays: Mapping[str, np.ndarray], part: str) -> Displacements | None:
+    found = _part(arrays, part)
+    return Displacements(**found) if len(found) == len(_PARTS[part]) else None
 
 
 def _plain(value: Any) -> object:
