@@ -305,7 +305,9 @@ def main() -> int:
 
         case = load_case("paper")
         points = runs[0]["coupled"].initial.points
-        initial = adapter.run(case.domain, case.size_field(), points=points, max_steps=0)
+        initial = adapter.run(
+            case.domain, case.size_field(), points=points, method="lloyd", max_steps=0
+        )
         write_report(
             runs[0], arguments.pictures, initial=initial, size=case.size_field(), title=case.title
         )

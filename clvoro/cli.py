@@ -19,7 +19,7 @@ examples:
   clvoro run paper                      the paper's validation case, into out/paper
   clvoro run airfoil --device gpu       a wing section on a GPU
   clvoro cases paper > my.toml          a case file to start from
-  clvoro run my.toml --method coupled --steps 200 --out result
+  clvoro run my.toml --effort fast --out result
 """
 
 
@@ -50,7 +50,9 @@ def build_parser() -> argparse.ArgumentParser:
         "--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices"
     )
     run.add_argument(
-        "--method", metavar="M", help="lloyd, poisson, coupled, ...; or several: lloyd,coupled"
+        "--method",
+        metavar="M",
+        help="adaptive (the default), exact, coupled, ...; or several: lloyd,coupled",
     )
     run.add_argument(
         "--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform"
@@ -62,6 +64,9 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--seed", type=int, metavar="S", help="of the random start")
     run.add_argument("--dtype", choices=("float64", "float32"), help="precision on the device")
     run.add_argument("--effort", choices=("fast", "default", "best"), help="work against quality")
+    run.add_argument(
+        "--levels", metavar="N", help="coarser levels to begin with, or auto (the default)"
+    )
     run.add_argument("--no-report", action="store_true", help="no pictures and no page")
     run.add_argument(
         "--format",
@@ -125,6 +130,7 @@ def _run(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         dtype=arguments.dtype,
         effort=arguments.effort,
+        levels=_level_count(arguments.levels),
     )
     job = Job(
         case,
@@ -136,6 +142,11 @@ def _run(arguments: argparse.Namespace) -> int:
         as_json=arguments.json,
     )
     return INTERRUPTED if job.run() else OK
+
+
+def _level_count(text: str | None) -> str | int | None:
+    """Return the number in `text`; what is none is for the case's checks to refuse."""
+    return int(text) if text is not None and text.isdecimal() else text
 
 
 def _devices(_: argparse.Namespace) -> int:

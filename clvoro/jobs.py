@@ -20,7 +20,10 @@ from .io import check_writable, save, write_history
 from .results import Result
 from .summary import summary
 
-_REPEATED = ("start", "n_cells", "max_steps", "tol", "alpha", "k", "seed", "dtype")
+_REPEATED = (
+    "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
+    "seed", "dtype",
+)  # fmt: skip
 """Settings that a run reports and that its `case.toml` fixes, whatever later defaults are."""
 
 
@@ -113,10 +116,6 @@ class Job:
             self.interrupted = True
         return replace(result, stop_reason="interrupted") if self.interrupted else result
 
-    def _inside(self, points: np.ndarray) -> np.ndarray:
-        """Undo what the change of units may have rounded across a wall."""
-        return np.clip(points, self.case.domain.lower, self.case.domain.upper)
-
     def _refuse_unknown(self, arguments: dict[str, Any], run: Callable[..., Any]) -> None:
         known = inspect.signature(run).parameters
         for name in arguments:
@@ -184,20 +183,20 @@ class Job:
     def _repeatable(self, main: Result) -> Case:
         """Return the case with all settings that took their default values written out."""
         known = {key: main.settings.get(key) for key in _REPEATED}
-        if "points" in self.case.run or known["start"] not in ("density", "uniform"):
-            known["start"] = self.case.run.get("start")
-        known["n_cells"] = None if "points" in self.case.run else known["n_cells"]
+        if known["start"] == "points":
+            known["start"] = None
+        if len(self.case.methods) > 1:  # of which each may choose its own
+            known["levels"] = None
         if len(self.case.methods) == 1:
             known["method"] = main.settings.get("method")
         return self.case.with_run(**known)
 
     def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
         """Return the mesh before the first step."""
-        if main.initial is None:
-            return None
-        return adapter.run(
-            self.case.domain, size, points=self._inside(main.initial.points), max_steps=0
-        )
+        if main.initial is None or main.history["level"][0] > 0:
+            return None  # no step, or a first one on a coarser level
+        points = np.clip(main.initial.points, self.case.domain.lower, self.case.domain.upper)
+        return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
 
     def _announce(self, name: str, result: Result, where: str) -> None:
         """Print the run as JSON if that was asked for."""

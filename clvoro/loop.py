@@ -57,7 +57,7 @@ class Loop:
         converged, reason = False, "plan completed"
         try:
             stop = self.record(0.0)
-            for action, progress in zip(self.plan, [*self.done[1:], 1.0], strict=True):
+            for action, progress in zip(self.plan, [*self.done[1:], 1.0], strict=False):
                 if stop or (self.max_steps is not None and self.steps >= self.max_steps):
                     reason = "stopped by the callback" if stop else "max_steps reached"
                     break

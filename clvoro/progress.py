@@ -23,7 +23,7 @@ class Progress:
     title : str
         What runs: the case and its method.
     max_steps : int or None
-        For the share done and the time left (at most: a run may stop earlier); None if unknown.
+        If it is known; a run may stop earlier, so that the time left is a bound.
     stream : text stream
         Usually the standard error.
     """
@@ -31,7 +31,7 @@ class Progress:
     def __init__(self, title: str, max_steps: int | None, stream: TextIO | None = None) -> None:
         self.title, self.max_steps = title, max_steps
         self.stream = sys.stderr if stream is None else stream
-        self.steps = -1
+        self.steps, self._cells = -1, 0
         self._shown, self._began = 0.0, time.monotonic()
         self._status = _rich_status(self.stream)
         self._live = self._status is not None or self.stream.isatty()
@@ -52,6 +52,8 @@ class Progress:
     def __call__(self, row: np.void) -> None:
         """Show `row`, a row of `HISTORY_DTYPE`, if the last one was shown long enough ago."""
         self.steps += 1
+        if self.steps:
+            self._cells += int(row["cells"])
         now = time.monotonic()
         if now - self._shown < (REFRESH if self._live else EVERY):
             return
@@ -70,9 +72,11 @@ class Progress:
 
     def line(self, row: np.void) -> str:
         """Return the text for `row`: step, errors, quality, cells per second, time left."""
-        seconds, n = float(row["seconds"]), int(row["cells"])
+        seconds, done = float(row["seconds"]), float(row["progress"])
         level = f" level {row['level']}" if row["level"] else ""
-        of = "" if self.max_steps is None else f"/{self.max_steps}"
+        of = f" ({done:.0%})" if self.max_steps is None else f"/{self.max_steps}"
+        if self.max_steps:
+            done = max(done, self.steps / self.max_steps)
         # Short enough for 80 columns with a title of some 15.
         parts = [
             f"{self.title}{level} {self.steps}{of}",
@@ -80,10 +84,9 @@ class Progress:
             f"Q {row['mean_quality']:.3f} min {row['min_quality']:.2f}",
         ]
         if self.steps > 0 and seconds > 0:
-            parts.append(f"{_short(n * self.steps / seconds)} cells/s")
-            if self.max_steps is not None:
-                left = seconds / self.steps * max(self.max_steps - self.steps, 0)
-                parts.append(f"{_duration(left)} left")
+            parts.append(f"{_short(self._cells / seconds)} cells/s")
+            if done > 0:
+                parts.append(f"{_duration(seconds * (1 / done - 1))} left")
         return "  ".join(parts)
 
 

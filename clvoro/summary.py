@@ -14,11 +14,12 @@ def summary(result: Result) -> dict[str, Any]:
     error, history = np.abs(result.error), result.history
     return {
         "cells": len(result.points),
-        "steps": max(len(history) - 1, 0),
+        "steps": int(history["step"][-1]) if len(history) else 0,
         "mean_error": float(error.mean()),
         "max_error": float(error.max()),
         "mean_quality": float(result.quality.mean()),
         "min_quality": float(result.quality.min()),
+        "size_factor": float(result.size_factor),
         "ever_changed": float(history["ever_changed"][-1]) if len(history) else 0.0,
         "converged": bool(result.converged),
         "stop_reason": result.stop_reason,

@@ -259,9 +259,10 @@ class Terminal(io.StringIO):
         return True
 
 
-def row(step, seconds, cells=1000):
+def row(step, seconds, cells=1000, progress=0.1):
     values = np.zeros((), HISTORY_DTYPE)
     values["step"], values["cells"], values["seconds"] = step, cells, seconds
+    values["progress"] = progress
     values["mean_error"], values["max_error"] = 0.125, 1.5
     values["mean_quality"], values["min_quality"] = 0.75, 0.5
     return values[()]
@@ -275,6 +276,16 @@ def test_line_holds_the_numbers():
     assert len(line) < 80
     for part in ["lloyd 1/10", "|e| 0.1250", "max 1.5", "min 0.50", "2k cells/s", "4 s left"]:
         assert part in line
+
+
+def test_line_of_a_run_of_unknown_length():
+    shown = progress.Progress("paper", None, io.StringIO())
+    for step, cells in enumerate([10, 10, 40]):
+        shown(row(step, float(step), cells, progress=step / 8))
+    line = shown.line(row(2, 2.0, 40, progress=0.25))
+    assert line.startswith("paper 2 (25%)")
+    assert "25 cells/s" in line  # 10 + 40 in two seconds
+    assert line.endswith("6 s left")
 
 
 def test_terminal_without_rich_gets_one_changing_line(monkeypatch):

@@ -21,7 +21,8 @@ __all__ = ["Case", "builtin_cases", "load_case", "naca4"]
 
 _FOLDER = Path(__file__).parent
 _RUN_ORDER = (
-    "method", "methods", "effort", "start", "points", "n_cells", "max_steps", "tol", "alpha", "k",
+    "method", "methods", "effort", "levels", "error_target", "start", "points", "n_cells",
+    "max_steps", "tol", "alpha", "k",
     "seed", "dtype",
 )  # fmt: skip
 

@@ -60,6 +60,11 @@ def whole(least: int) -> Check:
     return check
 
 
+def auto_or_whole(value: object, place: str) -> str | int:
+    """Check for "auto" or a whole number."""
+    return "auto" if value == "auto" else whole(0)(value, place)
+
+
 def one_of(*names: str) -> Check:
     """Return the check for one of a few words."""
 
@@ -225,6 +230,8 @@ RUN = Table(
         "seed": whole(0),
         "dtype": one_of("float64", "float32"),
         "effort": one_of("fast", "default", "best"),
+        "levels": auto_or_whole,
+        "error_target": positive,
     },
 )
 

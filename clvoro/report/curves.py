@@ -32,6 +32,8 @@ MOST_ARROWS = 2500
 def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
     """Draw error (log scale) and quality against the step, one colour per method.
 
+    Dotted lines mark where a run went on to a finer level.
+
     Parameters
     ----------
     results : mapping
@@ -66,6 +68,8 @@ def _history_panel(ax: Any, results: Mapping[str, Result], quantity: str) -> Non
         history = result.history
         steps = np.arange(len(history))  # counts on where the levels' own step numbers start anew
         longest = max(longest, len(steps) - 1)
+        for change in np.flatnonzero(np.diff(history["level"])):
+            ax.axvline(change + 0.5, color=colour, lw=0.7, ls=":")
         dots = "o" if len(steps) == 1 else None
         ax.plot(steps, _drawable(history[mean], quantity), color=colour, lw=1.5, marker=dots)
         ax.plot(steps, _drawable(history[worst], quantity), color=colour, lw=0.9, ls=(0, (4, 2)))
@@ -76,8 +80,9 @@ def _history_panel(ax: Any, results: Mapping[str, Result], quantity: str) -> Non
     ax.grid(True, which="major", color="#DDDDDD", lw=0.5)
     ax.set_axisbelow(True)
     if quantity == "error":
-        ax.set_yscale("log")
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+        if any((result.history[worst] > 0).any() for result in results.values()):
+            ax.set_yscale("log")
+            ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     else:
         ax.set_ylim(min(0.0, ax.get_ylim()[0]), 1.0)
 
@@ -107,6 +112,7 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
         if figure is None:
             figure = interactive_figure(WIDTH, displacements_height(result))
         axes = figure.subplots(len(rows), 2, squeeze=False)
+        coarse = result.history["level"][0] > 0
         for axes_row, (when, field) in zip(axes, rows, strict=True):
             field = _inside(field, lower, upper)
             factors = _magnifications(field)
@@ -116,7 +122,8 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
             )
             for ax, factor, (name, arrows, colour) in zip(axes_row, factors, halves, strict=True):
                 note = "to scale" if factor == 1 else f"magnified × {factor:g}"
-                ax.set_title(f"{name} displacement, {when} step ({note})")
+                on = ", coarsest level" if coarse and when == "first" else ""
+                ax.set_title(f"{name} displacement, {when} step{on} ({note})")
                 _draw_arrows(ax, field.points, arrows * factor, colour)
                 frame_domain(ax, lower, upper, ticks=len(result.points) > MOST_ARROWS)
                 ax.locator_params(nbins=4)

@@ -117,6 +117,11 @@ def _page(
         "time": f"{numbers['seconds']:.2f} s",
     }
     cards = "".join(f"<div><dt>{_safe(k)}</dt><dd>{_safe(v)}</dd></div>" for k, v in head.items())
+    if main.size_factor != 1:
+        facts = {
+            **facts,
+            "size field scaled by": f"{main.size_factor:.4g} to fit the number of cells",
+        }
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])
     parts = [
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
