@@ -4,11 +4,11 @@
    only decides ranks within a bin, and the last pass sorts each bin by generator index: the result is deterministic. */
 
 /* Per generator i: keys[i] = its bin in grid 0, ranks[i] = its place in the bin. counts must be zero. */
-kernel void count_root(const int size, global const REAL *points, const FRAME frame, const int side, global int *keys,
+kernel void count_root(const int size, global const REAL *points, const FRAME frame, const int4 shape, global int *keys,
                        global int *ranks, global int *counts)
 {
     WORK_ITEM(i);
-    const int key = bin_in_grid(points + DIM * i, frame, (int2)(0, side));
+    const int key = bin_in_grid(points + DIM * i, frame, shape);
     keys[i] = key;
     ranks[i] = atomic_inc(counts + key);
 }
@@ -37,7 +37,7 @@ kernel void plan_children(const int size, global const int *counts, const int be
    bin below level 0 starts where its parent starts: `parents[b]` names its grid, whose first bin and first item are
    known. */
 kernel void place_bins(const int size, global const int *counts, global const int *starts, const int begin, global const int *bin_grid,
-                       global const int2 *grid_shapes, global const int *grid_items, global int2 *bins)
+                       global const int4 *grid_shapes, global const int *grid_items, global int2 *bins)
 {
     WORK_ITEM(b);
     int start = starts[b];
@@ -51,7 +51,7 @@ kernel void place_bins(const int size, global const int *counts, global const in
 /* Per divided bin b: create grid g over its box, and note in each of the new bins which grid it belongs to. */
 kernel void make_grids(const int size, global int2 *bins, const int begin, const int next_begin, const int first_grid,
                        global const int *grid_ids, global const int *child_firsts, global int *bin_grid,
-                       global FRAME *grid_frames, global int2 *grid_shapes, global int *grid_items)
+                       global FRAME *grid_frames, global int4 *grid_shapes, global int *grid_items)
 {
     WORK_ITEM(b);
     const int2 bin = bins[begin + b];
@@ -61,29 +61,20 @@ kernel void make_grids(const int size, global int2 *bins, const int begin, const
     const int parent = bin_grid[begin + b];
     const int g = first_grid + grid_ids[b];
     const int first = next_begin + child_firsts[b];
-    const uint code = begin + b - grid_shapes[parent].s0;
-    const FRAME frame = grid_frames[parent];
+    const int4 shape = grid_shapes[parent];
+    const int place = begin + b - shape.s0;
+    FRAME frame = grid_frames[parent];
     const REAL edge = 1 / FRAME_INVERSE(frame);
-    FRAME child = frame;
-    /* The bin's corner, from the de-interleaved Morton code. */
-    uint index[3] = {0, 0, 0};
-    for (int bit = 0; bit < 16; ++bit)
-        for (int a = 0; a < DIM; ++a)
-            if (DIM * bit + a < 32)
-                index[a] |= ((code >> (DIM * bit + a)) & 1u) << bit;
-    child.s0 += index[0] * edge;
-    child.s1 += index[1] * edge;
-#if DIM == 2
-    child.s2 = frame.s2 * side;
-    const int volume = side * side;
-#else
-    child.s2 += index[2] * edge;
-    child.s3 = frame.s3 * side;
-    const int volume = side * side * side;
+    frame.s0 += place % shape.s1 * edge;
+    frame.s1 += place / shape.s1 % shape.s2 * edge;
+#if DIM == 3
+    frame.s2 += place / shape.s1 / shape.s2 * edge;
 #endif
-    grid_frames[g] = child;
-    grid_shapes[g] = (int2)(first, side);
+    FRAME_INVERSE(frame) *= side;
+    grid_frames[g] = frame;
+    grid_shapes[g] = (int4)(first, side, side, DIM == 3 ? side : 1);
     grid_items[g] = bin.s0;
+    const int volume = DIM == 2 ? side * side : side * side * side;
     for (int c = 0; c < volume; ++c)
         bin_grid[first + c] = g;
     bins[begin + b] = (int2)(-1 - g, bin.s1);
@@ -91,7 +82,7 @@ kernel void make_grids(const int size, global int2 *bins, const int begin, const
 
 /* Per generator i whose bin was divided: count it into its new bin. */
 kernel void count_children(const int size, global const REAL *points, global const int2 *bins, global const FRAME *grid_frames,
-                           global const int2 *grid_shapes, global int *keys, global int *ranks, global int *counts)
+                           global const int4 *grid_shapes, global int *keys, global int *ranks, global int *counts)
 {
     WORK_ITEM(i);
     const int g = -1 - bins[keys[i]].s0;

@@ -16,74 +16,79 @@ inline void raise_flag(global int *flags, int flag, int generator)
     atomic_min(flags + 1, generator);
 }
 
-/* Range of bins of one grid that the square (cube) of half-width w around x covers. */
-typedef struct {
-    int from[DIM];
-    int to[DIM];
-} range_t;
-
-inline range_t covered(const REAL *x, REAL w, FRAME frame, int side)
+/* How far a row of bins is from y; a little less, as positions are put into bins with rounding. */
+inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
 {
-    const REAL inverse = FRAME_INVERSE(frame);
-    range_t r;
-    r.from[0] = axis_bin(x[0] - w, frame.s0, inverse, side);
-    r.to[0] = axis_bin(x[0] + w, frame.s0, inverse, side);
-    r.from[1] = axis_bin(x[1] - w, frame.s1, inverse, side);
-    r.to[1] = axis_bin(x[1] + w, frame.s1, inverse, side);
-    return r;
+    const REAL below = origin + row * edge - y;
+    const REAL distance = (below > 0 ? below : -below - edge) - edge * (64 * REAL_EPS + R(1e-6));
+    return distance > 0 ? distance : 0;
 }
 
-/* Clip the cell at place p by every generator in the bins that the square of half-width w covers and the square of
-   half-width `inner` does not (inner < 0: no bin was opened before). Returns FLAG_* or 0. */
-inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, bool warm, global const REAL *points, global const REAL *binned,
-                        global const int *items, global const int2 *bins, global const FRAME *grid_frames,
-                        global const int2 *grid_shapes)
+/* Clip the cell of generator i by every generator in the bins that the square of half-width w covers and the square of
+   half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice the farthest
+   corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or 0. */
+inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, bool warm,
+                        global const REAL *points, global const REAL *binned, global const int *items,
+                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
-    /* The grids that are open, from the root down, and the bin at which each was left. */
-    int grids[MAX_DEPTH], at_x[MAX_DEPTH], at_y[MAX_DEPTH];
+    /* The grids that are open, from the root down, and where each was left: row in outward order, bin in the row. */
+    int grids[MAX_DEPTH], turns[MAX_DEPTH], places[MAX_DEPTH];
     bool inside[MAX_DEPTH]; /* was the grid's own bin opened for the inner square? */
     int depth = 0;
-    grids[0] = 0;
+    grids[0] = turns[0] = 0;
+    places[0] = -1;
     inside[0] = inner >= 0;
-    at_x[0] = -1;
     while (depth >= 0) {
-        const int g = grids[depth];
-        const FRAME frame = grid_frames[g];
-        const int2 shape = grid_shapes[g];
-        const range_t outer = covered(x, w, frame, shape.s1);
-        range_t done = outer;
+        const FRAME frame = grid_frames[grids[depth]];
+        const int4 shape = grid_shapes[grids[depth]];
+        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
+        const int bottom = axis_bin(x[1] - w, frame.s1, inverse, shape.s2);
+        const int top = axis_bin(x[1] + w, frame.s1, inverse, shape.s2);
+        const int middle = axis_bin(x[1], frame.s1, inverse, shape.s2);
+        /* The rows and places that the inner square has taken. */
+        int4 done = (int4)(0, -1, 0, -1);
         if (inside[depth])
-            done = covered(x, inner, frame, shape.s1);
-        int ix = at_x[depth], iy = at_y[depth];
-        if (ix < 0) {
-            ix = outer.from[0];
-            iy = outer.from[1];
-        }
-        bool descend = false;
-        for (; iy <= outer.to[1] && !descend; ++iy, ix = outer.from[0]) {
-            const bool row_done = inside[depth] && iy >= done.from[1] && iy <= done.to[1];
-            const uint code_y = spread(iy) << 1;
-            for (; ix <= outer.to[0]; ++ix) {
-                const bool bin_done = row_done && ix >= done.from[0] && ix <= done.to[0];
-                const int2 bin = bins[shape.s0 + (spread(ix) | code_y)];
-                if (bin.s0 < 0) {
-                    /* Leave this grid after the bin, and go down. */
-                    at_x[depth] = ix + 1;
-                    at_y[depth] = iy;
-                    if (ix == outer.to[0]) {
-                        at_x[depth] = outer.from[0];
-                        at_y[depth] = iy + 1;
+            done = (int4)(axis_bin(x[0] - inner, frame.s0, inverse, shape.s1),
+                          axis_bin(x[0] + inner, frame.s0, inverse, shape.s1),
+                          axis_bin(x[1] - inner, frame.s1, inverse, shape.s2),
+                          axis_bin(x[1] + inner, frame.s1, inverse, shape.s2));
+        const int last_turn = 2 * max(middle - bottom, top - middle);
+        int turn = turns[depth], ix = places[depth];
+        int child = -1;
+        for (; turn <= last_turn; ++turn, ix = -1) {
+            const int row = turn & 1 ? middle + (turn + 1) / 2 : middle - turn / 2;
+            if (row < bottom || row > top)
+                continue;
+            const REAL away = row_distance(x[1], frame.s1, edge, row);
+            if (away * away >= 4 * cell->reach2)
+                continue;
+            const REAL span = min(w, 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS));
+            const int to = axis_bin(x[0] + span, frame.s0, inverse, shape.s1);
+            if (ix < 0)
+                ix = axis_bin(x[0] - span, frame.s0, inverse, shape.s1);
+            const bool row_done = row >= done.s2 && row <= done.s3;
+            global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
+            while (ix <= to && child < 0) {
+                /* The next run of generators in leaves beside each other. */
+                int begin = 0, end = 0;
+                for (; ix <= to; ++ix) {
+                    const int2 bin = row_bins[ix];
+                    const bool bin_done = row_done && ix >= done.s0 && ix <= done.s1;
+                    if (bin.s0 < 0) {
+                        child = -1 - bin.s0;
+                        inside[depth + 1] = bin_done;
+                        ++ix;
+                        break;
                     }
-                    ++depth;
-                    grids[depth] = -1 - bin.s0;
-                    inside[depth] = bin_done;
-                    at_x[depth] = -1;
-                    descend = true;
-                    break;
+                    if (bin_done || bin.s1 == 0)
+                        continue;
+                    if (end == 0)
+                        begin = bin.s0;
+                    else if (bin.s0 != end)
+                        break;
+                    end = bin.s0 + bin.s1;
                 }
-                if (bin_done)
-                    continue;
-                for (int q = bin.s0; q < bin.s0 + bin.s1; ++q) {
+                for (int q = begin; q < end; ++q) {
                     const REAL d[2] = {binned[2 * q] - x[0], binned[2 * q + 1] - x[1]};
                     const REAL d2 = d[0] * d[0] + d[1] * d[1];
                     if (d2 >= 4 * cell->reach2)
@@ -97,9 +102,19 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, 
                         return FLAG_FULL;
                 }
             }
+            if (child >= 0)
+                break;
         }
-        if (!descend)
+        if (child >= 0) {
+            turns[depth] = turn;
+            places[depth] = ix;
+            ++depth;
+            grids[depth] = child;
+            turns[depth] = 0;
+            places[depth] = -1;
+        } else {
             --depth;
+        }
     }
     return 0;
 }
@@ -113,7 +128,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, 
 
    rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; row_counts[i] of them */
 kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
-                       global const int2 *bins, global const FRAME *grid_frames, global const int2 *grid_shapes,
+                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
                        global const int *old_starts, global const int *old_neighbours, global int *rows,
                        global int *row_counts, global int *flags)

@@ -85,9 +85,9 @@ class Adapter:
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
         origin, scale = domain.frame
-        binned = stages.bins.build(engine.upload((host - origin) / scale), n)
+        binned = stages.bins.build(domain, engine.upload((host - origin) / scale), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
-        binned = stages.bins.build(sorted_points, n)
+        binned = stages.bins.build(domain, sorted_points, n)
         with _Naming(host, domain, self.dtype):
             t = stages.cells.tessellate(domain, sorted_points, n, binned)
         return fetch_diagram(engine, domain, t, labels)

@@ -1,4 +1,4 @@
-"""Neighbour search: generators sorted into hierarchical bins along a Morton curve (`bins.cl`)."""
+"""Neighbour search: generators sorted into hierarchical bins (`bins.cl`)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import pyopencl.array as cla
 
 from ._primitives import Scan
 from ._program import Engine
+from .domain import Box
 
-OCCUPANCY = 2.0
+OCCUPANCY = 2
 """Generators per bin that the grids aim at: fewer bins to open against fewer generators to test."""
 SPLIT_COUNT = 10
 """A bin that holds more is divided by a grid of its own. Uniform random sets (Poisson, mean 2) stay on one level."""
@@ -33,7 +34,7 @@ class BinnedPoints:
         Edge of the leaf that holds the generator, in the same order.
     bins : (b, 2) int32
     grid_frames : (g, 4) real
-    grid_shapes : (g, 2) int32
+    grid_shapes : (g, 4) int32
     """
 
     items: cla.Array
@@ -55,7 +56,7 @@ class Bins:
             {
                 "SPLIT_COUNT": SPLIT_COUNT,
                 "MAX_CHILD_SIDE": MAX_CHILD_SIDE,
-                "OCCUPANCY": int(OCCUPANCY),
+                "OCCUPANCY": OCCUPANCY,
             },
         )
         self._capacity: tuple[int, int] = (0, 0)
@@ -78,7 +79,7 @@ class Bins:
                 setattr(self, f"_{name}", grown)
             # A divided bin holds more than SPLIT_COUNT generators, so grids are far fewer than bins.
             self._frames = self._grown("_frames", (bins // 4 + 1) * 4, engine.real)
-            self._shapes = self._grown("_shapes", (bins // 4 + 1) * 2, np.int32)
+            self._shapes = self._grown("_shapes", (bins // 4 + 1) * 4, np.int32)
             self._grid_items = self._grown("_grid_items", bins // 4 + 1, np.int32)
             self._starts = engine.empty(bins + 1, np.int32)
             self._flags = engine.empty(bins + 1, np.int32)
@@ -92,23 +93,25 @@ class Bins:
             grown[: old.size] = old
         return grown
 
-    def build(self, points: cla.Array, n: int) -> BinnedPoints:
-        """Sort the first `n` of `points` (n, d; normalised coordinates in [0, 1]) into bins.
+    def build(self, box: Box, points: cla.Array, n: int) -> BinnedPoints:
+        """Sort the first `n` of `points` (n, d; normalised coordinates, within `box`) into bins.
 
         The host reads two integers per level; uniform sets have one level.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
-        side = max(1, round((n / OCCUPANCY) ** (1 / d)))
-        root_bins = (1 << (side - 1).bit_length()) ** d
+        lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
+        edge = float(np.prod(upper - lower) * OCCUPANCY / n) ** (1 / d)
+        sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
+        root_bins = int(np.prod(sides))
         self._reserve(n, root_bins + n // 2)
         self._counts.fill(0)
-        frame = np.zeros(4, engine.real)
-        frame[2 if d == 2 else 3] = side
+        frame, shape = np.zeros(4, engine.real), np.ones(4, np.int32)
+        frame[:d], frame[3], shape[0], shape[1 : d + 1] = lower, 1 / edge, 0, sides
         self._frames[:4] = frame
-        self._shapes[:2] = np.array([0, side], np.int32)
+        self._shapes[:4] = shape
         self._grid_of[:root_bins].fill(0)
         engine.run_each(
-            k.count_root, n, points, frame, np.int32(side), self._keys, self._ranks, self._counts
+            k.count_root, n, points, frame, shape, self._keys, self._ranks, self._counts
         )
         begin, size, grids = 0, root_bins, 1
         for level in range(MAX_LEVELS):

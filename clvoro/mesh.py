@@ -159,7 +159,7 @@ class Mesh:
         engine, stages = self.engine, self.stages
         first = not hasattr(self, "tessellation")
         self.n = n = len(points)
-        items = stages.bins.build(points, n).items[:n].copy()
+        items = stages.bins.build(self.domain, points, n).items[:n].copy()
         rows = stages.gather.rows
         self.points, self.labels = rows(items, points), rows(items, labels)
         self.velocity, self.signatures = rows(items, velocity), rows(items, signatures)
@@ -182,7 +182,7 @@ class Mesh:
     def update(self, first: bool = False) -> None:
         """Tessellate the generators where they are now, and evaluate size, error and quality."""
         stages = self.stages
-        binned = stages.bins.build(self.points, self.n)
+        binned = stages.bins.build(self.domain, self.points, self.n)
         self.tessellation = stages.cells.tessellate(
             self.domain, self.points, self.n, binned, self.tessellation
         )

@@ -8,9 +8,16 @@
 #error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
 #endif
 
+#define CHUNK 8 /* corners are tested this many at a time */
+#define REAL8 CLVORO_JOIN(REAL, 8)
+#if CELL_CAPACITY % CHUNK
+#error "CELL_CAPACITY must be a multiple of 8"
+#endif
+
 /* Face k runs counter-clockwise from corner k to corner k + 1 and belongs to faces[k]: a generator, or -1 - wall. */
 typedef struct {
     int n;
+    /* Places beyond n, to the end of a chunk, hold the generator itself, which no bisector cuts off. */
     REAL x[CELL_CAPACITY];
     REAL y[CELL_CAPACITY];
     int faces[CELL_CAPACITY];
@@ -30,6 +37,8 @@ inline void start_cell(cell_t *cell, int i, const REAL *x, const REAL *lower, co
         cell->upper[a] = upper[a];
     }
     cell->n = 4;
+    vstore8((REAL8)(0), 0, cell->x);
+    vstore8((REAL8)(0), 0, cell->y);
     cell->x[0] = cell->x[3] = lower[0] - x[0];
     cell->x[1] = cell->x[2] = upper[0] - x[0];
     cell->y[0] = cell->y[1] = lower[1] - x[1];
@@ -65,13 +74,13 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
     const REAL level = d2 / 2;
     const REAL depth = 4 * REAL_EPS * d2;
     REAL s[CELL_CAPACITY];
-    int cut = -1;
-    for (int k = 0; k < n; ++k) {
-        s[k] = cell->x[k] * d[0] + cell->y[k] * d[1] - level;
-        if (s[k] > depth)
-            cut = k;
+    bool any_cut = false;
+    for (int c = 0; c * CHUNK < n; ++c) {
+        const REAL8 side = vload8(c, cell->x) * d[0] + vload8(c, cell->y) * d[1] - level;
+        vstore8(side, c, s);
+        any_cut |= any(side > depth);
     }
-    if (cut < 0)
+    if (!any_cut)
         return true;
     if (seen_before)
         for (int k = 0; k < n; ++k)
@@ -79,6 +88,9 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
                 return true;
 
     /* The corners cut off are first..last, cyclically. */
+    int cut = 0;
+    while (s[cut] <= depth)
+        ++cut;
     int first = cut;
     int before = first == 0 ? n - 1 : first - 1;
     while (s[before] > depth && before != cut) {
@@ -138,9 +150,16 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
     cell->y[a + 1] = vb.s1;
     cell->faces[a + 1] = last_face;
 
+    for (int k = cell->n; k < n; ++k)
+        cell->x[k] = cell->y[k] = 0;
+    if (cell->n > n && n % CHUNK == 0)
+        for (int k = cell->n; k < n + CHUNK; ++k)
+            cell->x[k] = cell->y[k] = 0;
     REAL reach2 = 0;
-    for (int k = 0; k < cell->n; ++k)
-        reach2 = fmax(reach2, cell->x[k] * cell->x[k] + cell->y[k] * cell->y[k]);
+    for (int k = 0; k < cell->n; ++k) {
+        const REAL r2 = cell->x[k] * cell->x[k] + cell->y[k] * cell->y[k];
+        reach2 = r2 > reach2 ? r2 : reach2;
+    }
     cell->reach2 = reach2;
     return true;
 }
