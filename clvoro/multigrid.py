@@ -15,6 +15,8 @@ from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, Room, who
 
 _COARSEST = 64
 _MOST_LEVELS = 30
+_TWICE = (2,)
+"""Levels visited twice by a cycle: the third costs little and keeps the count from growing."""
 # Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as damping factors of two steps. What lies
 # below is left to the coarse levels.
 _LOWEST = 0.35
@@ -139,7 +141,8 @@ class Multigrid:
                 bound[key] = _Bound(self._single, kernel, size, np.int32(size), *args)
             launches.append(bound[key])
 
-        def visit(depth: int) -> None:
+        def visit(depth: int, again: bool = False) -> None:
+            """Improve x of a level: from zero, or again from where it is."""
             level = self._levels[depth]
             n, b, x, t = len(level.graph), level.b, level.x, level.t
             blocks = (level.pairs.partner, level.pairs.same, level.pairs.other)
@@ -151,7 +154,10 @@ class Multigrid:
                     bind(0, "correct_out", n, np.float32(0), *blocks, b, x, u)
                 return
             rows = (level.graph.starts, level.graph.columns, level.graph.weights)
-            if depth > 0:
+            if again:
+                bind(depth, "defect", n, *rows, b, x, t)
+                bind(depth, "correct", n, late, *blocks, t, x, variant=1)
+            elif depth > 0:
                 bind(depth, "first", n, late, *blocks, b, x)
             bind(depth, "defect", n, *rows, b, x, t)
             bind(depth, "correct", n, early, *blocks, t, x)
@@ -161,6 +167,8 @@ class Multigrid:
                 lists = (groups.starts, groups.members)
                 bind(depth, "restrict_sum", len(groups), *lists, t, coarse.b)
                 visit(depth + 1)
+                if depth + 1 in _TWICE and coarse.groups is not None:
+                    visit(depth + 1, again=True)
                 bind(depth, "prolong", n, groups.group, coarse.x, x)
             bind(depth, "defect", n, *rows, b, x, t)
             bind(depth, "correct", n, early, *blocks, t, x)

@@ -236,14 +236,16 @@ def test_warm_start(make):
     assert again.residual <= 1e-8
 
 
+@pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("real", REALS)
-def test_repeats_bit_by_bit(make, real):
+def test_repeats_bit_by_bit(make, real, preconditioner):
     engine = make(real=real)
     poisson, laplacian = assembled(engine, graphs.random_graph(3000, seed=55))
     b = engine.upload(np.random.default_rng(56).standard_normal(3000))
     first, second = engine.zeros(3000), engine.zeros(3000)
-    one = poisson.solve(laplacian, b, first, tolerance=1e-5)
-    two = Poisson(engine).solve(laplacian, b, second, tolerance=1e-5)
+    options = {"tolerance": 1e-5, "preconditioner": preconditioner}
+    one = poisson.solve(laplacian, b, first, **options)
+    two = Poisson(engine).solve(laplacian, b, second, **options)
     assert np.array_equal(one.residuals, two.residuals)
     assert np.array_equal(first.get(), second.get())
 
