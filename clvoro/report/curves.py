@@ -122,8 +122,8 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
             )
             for ax, factor, (name, arrows, colour) in zip(axes_row, factors, halves, strict=True):
                 note = "to scale" if factor == 1 else f"magnified × {factor:g}"
-                on = ", coarsest level" if coarse and when == "first" else ""
-                ax.set_title(f"{name} displacement, {when} step{on} ({note})")
+                step = "coarse step" if coarse and when == "first" else "step"
+                ax.set_title(f"{name}, {when} {step} ({note})")
                 _draw_arrows(ax, field.points, arrows * factor, colour)
                 frame_domain(ax, lower, upper, ticks=len(result.points) > MOST_ARROWS)
                 ax.locator_params(nbins=4)

@@ -48,24 +48,20 @@ def pictures_of(
     pictures: list[Picture] = [
         ("size", "Target size h.", lambda: _size(main, size)),
         ("cells", f"The mesh ({name}), coloured by metric error.", lambda: _one(main, "error")),
-        (
-            "diagrams_error",
-            "Metric error e, one scale for all: red cells are too large, blue ones too small.",
-            lambda: _grid(panels, "error"),
-        ),
-        (
-            "diagrams_quality",
-            "Cell quality Q, one scale for all: 1 is a regular polygon.",
-            lambda: _grid(panels, "quality"),
-        ),
-        history,
     ]
+    if len(panels) == 1:
+        caption = f"The mesh ({name}), coloured by cell quality; 1 is a regular polygon."
+        pictures.append(("quality", caption, lambda: _one(main, "quality")))
+    else:
+        pictures += _comparisons(panels)
+    pictures.append(history)
     if main.initial is not None or main.final is not None:
         height = displacements_height(main)
         pictures.append(
             (
                 "displacements",
-                f"The two halves of a step ({name}): Lloyd's and the Poisson correction's.",
+                f"The two halves of a step's displacements ({name}): Lloyd's and the Poisson "
+                "correction's.",
                 lambda: plot_displacements(main, new_figure(WIDTH, height)),
             )
         )
@@ -77,6 +73,22 @@ def pictures_of(
             ("closer", f"Where the cells are smallest ({name}).", lambda: _closer(main))
         )
     return pictures
+
+
+def _comparisons(panels: Mapping[str, Result]) -> list[Picture]:
+    """Return the pictures of several meshes side by side."""
+    return [
+        (
+            "diagrams_error",
+            "Metric error e, one scale for all: red cells are too large, blue ones too small.",
+            lambda: _grid(panels, "error"),
+        ),
+        (
+            "diagrams_quality",
+            "Cell quality Q, one scale for all: 1 is a regular polygon.",
+            lambda: _grid(panels, "quality"),
+        ),
+    ]
 
 
 def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
@@ -129,7 +141,7 @@ def _grid(panels: Mapping[str, Result], colour: str) -> Any:
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for letter, ax, (name, result) in zip("abcdefghij", axes, panels.items(), strict=False):
             e, q = np.abs(result.error).mean(), result.quality.mean()
-            title = f"({letter}) {name}: mean $|e|$ {e:.3f}, mean $Q$ {q:.3f}"
+            title = f"({letter}) {name}: mean $|e|$ {e:.3g}, mean $Q$ {q:.3f}"
             draw.plot_cells(result, colour, ax, limits=limits, key=False, title=title)
             ax.set_xticks([])
             ax.set_yticks([])
