@@ -129,21 +129,21 @@ kernel void drop_sites(const int size, global const ulong *spread, global ulong 
         keys[i] = 0;
 }
 
-/* Per chosen site: count it in the histogram of the bits of its magnitude from `low` on, HISTOGRAM bins of `width`. */
-kernel void count_sites(const int size, global const ulong *chosen, const uint low, const uint width,
+/* Per chosen site: count it in the histogram of the keys from `low` on, HISTOGRAM bins of `width`. */
+kernel void count_sites(const int size, global const ulong *chosen, const ulong low, const ulong width,
                         global int *histogram)
 {
     WORK_ITEM(i);
-    const uint bits = (uint)(chosen[i] >> 32);
-    if (chosen[i] && bits >= low && (bits - low) / width < HISTOGRAM)
-        atomic_inc(histogram + (bits - low) / width);
+    const ulong key = chosen[i];
+    if (key && key >= low && (key - low) / width < HISTOGRAM)
+        atomic_inc(histogram + (key - low) / width);
 }
 
-/* Per chosen site: drop it if the bits of its magnitude are below `least`. */
-kernel void limit_sites(const int size, const uint least, global ulong *chosen)
+/* Per chosen site: drop it if its key is below `least`. */
+kernel void limit_sites(const int size, const ulong least, global ulong *chosen)
 {
     WORK_ITEM(i);
-    if ((uint)(chosen[i] >> 32) < least)
+    if (chosen[i] < least)
         chosen[i] = 0;
 }
 

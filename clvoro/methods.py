@@ -161,7 +161,8 @@ class ProjectedMethod:
         stages, t = mesh.stages, mesh.t
         if self.aim and self.steps > 2:
             off = mesh.mean_log_error()
-            self.eps = min(3.0, max(1e-3, self.eps * min(1.33, max(0.75, self.aim / off))))
+            change = self.aim / max(off, 1e-9)  # every cell may be exactly right
+            self.eps = min(3.0, max(1e-3, self.eps * min(1.33, max(0.75, change))))
         self.steps += 1
         w = stages.density.evaluate(t, mesh.h)
         mesh.lloyd = w.lloyd

@@ -201,21 +201,23 @@ class PopulationControl:
         return chosen
 
     def _limit(self, chosen: cla.Array, n: int, most: int) -> None:
-        """Keep the `most` strongest of the sites (fewer where several tie for the last place)."""
+        """Keep the `most` strongest of the sites; keys are distinct, so that no two tie."""
         engine, k = self.engine, self._kernels
-        low, width = 0, 2**32 // HISTOGRAM
+        low, span = 0, 2**64
         while True:
+            bins = min(HISTOGRAM, span)
+            width = span // bins
             histogram = engine.zeros(HISTOGRAM, np.int32)
-            engine.run_each(k.count_sites, n, chosen, np.uint32(low), np.uint32(width), histogram)
-            from_top = np.cumsum(histogram.get()[::-1])
+            engine.run_each(k.count_sites, n, chosen, np.uint64(low), np.uint64(width), histogram)
+            from_top = np.cumsum(histogram.get()[:bins][::-1])
             whole = int(np.searchsorted(from_top, most, side="right"))
-            least = low + (HISTOGRAM - whole) * width
-            if whole == HISTOGRAM or width == 1:
+            least = low + (bins - whole) * width
+            most -= int(from_top[whole - 1]) if whole else 0
+            if whole == bins or most == 0:
                 break
             # Look closer at the bin in which the count is passed.
-            most -= int(from_top[whole - 1]) if whole else 0
-            low, width = least - width, max(1, width // HISTOGRAM)
-        engine.run_each(k.limit_sites, n, np.uint32(min(least, 2**32 - 1)), chosen)
+            low, span = least - width, width
+        engine.run_each(k.limit_sites, n, np.uint64(min(least, 2**64 - 1)), chosen)
 
     def _apply(
         self, box: Box, t: Tessellation, rows: Population, marks: _Marks, next_label: int
