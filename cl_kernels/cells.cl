@@ -126,7 +126,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, 
    square of bins that it has seen covers that circle. With `warm` the neighbours of an earlier, similar diagram are
    clipped first, and the search only has to confirm them.
 
-   rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; row_counts[i] of them */
+   rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt */
 kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
@@ -165,8 +165,11 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         inner = w;
         w = fmin(need, 2 * w);
     }
+    bool doubtful = false;
     if (flag == 0) {
-        drop_short_faces(&cell, 16 * REAL_EPS, x, points);
+        doubtful = is_doubtful(&cell, x, points);
+        if (doubtful)
+            drop_short_faces(&cell, 16 * REAL_EPS, x, points);
         if (cell.n > ROW_CAPACITY)
             flag = FLAG_FULL;
     }
@@ -176,11 +179,12 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     }
     for (int k = 0; k < cell.n; ++k)
         rows[i * ROW_CAPACITY + k] = cell.faces[k];
-    row_counts[i] = cell.n;
+    row_counts[i] = doubtful ? -cell.n : cell.n;
 }
 
 /* Per generator i: bit k of keep[i * KEEP_WORDS ...] marks a neighbour that also lists i. Rounding may let one of two
-   cells see a face of no length that the other does not see; such a face is dropped, so that the graph is symmetric. If
+   cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
+   the graph is symmetric. If
    what it cuts off is more than rounding, generators are too close to tell apart (from far away, two an ulp apart have
    the same bisector), and that is flagged. */
 kernel void match_faces(const int size, global const int *rows, global const int *row_counts, global const REAL *points,
@@ -188,14 +192,15 @@ kernel void match_faces(const int size, global const int *rows, global const int
                         global int *flags)
 {
     WORK_ITEM(i);
-    const int n = row_counts[i];
+    const bool doubtful = row_counts[i] < 0;
+    const int n = abs(row_counts[i]);
     uint word = 0;
     int count = 0;
     for (int k = 0; k < n; ++k) {
-        const int j = rows[i * ROW_CAPACITY + k];
-        bool mutual = j < 0;
+        const int j = doubtful ? rows[i * ROW_CAPACITY + k] : -1;
+        bool mutual = j < 0 || !doubtful;
         if (!mutual) {
-            const int m = row_counts[j];
+            const int m = abs(row_counts[j]);
             for (int q = 0; q < m && !mutual; ++q)
                 mutual = rows[j * ROW_CAPACITY + q] == i;
         }
@@ -244,7 +249,7 @@ kernel void measure_cells(const int size, global const int *rows, global const i
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     int faces[ROW_CAPACITY];
     int n = 0;
-    const int listed = row_counts[i];
+    const int listed = abs(row_counts[i]);
     for (int k = 0; k < listed; ++k)
         if ((keep[i * KEEP_WORDS + k / 32] >> (k % 32)) & 1u)
             faces[n++] = rows[i * ROW_CAPACITY + k];

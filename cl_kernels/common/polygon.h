@@ -10,6 +10,13 @@
 
 #define CHUNK 8 /* corners are tested this many at a time */
 #define REAL8 CLVORO_JOIN(REAL, 8)
+#if IS_DOUBLE
+#define MASK8 long8
+#define MASK4 long4
+#else
+#define MASK8 int8
+#define MASK4 int4
+#endif
 #if CELL_CAPACITY % CHUNK
 #error "CELL_CAPACITY must be a multiple of 8"
 #endif
@@ -78,7 +85,10 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
     for (int c = 0; c * CHUNK < n; ++c) {
         const REAL8 side = vload8(c, cell->x) * d[0] + vload8(c, cell->y) * d[1] - level;
         vstore8(side, c, s);
-        any_cut |= any(side > depth);
+        /* any(), but by halves: PoCL's looks at one element after the other. */
+        const MASK8 out = side > depth;
+        const MASK4 half_out = out.lo | out.hi;
+        any_cut |= ((half_out.s0 | half_out.s1) | (half_out.s2 | half_out.s3)) != 0;
     }
     if (!any_cut)
         return true;
@@ -172,6 +182,26 @@ inline REAL2 face_direction(int label, const REAL *x, global const REAL *points)
     const int wall = -1 - label;
     const REAL sign = wall % 2 == 0 ? -1 : 1;
     return wall < 2 ? (REAL2)(sign, 0) : (REAL2)(0, sign);
+}
+
+/* Might rounding let a neighbour see this cell's faces otherwise? Only where a face is short beside the distance of its
+   generators, or a generator is near beside the cell (then far corners are ill-conditioned). */
+inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *points)
+{
+    bool doubtful = false;
+    const REAL near2 = sqrt(REAL_EPS) * cell->reach2;
+    for (int k = 0; k < cell->n; ++k) {
+        const int next = k == cell->n - 1 ? 0 : k + 1;
+        const REAL ex = cell->x[next] - cell->x[k];
+        const REAL ey = cell->y[next] - cell->y[k];
+        REAL d2 = cell->reach2;
+        if (cell->faces[k] >= 0) {
+            const REAL2 d = face_direction(cell->faces[k], x, points);
+            d2 = dot(d, d);
+        }
+        doubtful |= ex * ex + ey * ey < REAL_EPS * d2 || d2 < near2;
+    }
+    return doubtful;
 }
 
 /* Drop faces that are shorter than `noise`, the rounding of positions in the unit box: they arise where more than three
