@@ -44,8 +44,11 @@ class Adapter:
     """
 
     def __init__(self, ctx: cl.Context | None = None, dtype: object = "float64") -> None:
-        real = np.dtype(dtype)  # type: ignore[arg-type]
-        if real not in (np.dtype(np.float64), np.dtype(np.float32)):
+        try:
+            real = np.dtype(dtype)  # type: ignore[arg-type]
+        except TypeError:
+            real = np.dtype(object)
+        if dtype is None or real not in (np.dtype(np.float64), np.dtype(np.float32)):
             raise InputError(f"dtype is {dtype!r}, expected 'float64' or 'float32'")
         self.ctx = device.create_context() if ctx is None else ctx
         self.dtype = real
@@ -57,6 +60,11 @@ class Adapter:
     def _stages_for(self, domain: Box) -> Stages:
         if not isinstance(domain, Box):
             raise InputTypeError(f"domain is a {type(domain).__name__}, expected a clvoro.Box")
+        if domain.dim != 2:
+            raise InputError(
+                f"domain is {domain}, in {domain.dim} dimensions; this version meshes boxes in 2: "
+                "give two coordinates for each corner"
+            )
         if domain.dim not in self._stages:
             engine = Engine(self.ctx, self.queue, domain.dim, self.dtype)
             self._stages[domain.dim] = Stages(engine)
@@ -127,8 +135,9 @@ class Adapter:
             step: "lloyd", "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density
             h^-d (see `clvoro.methods`).
         n_cells : int, optional
-            Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" then scale
-            the size field by one factor so that the count fits, and report it as ``Result.size_factor``.
+            Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" end with
+            exactly that many; they scale the size field by the common factor at which the mean of log(L / h) vanishes,
+            and report it as ``Result.size_factor``.
         start : "density" or "uniform"
             Random generators with density h^-d, or uniform (the paper's).
         max_steps : int, optional
@@ -182,9 +191,18 @@ class Adapter:
             max_steps = check_integer("max_steps", max_steps, 0)
         if n_cells is not None:
             n_cells = check_integer("n_cells", n_cells, 1)
+        if callback is not None and not callable(callback):
+            raise InputTypeError(
+                f"callback is {callback!r} of type {type(callback).__name__}, expected a function "
+                "of a row of the history"
+            )
         planned = method in ("adaptive", "exact")
         host = None if points is None else check_points(points, domain)
-
+        if host is not None and not planned and n_cells not in (None, len(host)):
+            raise InputError(
+                f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} keeps their number; "
+                "leave n_cells out, or use method='adaptive'"
+            )
         sizing = Sizing(engine, domain, as_field(size))
         asked = count_cells(sizing, domain) if host is None or planned else float(len(host))
         target = n_cells if n_cells is not None else max(1, round(asked))
@@ -195,6 +213,14 @@ class Adapter:
             level_count = 0
         elif levels != "auto":
             level_count = check_integer("levels", levels, 0)
+            most = int(np.log2(max(target, 1)) / domain.dim)
+            if host is None and level_count > most:
+                raise InputError(
+                    f"levels is {levels}, expected at most {most} for {target} cells, or 'auto': each level "
+                    f"has {2**domain.dim} times fewer"
+                )
+            finest = 0 if host is None else len(host) * 2.0 ** (domain.dim * min(level_count, 99))
+            check_memory(engine, finest)
         elif host is None:
             level_count = auto_levels(target, domain.dim)
         else:
@@ -226,8 +252,8 @@ class Adapter:
             "dtype": self.dtype.name, "effort": effort, "levels": level_count,
             "error_target": error_target,
         }  # fmt: skip
-        loop = Loop(mesh, plan, level_count, max_steps, 0.0 if planned else tol, callback)
-        return loop.run(n_cells if planned else None, factor, settings)
+        loop = Loop(mesh, plan, level_count, max_steps, None if planned else tol, callback)
+        return loop.run(n_cells if planned else None, settings)
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

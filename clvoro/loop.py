@@ -10,7 +10,7 @@ import numpy as np
 
 from .krylov import Solution
 from .mesh import Mesh
-from .plans import Action, Refine, Reorganise, Rest, Step, work_of
+from .plans import Action, Refine, Reorganise, Rest, Settle, Step, work_of
 from .results import HISTORY_DTYPE, Displacements, Result
 
 WINDOW = 10
@@ -28,8 +28,9 @@ class Loop:
     levels : int
         Coarser levels that the plan begins with.
     max_steps : int or None
-    tol : float
-        Share by which error or quality must improve over a window of steps; 0 takes all steps.
+    tol : float or None
+        Share by which error or quality must improve over a window of steps; 0 takes all steps. None: the plan ends where
+        the run has converged.
     callback : callable or None
         Takes the new row of the history; the run stops if it returns True.
     """
@@ -40,7 +41,7 @@ class Loop:
         plan: list[Action],
         levels: int,
         max_steps: int | None,
-        tol: float,
+        tol: float | None,
         callback: Callable[[np.void], object] | None,
     ) -> None:
         self.mesh, self.plan, self.level = mesh, plan, levels
@@ -52,8 +53,13 @@ class Loop:
         self.initial: Displacements | None = None
         self.began = time.perf_counter()
 
-    def run(self, n_cells: int | None, factor: float, settings: dict[str, Any]) -> Result:
-        """Carry out the plan; `n_cells` holds the finest level's count, None lets the size field decide."""
+    def run(self, n_cells: int | None, settings: dict[str, Any]) -> Result:
+        """Carry out the plan.
+
+        `n_cells` holds the finest level's count, and a common factor on the size field follows; with None the size field
+        decides.
+        """
+        self.n_cells = n_cells
         converged, reason = False, "plan completed"
         try:
             stop = self.record(0.0)
@@ -65,7 +71,9 @@ class Loop:
                     self.step(action)
                     stop = self.record(progress)
                 elif isinstance(action, Reorganise):
-                    self.reorganise(action, n_cells)
+                    self.reorganise(action)
+                elif isinstance(action, Settle):
+                    self.settle()
                 elif isinstance(action, Refine):
                     self.refine()
                 elif isinstance(action, Rest):
@@ -74,14 +82,28 @@ class Loop:
                     converged, reason = True, "error and quality no longer improve"
                     break
             else:
-                converged = self.tol == 0 and self.level == 0
+                if stop:
+                    reason = "stopped by the callback"
+                elif self.tol is None:
+                    converged = True
+                else:
+                    reason = "max_steps reached"
         except KeyboardInterrupt:
             reason = "interrupted"
             self.mesh.update()
-        # Whatever stopped the run, the mesh has the size that was asked for.
+        # Whatever stopped the run, the mesh has the size and the count that were asked for.
         while self.level > 0:
             self.refine()
-        return self.result(converged, reason, factor, settings)
+        self.settle()
+        if self.inserted or self.deleted or not self.rows:
+            self.solution = None
+            self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
+        return self.result(converged, reason, settings)
+
+    @property
+    def held(self) -> int | None:
+        """The count that the present level has to have; None: what the size field asks for."""
+        return self.n_cells if self.level == 0 else None
 
     def step(self, action: Step) -> None:
         """Displace and move all generators, and tessellate anew."""
@@ -90,16 +112,29 @@ class Loop:
             self.initial = self.displacements()
         action.method.move(self.mesh)
         self.mesh.update()
+        if self.held is not None:
+            self.mesh.match_size()
         self.last = action.method
         self.steps += 1
 
-    def reorganise(self, action: Reorganise, n_cells: int | None) -> None:
+    def reorganise(self, action: Reorganise) -> None:
         """Insert and delete generators."""
-        n = self.mesh.n
-        held = n_cells if self.level == 0 else None
-        inserted, deleted = self.mesh.reorganise(round(action.nuclei * n), held)
+        nuclei = round(action.nuclei * self.mesh.n)
+        inserted, deleted = self.mesh.reorganise(nuclei, self.held, theta=action.theta)
         self.inserted += inserted
         self.deleted += deleted
+
+    def settle(self) -> None:
+        """Bring the count to the one that is held, to the last cell."""
+        if self.held is None:
+            return
+        while self.mesh.n != self.held:
+            inserted, deleted = self.mesh.reorganise(0, self.held, climb=False)
+            self.inserted += inserted
+            self.deleted += deleted
+            if inserted == deleted == 0:
+                break
+        self.mesh.match_size()
 
     def refine(self) -> None:
         """Go to the next finer level."""
@@ -110,6 +145,11 @@ class Loop:
 
     def record(self, progress: float) -> bool:
         """Append a row to the history; True if the callback wants to stop."""
+        self.add_row(progress)
+        return bool(self.callback is not None and self.callback(self.rows[-1][0]))
+
+    def add_row(self, progress: float) -> None:
+        """Append a row to the history."""
         mesh = self.mesh
         s, n = mesh.assess(), mesh.n
         mesh.sizing.check(mesh.points, mesh.h)
@@ -126,11 +166,10 @@ class Loop:
             row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
         row["seconds"] = time.perf_counter() - self.began
         self.rows.append(row)
-        return bool(self.callback is not None and self.callback(row[0]))
 
     def stalled(self) -> bool:
         """Tell whether neither mean error nor mean quality has improved by `tol` over the last steps."""
-        if self.tol == 0 or len(self.rows) <= 2 * WINDOW:
+        if not self.tol or len(self.rows) <= 2 * WINDOW:
             return False
         history = np.concatenate(self.rows[-2 * WINDOW :])
         old, new = history[:WINDOW], history[WINDOW:]
@@ -148,7 +187,7 @@ class Loop:
         )
 
     def result(
-        self, converged: bool, reason: str, factor: float, settings: dict[str, Any]
+        self, converged: bool, reason: str, settings: dict[str, Any]
     ) -> Result:
         """Fetch what the run has come to."""
         mesh = self.mesh
@@ -168,6 +207,6 @@ class Loop:
             stop_reason=reason,
             initial=self.initial,
             final=final,
-            size_factor=factor,
+            size_factor=mesh.coarsening,
             settings=settings,
         )

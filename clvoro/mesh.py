@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -18,13 +19,15 @@ from .fetch import fetch_diagram
 from .metric import Metric
 from .motion import Motion
 from .poisson import Poisson
-from .population import Population, PopulationControl
+from .population import THETA, Population, PopulationControl
 from .projection import Projection
 from .refinement import Refinement
 from .results import Diagram
 from .shape import Shape
 from .sizing import Sizing
 
+MOST_CELLS = 100_000_000
+"""Cells that 32-bit indices into the rows of neighbours allow for."""
 SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess")
 
 
@@ -91,6 +94,12 @@ def check_memory(engine: Engine, n: float) -> None:
     reals, integers = (110, 60) if engine.dim == 2 else (300, 150)
     needed = n * (reals * engine.real.itemsize + integers * 4)
     available = engine.queue.device.global_mem_size
+    if n > MOST_CELLS:
+        raise MemoryLimitError(
+            f"the run asks for {n:.3g} cells, expected at most {MOST_CELLS:.3g}, which the device's 32-bit "
+            f"indices can tell apart (and they would need {needed / 2**30:.3g} GiB of "
+            f"{available / 2**30:.3g} GiB). Use a larger size or n_cells"
+        )
     if needed > available:
         raise MemoryLimitError(
             f"the size field asks for {n:.3g} cells, which need {needed / 2**30:.3g} GiB on the device; "
@@ -118,7 +127,8 @@ class Mesh:
         In an order of the device's own: along its bins.
     labels : (n,) int32
     tessellation : Tessellation
-    h, error, quality, energy : (n,) real
+    h, error, quality, energy, reach : (n,) real
+        `reach` is the lesser of h and L, by which motion is limited.
     source, potential : (n,) real
         Right side of the latest Poisson solve, and its solution: the next one's start.
     lloyd, correction, velocity : (n, d) real
@@ -158,14 +168,15 @@ class Mesh:
         """Take other generators for the present ones, sort them by bin so that neighbours are near in memory."""
         engine, stages = self.engine, self.stages
         first = not hasattr(self, "tessellation")
-        self.n = n = len(points)
+        n = len(points)
         items = stages.bins.build(self.domain, points, n).items[:n].copy()
         rows = stages.gather.rows
-        self.points, self.labels = rows(items, points), rows(items, labels)
-        self.velocity, self.signatures = rows(items, velocity), rows(items, signatures)
-        self.ever = rows(items, ever)
+        sorted_rows = [rows(items, a) for a in (points, labels, velocity, signatures, ever)]
+        self.n = n
+        self.points, self.labels, self.velocity, self.signatures, self.ever = sorted_rows
         shape = points.shape
         self.h, self.error, self.quality, self.energy = (engine.empty(n) for _ in range(4))
+        self.reach = engine.empty(n)
         self.source, self.potential = engine.empty(n), engine.zeros(n)
         self.lloyd, self.correction = engine.zeros(shape), engine.zeros(shape)
         self.lloyd_speed, self.correction_speed = engine.zeros(n), engine.zeros(n)
@@ -189,9 +200,14 @@ class Mesh:
         self.sizing.evaluate(self.points, self.n, self.h)
         if self.coarsening != 1:
             stages.metric.scale_sizes(self.coarsening, self.h)
-        stages.metric.evaluate(self.t, self.h, self.error, self.quality, self.energy)
+        self._evaluate_metric()
         stages.metric.compare_neighbours(
             self.t, self.labels, first, self.signatures, self.changed, self.ever
+        )
+
+    def _evaluate_metric(self) -> None:
+        self.stages.metric.evaluate(
+            self.t, self.h, self.error, self.quality, self.energy, self.reach
         )
 
     def mean_log_error(self) -> float:
@@ -200,7 +216,23 @@ class Mesh:
         self.summaries.collect("excess", w.excess, self.n)
         return self.summaries.read()["excess"].magnitude / self.n / self.engine.dim
 
-    def reorganise(self, nuclei: int = 0, n_cells: int | None = None) -> tuple[int, int]:
+    def match_size(self) -> None:
+        """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""
+        w = self.stages.density.evaluate(self.t, self.h)
+        self.summaries.collect("excess", w.excess, self.n)
+        factor = math.exp(self.summaries.read()["excess"].sum / self.n / self.engine.dim)
+        self.coarsening *= factor
+        metric = self.stages.metric
+        metric.scale_sizes(factor, self.h)
+        self._evaluate_metric()
+
+    def reorganise(
+        self,
+        nuclei: int = 0,
+        n_cells: int | None = None,
+        climb: bool = True,
+        theta: float = THETA,
+    ) -> tuple[int, int]:
         """Insert and delete generators (see `PopulationControl.reorganise`); return how many of each.
 
         The count goes to `n_cells` or, with None, to what the size field asks for.
@@ -210,8 +242,9 @@ class Mesh:
         total = self.summaries.read()["excess"].sum if n_cells is None else float(n_cells - self.n)
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(
-            self.domain, self.t, self.h, w.excess, rows, total, self.next_label, nuclei
-        )
+            self.domain, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,
+            climb, theta,
+        )  # fmt: skip
         if new is None:
             return 0, 0
         self.next_label += new.inserted

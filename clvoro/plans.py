@@ -1,10 +1,11 @@
 """Plans: in which order a run takes its steps, from the coarsest level to the finest.
 
-    density start ─► couple ─► [ reorganise ─► glide ] x sweeps ─► refine ─► couple ─► [...] ... ─► polish (─► project)
+    density start ─► couple ─► [ reorganise ─► glide ] x sweeps ─► refine ─► couple ─► [...] ... ─► settle ─► polish (─► project)
 
 *couple*      weighted Lloyd and Poisson: from any start to nearly the right sizes
 *reorganise*  insert and delete generators: dislocations climb, the count meets the field
 *glide*       weighted Lloyd with momentum, softly projected: defects move and annihilate
+*settle*      where a count was asked for: exactly that many
 *polish*      descent of cell quality, projected; the penalty is steered to the error that is aimed at
 *project*     the same with next to no penalty: every cell the size that was asked for
 """
@@ -13,9 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .methods import Method, ProjectedMethod, WeightedMethod
+from .population import THETA
 
 COARSEST = 700
 """Cells of the coarsest level of a 2D run, roughly: enough to feel the field, few enough to be free."""
@@ -64,7 +66,13 @@ EFFORTS = {
     ),
 }  # fmt: skip
 
-EXACT_STEPS, EXACT_ITERATIONS = 6, 45
+LENIENCE = 0.03
+"""-log Q from which on a cell may be off its size for its shape."""
+BOUND = 12.0
+"""Excess, over the mean that is aimed at, from which on it may not."""
+COUNT_THETA = 0.3
+"""Strain for pairs to climb while polishing: only the count makes them."""
+EXACT_STEPS, EXACT_ITERATIONS = 8, 45
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,7 @@ class Reorganise:
     """Insert and delete generators; `nuclei` is the share of the cells where pairs may be made."""
 
     nuclei: float = 0.0
+    theta: float = THETA
 
 
 @dataclass(frozen=True)
@@ -91,7 +100,12 @@ class Rest:
     """Take the momentum away."""
 
 
-Action = Step | Reorganise | Refine | Rest
+@dataclass(frozen=True)
+class Settle:
+    """Bring the count to the one that was asked for."""
+
+
+Action = Step | Reorganise | Refine | Rest | Settle
 
 
 def auto_levels(n: float, dim: int) -> int:
@@ -144,12 +158,23 @@ def _adaptive(
             yield from [Step(glide)] * effort.glide
         if level == 0 and sweeps < 3:
             yield Reorganise()
+    yield Settle()
     yield Rest()
-    polish = ProjectedMethod("shape", eps=effort.eps, bound=0.05, k=0.3, aim=aim)
-    yield from [Step(polish)] * effort.polish
+    polish = ProjectedMethod(
+        "shape", eps=effort.eps, lenience=LENIENCE, bound=BOUND * aim, k=0.3, aim=aim
+    )
+    for step in range(effort.polish):
+        if step == 3:
+            yield Reorganise(theta=COUNT_THETA)
+        yield Step(polish)
     if exact:
-        project = ProjectedMethod("shape", eps=1e-3, iterations=EXACT_ITERATIONS, k=0.3)
-        yield from [Step(project)] * EXACT_STEPS
+        project = ProjectedMethod(
+            "shape", eps=1e-3, iterations=EXACT_ITERATIONS, k=0.3, sampled_gradient=True
+        )
+        # The last two only project: Newton's steps on the sizes.
+        newton = replace(project, relaxation=0.0, momentum=0.0)
+        yield from [Step(project)] * (EXACT_STEPS - 2)
+        yield from [Step(newton)] * 2
 
 
 def work_of(plan: list[Action], levels: int, dim: int) -> list[float]:

@@ -15,6 +15,8 @@ from .domain import Box
 
 THETA = 0.06
 """Strain across a pair of a 5-sided and a 7-sided cell at which it climbs."""
+WALL_THETA = 0.3
+"""Strain that keeps a pair from ending at the wall beside it."""
 NUCLEATION_STRAIN = 0.22
 """Anisotropy of the lattice above which a pair may be made."""
 PAIR_RINGS, NUCLEUS_RINGS, EXCESS_RINGS = 4, 6, 3
@@ -51,6 +53,7 @@ class PopulationControl:
         self._kernels = engine.kernels(
             "population",
             {
+                "WALL_THETA": WALL_THETA,
                 "SHIFTS": SHIFTS,
                 "SHIFT_STEP": SHIFT_STEP,
                 "SPLIT_DISTANCE": SPLIT_DISTANCE,
@@ -63,17 +66,22 @@ class PopulationControl:
         box: Box,
         t: Tessellation,
         h: cla.Array,
+        reach: cla.Array,
         excess: cla.Array,
         rows: Population,
         total_excess: float,
         next_label: int,
         nuclei: int = 0,
+        climb: bool = True,
+        theta: float = THETA,
     ) -> Population | None:
         """Make pairs (`nuclei` of each kind), let pairs climb, and bring the count to what the field asks for.
 
         Parameters
         ----------
         h, excess : (n,) real
+        reach : (n,) real
+            Length by which a generator may be moved: the lesser of h and L.
         rows : Population
             The present generators.
         total_excess : float
@@ -81,6 +89,10 @@ class PopulationControl:
         next_label : int
             First label for the new ones.
         nuclei : int
+        climb : bool
+            Without it only the count is corrected, to the last generator.
+        theta : float
+            Strain from which on a pair climbs; above `THETA`, pairs at walls are left alone.
 
         Returns
         -------
@@ -90,36 +102,39 @@ class PopulationControl:
         n = t.n
         # Less than 0.7 of a generator is left to strain; a large change is made in several calls.
         need = math.trunc(total_excess + math.copysign(0.3, total_excess))
-        most = max(1, int(LARGEST_CHANGE * n))
+        most = max(4, int(LARGEST_CHANGE * n))
         need = max(-most, min(most, need))
         marks = _Marks.clean(self.engine, n)
-        sides, strain_1, strain_2 = self._measure(t, h)
-        if nuclei:
-            self._nucleate(t, sides, strain_1, marks, nuclei)
-        gained = self._climb(t, h, sides, strain_2, marks, need)
-        rest = need - gained
-        if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
-            self._split_or_delete(t, excess, marks, rest)
+        if climb:
+            kinds, strain_1, strain_2 = self._measure(t, h)
+            if nuclei:
+                self._nucleate(t, kinds, strain_1, marks, nuclei)
+            gained = self._climb(t, reach, kinds, strain_2, marks, need, theta)
+            rest = need - gained
+            if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
+                self._split_or_delete(t, excess, marks, rest)
+        elif need:
+            self._split_or_delete(t, excess, marks, need)
         return self._apply(box, t, rows, marks, next_label)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
-        """Return sides (n,), and the strain averaged over one ring and over two (n, 4)."""
+        """Return charge and walls (n, 2), and the strain averaged over one ring and over two (n, 4)."""
         engine, k, n = self.engine, self._kernels, t.n
-        sides = engine.empty(n, np.int32)
+        kinds = engine.empty((n, 2), np.int32)
         raw, once, twice = (engine.empty((n, 4)) for _ in range(3))
-        engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, sides, raw)
+        engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, twice)
-        return sides, once, twice
+        return kinds, once, twice
 
     def _nucleate(
-        self, t: Tessellation, sides: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int
+        self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int
     ) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the clean lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
         keys = engine.empty(n, np.uint64)
         engine.run_each(
-            k.score_strain, n, t.starts, t.neighbours, sides, strain,
+            k.score_strain, n, t.starts, t.neighbours, kinds, strain,
             engine.real.type(NUCLEATION_STRAIN), keys,
         )  # fmt: skip
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
@@ -135,32 +150,34 @@ class PopulationControl:
     def _climb(
         self,
         t: Tessellation,
-        h: cla.Array,
-        sides: cla.Array,
+        reach: cla.Array,
+        kinds: cla.Array,
         strain: cla.Array,
         marks: _Marks,
         need: int,
+        theta: float,
     ) -> int:
         """Mark the pairs that climb, with thresholds shifted to bring the count nearest to `need`; return the gain."""
         engine, k, n = self.engine, self._kernels, t.n
-        theta = engine.real.type(THETA)
+        real = engine.real.type
         partners, pull = engine.empty(n, np.int32), engine.empty(n)
         keys = engine.empty(n, np.uint64)
         engine.run_each(
-            k.score_pairs, n, t.starts, t.neighbours, t.points, sides, strain, partners, pull, keys
-        )
+            k.score_pairs, n, t.starts, t.neighbours, t.points, kinds, strain,
+            np.int32(theta <= THETA), partners, pull, keys,
+        )  # fmt: skip
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = engine.zeros(SHIFTS, np.int32)
-        engine.run_each(k.tally_pairs, n, chosen, pull, theta, tally)
+        engine.run_each(k.tally_pairs, n, chosen, pull, kinds, partners, real(theta), tally)
         changes = tally.get()
         # The shift of the threshold whose change is nearest to the need, the least among equals.
         shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
         engine.run_each(
-            k.mark_pairs, n, chosen, pull, theta, engine.real.type(shifts[best]), partners,
-            t.points, h, *marks.arrays, marks.busy,
+            k.mark_pairs, n, chosen, pull, kinds, partners, real(theta), real(shifts[best]),
+            t.points, reach, *marks.arrays, marks.busy,
         )  # fmt: skip
         return int(changes[best])
 

@@ -34,7 +34,7 @@ HISTORY_DTYPE = np.dtype(
         ("seconds", "f8"),  # wall time since the run began
     ]
 )
-"""One row per step of a run."""
+"""One row per step of a run, and one more if the count of cells has changed after the last."""
 
 
 class Diagram:
