@@ -3,12 +3,13 @@
 /* Per generator i: metric error and quality of its cell.
 
    error    e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
+   reach    min(L, h): the length that limits a generator's motion, also where the target has only just grown or shrunk
    energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
    quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts, global const REAL *face_measures,
                             global const REAL *offsets, global const REAL *covariances, global const REAL *h,
-                            global REAL *error, global REAL *quality, global REAL *energy)
+                            global REAL *error, global REAL *quality, global REAL *energy, global REAL *reach)
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
@@ -31,6 +32,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
     }
     energy[i] = volume * square;
     const REAL target = h[i];
+    reach[i] = fmin(length, target);
     error[i] = (length - target) / fmin(length, target);
 }
 

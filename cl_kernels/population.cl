@@ -2,42 +2,36 @@
 
 /* Insertion and deletion of generators, in 2D: the paper's 2.3.1, where the lattice asks for it.
 
-   A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell. One that
-   sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the 5-sided one goes. The
+   A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell (charge -1
+   and +1). One that sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the
+   5-sided one goes. One that has come to a wall ends there. The
    same moves carry the count of generators to what the size field asks for. Sites act at the same time only if they are
    RINGS rings of cells apart. */
 
 #define LATTICE_2 R(1.1547005383792515) /* (neighbour distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
 
-inline int is_inner(int i, global const int *starts, global const int *neighbours)
-{
-    int inner = 1;
-    for (int k = starts[i]; k < starts[i + 1]; ++k)
-        inner &= neighbours[k] >= 0;
-    return inner;
-}
-
-/* Per generator i: sides[i] = its number of neighbours, 0 at a wall; strain[i] = (xx, xy, yy, weight) of
-   S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an unstrained lattice. Only six-sided cells have weight. */
-kernel void measure_strain(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
-                           global const REAL *h, global int *sides, global REAL4 *strain)
+/* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5 at
+   a wall, 4 in a corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an
+   unstrained lattice. Only six-sided inner cells have weight. */
+kernel void measure_strain(const int size, global const int *starts, global const int *neighbours,
+                           global const REAL *points, global const REAL *h, global int2 *kinds, global REAL4 *strain)
 {
     WORK_ITEM(i);
     const int n = starts[i + 1] - starts[i];
-    const int inner = is_inner(i, starts, neighbours);
-    sides[i] = inner ? n : 0;
+    int walls = 0;
     REAL4 s = 0;
-    int count = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
-        if (j < 0)
+        if (j < 0) {
+            ++walls;
             continue;
+        }
         const REAL dx = points[2 * j] - points[2 * i], dy = points[2 * j + 1] - points[2 * i + 1];
         s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(dx * dx, dx * dy, dy * dy, 0);
-        ++count;
     }
-    s /= max(count, 1);
-    s.s3 = inner && n == 6;
+    kinds[i] = (int2)(n - (6 - min(walls, 2)), walls);
+    s /= max(n - walls, 1);
+    s.s3 = walls == 0 && n == 6;
     strain[i] = s;
 }
 
@@ -68,33 +62,40 @@ inline ulong site_key(REAL magnitude, int i)
     return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
 }
 
-/* Per 5-sided cell i: the pull s = b.S.b - t.S.t on its pair with the 7-sided neighbour where |s| is largest, t from the
-   5 to the 7, b across. */
-kernel void score_pairs(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
-                        global const int *sides, global const REAL4 *strain, global int *partners, global REAL *pull,
-                        global ulong *keys)
+/* Per cell i of charge -1: the pull s = b.S.b - t.S.t on its pair with the neighbour of charge +1 where |s| is largest, t
+   from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if wanted, come
+   first: they can go altogether. */
+kernel void score_pairs(const int size, global const int *starts, global const int *neighbours,
+                        global const REAL *points, global const int2 *kinds, global const REAL4 *strain,
+                        const int at_walls, global int *partners, global REAL *pull, global ulong *keys)
 {
     WORK_ITEM(i);
-    REAL best = 0;
+    REAL best = 0, rank = 0;
     int partner = -1;
-    if (sides[i] == 5)
+    const int2 kind = kinds[i];
+    if (kind.s0 == -1 && (kind.s1 == 0 || at_walls))
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbours[k];
-            if (sides[j] != 7)
+            if (j < 0 || kinds[j].s0 != 1)
+                continue;
+            const bool one_wall = (kind.s1 > 0) != (kinds[j].s1 > 0);
+            if ((kind.s1 > 0 && kinds[j].s1 > 0) || (one_wall && !at_walls))
                 continue;
             const REAL2 d = (REAL2)(points[2 * j] - points[2 * i], points[2 * j + 1] - points[2 * i + 1]);
             const REAL4 s = (strain[i] + strain[j]) / 2;
             const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
             const REAL value = (across - along) / dot(d, d);
-            if (partner < 0 || fabs(value) > fabs(best)) {
+            const REAL value_rank = fabs(value) + (one_wall ? R(WALL_THETA) : R(0));
+            if (partner < 0 || value_rank > rank) {
                 best = value;
+                rank = value_rank;
                 partner = j;
             }
         }
     partners[i] = partner;
     pull[i] = best;
-    keys[i] = partner < 0 ? 0 : site_key(fabs(best), i);
+    keys[i] = partner < 0 ? 0 : site_key(rank, i);
 }
 
 /* Per generator i: the largest key in itself and its neighbours. */
@@ -154,28 +155,30 @@ kernel void flag_sites(const int size, global const ulong *chosen, global int *f
     flags[i] = chosen[i] != 0;
 }
 
-/* Thresholds that the count may need: shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A site is split if
-   pull > theta - shift, and deleted if -pull > theta + shift. */
-inline bool is_split(REAL pull, REAL theta, REAL shift)
+/* What a pair does to the count of generators, 1 if it is split, -1 if it is deleted. Thresholds give way as the count needs:
+   shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A pair with one cell at a wall ends there, unless the
+   strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. */
+inline int pair_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
 {
-    return pull > theta - shift;
-}
-
-inline bool is_deleted(REAL pull, REAL theta, REAL shift)
-{
-    return !is_split(pull, theta, shift) && -pull > theta + shift;
+    if (minus.s1 > 0)
+        return pull < R(WALL_THETA) ? -1 : 0;
+    if (plus.s1 > 0)
+        return pull > -R(WALL_THETA) ? 1 : 0;
+    if (pull > theta - shift)
+        return 1;
+    return -pull > theta + shift ? -1 : 0;
 }
 
 /* Per chosen pair: tally[m] += what shift m would add to the count of generators. Integer sums: any order will do. */
-kernel void tally_pairs(const int size, global const ulong *chosen, global const REAL *pull, const REAL theta,
-                        global int *tally)
+kernel void tally_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
+                        global const int *partners, const REAL theta, global int *tally)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
         return;
     for (int m = 0; m < SHIFTS; ++m) {
         const REAL shift = (m - SHIFTS / 2) * R(SHIFT_STEP);
-        const int change = (int)is_split(pull[i], theta, shift) - (int)is_deleted(pull[i], theta, shift);
+        const int change = pair_change(pull[i], kinds[i], kinds[partners[i]], theta, shift);
         if (change)
             atomic_add(tally + m, change);
     }
@@ -186,40 +189,42 @@ inline REAL2 difference(global const REAL *points, int from, int to)
     return (REAL2)(points[2 * to] - points[2 * from], points[2 * to + 1] - points[2 * from + 1]);
 }
 
-/* Per chosen pair: split it at its 7, into two generators across the pair, or delete it at its 5. `busy` marks the sites
-   that act. */
-kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, const REAL theta,
-                       const REAL shift, global const int *partners, global const REAL *points, global const REAL *h,
-                       global int *kept, global REAL2 *shifts, global int *born, global REAL2 *births,
-                       global ulong *busy)
+/* Per chosen pair: split it at its cell of charge +1, into two generators across the pair, or delete that of charge -1.
+   `busy` marks the sites that act. */
+kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
+                       global const int *partners, const REAL theta, const REAL shift, global const REAL *points,
+                       global const REAL *reach, global int *kept, global REAL2 *shifts, global int *born,
+                       global REAL2 *births, global ulong *busy)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
         return;
     const int j = partners[i];
-    if (is_split(pull[i], theta, shift)) {
-        const REAL2 d = difference(points, i, j);
-        const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
-        born[j] = 1;
-        shifts[j] = R(SPLIT_DISTANCE) * h[j] * across;
-        births[j] = -shifts[j];
-        busy[i] = 1;
-    } else if (is_deleted(pull[i], theta, shift)) {
+    const int change = pair_change(pull[i], kinds[i], kinds[j], theta, shift);
+    if (change == 0)
+        return;
+    busy[i] = 1;
+    if (change < 0) {
         kept[i] = 0;
-        busy[i] = 1;
+        return;
     }
+    const REAL2 d = difference(points, i, j);
+    const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
+    born[j] = 1;
+    shifts[j] = R(SPLIT_DISTANCE) * reach[j] * across;
+    births[j] = -shifts[j];
 }
 
 /* Per six-sided cell i among six-sided cells: the anisotropy of the strain, the difference of its eigenvalues, as a site
    where a pair may be made. */
 kernel void score_strain(const int size, global const int *starts, global const int *neighbours,
-                         global const int *sides, global const REAL4 *strain, const REAL threshold,
+                         global const int2 *kinds, global const REAL4 *strain, const REAL threshold,
                          global ulong *keys)
 {
     WORK_ITEM(i);
-    bool clean = sides[i] == 6;
+    bool clean = kinds[i].s0 == 0 && kinds[i].s1 == 0;
     for (int k = starts[i]; k < starts[i + 1] && clean; ++k)
-        clean = sides[neighbours[k]] == 6;
+        clean = kinds[neighbours[k]].s0 == 0 && kinds[neighbours[k]].s1 == 0;
     const REAL4 s = strain[i];
     const REAL anisotropy = sqrt((s.s0 - s.s2) * (s.s0 - s.s2) + 4 * s.s1 * s.s1);
     keys[i] = clean && anisotropy > threshold ? site_key(anisotropy, i) : 0;

@@ -101,14 +101,26 @@ kernel void apply_derivative(const int size, global const int *starts, global co
     out[i] = sum + eps[i] * y[i];
 }
 
-/* Per generator i: eps[i] = penalty / (1 + (r / bound)^2): cells that are far off give way less than those that are
-   nearly right, which caps the largest error at little cost. bound = 0: eps = penalty everywhere. */
-kernel void set_penalty(const int size, global const REAL *excess, const REAL penalty, const REAL bound,
-                        global REAL *eps)
+/* Per generator i: eps[i] = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of
+   its neighbours. Bad cells and those around them are let off their size a little, for they are what costs quality;
+   cells that are far off give way less than those that are nearly right, which caps the largest error. A lenience or
+   bound of 0 leaves its factor out. */
+kernel void set_penalty(const int size, global const int *starts, global const int *neighbours,
+                        global const REAL *quality, global const REAL *excess, const REAL penalty,
+                        const REAL lenience, const REAL bound, global REAL *eps)
 {
     WORK_ITEM(i);
+    REAL e = penalty;
+    if (lenience > 0) {
+        REAL worst = quality[i];
+        for (int k = starts[i]; k < starts[i + 1]; ++k)
+            if (neighbours[k] >= 0)
+                worst = fmin(worst, quality[neighbours[k]]);
+        const REAL q = log(fmax(worst, R(1e-6))) / lenience;
+        e = fmin(e * (1 + q * q), fmax(R(3), penalty));
+    }
     const REAL r = bound > 0 ? excess[i] / bound : 0;
-    eps[i] = penalty / (1 + r * r);
+    eps[i] = e / (1 + r * r);
 }
 
 /* Per generator i: what the projection takes from the displacement, correction = -W J^T y. */

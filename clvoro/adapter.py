@@ -23,6 +23,8 @@ from .start import count_cells, sample_density, sample_uniform
 
 METHODS = ("adaptive", "exact", *PUBLISHED)
 STARTS = ("density", "uniform")
+GRADIENT_STEP = 0.2
+"""Step over h in which the exact projection sees the gradient of the size field."""
 STEPS = 100
 """Steps of a method that repeats one kind of step, unless the caller says otherwise."""
 
@@ -203,7 +205,7 @@ class Adapter:
                 f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} keeps their number; "
                 "leave n_cells out, or use method='adaptive'"
             )
-        sizing = Sizing(engine, domain, as_field(size))
+        sizing = Sizing(engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
         asked = count_cells(sizing, domain) if host is None or planned else float(len(host))
         target = n_cells if n_cells is not None else max(1, round(asked))
         check_memory(engine, max(target, 0 if host is None else len(host)))

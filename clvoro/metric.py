@@ -23,11 +23,12 @@ class Metric:
         error: cla.Array,
         quality: cla.Array,
         energy: cla.Array,
+        reach: cla.Array,
     ) -> None:
-        """Write the paper's (3.1), signed, its (4.1) and each cell's part of its (2.3); all (n,)."""
+        """Write the paper's (3.1), signed, its (4.1), each cell's part of its (2.3), and min(L, h); all (n,)."""
         self.engine.run_each(
             self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
-            t.covariances, h, error, quality, energy,
+            t.covariances, h, error, quality, energy, reach,
         )  # fmt: skip
 
     def compare_neighbours(

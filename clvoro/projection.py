@@ -44,8 +44,10 @@ class Projection:
         excess: cla.Array,
         displacement: cla.Array,
         correction: cla.Array,
+        quality: cla.Array,
         *,
         eps: float,
+        lenience: float = 0.0,
         bound: float = 0.0,
         max_iterations: int,
         tolerance: float = 1e-6,
@@ -54,10 +56,12 @@ class Projection:
 
         Parameters
         ----------
-        h, excess : (n,) real
+        h, excess, quality : (n,) real
         gradient : (n, d) real
             grad log h.
         eps : float
+        lenience : float
+            -log Q at which the eps of a cell and its neighbours is twice as large; 0: quality does not matter.
         bound : float
             Excess at which a cell's eps is half; 0: the same eps for all.
         max_iterations : int
@@ -66,7 +70,10 @@ class Projection:
         engine, k, n = self.engine, self._kernels, t.n
         real = engine.real.type
         self._reserve(n, t.neighbours.shape[0])
-        engine.run_each(k.set_penalty, n, excess, real(eps), real(bound), self._eps)
+        engine.run_each(
+            k.set_penalty, n, t.starts, t.neighbours, quality, excess, real(eps), real(lenience),
+            real(bound), self._eps,
+        )  # fmt: skip
         engine.run_each(
             k.assemble_derivative, n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
             t.volumes, t.points, gradient, h, self._eps, self._weights, self._own, self._inverse,

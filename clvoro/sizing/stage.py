@@ -55,25 +55,33 @@ class Sizing:
         If the field is of another dimension than the domain.
     """
 
-    def __init__(self, engine: Engine, domain: Box, field: object):
+    def __init__(
+        self, engine: Engine, domain: Box, field: object, gradient_step: float | None = None
+    ):
         self.engine, self.domain, self.field = engine, domain, as_field(field)
         self.field.check_dim(domain.dim)
         self._origin, self._scale = domain.frame
         self._walls = (np.array([domain.lower, domain.upper]) - self._origin) / self._scale
+        self._gradient_step = gradient_step
         self.prelude, self.data, self._kernels = None, None, None
         if self.field.on_device:
             self.prelude, numbers = bind(self.field, domain, engine.real)
             self.data = engine.upload(numbers)
             self._box = engine.upload(self._walls.ravel())
             self._bad = engine.upload([_NONE_BAD], np.int32)
-            step = _GRADIENT_STEP[np.dtype(engine.real)]
+            step = self._step(engine.real)
             self._kernels = engine.kernels(
                 "sizing", defines={"GRADIENT_STEP": repr(step)}, prelude=self.prelude
             )
         else:
             # The callable itself is exact in float64; its fellows are not, if the device is not.
-            self._host_step = _GRADIENT_STEP[np.dtype(np.float64)]
+            self._host_step = self._step(np.float64)
             self._host_field = self._with_device_parts(self.field)
+
+    def _step(self, real: object) -> float:
+        """Step of the differences over h."""
+        own = _GRADIENT_STEP[np.dtype(real)]  # type: ignore[call-overload]
+        return own if self._gradient_step is None else self._gradient_step
 
     @property
     def real(self) -> np.dtype:
@@ -184,7 +192,7 @@ class Sizing:
         if isinstance(field, Constant):
             return field
         if field.on_device:
-            self._host_step = _GRADIENT_STEP[np.dtype(self.engine.real)]
+            self._host_step = self._step(self.engine.real)
             return _DevicePart(Sizing(self.engine, self.domain, field))
         return field.with_parts(self._with_device_parts)
 
