@@ -1,0 +1,67 @@
+"""A diagram on the device and its copy on the host: what the tests of the stages start from."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+
+from clvoro._program import Engine
+from clvoro.bins import Bins
+from clvoro.cells import Cells
+from clvoro.domain import Box
+
+BOX = Box((0, 0), (1, 0.75))
+"""Its frame is the unit square's: normalised coordinates are physical ones."""
+
+
+def make_engine(ctx, real="float64", dim=2, group_size=None):
+    """Return an engine; with `group_size` as on a GPU also where the device is a CPU."""
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
+    if group_size is not None:
+        object.__setattr__(engine, "group_size", group_size)
+    return engine
+
+
+def tessellate(engine, points, box=BOX):
+    """Return the tessellation by `points` (n, d) in their order, in buffers of its own."""
+    n, on_device = len(points), engine.upload(points)
+    binned = Bins(engine).build(box, on_device, n)
+    return Cells(engine).tessellate(box, on_device, n, binned)
+
+
+def fetch(t):
+    """Return the arrays of `t` as NumPy's, faces cut to their number, and `owners` (m,) of the faces."""
+    starts = t.starts.get()
+    m = int(starts[t.n])
+    names = ("neighbours", "face_measures", "face_centroids")
+    faces = {name: getattr(t, name).get()[:m] for name in names}
+    cells = {name: getattr(t, name).get() for name in ("points", "volumes", "offsets", "covariances")}
+    owners = np.repeat(np.arange(t.n), np.diff(starts))
+    return SimpleNamespace(n=t.n, starts=starts, owners=owners, **faces, **cells)
+
+
+def hexagons(a, box=BOX):
+    """Return the points of a hexagonal lattice of spacing `a` that lie in the box, none near a wall."""
+    rows = np.arange(a / 4, box.upper[1] - a / 4, a * np.sqrt(3) / 2)
+    lines = [
+        np.stack([x := np.arange(a / 4 + a / 2 * (k % 2), box.upper[0] - a / 8, a), np.full_like(x, y)], 1)
+        for k, y in enumerate(rows)
+    ]
+    return np.concatenate(lines)
+
+
+def random_points(n, seed, box=BOX):
+    return np.random.default_rng(seed).random((n, box.dim)) * box.extent + box.lower
+
+
+def relaxed_points(n, seed, steps=8):
+    """Random points after some steps of Lloyd's: cells of all shapes, but none degenerate."""
+    import reference
+
+    points = random_points(n, seed)
+    for _ in range(steps):
+        cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
+        points = np.array([c.centroid for c in cells])
+    return points

@@ -1,0 +1,162 @@
+"""The bins as a structure: walked on the host, they hold every generator once, where it belongs."""
+
+import numpy as np
+import patch
+import pytest
+
+from clvoro.bins import MAX_LEVELS, SPLIT_COUNT, Bins
+from clvoro.domain import Box
+
+
+def walk(binned, n, dim):
+    """Return the leaves as (first, count, origin, edge, level), from grid 0 down; each bin's place is in its grid's row."""
+    bins = binned.bins.get().reshape(-1, 2)
+    frames = binned.grid_frames.get().reshape(-1, 4).astype(float)
+    shapes = binned.grid_shapes.get().reshape(-1, 4)
+    leaves, opened = [], set()
+
+    def open_grid(g, level):
+        assert g not in opened, "a grid is reached twice"
+        opened.add(g)
+        first, *sides = shapes[g]
+        sides = sides[:dim]
+        edge = 1 / frames[g, 3]
+        held = 0
+        for place in range(int(np.prod(sides))):
+            index = np.unravel_index(place, sides[::-1])[::-1]
+            origin = frames[g, :dim] + np.array(index) * edge
+            start, count = bins[first + place]
+            if start >= 0:
+                leaves.append((start, count, origin, edge, level, index, sides))
+            else:
+                inside = open_grid(-1 - start, level + 1)
+                assert inside == count, "a divided bin does not hold what its grid holds"
+            held += count
+        return held
+
+    assert open_grid(0, 0) == n
+    return leaves
+
+
+def check(binned, points, dim, eps):
+    n = len(points)
+    leaves = walk(binned, n, dim)
+    items = binned.items.get()[:n]
+    assert np.array_equal(np.sort(items), np.arange(n)), "not every generator is in one place"
+    assert np.array_equal(binned.points.get().reshape(-1, dim)[:n], points[items])
+    reach = binned.reach.get()[:n]
+    covered = np.zeros(n, int)
+    for start, count, origin, edge, level, index, sides in leaves:
+        place = slice(start, start + count)
+        covered[place] += 1
+        assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
+        assert count <= SPLIT_COUNT or level == MAX_LEVELS - 1
+        assert np.allclose(reach[place], edge, rtol=1e-6)
+        # A generator lies in its bin but for the rounding of the bin's corner; outermost bins take what rounds out.
+        inside = points[items[place]]
+        for a in range(dim):
+            if index[a] > 0:
+                assert (inside[:, a] >= origin[a] - 8 * eps).all()
+            if index[a] < sides[a] - 1:
+                assert (inside[:, a] <= origin[a] + edge + 8 * eps).all()
+    assert (covered == 1).all(), "leaves overlap or leave a gap"
+    return leaves
+
+
+def sets(dim, box):
+    rng = np.random.default_rng(8111)
+    lower, extent = np.array(box.lower), box.extent
+    square = lower + rng.random((700, dim)) * extent
+    corners = np.array(list(np.ndindex(*(2,) * dim))) * extent + lower
+    tight = lower + 0.3 * extent
+    return {
+        "one": square[:1],
+        "two": square[:2],
+        "random": square,
+        "graded": lower + rng.random((900, dim)) ** 5 * extent,
+        "corners": np.concatenate([corners, square[:50]]),
+        "clusters": np.concatenate([tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-8, 1e-12)]),
+        "one place": np.repeat(square[:1], 400, axis=0),
+        "few places": np.repeat(square[:5], [1, 90, 11, 3000, 10], axis=0)[rng.permutation(3112)],
+        "line": lower + np.linspace(0, 1, 501)[:, None] * extent,
+        "lattice": np.array(list(np.ndindex(*(9,) * dim))) / 8 * extent + lower,
+    }
+
+
+BOXES = {
+    "box": Box((0, 0), (1, 0.75)),
+    "needle": Box((0, 0), (1, 1e-4)),
+    "cube": Box((0, 0, 0), (1, 0.5, 0.75)),
+}
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def real(request):
+    return request.param
+
+
+@pytest.mark.parametrize("box", BOXES)
+def test_every_generator_in_one_leaf(ctx, real, box):
+    box = BOXES[box]
+    engine = patch.make_engine(ctx, real, box.dim)
+    bins = Bins(engine)  # one object for all sets: its buffers are used again, and grow
+    corner = np.array(box.upper).astype(real)
+    for name, points in sets(box.dim, box).items():
+        points = np.minimum(points.astype(real), corner)
+        binned = bins.build(box, engine.upload(points), len(points))
+        try:
+            leaves = check(binned, points, box.dim, float(np.finfo(real).eps))
+        except AssertionError as error:
+            raise AssertionError(f"{name}: {error}") from error
+        levels = max(leaf[4] for leaf in leaves)
+        if name in ("one place", "few places"):
+            assert levels == MAX_LEVELS - 1, name
+        elif name in ("one", "two", "lattice"):
+            assert levels == 0, name
+        elif name == "clusters":
+            assert levels >= 2, name
+
+
+def test_uniform_sets_stay_on_one_level(ctx):
+    """Of a random set hardly a bin holds more than SPLIT_COUNT: Poisson with mean 2 exceeds 10 in one of 1e5 bins."""
+    engine = patch.make_engine(ctx)
+    points = patch.random_points(20000, 202)
+    leaves = walk(Bins(engine).build(patch.BOX, engine.upload(points), 20000), 20000, 2)
+    assert np.mean([leaf[4] > 0 for leaf in leaves]) < 1e-3
+    assert 0.4 * 20000 < len(leaves) < 0.6 * 20000 + 300
+
+
+def test_repeats_bit_by_bit_whatever_came_before(ctx, real):
+    """Atomics may arrive in any order, and buffers hold what an earlier, larger set has left."""
+    engine = patch.make_engine(ctx, real)
+    used, points = Bins(engine), sets(2, patch.BOX)
+    first = {}
+    for name in ("graded", "few places", "clusters"):
+        binned = Bins(engine).build(patch.BOX, engine.upload(points[name]), len(points[name]))
+        first[name] = binned.items.get()[: len(points[name])]
+    for name in ("few places", "graded", "one", "clusters", "graded", "few places"):
+        n = len(points[name])
+        items = used.build(patch.BOX, engine.upload(points[name]), n).items.get()[:n]
+        if name in first:
+            assert np.array_equal(items, first[name]), name
+
+
+def test_only_the_first_n_are_binned(ctx):
+    engine = patch.make_engine(ctx)
+    points = patch.random_points(300, 4)
+    binned = Bins(engine).build(patch.BOX, engine.upload(points), 120)
+    check(binned, points[:120], 2, 2e-16)
+
+
+def test_capacity_grows(ctx):
+    """A small set, a large one, one whose levels need more bins than any estimate; then small again."""
+    engine = patch.make_engine(ctx)
+    bins = Bins(engine)
+    rng = np.random.default_rng(64)
+    for points in (
+        patch.random_points(3, 1),
+        patch.random_points(9000, 2),
+        0.5 + 1e-6 * rng.random((9000, 2)) * (rng.random((9000, 1)) < 0.9),
+        patch.random_points(3, 1),
+    ):
+        check(bins.build(patch.BOX, engine.upload(points), len(points)), points, 2, 2e-16)

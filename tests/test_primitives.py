@@ -1,0 +1,104 @@
+"""Scans, summaries and gathers against NumPy and exact sums, in groups as on a CPU and as on a GPU."""
+
+import math
+
+import numpy as np
+import patch
+import pytest
+
+from clvoro._primitives import Gather, Scan, Summaries
+
+
+@pytest.fixture(scope="module", params=[1, 128], ids=["cpu", "gpu"])
+def group_size(request):
+    return request.param
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def engine(ctx, request, group_size):
+    return patch.make_engine(ctx, request.param, group_size=group_size)
+
+
+@pytest.fixture(scope="module")
+def scan(ctx):
+    return Scan(patch.make_engine(ctx))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 1000, 100003])
+@pytest.mark.parametrize("first", [0, 5])
+def test_scan(scan, n, first):
+    values = np.random.default_rng(n + 31).integers(-50, 90, n + first + 3).astype(np.int32)
+    device = scan.engine.upload(values, np.int32)
+    out = scan.engine.upload(np.full(n + 3, -7), np.int32)
+    scan.exclusive(device, out, n, first)
+    expected = np.concatenate([[0], np.cumsum(values[first : first + n])])
+    assert np.array_equal(out.get(), [*expected, -7, -7]), "or beyond n + 1 is written"
+    assert np.array_equal(device.get(), values)
+
+
+@pytest.mark.parametrize("n", [1, 3, 4096, 50001])
+def test_scan_in_place(scan, n):
+    values = np.random.default_rng(n).integers(0, 5, n + 1).astype(np.int32)
+    device = scan.engine.upload(values, np.int32)
+    scan.exclusive(device, device, n)
+    assert np.array_equal(device.get(), np.concatenate([[0], np.cumsum(values[:n])]))
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 129, 4096, 300007])
+def test_summaries(engine, n):
+    values = np.random.default_rng(n + 5).normal(0.01, 1, n).astype(engine.real)
+    summaries = Summaries(engine, ("a", "b"))
+    array = engine.upload(np.concatenate([values, [1e9]]))  # what lies behind the n is not looked at
+    summaries.collect("b", array, n)
+    summaries.collect("a", engine.upload(-values), n)
+    a, b = (summaries.read()[name] for name in "ab")
+    # Compensated sums: a few roundings of the result, and eps^2 of every term.
+    eps = float(np.finfo(engine.real).eps)
+    total, magnitude = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
+    assert b.sum == pytest.approx(total, abs=4 * eps * abs(total) + n * eps**2 * magnitude)
+    assert b.magnitude == pytest.approx(magnitude, rel=4 * eps)
+    assert (b.least, b.largest) == (values.min(), values.max())
+    assert b.peak == np.abs(values).max()
+    assert (a.sum, a.magnitude, a.least) == (-b.sum, b.magnitude, -b.largest)
+
+
+def test_summaries_are_compensated(engine):
+    """Large terms that cancel: a plain sum would lose the small ones altogether."""
+    n = 200001
+    values = np.full(n, 0.1, engine.real)
+    large = engine.real.type(1e3 / np.finfo(engine.real).eps)
+    values[: n // 2 : 2], values[1 : n // 2 : 2] = large, -large
+    summaries = Summaries(engine, ("a",))
+    summaries.collect("a", engine.upload(values), n)
+    expected = math.fsum(values.tolist())
+    assert expected == pytest.approx(0.1 * (n - n // 2), rel=1e-6)
+    assert summaries.read()["a"].sum == pytest.approx(expected, rel=1e-6)
+
+
+def test_summaries_repeat_bit_by_bit(engine):
+    values = engine.upload(np.random.default_rng(17).normal(size=77777))
+    summaries = Summaries(engine, ("a", "b"))
+    summaries.collect("a", values, 77777)
+    summaries.collect("b", values, 77777)
+    assert summaries.read()["a"] == summaries.read()["b"]
+
+
+def test_summary_shows_what_is_not_finite(engine):
+    values = np.ones(1000)
+    values[613] = np.nan
+    summaries = Summaries(engine, ("a",))
+    summaries.collect("a", engine.upload(values), 1000)
+    assert math.isnan(summaries.read()["a"].sum)
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.float32, np.float64, np.uint64])
+@pytest.mark.parametrize("width", [None, 2, 3])
+def test_gather(scan, dtype, width):
+    rng = np.random.default_rng(91)
+    shape = (500,) if width is None else (500, width)
+    array = rng.integers(0, 2**31, shape).astype(dtype)
+    items = rng.integers(0, 500, 777).astype(np.int32)
+    engine = scan.engine
+    out = Gather(engine).rows(engine.upload(items, np.int32), engine.upload(array, dtype))
+    assert out.dtype == dtype
+    assert np.array_equal(out.get(), array[items])
