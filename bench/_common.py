@@ -1,0 +1,204 @@
+"""What the benches share: options, the test fields, the figures of a mesh, tables.
+
+Importing it makes `clvoro` importable from the checkout that holds `bench/`, installed or not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+try:
+    import clvoro
+except ModuleNotFoundError:
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+    import clvoro
+from clvoro import sizing
+
+PICTURES = Path(__file__).resolve().parent / "pictures"
+BOX = clvoro.Box((0, 0), (2.5, 1.5))
+FIRST_SEED = 20251
+
+
+def test_field(name: str) -> sizing.Field:
+    """Return the size field F1, F2, F3 or F4; all on `BOX`, all absolute.
+
+    F1 = 0.02 + 0.3 d, F2 = 0.002 + 0.08 d, F4 = F2 / 6.6, with d the distance to the circle of
+    radius 0.3 about (0.9, 0.75); F3 = 0.9306 min(0.15, 0.02 + ln(1.3) d) / 4, radius 0.25 about
+    (0.8, 0.75).
+    """
+    circle = sizing.Circle((0.9, 0.75), 0.3)
+    if name == "F1":
+        return sizing.Distance(circle, h_min=0.02, slope=0.3)
+    if name in ("F2", "F4"):
+        field = sizing.Distance(circle, h_min=0.002, slope=0.08)
+        return field if name == "F2" else field * (1 / 6.6)
+    if name == "F3":
+        circle = sizing.Circle((0.8, 0.75), 0.25)
+        return sizing.Distance(circle, h_min=0.02, growth=1.3, h_max=0.15) * (0.9306 / 4)
+    raise ValueError(f"no field {name}")
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser that knows --device, --dtype and --json; `doc` is the script's docstring."""
+    title, _, rest = (doc or "").partition("\n")
+    made = argparse.ArgumentParser(
+        description=title, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument(
+        "--device", metavar="NAME", help="as for clvoro run: gpu, part of a name, 0:0"
+    )
+    made.add_argument("--dtype", choices=("float64", "float32"), default="float64")
+    made.add_argument("--json", action="store_true", help="print one JSON object per line instead")
+    return made
+
+
+def names(text: str) -> list[str]:
+    """Split a comma-separated option."""
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def counts(text: str) -> list[int]:
+    """Split a comma-separated option of whole numbers, 1e6 allowed."""
+    return [round(float(part)) for part in names(text)]
+
+
+def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
+    """Return the adapter that the options ask for, or end the script with a plain message."""
+    try:
+        return clvoro.Adapter(clvoro.create_context(options.device), dtype=options.dtype)
+    except clvoro.ClvoroError as error:
+        raise SystemExit(f"{type(error).__name__}: {error}") from error
+
+
+def device_name(adapter: clvoro.Adapter) -> str:
+    """Name of the device, its platform and its number of compute units."""
+    device = adapter.ctx.devices[0]
+    platform = device.platform
+    units = f"{device.max_compute_units} compute units"
+    return f"{device.name.strip()} ({platform.name.strip()}, {units})"
+
+
+def heading(adapter: clvoro.Adapter, what: str) -> str:
+    """Line above a table: what, when, where, in which precision."""
+    return f"{what}. {date.today()}, {device_name(adapter)}, {adapter.dtype.name}."
+
+
+def off_walls(diagram: clvoro.Diagram) -> np.ndarray:
+    """Tell for each cell whether it has no face on a wall, (n,) bool."""
+    on_wall = np.logical_or.reduceat(diagram.neighbours < 0, diagram.neighbour_starts[:-1])
+    return ~on_wall
+
+
+def figures(diagram: clvoro.Diagram, h: np.ndarray, quality: np.ndarray) -> dict[str, float]:
+    """Return the figures that describe a mesh of target sizes `h` (n,).
+
+    Error e is the paper's (3.1), Q its (4.1); "deviation" is |L / h - 1|. Quality and the share of
+    six-sided cells count the cells off the walls, those named "..._all" every cell; error and
+    deviation count every cell.
+    """
+    length = diagram.volumes ** (1 / diagram.points.shape[1])
+    error = np.abs(length - h) / np.minimum(length, h)
+    deviation = np.abs(length / h - 1)
+    inner = off_walls(diagram)
+    if not inner.any():
+        inner[:] = True
+    sides = np.diff(diagram.neighbour_starts)
+    return {
+        "cells": len(diagram),
+        "mean_error": float(error.mean()),
+        "max_error": float(error.max()),
+        "mean_error_inner": float(error[inner].mean()),
+        "max_error_inner": float(error[inner].max()),
+        "signed_log": float(np.log(length / h).mean()),
+        "mean_quality": float(quality[inner].mean()),
+        "min_quality": float(quality[inner].min()),
+        "mean_quality_all": float(quality.mean()),
+        "min_quality_all": float(quality.min()),
+        "six_sided": float((sides[inner] == 6).mean()),
+        "mean_deviation": float(deviation.mean()),
+        "max_deviation": float(deviation.max()),
+    }
+
+
+def cell_quality(diagram: clvoro.Diagram) -> np.ndarray:
+    """Return the paper's (4.1) for each cell of a 2D diagram, on the host."""
+    starts = diagram.neighbour_starts
+    sides = np.diff(starts)
+    perimeter = np.add.reduceat(diagram.face_measures, starts[:-1])
+    return 4 * diagram.volumes * sides * np.tan(math.pi / sides) / perimeter**2
+
+
+def work(history: np.ndarray) -> dict[str, float]:
+    """Return what a run has cost, in steps of its finest level: a step costs as it has cells.
+
+    "work" counts steps; "tessellations" adds the start and those after generators came or went.
+    """
+    cells = history["cells"] / history["cells"][-1]
+    anew = history["inserted"] + history["deleted"] > 0
+    # The first row is the start; a closing row that follows no step tells of generators only.
+    stepped = np.diff(history["step"], prepend=history["step"][0]) > 0
+    steps = float(cells[stepped].sum())
+    return {
+        "steps": int(history["step"][-1]),
+        "work": steps,
+        "tessellations": steps + float(cells[0]) + float(cells[anew].sum()),
+    }
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Write one value, or the median and the range of several."""
+    if len(values) == 1:
+        return format(values[0], form)
+    low, middle, high = min(values), statistics.median(values), max(values)
+    shown = [format(v, form) for v in (low, middle, high)]
+    return shown[1] if shown[0] == shown[2] else f"{shown[1]} ({shown[0]} .. {shown[2]})"
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a Markdown table; bars in the text are escaped."""
+
+    def line(cells: Iterable[object]) -> str:
+        return "| " + " | ".join(str(c).replace("|", "\\|") for c in cells) + " |"
+
+    return "\n".join([line(header), "|" + "---|" * len(header), *(line(row) for row in rows)])
+
+
+class Report:
+    """Print rows as they come with --json, else gather them into one Markdown table.
+
+    Parameters
+    ----------
+    as_json : bool
+    columns : mapping of str to function
+        Header of each column, and what it shows of a record.
+    """
+
+    def __init__(
+        self, as_json: bool, columns: Mapping[str, Callable[[dict[str, Any]], object]]
+    ) -> None:
+        self.as_json, self.columns = as_json, columns
+        self.records: list[dict[str, Any]] = []
+
+    def add(self, record: dict[str, Any], note: str = "") -> None:
+        """Take one record; while a table is being made, `note` shows on stderr that it goes on."""
+        self.records.append(record)
+        if self.as_json:
+            print(json.dumps(record), flush=True)
+        elif note:
+            print(note, file=sys.stderr, flush=True)
+
+    def finish(self, title: str) -> None:
+        """Print the table."""
+        if not self.as_json:
+            rows = [[show(r) for show in self.columns.values()] for r in self.records]
+            print(f"{title}\n\n{markdown(list(self.columns), rows)}\n")

@@ -1,0 +1,207 @@
+"""How far a few steps go: size, shape and work of each method on four fields, against targets.
+
+    python bench/convergence.py [--fields F1,F3] [--rows default,exact] [--seeds 3] [--large]
+                                [--device NAME] [--dtype float32] [--json]
+
+Prints a Markdown table; every row is one method on one field with its target beside what is
+measured, over `--seeds` random starts as median (least .. largest). A row holds if it does for
+every start. `--large` adds the rows with a million cells. Exits with 1 if a row does not hold.
+
+Quality and the share of six-sided cells count the cells off the walls; "all Q" is mean and min of
+every cell. Work is counted in steps of the finest level (a step on a quarter of the cells counts
+a quarter). The size field is absolute: no factor is taken out of the error.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from _common import (
+    BOX,
+    FIRST_SEED,
+    Report,
+    figures,
+    heading,
+    make_adapter,
+    names,
+    parser,
+    spread,
+    test_field,
+    work,
+)
+
+import clvoro
+from clvoro.plans import EXACT_STEPS
+
+LARGE = ("F4",)
+AT_LEAST = ("mean_quality", "min_quality")
+"""Figures that are the better the larger; all others the smaller."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is run, and what it must reach.
+
+    Attributes
+    ----------
+    name : str
+        As `--rows` takes it.
+    fields : tuple of str
+    arguments : dict
+        Of `Adapter.run`.
+    targets : dict
+        Figure -> bound.
+    """
+
+    name: str
+    fields: tuple[str, ...]
+    arguments: dict[str, Any]
+    targets: dict[str, float] = field(default_factory=dict)
+
+
+DEFAULT = {
+    "mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990, "min_quality": 0.92, "work": 100,
+}  # fmt: skip
+EXACT = {
+    "mean_deviation": 1e-4, "max_deviation": 2e-3, "mean_quality": 0.986, "min_quality": 0.85,
+    "exact_steps": 8, "exact_iterations": 50,
+}  # fmt: skip
+WEIGHTED = {"method": "weighted", "tol": 0}
+
+ROWS = (
+    Row("weighted", ("F1",), {**WEIGHTED, "max_steps": 8}, {"mean_error": 0.030}),
+    Row(
+        "weighted-uniform", ("F1",),
+        {**WEIGHTED, "start": "uniform", "k": 1.0, "max_steps": 20},
+        {"mean_error": 0.035},
+    ),
+    Row(
+        "default", ("F1",), {},
+        {"mean_error": 0.002, "max_error": 0.02, "mean_quality": 0.967, "min_quality": 0.85},
+    ),
+    Row("default", ("F2", "F3", "F4"), {}, DEFAULT),
+    Row(
+        "best", ("F3",), {"effort": "best"},
+        {"mean_error": 0.004, "mean_quality": 0.994, "min_quality": 0.96},
+    ),
+    Row(
+        "fast", ("F2", "F3", "F4"), {"effort": "fast"},
+        {"mean_error": 0.006, "mean_quality": 0.975, "work": 15},
+    ),
+    Row("exact", ("F1",), {"method": "exact"}, {"max_deviation": 1e-3, "mean_quality": 0.965}),
+    Row("exact", ("F2", "F3", "F4"), {"method": "exact"}, EXACT),
+)  # fmt: skip
+
+
+def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int) -> dict[str, float]:
+    """Run `row` on the field of that name and return its figures."""
+    start = time.perf_counter()
+    result = adapter.run(BOX, test_field(name), seed=seed, **row.arguments)
+    seconds = time.perf_counter() - start
+    history = result.history
+    measured = {
+        **figures(result.diagram, result.size, result.quality),
+        **work(history),
+        "seconds": seconds,
+        "iterations": int(history["iterations"].sum()),
+    }
+    if row.arguments.get("method") == "exact":
+        measured["exact_steps"] = EXACT_STEPS
+        extra = history["step"] > history["step"][-1] - EXACT_STEPS
+        measured["exact_iterations"] = int(history["iterations"][extra].max())
+    return measured
+
+
+def meets(name: str, value: float, bound: float) -> bool:
+    return value >= bound if name in AT_LEAST else value <= bound
+
+
+def show(figure: str, form: str) -> Any:
+    """Return what writes `figure` of a record, its target beside it, bold where missed."""
+
+    def text(record: dict[str, Any]) -> str:
+        values = [run[figure] for run in record["runs"] if figure in run]
+        if not values:
+            return ""
+        written = spread(values, form)
+        if figure not in record["targets"]:
+            return written
+        bound = record["targets"][figure]
+        sign = "≥" if figure in AT_LEAST else "≤"
+        if not all(meets(figure, v, bound) for v in values):
+            written = f"**{written}**"
+        return f"{written} [{sign} {bound:g}]"
+
+    return text
+
+
+COLUMNS = {
+    "row": lambda r: r["row"],
+    "field": lambda r: r["field"],
+    "cells": show("cells", ".0f"),
+    "mean |e|": show("mean_error", ".5f"),
+    "max |e|": show("max_error", ".4f"),
+    "mean Q": show("mean_quality", ".4f"),
+    "min Q": show("min_quality", ".3f"),
+    "all Q": lambda r: (
+        f"{show('mean_quality_all', '.4f')(r)} / {show('min_quality_all', '.3f')(r)}"
+    ),
+    "six-sided": show("six_sided", ".1%"),
+    "mean |L/h-1|": show("mean_deviation", ".1e"),
+    "max |L/h-1|": show("max_deviation", ".1e"),
+    "steps": show("steps", ".0f"),
+    "work": show("work", ".1f"),
+    "seconds": show("seconds", ".1f"),
+    "exact steps": show("exact_steps", ".0f"),
+    "CG its each": show("exact_iterations", ".0f"),
+    "holds": lambda r: "yes" if r["holds"] else f"**no**: {', '.join(r['missed'])}",
+}
+
+
+def judge(row: Row, name: str, runs: list[dict[str, float]]) -> dict[str, Any]:
+    """Return the record of one row: its runs, its targets, and what missed them how often."""
+    missed = []
+    for figure, bound in row.targets.items():
+        bad = sum(not meets(figure, run[figure], bound) for run in runs)
+        if bad:
+            missed.append(f"{figure} ({bad} of {len(runs)})" if len(runs) > 1 else figure)
+    return {
+        "row": row.name, "field": name, "arguments": row.arguments, "targets": row.targets,
+        "runs": runs, "holds": not missed, "missed": missed,
+    }  # fmt: skip
+
+
+def main() -> int:
+    options_of = parser(__doc__)
+    known = list(dict.fromkeys(row.name for row in ROWS))
+    options_of.add_argument("--fields", type=names, default=["F1", "F2", "F3", "F4"])
+    options_of.add_argument("--rows", type=names, default=known, help=", ".join(known))
+    options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="random starts (1)")
+    options_of.add_argument("--large", action="store_true", help="also F4, a million cells")
+    options = options_of.parse_args()
+    if unknown := set(options.rows) - set(known):
+        options_of.error(f"no row {', '.join(unknown)}; there are {', '.join(known)}")
+
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    # Kernels are built here, so that no row's time holds it.
+    adapter.run(BOX, test_field("F1"), method="exact", effort="fast")
+    for row in ROWS:
+        for name in row.fields:
+            asked = row.name in options.rows and name in options.fields
+            if not asked or (name in LARGE and not options.large):
+                continue
+            runs = [
+                measure(adapter, row, name, FIRST_SEED + 17 * k) for k in range(options.seeds)
+            ]  # fmt: skip
+            record = judge(row, name, runs)
+            report.add(record, f"{row.name} on {name}: {'yes' if record['holds'] else 'no'}")
+    report.finish(heading(adapter, f"Convergence, {options.seeds} start(s)"))
+    return 0 if all(record["holds"] for record in report.records) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

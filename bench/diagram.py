@@ -1,0 +1,282 @@
+"""The tessellation alone: time of each stage, cold and warm-started, uniform and graded.
+
+    python bench/diagram.py [--sizes 1e4,1e5,1e6,4e6] [--sets uniform,cubed,radial,hexagonal]
+                            [--scipy] [--repeat 5] [--device NAME] [--dtype float32] [--json]
+
+Point sets in the unit square, random with a fixed seed: "uniform"; "cubed", uniform with x -> x^3
+in both coordinates; "radial", spacing in proportion to the distance from the centre, sizes
+1 : 10 000; "hexagonal", a lattice jittered by a tenth of its spacing, as a finished mesh is.
+
+Times are medians of `--repeat` after a first call, from an idle queue to an idle queue, in
+milliseconds:
+  order    the generators' first binning, and bringing them into the order of the bins
+  bins     the binning of ordered generators: what every step of a run does
+  diagram  clipping, matching, scan, areas, centroids, faces, graph
+"clip", "match" and "measure" are the device's own times of the kernels in "diagram", by its
+events. Warm rows: the generators moved by up to a tenth of their spacing; clipping starts from
+the diagram before. Rates are millions of cells per second: of clipping alone; from binning to
+graph; and the same with "order", which is a diagram of points in any order. With `--scipy`
+SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up to
+`--scipy-up-to` cells; "x SciPy" compares it with the last of the rates. The table ends with the
+rates of graded sets over the uniform one and with the slope of time against count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from _common import Report, counts, heading, make_adapter, markdown, names, parser
+from _profile import Profile, profiled_queue
+
+import clvoro
+from clvoro._primitives import Gather
+from clvoro._program import Engine
+from clvoro.bins import Bins
+from clvoro.cells import Cells
+
+BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
+SEED = 7919
+RATIO = 1e4
+JITTER = 0.1
+WARM_MOVE = 0.1
+
+
+def uniform(n: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.random((n, 2))
+
+
+def cubed(n: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.random((n, 2)) ** 3
+
+
+def radial(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Points of density 1 / r^2 between r = R / 10 000 and the corners, R = sqrt(1/2)."""
+    kept: list[np.ndarray] = []
+    while sum(map(len, kept)) < n:
+        r = math.sqrt(0.5) * RATIO ** -rng.random(n)
+        turn = 2 * np.pi * rng.random(n)
+        p = 0.5 + r[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+        kept.append(p[((p >= 0) & (p <= 1)).all(axis=1)])
+    return np.concatenate(kept)[:n]
+
+
+def hexagonal(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Jittered triangular lattice in random order, of about n points."""
+    a = math.sqrt(2 / (math.sqrt(3) * n))
+    rows, columns = round(1 / (a * math.sqrt(0.75))), round(1 / a)
+    y, x = np.mgrid[0:rows, 0:columns].astype(float)
+    p = np.column_stack([
+        ((x + 0.5 * (y % 2) + 0.25) / columns).ravel(), ((y + 0.5) / rows).ravel()
+    ])  # fmt: skip
+    p += JITTER * a * (rng.random(p.shape) - 0.5) * 2
+    return rng.permutation(np.clip(p, 0, 1))
+
+
+SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
+
+
+def median_time(queue: Any, repeat: int, function: Callable[[], object]) -> float:
+    """Median seconds of `function`, from an idle queue to an idle queue, after a first call."""
+    times = []
+    for k in range(repeat + 1):
+        queue.finish()
+        start = time.perf_counter()
+        function()
+        queue.finish()
+        if k:
+            times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+class Tessellator:
+    """The stages of a diagram on one queue, over generators in the order of their bins."""
+
+    def __init__(self, engine: Engine, points: np.ndarray) -> None:
+        self.engine, self.n = engine, len(points)
+        self.bins, self.cells, self.gather = Bins(engine), Cells(engine), Gather(engine)
+        self.given = engine.upload(points)
+        self.points = self.order()
+        self.turn = 0
+
+    def order(self) -> Any:
+        """Bin the generators as given; return them in the order of the bins."""
+        items = self.bins.build(BOX, self.given, self.n).items[: self.n].copy()
+        return self.gather.rows(items, self.given)
+
+    def bin(self) -> None:
+        """Bin the ordered generators."""
+        self.binned = self.bins.build(BOX, self.points, self.n)
+
+    def diagram(self) -> Any:
+        """Tessellate from nothing."""
+        self.t = self.cells.tessellate(BOX, self.points, self.n, self.binned)
+        return self.t
+
+    def prepare_warm(self, rng: np.random.Generator) -> None:
+        """Move the generators to and fro by a share of their spacing."""
+        self.bin()
+        spacing = np.sqrt(self.diagram().volumes.get()[: self.n])
+        host = self.points.get()
+        moved = host + WARM_MOVE * spacing[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
+        moved = np.clip(moved, 0, 1)
+        self.places = [self.points, self.engine.upload(moved)]
+        self.warm_bins = [Bins(self.engine), Bins(self.engine)]
+        self.warm_binned = [
+            b.build(BOX, p, self.n) for b, p in zip(self.warm_bins, self.places, strict=True)
+        ]
+
+    def bin_moved(self) -> None:
+        """Bin the generators where they moved to: their order is no longer the bins'."""
+        self.warm_bins[1].build(BOX, self.places[1], self.n)
+
+    def diagram_warm(self) -> None:
+        """Tessellate where the generators moved to, from where they were, to and fro."""
+        self.turn = 1 - self.turn
+        self.t = self.cells.tessellate(
+            BOX, self.places[self.turn], self.n, self.warm_binned[self.turn], self.t
+        )
+
+
+def kernel_times(function: Callable[[], object], repeat: int) -> dict[str, float]:
+    """Median device times of the kernels of "diagram"."""
+    function()
+    times: dict[str, list[float]] = {"clip": [], "match": [], "measure": []}
+    for _ in range(repeat):
+        with Profile() as profile:
+            function()
+        for name, seen in times.items():
+            seen.append(sum(t for (_, k), t in profile.seconds.items() if k.startswith(name)))
+    return {name: statistics.median(seen) for name, seen in times.items()}
+
+
+def measure(
+    adapter: clvoro.Adapter, name: str, n: int, options: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Return the records of one set: cold and warm."""
+    rng = np.random.default_rng(SEED + n)
+    points = SETS[name](n, rng).astype(adapter.dtype)
+    repeat = options.repeat
+    plain = Tessellator(Engine(adapter.ctx, adapter.queue, 2, adapter.dtype), points)
+    queue = plain.engine.queue
+    order = median_time(queue, repeat, plain.order)
+    bins = median_time(queue, repeat, plain.bin)
+    cold = median_time(queue, repeat, plain.diagram)
+    plain.prepare_warm(rng)
+    warm_bins = median_time(queue, repeat, plain.bin_moved)
+    warm = median_time(queue, repeat, plain.diagram_warm)
+    del plain
+
+    queue = profiled_queue(adapter.ctx)
+    timed = Tessellator(Engine(adapter.ctx, queue, 2, adapter.dtype), points)
+    timed.bin()
+    cold_kernels = kernel_times(timed.diagram, repeat)
+    timed.prepare_warm(rng)
+    warm_kernels = kernel_times(timed.diagram_warm, repeat)
+    del timed
+
+    n = len(points)
+    records = []
+    for start, seconds, binning, kernels in (
+        ("cold", cold, bins, cold_kernels), ("warm", warm, warm_bins, warm_kernels),
+    ):  # fmt: skip
+        record: dict[str, Any] = {
+            "set": name, "cells": n, "start": start, "bins": binning, "diagram": seconds, **kernels,
+            "clip_rate": n / kernels["clip"], "graph_rate": n / (binning + seconds),
+        }  # fmt: skip
+        if start == "cold":
+            record |= {"order": order, "whole_rate": n / (order + binning + seconds)}
+        records.append(record)
+    if options.scipy and n <= options.scipy_up_to:
+        records[0]["scipy"] = scipy_time(points)
+        records[0]["over_scipy"] = records[0]["scipy"] * records[0]["whole_rate"] / n
+    return records
+
+
+def scipy_time(points: np.ndarray) -> float:
+    from scipy.spatial import Voronoi
+
+    start = time.perf_counter()
+    Voronoi(points)
+    return time.perf_counter() - start
+
+
+def shown(figure: str, scale: float, form: str) -> Callable[[dict[str, Any]], str]:
+    return lambda r: format(r[figure] * scale, form) if figure in r else ""
+
+
+COLUMNS = {
+    "points": lambda r: r["set"],
+    "cells": lambda r: f"{r['cells']:,}",
+    "start": lambda r: r["start"],
+    "order ms": shown("order", 1e3, ".1f"),
+    "bins ms": shown("bins", 1e3, ".1f"),
+    "diagram ms": shown("diagram", 1e3, ".1f"),
+    "clip ms": shown("clip", 1e3, ".1f"),
+    "match ms": shown("match", 1e3, ".1f"),
+    "measure ms": shown("measure", 1e3, ".1f"),
+    "clip M/s": shown("clip_rate", 1e-6, ".2f"),
+    "bins to graph M/s": shown("graph_rate", 1e-6, ".2f"),
+    "with order M/s": shown("whole_rate", 1e-6, ".2f"),
+    "SciPy s": shown("scipy", 1, ".2f"),
+    "x SciPy": shown("over_scipy", 1, ".0f"),
+}
+
+
+def comparisons(records: list[dict[str, Any]]) -> list[list[str]]:
+    """Return cost per cell over the uniform set's at the largest count, and slopes in log-log."""
+    rows = []
+    for name in dict.fromkeys(r["set"] for r in records):
+        for start in ("cold", "warm"):
+            mine = [r for r in records if r["set"] == name and r["start"] == start]
+            last = mine[-1]
+            base = next(
+                (r for r in records if r["set"] == "uniform" and r["start"] == start
+                 and abs(r["cells"] / last["cells"] - 1) < 0.05), None,
+            )  # fmt: skip
+            clip = f"{base['clip_rate'] / last['clip_rate']:.2f}" if base else ""
+            graph = f"{base['graph_rate'] / last['graph_rate']:.2f}" if base else ""
+            slope = ""
+            if len(mine) > 1:
+                n = np.log([r["cells"] for r in mine])
+                seconds = np.log([r["cells"] / r["graph_rate"] for r in mine])
+                slope = f"{np.polyfit(n, seconds, 1)[0]:.3f}"
+            rows.append([name, start, f"{last['cells']:,}", clip, graph, slope])
+    return rows
+
+
+def main() -> None:
+    options_of = parser(__doc__)
+    options_of.add_argument("--sizes", type=counts, default=[10**4, 10**5, 10**6, 4 * 10**6])
+    options_of.add_argument("--sets", type=names, default=list(SETS), help=", ".join(SETS))
+    options_of.add_argument("--repeat", type=int, default=5)
+    options_of.add_argument("--scipy", action="store_true")
+    options_of.add_argument("--scipy-up-to", type=float, default=1e6, metavar="N")
+    options = options_of.parse_args()
+    if unknown := set(options.sets) - set(SETS):
+        options_of.error(f"no set {', '.join(unknown)}; there are {', '.join(SETS)}")
+
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    for name in options.sets:
+        for n in options.sizes:
+            try:
+                for record in measure(adapter, name, n, options):
+                    report.add(record, f"{name} {n:,} {record['start']}")
+            except clvoro.ClvoroError as error:
+                print(f"{name} {n:,}: {error}", file=sys.stderr)
+    report.finish(heading(adapter, f"Diagram alone, medians of {options.repeat}"))
+    if not options.json:
+        header = ["points", "start", "cells", "clip: cost per cell / uniform's",
+                  "bins to graph: the same", "slope of time against cells"]  # fmt: skip
+        print(markdown(header, comparisons(report.records)))
+
+
+if __name__ == "__main__":
+    main()

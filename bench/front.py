@@ -1,0 +1,302 @@
+"""The front of size against quality of all methods on one field, and a picture of the defects.
+
+    python bench/front.py [--no-best] [--seeds 1] [--out DIR] [--records FILE]
+                          [--device NAME] [--dtype float32] [--json]
+
+Runs every method and, of the adaptive one, several error targets on F3 (see `convergence.py`),
+prints a table, and draws `front.png` (mean |e| against 1 - mean Q of the cells off the walls) and
+`defects.png` (cells by number of sides) into `bench/pictures` or `--out`. The runs of effort
+"best" take most of the time; `--no-best` leaves them out.
+
+Gmsh is measured too if it is installed (see `peers.py`). The points of JIGSAW and MMG are given,
+not measured here: the figures of the project's notes for the same field, e after one global
+factor on h. The picture says so.
+
+`--records FILE` keeps the points (one JSON object per line) and, if the file exists, draws the
+front from it without running anything; `defects.png` is then left as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _common import (
+    BOX,
+    FIRST_SEED,
+    PICTURES,
+    Report,
+    figures,
+    heading,
+    make_adapter,
+    parser,
+    test_field,
+    work,
+)
+from peers import MissingPeerError, judge, mesh_gmsh
+
+import clvoro
+
+FIELD = "F3"
+REPEATED = 100
+"""Steps of the methods that repeat one kind of step."""
+
+NOTES = (
+    ("JIGSAW", 0.0185, 0.9944),
+    ("JIGSAW, 64 passes", 0.0270, 0.9961),
+    ("MMG2D", 0.056, 0.965),
+)
+"""Published meshers on this field: name, mean |e|, mean Q. Given, not measured by this script."""
+
+ERROR_TARGETS = {
+    "fast": (None, 0.0015, 0.007, 0.014),
+    "default": (None, 0.0005, 0.001, 0.0035, 0.007, 0.014),
+    "best": (None, 0.0005, 0.0012, 0.002, 0.008, 0.016),
+}
+"""Error targets per effort, None for its own."""
+
+DEFECTS = (
+    ("weighted", f"weighted, {REPEATED} steps"),
+    ("adaptive fast", 'effort="fast"'),
+    ("adaptive default", "default"),
+    ("adaptive best", 'effort="best"'),
+)
+"""Points whose cells are drawn, and how they are called."""
+
+
+def plan(best: bool) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return (group, name, arguments of `Adapter.run`) of every point."""
+    points: list[tuple[str, str, dict[str, Any]]] = []
+    for method in ("lloyd", "weighted-lloyd", "poisson", "coupled", "weighted"):
+        points.append((method, method, {"method": method, "max_steps": REPEATED, "tol": 0}))
+    efforts = [e for e in ERROR_TARGETS if best or e != "best"]
+    for effort in efforts:
+        for target in ERROR_TARGETS[effort]:
+            name = f"adaptive {effort}" + ("" if target is None else f", target {target:g}")
+            points.append(
+                (f"adaptive {effort}", name, {"effort": effort, "error_target": target})
+            )  # fmt: skip
+    for effort in efforts:
+        points.append(("exact", f"exact {effort}", {"method": "exact", "effort": effort}))
+    return points
+
+
+def measure(
+    adapter: clvoro.Adapter, group: str, name: str, arguments: dict[str, Any], seeds: int
+) -> tuple[dict[str, Any], clvoro.Result]:
+    """Return the record of one point, medians over the seeds, and the first seed's result."""
+    runs, first = [], None
+    for k in range(seeds):
+        start = time.perf_counter()
+        result = adapter.run(BOX, test_field(FIELD), seed=FIRST_SEED + 17 * k, **arguments)
+        seconds = time.perf_counter() - start
+        first = first or result
+        runs.append({
+            **figures(result.diagram, result.size, result.quality), **work(result.history),
+            "seconds": seconds,
+        })  # fmt: skip
+    medians = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
+    assert first is not None
+    return {"group": group, "name": name, **medians}, first
+
+
+def measure_gmsh(adapter: clvoro.Adapter) -> dict[str, Any] | None:
+    try:
+        points, seconds = mesh_gmsh(adapter, 1.0)
+    except MissingPeerError:
+        return None
+    found = judge(adapter, points, 1.0)
+    # Its vertices on the walls have cut cells: those are no part of the comparison.
+    found["mean_error"], found["max_error"] = found["mean_error_inner"], found["max_error_inner"]
+    return {"group": "Gmsh", "name": "Gmsh", **found, "seconds": seconds}
+
+
+STYLES = {
+    "lloyd": ("lloyd (paper)", "v", "#555555"),
+    "poisson": ("poisson (paper)", "^", "#555555"),
+    "coupled": ("coupled (paper)", "s", "#555555"),
+    "weighted-lloyd": ("weighted-lloyd", "v", "#56B4E9"),
+    "weighted": ("weighted", "s", "#56B4E9"),
+    "adaptive fast": ('adaptive, "fast"', "o", "#E69F00"),
+    "adaptive default": ("adaptive, default", "o", "#0072B2"),
+    "adaptive best": ('adaptive, "best"', "o", "#009E73"),
+    "exact": ("exact", "D", "#CC79A7"),
+    "Gmsh": ("Gmsh, measured here", "X", "#D55E00"),
+}
+"""Group -> label, marker, colour."""
+
+
+def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
+    from clvoro.report.style import new_figure, styled
+
+    with styled():
+        figure = new_figure(7.0, 4.5)
+        ax = figure.add_subplot()
+        for group, (label, marker, colour) in STYLES.items():
+            mine = [r for r in records if r["group"] == group]
+            if not mine:
+                continue
+            if group.startswith("adaptive"):
+                line = sorted(mine, key=lambda r: r["mean_error"])
+                ax.plot(
+                    [r["mean_error"] for r in line], [1 - r["mean_quality"] for r in line],
+                    color=colour, linewidth=1, alpha=0.6, zorder=2,
+                )  # fmt: skip
+            for k, r in enumerate(mine):
+                own = not group.startswith("adaptive") or "target" not in r["name"]
+                ax.scatter(
+                    r["mean_error"], 1 - r["mean_quality"], marker=marker, s=46 if own else 18,
+                    color=colour, edgecolor="white", linewidth=0.6, zorder=4 if own else 3,
+                    label=label if k == 0 else None,
+                )  # fmt: skip
+        for k, (name, error, quality) in enumerate(NOTES):
+            ax.scatter(
+                error, 1 - quality, marker="*", s=90, facecolor="none", edgecolor="#1A1A1A",
+                linewidth=0.9, zorder=3,
+                label="notes: given figures,\nnot measured here*" if k == 0 else None,
+            )  # fmt: skip
+            ax.annotate(
+                name, (error, 1 - quality), xytext=(-8, 0), textcoords="offset points",
+                fontsize=7.5, va="center", ha="right",
+            )  # fmt: skip
+        for r in records:
+            if r["group"] == "exact":
+                ax.annotate(
+                    r["name"].split()[-1], (r["mean_error"], 1 - r["mean_quality"]),
+                    xytext=(6, 2), textcoords="offset points", fontsize=7, color="#8A4A73",
+                )  # fmt: skip
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_xlabel("mean metric error |e| [–]")
+        ax.set_ylabel("1 − mean cell quality Q [–], cells off the walls")
+        ax.grid(which="major", linewidth=0.4, alpha=0.5)
+        ax.grid(which="minor", linewidth=0.25, alpha=0.25)
+        ax.set_axisbelow(True)
+        ax.annotate(
+            "better", xy=(0.015, 0.02), xytext=(0.085, 0.095), xycoords="axes fraction",
+            textcoords="axes fraction", fontsize=8, color="#777777",
+            arrowprops={"arrowstyle": "->", "color": "#777777", "linewidth": 0.8},
+        )  # fmt: skip
+        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, labelspacing=0.7)
+        ax.set_title(caption, loc="left", fontsize=8)
+        figure.supxlabel(
+            "* e after one global factor on h. Every other point is measured by this script: "
+            "absolute size field, but one factor for Gmsh.", fontsize=7, x=0.01, ha="left",
+        )  # fmt: skip
+        figure.savefig(path, dpi=220)
+
+
+def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
+    from matplotlib.patches import Patch
+
+    from clvoro.report import plot_cells
+    from clvoro.report.cells import COLOURINGS
+    from clvoro.report.style import new_figure, styled
+
+    panels = [(results[key], title) for key, title in DEFECTS if key in results]
+    window = ((0.72, 0.42), (1.52, 0.98))
+    columns = 2
+    rows = -(-len(panels) // columns)
+    shape = (window[1][1] - window[0][1]) / (window[1][0] - window[0][0])
+    with styled():
+        figure = new_figure(7.0, rows * (3.4 * shape + 0.42) + 0.35)
+        axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
+        for k, (ax, (result, title)) in enumerate(zip(axes, panels, strict=False)):
+            f = figures(result.diagram, result.size, result.quality)
+            error = np.abs(result.error).mean()
+            plot_cells(result, "sides", ax, window=window, key=False)
+            ax.set_xticks([])
+            ax.set_yticks([])
+            ax.set_title(
+                f"({'abcd'[k]}) {title}: {f['six_sided']:.1%} six-sided\n"
+                f"mean |e| {error:.4f}, mean Q {f['mean_quality']:.4f}, "
+                f"min Q {f['min_quality']:.2f}",
+                fontsize=8, loc="left",
+            )  # fmt: skip
+        for ax in axes[len(panels) :]:
+            ax.set_axis_off()
+        colours = COLOURINGS["sides"].colour_map.colors
+        labels = ("4 or fewer sides", "5", "6", "7", "8 or more")
+        figure.legend(
+            handles=[
+                Patch(facecolor=c, edgecolor="#1A1A1A", linewidth=0.4, label=label)
+                for c, label in zip(colours, labels, strict=True)
+            ],
+            loc="outside lower center", ncols=5, frameon=False, handlelength=1.2,
+        )  # fmt: skip
+        figure.savefig(path, dpi=300)
+
+
+def shown(figure: str, form: str) -> Callable[[dict[str, Any]], str]:
+    return lambda r: format(r[figure], form) if r.get(figure) is not None else ""
+
+
+COLUMNS = {
+    "method": lambda r: r["name"],
+    "cells": shown("cells", ".0f"),
+    "mean |e|": shown("mean_error", ".4f"),
+    "max |e|": shown("max_error", ".3f"),
+    "mean Q": shown("mean_quality", ".4f"),
+    "min Q": shown("min_quality", ".3f"),
+    "six-sided": shown("six_sided", ".1%"),
+    "work": shown("work", ".0f"),
+    "seconds": shown("seconds", ".1f"),
+}
+
+
+def run_all(
+    adapter: clvoro.Adapter, options: argparse.Namespace, report: Report
+) -> dict[str, clvoro.Result]:
+    kept: dict[str, clvoro.Result] = {}
+    drawn = {key for key, _ in DEFECTS}
+    for group, name, arguments in plan(options.best):
+        record, result = measure(adapter, group, name, arguments, options.seeds)
+        report.add(record, f"{name}: mean |e| {record['mean_error']:.4f}")
+        if name in drawn:
+            kept[name] = result
+        if options.records:
+            with options.records.open("a") as file:
+                file.write(json.dumps(record) + "\n")
+    return kept
+
+
+def main() -> None:
+    options_of = parser(__doc__)
+    options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="medians over N (1)")
+    options_of.add_argument(
+        "--best", action=argparse.BooleanOptionalAction, default=True, help='effort "best" too'
+    )
+    options_of.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
+    options_of.add_argument("--records", type=Path, metavar="FILE")
+    options = options_of.parse_args()
+
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    results: dict[str, clvoro.Result] = {}
+    if options.records and options.records.exists():
+        for line in options.records.read_text().splitlines():
+            report.add(json.loads(line))
+    else:
+        results = run_all(adapter, options, report)
+    gmsh = measure_gmsh(adapter)
+    if gmsh is not None:
+        report.add(gmsh, "Gmsh")
+    options.out.mkdir(parents=True, exist_ok=True)
+    cells = statistics.median(r["cells"] for r in report.records)
+    draw_front(
+        report.records, options.out / "front.png",
+        f"{FIELD}: sizes 1 : 7.5, {cells:,.0f} cells. Small markers: runs with an error_target",
+    )  # fmt: skip
+    if results:
+        draw_defects(results, options.out / "defects.png")
+    report.finish(heading(adapter, f"Size against quality on {FIELD}"))
+
+
+if __name__ == "__main__":
+    main()
