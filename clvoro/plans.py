@@ -166,6 +166,7 @@ def _adaptive(
     for step in range(effort.polish):
         if step == 3:
             yield Reorganise(theta=COUNT_THETA)
+            yield Settle()
         yield Step(polish)
     if exact:
         project = ProjectedMethod(

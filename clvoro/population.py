@@ -191,7 +191,7 @@ class PopulationControl:
         engine.run_each(k.score_excess, n, t.starts, excess, sign, keys)
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, EXCESS_RINGS), keys)
         chosen = self._choose(t, keys, EXCESS_RINGS)
-        self._limit(chosen, n, min(abs(rest), n - 1))
+        self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
         engine.run_each(
             k.mark_excess, n, chosen, sign, t.offsets, t.covariances, t.volumes, *marks.arrays
         )
