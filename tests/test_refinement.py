@@ -1,0 +1,86 @@
+"""Refinement: parents, middles of edges, and the rule at walls, counted and placed by NumPy."""
+
+import numpy as np
+import patch
+import pytest
+
+from clvoro.refinement import SHORT_FACE, Refinement
+
+BOX = patch.BOX
+
+
+def refine(engine, points, h):
+    t = patch.tessellate(engine, points)
+    return patch.fetch(t), Refinement(engine).refine(BOX, t, engine.upload(h)).get()
+
+
+def expected_children(host, h):
+    """Middles of all edges across faces of some length, and one point between each wall and its cells."""
+    children = []
+    for i, j, length in zip(host.owners, host.neighbours, host.face_measures, strict=True):
+        if j < 0:
+            axis, upper = divmod(-1 - j, 2)
+            wall = (BOX.lower, BOX.upper)[upper][axis]
+            gap = abs(host.points[i, axis] - wall)
+            way = h[i] / 2 if gap == 0 else min(gap / 2, h[i] / 4)
+            child = host.points[i].copy()
+            child[axis] = wall - way if upper else wall + way
+            children.append(child)
+        elif j > i and length > SHORT_FACE * np.sqrt(host.volumes[i]):
+            children.append((host.points[i] + host.points[j]) / 2)
+    return np.array(children)
+
+
+def as_sorted(points):
+    return points[np.lexsort(points.T)]
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("n", [1, 2, 3, 40, 700])
+def test_children(ctx, real, n):
+    engine = patch.make_engine(ctx, real)
+    points = patch.random_points(n, n + 41).astype(real)
+    points[0] = (0, 0.3)  # on a wall
+    h = np.random.default_rng(n).uniform(0.5, 1, n).astype(real) * np.sqrt(0.75 / n / 4)
+    host, finer = refine(engine, points, h)
+    assert np.array_equal(finer[:n], points), "the parents come first, in their order"
+    expected = expected_children(host, h)
+    assert len(finer) == n + len(expected)
+    eps = float(np.finfo(real).eps)
+    assert as_sorted(finer[n:]) == pytest.approx(as_sorted(expected), abs=2 * eps)
+    assert BOX.contains(finer).all()
+
+
+def test_count_is_four_times(ctx):
+    """A planar graph has nearly three edges for each cell, and the walls give the rest."""
+    points = patch.relaxed_points(900, 77, steps=5)
+    _, finer = refine(patch.make_engine(ctx), points, np.full(900, np.sqrt(0.75 / 3600)))
+    assert len(finer) == pytest.approx(3600, rel=0.01)
+
+
+def test_a_lattice_is_carried_over(ctx):
+    """Half the spacing, all cells alike: inside, the new mesh is the lattice of half the spacing."""
+    a = 1 / 16
+    points = patch.hexagons(a)
+    engine = patch.make_engine(ctx)
+    _, finer = refine(engine, points, np.full(len(points), a / 2))
+    host = patch.fetch(patch.tessellate(engine, finer))
+    inside = ((finer > 1.5 * a) & (finer < np.array(BOX.upper) - 1.5 * a)).all(axis=1)
+    assert inside.sum() > 300
+    assert (np.diff(host.starts)[inside] == 6).all()
+    assert host.volumes[inside] == pytest.approx(np.full(inside.sum(), (a / 2) ** 2 * np.sqrt(3) / 2))
+
+
+def test_squares_get_no_point_twice(ctx):
+    """Four cells meet in a point: neither diagonal has a face, so no middle is made for it."""
+    xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    points = (xy + 0.5) / 8
+    _, finer = refine(patch.make_engine(ctx), points, np.full(48, 1 / 16))
+    assert len(finer) == 48 + 7 * 6 + 8 * 5 + 2 * (8 + 6)
+    assert len(np.unique(finer, axis=0)) == len(finer)
+
+
+def test_repeats_bit_by_bit(ctx):
+    engine, points = patch.make_engine(ctx), patch.random_points(500, 3)
+    first = refine(engine, points, np.full(500, 0.02))[1]
+    assert np.array_equal(first, refine(engine, points, np.full(500, 0.02))[1])
