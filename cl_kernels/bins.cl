@@ -24,20 +24,21 @@ inline int child_side(int count)
     return side;
 }
 
-/* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins? */
-kernel void plan_children(const int size, global const int *counts, const int begin, global int *grid_flags, global int *child_bins)
+/* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins (and one entry that ends them)? */
+kernel void plan_children(const int size, global const int *counts, const int begin, const int may_divide,
+                          global int *grid_flags, global int *child_bins)
 {
     WORK_ITEM(b);
-    const int side = child_side(counts[begin + b]);
+    const int side = may_divide ? child_side(counts[begin + b]) : 0;
     grid_flags[b] = side > 0;
-    child_bins[b] = DIM == 2 ? side * side : side * side * side;
+    child_bins[b] = side == 0 ? 0 : (DIM == 2 ? side * side : side * side * side) + 1;
 }
 
-/* Per bin b of the newest level: bins[b] = (first item, count). starts are the prefix sums of this level's counts. A
-   bin below level 0 starts where its parent starts: `parents[b]` names its grid, whose first bin and first item are
-   known. */
-kernel void place_bins(const int size, global const int *counts, global const int *starts, const int begin, global const int *bin_grid,
-                       global const int4 *grid_shapes, global const int *grid_items, global int2 *bins)
+/* Per bin b of the newest level: write bins[b]. starts are the prefix sums of this level's counts; a grid below level 0
+   starts where its bin does. grid_ids are the prefix sums of the flags. */
+kernel void place_bins(const int size, global const int *starts, const int begin, global const int *bin_grid,
+                       global const int4 *grid_shapes, global const int *grid_items, const int first_grid,
+                       global const int *grid_ids, global int2 *bins)
 {
     WORK_ITEM(b);
     int start = starts[b];
@@ -45,21 +46,21 @@ kernel void place_bins(const int size, global const int *counts, global const in
         const int g = bin_grid[begin + b];
         start += grid_items[g] - starts[grid_shapes[g].s0 - begin];
     }
-    bins[begin + b] = (int2)(start, counts[begin + b]);
+    bins[begin + b] = (int2)(start, first_grid + grid_ids[b]);
 }
 
 /* Per divided bin b: create grid g over its box, and note in each of the new bins which grid it belongs to. */
-kernel void make_grids(const int size, global int2 *bins, const int begin, const int next_begin, const int first_grid,
-                       global const int *grid_ids, global const int *child_firsts, global int *bin_grid,
+kernel void make_grids(const int size, global const int2 *bins, global const int *counts, const int begin,
+                       const int next_begin, global const int *child_firsts, global int *bin_grid,
                        global FRAME *grid_frames, global int4 *grid_shapes, global int *grid_items)
 {
     WORK_ITEM(b);
-    const int2 bin = bins[begin + b];
-    const int side = child_side(bin.s1);
+    const int side = child_side(counts[begin + b]);
     if (side == 0)
         return;
+    const int2 bin = bins[begin + b];
     const int parent = bin_grid[begin + b];
-    const int g = first_grid + grid_ids[b];
+    const int g = bin.s1;
     const int first = next_begin + child_firsts[b];
     const int4 shape = grid_shapes[parent];
     const int place = begin + b - shape.s0;
@@ -75,9 +76,8 @@ kernel void make_grids(const int size, global int2 *bins, const int begin, const
     grid_shapes[g] = (int4)(first, side, side, DIM == 3 ? side : 1);
     grid_items[g] = bin.s0;
     const int volume = DIM == 2 ? side * side : side * side * side;
-    for (int c = 0; c < volume; ++c)
+    for (int c = 0; c <= volume; ++c)
         bin_grid[first + c] = g;
-    bins[begin + b] = (int2)(-1 - g, bin.s1);
 }
 
 /* Per generator i whose bin was divided: count it into its new bin. */
@@ -85,8 +85,8 @@ kernel void count_children(const int size, global const REAL *points, global con
                            global const int4 *grid_shapes, global int *keys, global int *ranks, global int *counts)
 {
     WORK_ITEM(i);
-    const int g = -1 - bins[keys[i]].s0;
-    if (g < 0)
+    const int g = bins[keys[i]].s1;
+    if (bins[keys[i] + 1].s1 == g)
         return;
     const int key = bin_in_grid(points + DIM * i, grid_frames[g], grid_shapes[g]);
     keys[i] = key;
@@ -101,18 +101,20 @@ kernel void place_items(const int size, global const int *keys, global const int
 }
 
 /* Per bin: sort its items by generator index (Shell's sort: a leaf holds a handful, but duplicates may pile up). */
-kernel void sort_bins(const int size, global const int2 *bins, global int *items)
+kernel void sort_bins(const int size, global const int2 *bins, global const int *bin_grid,
+                      global const int4 *grid_shapes, global int *items)
 {
     WORK_ITEM(b);
-    const int2 bin = bins[b];
-    if (bin.s0 < 0)
+    const int4 shape = grid_shapes[bin_grid[b]];
+    if (b - shape.s0 == shape.s1 * shape.s2 * shape.s3 || bins[b].s1 != bins[b + 1].s1)
         return;
-    global int *list = items + bin.s0;
+    const int count = bins[b + 1].s0 - bins[b].s0;
+    global int *list = items + bins[b].s0;
     int gap = 1;
-    while (gap < bin.s1 / 9)
+    while (gap < count / 9)
         gap = 3 * gap + 1;
     for (; gap > 0; gap /= 3)
-        for (int k = gap; k < bin.s1; ++k) {
+        for (int k = gap; k < count; ++k) {
             const int item = list[k];
             int at = k;
             for (; at >= gap && list[at - gap] > item; at -= gap)

@@ -24,28 +24,30 @@ inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
     return distance > 0 ? distance : 0;
 }
 
-/* Clip the cell of generator i by every generator in the bins that the square of half-width w covers and the square of
+/* Clip the cell of the generator at place `own` by every generator in the bins that the square of half-width w covers and the square of
    half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice the farthest
    corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or 0. */
-inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, bool warm,
+inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, bool warm,
                         global const REAL *points, global const REAL *binned, global const int *items,
                         global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
-    /* The grids that are open, from the root down, and where each was left: row in outward order, bin in the row. */
-    int grids[MAX_DEPTH], turns[MAX_DEPTH], places[MAX_DEPTH];
+    /* The grids that are open, from the root down, and where each was left: row in outward order, part of the row, bin. */
+    int grids[MAX_DEPTH], turns[MAX_DEPTH], parts[MAX_DEPTH], places[MAX_DEPTH];
     bool inside[MAX_DEPTH]; /* was the grid's own bin opened for the inner square? */
     int depth = 0;
-    grids[0] = turns[0] = 0;
+    grids[0] = turns[0] = parts[0] = 0;
     places[0] = -1;
     inside[0] = inner >= 0;
     while (depth >= 0) {
         const FRAME frame = grid_frames[grids[depth]];
         const int4 shape = grid_shapes[grids[depth]];
         const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
+        const int left = axis_bin(x[0] - w, frame.s0, inverse, shape.s1);
+        const int right = axis_bin(x[0] + w, frame.s0, inverse, shape.s1);
         const int bottom = axis_bin(x[1] - w, frame.s1, inverse, shape.s2);
         const int top = axis_bin(x[1] + w, frame.s1, inverse, shape.s2);
         const int middle = axis_bin(x[1], frame.s1, inverse, shape.s2);
-        /* The rows and places that the inner square has taken. */
+        /* The places and rows that the inner square has taken. */
         int4 done = (int4)(0, -1, 0, -1);
         if (inside[depth])
             done = (int4)(axis_bin(x[0] - inner, frame.s0, inverse, shape.s1),
@@ -53,64 +55,68 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int i, REAL w, REAL inner, 
                           axis_bin(x[1] - inner, frame.s1, inverse, shape.s2),
                           axis_bin(x[1] + inner, frame.s1, inverse, shape.s2));
         const int last_turn = 2 * max(middle - bottom, top - middle);
-        int turn = turns[depth], ix = places[depth];
+        int turn = turns[depth], part = parts[depth], ix = places[depth];
         int child = -1;
-        for (; turn <= last_turn; ++turn, ix = -1) {
+        while (turn <= last_turn) {
             const int row = turn & 1 ? middle + (turn + 1) / 2 : middle - turn / 2;
-            if (row < bottom || row > top)
-                continue;
             const REAL away = row_distance(x[1], frame.s1, edge, row);
-            if (away * away >= 4 * cell->reach2)
+            if (row < bottom || row > top || away * away >= 4 * cell->reach2) {
+                ++turn;
+                part = 0;
+                ix = -1;
                 continue;
-            const REAL span = min(w, 2 * sqrt(cell->reach2) * (1 + 8 * REAL_EPS));
-            const int to = axis_bin(x[0] + span, frame.s0, inverse, shape.s1);
-            if (ix < 0)
-                ix = axis_bin(x[0] - span, frame.s0, inverse, shape.s1);
+            }
+            /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
             const bool row_done = row >= done.s2 && row <= done.s3;
             global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
-            while (ix <= to && child < 0) {
-                /* The next run of generators in leaves beside each other. */
-                int begin = 0, end = 0;
-                for (; ix <= to; ++ix) {
-                    const int2 bin = row_bins[ix];
-                    const bool bin_done = row_done && ix >= done.s0 && ix <= done.s1;
-                    if (bin.s0 < 0) {
-                        child = -1 - bin.s0;
-                        inside[depth + 1] = bin_done;
-                        ++ix;
-                        break;
-                    }
-                    if (bin_done || bin.s1 == 0)
-                        continue;
-                    if (end == 0)
-                        begin = bin.s0;
-                    else if (bin.s0 != end)
-                        break;
-                    end = bin.s0 + bin.s1;
+            while (part < 3 && child < 0) {
+                const int from = part == 0 ? left : (part == 1 ? done.s0 : done.s1 + 1);
+                const int to = !row_done || part == 2 ? right : (part == 0 ? done.s0 - 1 : done.s1);
+                const int bin = max(ix, from);
+                if (bin > to) {
+                    part = row_done ? part + 1 : 3;
+                    ix = -1;
+                    continue;
                 }
-                for (int q = begin; q < end; ++q) {
+                /* A run of leaves beside each other is a run of items. */
+                int2 first = row_bins[bin], end = row_bins[to + 1];
+                ix = to + 1;
+                if (first.s1 != end.s1) {
+                    /* There are divided bins ahead: one bin at a time. */
+                    end = row_bins[bin + 1];
+                    ix = bin + 1;
+                    if (first.s1 != end.s1) {
+                        child = first.s1;
+                        inside[depth + 1] = part == 1 && row_done;
+                        end.s0 = first.s0;
+                    }
+                }
+                if (part == 1 && row_done)
+                    end.s0 = first.s0;
+                for (int q = first.s0; q < end.s0; ++q) {
                     const REAL d[2] = {binned[2 * q] - x[0], binned[2 * q + 1] - x[1]};
                     const REAL d2 = d[0] * d[0] + d[1] * d[1];
-                    if (d2 >= 4 * cell->reach2)
-                        continue;
-                    const int j = items[q];
-                    if (j == i)
+                    if (d2 >= 4 * cell->reach2 || q == own)
                         continue;
                     if (d2 == 0)
                         return FLAG_COINCIDE;
-                    if (!clip_cell(cell, d, d2, j, warm, points))
+                    if (!clip_cell(cell, d, d2, items[q], warm, points))
                         return FLAG_FULL;
                 }
             }
             if (child >= 0)
                 break;
+            ++turn;
+            part = 0;
+            ix = -1;
         }
         if (child >= 0) {
             turns[depth] = turn;
+            parts[depth] = part;
             places[depth] = ix;
             ++depth;
             grids[depth] = child;
-            turns[depth] = 0;
+            turns[depth] = parts[depth] = 0;
             places[depth] = -1;
         } else {
             --depth;
@@ -158,7 +164,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         w = 2 * sqrt(cell.reach2);
     }
     while (flag == 0) {
-        flag = clip_by_bins(&cell, x, i, w, inner, warm, points, binned, items, bins, grid_frames, grid_shapes);
+        flag = clip_by_bins(&cell, x, p, w, inner, warm, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
         if (need <= w)
             break;

@@ -68,7 +68,7 @@ class Bins:
             self._keys = engine.empty(n, np.int32)
             self._ranks = engine.empty(n, np.int32)
             self._items = engine.empty(n, np.int32)
-            self._points = engine.empty((n, d))
+            self._points = engine.zeros((n + 3, d))  # read four at a time
             self._reach = engine.empty(n, np.float32)
         if bins > self._capacity[1]:
             old = self._capacity[1]
@@ -102,7 +102,7 @@ class Bins:
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
         edge = float(np.prod(upper - lower) * OCCUPANCY / n) ** (1 / d)
         sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
-        root_bins = int(np.prod(sides))
+        root_bins = int(np.prod(sides)) + 1
         self._reserve(n, root_bins + n // 2)
         self._counts.fill(0)
         frame, shape = np.zeros(4, engine.real), np.ones(4, np.int32)
@@ -115,29 +115,27 @@ class Bins:
         )
         begin, size, grids = 0, root_bins, 1
         for level in range(MAX_LEVELS):
-            end = begin + size
+            end, may_divide = begin + size, np.int32(level < MAX_LEVELS - 1)
+            engine.run_each(
+                k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags,
+                self._sizes,
+            )  # fmt: skip
+            for values, first in ((self._flags, 0), (self._sizes, 0)):
+                self._scan.exclusive(values, values, size, first)
             self._scan.exclusive(self._counts, self._starts, size, first=begin)
             engine.run_each(
-                k.place_bins, size, self._counts, self._starts, np.int32(begin), self._grid_of,
-                self._shapes, self._grid_items, self._bins,
+                k.place_bins, size, self._starts, np.int32(begin), self._grid_of, self._shapes,
+                self._grid_items, np.int32(grids), self._flags, self._bins,
             )  # fmt: skip
-            if level == MAX_LEVELS - 1:
-                break
-            engine.run_each(
-                k.plan_children, size, self._counts, np.int32(begin), self._flags, self._sizes
-            )
-            self._scan.exclusive(self._flags, self._flags, size)
-            self._scan.exclusive(self._sizes, self._sizes, size)
             new_grids = int(self._flags[size].get())
             if new_grids == 0:
                 break
             new_bins = int(self._sizes[size].get())
-            grid_ids, child_firsts = self._flags, self._sizes  # _reserve may replace them
+            child_firsts = self._sizes  # _reserve may replace it
             self._reserve(n, end + new_bins)
             engine.run_each(
-                k.make_grids, size, self._bins, np.int32(begin), np.int32(end), np.int32(grids),
-                grid_ids, child_firsts, self._grid_of, self._frames, self._shapes,
-                self._grid_items,
+                k.make_grids, size, self._bins, self._counts, np.int32(begin), np.int32(end),
+                child_firsts, self._grid_of, self._frames, self._shapes, self._grid_items,
             )  # fmt: skip
             engine.run_each(
                 k.count_children, n, points, self._bins, self._frames, self._shapes,
@@ -146,7 +144,9 @@ class Bins:
             begin, size, grids = end, new_bins, grids + new_grids
         total = begin + size
         engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
-        engine.run_each(k.sort_bins, total, self._bins, self._items)
+        engine.run_each(
+            k.sort_bins, total, self._bins, self._grid_of, self._shapes, self._items
+        )
         engine.run_each(
             k.gather_items, n, self._items, points, self._keys, self._grid_of, self._frames,
             self._points, self._reach,

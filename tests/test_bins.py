@@ -25,11 +25,12 @@ def walk(binned, n, dim):
         for place in range(int(np.prod(sides))):
             index = np.unravel_index(place, sides[::-1])[::-1]
             origin = frames[g, :dim] + np.array(index) * edge
-            start, count = bins[first + place]
-            if start >= 0:
+            (start, grid), (end, next_grid) = bins[first + place : first + place + 2]
+            count = end - start
+            if grid == next_grid:
                 leaves.append((start, count, origin, edge, level, index, sides))
             else:
-                inside = open_grid(-1 - start, level + 1)
+                inside = open_grid(grid, level + 1)
                 assert inside == count, "a divided bin does not hold what its grid holds"
             held += count
         return held

@@ -3,8 +3,9 @@
    divided bin holds stays in its place: the generators in neighbouring bins of a row are one run of memory.
 
    grid_frames[g]  origin (DIM), 1 / edge of a bin
-   grid_shapes[g]  (first bin, bins along x, y, z)
-   bins[b]         (first item, count), or (-1 - g, count) where grid g divides the bin */
+   grid_shapes[g]  (first bin, bins along x, y, z); behind its bins a grid has one more entry, which only ends the last
+   bins[b]         (first item, next grid): bin b holds the items up to those of bin b + 1, and is divided, by grid
+                   bins[b].s1, if that of bin b + 1 is another */
 #include "common/real.h"
 
 #define FRAME REAL4

@@ -8,23 +8,9 @@
 #error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
 #endif
 
-#define CHUNK 8 /* corners are tested this many at a time */
-#define REAL8 CLVORO_JOIN(REAL, 8)
-#if IS_DOUBLE
-#define MASK8 long8
-#define MASK4 long4
-#else
-#define MASK8 int8
-#define MASK4 int4
-#endif
-#if CELL_CAPACITY % CHUNK
-#error "CELL_CAPACITY must be a multiple of 8"
-#endif
-
 /* Face k runs counter-clockwise from corner k to corner k + 1 and belongs to faces[k]: a generator, or -1 - wall. */
 typedef struct {
     int n;
-    /* Places beyond n, to the end of a chunk, hold the generator itself, which no bisector cuts off. */
     REAL x[CELL_CAPACITY];
     REAL y[CELL_CAPACITY];
     int faces[CELL_CAPACITY];
@@ -44,8 +30,6 @@ inline void start_cell(cell_t *cell, int i, const REAL *x, const REAL *lower, co
         cell->upper[a] = upper[a];
     }
     cell->n = 4;
-    vstore8((REAL8)(0), 0, cell->x);
-    vstore8((REAL8)(0), 0, cell->y);
     cell->x[0] = cell->x[3] = lower[0] - x[0];
     cell->x[1] = cell->x[2] = upper[0] - x[0];
     cell->y[0] = cell->y[1] = lower[1] - x[1];
@@ -69,7 +53,21 @@ inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out
     const REAL2 ab = (REAL2)(cell->x[out], cell->y[out]) - a;
     if (d2 < R(1e-10) * dot(ab, ab))
         return corner(cell->generator, cell->position, face, neighbour, points, cell->lower, cell->upper);
-    return a + ab * (fmax(-s_in, R(0)) / (s_out - fmin(s_in, R(0))));
+    const REAL s = s_in < 0 ? s_in : 0;
+    return a + ab * (s / (s - s_out));
+}
+
+/* Signed distance, times |d|, of corner k from the bisector with the neighbour at x + d; level = d.d / 2. */
+inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL level)
+{
+    return cell->x[k] * d[0] + cell->y[k] * d[1] - level;
+}
+
+inline void copy_corner(cell_t *cell, int to, int from)
+{
+    cell->x[to] = cell->x[from];
+    cell->y[to] = cell->y[from];
+    cell->faces[to] = cell->faces[from];
 }
 
 /* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2. False if the cell is full.
@@ -80,17 +78,16 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
     const int n = cell->n;
     const REAL level = d2 / 2;
     const REAL depth = 4 * REAL_EPS * d2;
-    REAL s[CELL_CAPACITY];
-    bool any_cut = false;
-    for (int c = 0; c * CHUNK < n; ++c) {
-        const REAL8 side = vload8(c, cell->x) * d[0] + vload8(c, cell->y) * d[1] - level;
-        vstore8(side, c, s);
-        /* any(), but by halves: PoCL's looks at one element after the other. */
-        const MASK8 out = side > depth;
-        const MASK4 half_out = out.lo | out.hi;
-        any_cut |= ((half_out.s0 | half_out.s1) | (half_out.s2 | half_out.s3)) != 0;
+    /* The first corner that is cut off, and the one before it. */
+    int first = 0;
+    REAL s_before = 0, s_first = 0;
+    for (; first < n; ++first) {
+        s_first = beyond(cell, first, d, level);
+        if (s_first > depth)
+            break;
+        s_before = s_first;
     }
-    if (!any_cut)
+    if (first == n)
         return true;
     if (seen_before)
         for (int k = 0; k < n; ++k)
@@ -98,45 +95,43 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
                 return true;
 
     /* The corners cut off are first..last, cyclically. */
-    int cut = 0;
-    while (s[cut] <= depth)
-        ++cut;
-    int first = cut;
-    int before = first == 0 ? n - 1 : first - 1;
-    while (s[before] > depth && before != cut) {
-        first = before;
-        before = first == 0 ? n - 1 : first - 1;
+    int last = first, before = first - 1;
+    REAL s_last = s_first;
+    if (first == 0) {
+        before = n - 1;
+        s_before = beyond(cell, before, d, level);
+        while (s_before > depth && before > 0) {
+            first = before;
+            s_first = s_before;
+            --before;
+            s_before = beyond(cell, before, d, level);
+        }
     }
-    int last = cut;
     int after = last == n - 1 ? 0 : last + 1;
-    while (s[after] > depth && after != cut) {
+    REAL s_after = beyond(cell, after, d, level);
+    while (s_after > depth && after != before) {
         last = after;
+        s_last = s_after;
         after = last == n - 1 ? 0 : last + 1;
+        s_after = beyond(cell, after, d, level);
     }
     /* Where the bisector meets the faces before -> first and last -> after. */
-    const REAL2 va = cut_face(cell, before, first, s[before], s[first], cell->faces[before], neighbour, d2, points);
-    const REAL2 vb = cut_face(cell, after, last, s[after], s[last], cell->faces[last], neighbour, d2, points);
     const int last_face = cell->faces[last];
+    const REAL2 va = cut_face(cell, before, first, s_before, s_first, cell->faces[before], neighbour, d2, points);
+    const REAL2 vb = cut_face(cell, after, last, s_after, s_last, last_face, neighbour, d2, points);
 
     int a; /* where the new corners go: a and a + 1 */
     if (first <= last && first > 0) {
         /* The gap lies inside the list: move the tail so that it is two wide. */
         const int shift = 2 - (last - first + 1);
-        if (shift > 0) {
-            if (n + shift > CELL_CAPACITY)
-                return false;
-            for (int k = n - 1; k > last; --k) {
-                cell->x[k + shift] = cell->x[k];
-                cell->y[k + shift] = cell->y[k];
-                cell->faces[k + shift] = cell->faces[k];
-            }
-        } else if (shift < 0) {
-            for (int k = last + 1; k < n; ++k) {
-                cell->x[k + shift] = cell->x[k];
-                cell->y[k + shift] = cell->y[k];
-                cell->faces[k + shift] = cell->faces[k];
-            }
-        }
+        if (n + shift > CELL_CAPACITY)
+            return false;
+        if (shift > 0)
+            for (int k = n - 1; k > last; --k)
+                copy_corner(cell, k + shift, k);
+        else if (shift < 0)
+            for (int k = last + 1; k < n; ++k)
+                copy_corner(cell, k + shift, k);
         cell->n = n + shift;
         a = first;
     } else {
@@ -145,11 +140,8 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
         if (kept + 2 > CELL_CAPACITY)
             return false;
         if (after > 0)
-            for (int k = 0; k < kept; ++k) {
-                cell->x[k] = cell->x[k + after];
-                cell->y[k] = cell->y[k + after];
-                cell->faces[k] = cell->faces[k + after];
-            }
+            for (int k = 0; k < kept; ++k)
+                copy_corner(cell, k, k + after);
         cell->n = kept + 2;
         a = kept;
     }
@@ -160,11 +152,6 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
     cell->y[a + 1] = vb.s1;
     cell->faces[a + 1] = last_face;
 
-    for (int k = cell->n; k < n; ++k)
-        cell->x[k] = cell->y[k] = 0;
-    if (cell->n > n && n % CHUNK == 0)
-        for (int k = cell->n; k < n + CHUNK; ++k)
-            cell->x[k] = cell->y[k] = 0;
     REAL reach2 = 0;
     for (int k = 0; k < cell->n; ++k) {
         const REAL r2 = cell->x[k] * cell->x[k] + cell->y[k] * cell->y[k];
