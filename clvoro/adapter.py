@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -58,6 +61,22 @@ class Adapter:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
         self._stages: dict[int, Stages] = {}
+        self._busy = threading.Lock()
+        self._owner: int | None = None
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """One call at a time: the stages' buffers are shared. Other threads wait; a callback must not call back."""
+        if self._owner == threading.get_ident():
+            raise InputError(
+                "the adapter is at work: a callback may not use it; expected another Adapter for it"
+            )
+        with self._busy:
+            self._owner = threading.get_ident()
+            try:
+                yield
+            finally:
+                self._owner = None
 
     def _stages_for(self, domain: Box) -> Stages:
         if not isinstance(domain, Box):
@@ -91,6 +110,10 @@ class Adapter:
         InputError
             If the points are not as expected, or too close together for the precision.
         """
+        with self._alone():
+            return self._diagram(domain, points)
+
+    def _diagram(self, domain: Box, points: np.ndarray) -> Diagram:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
@@ -176,86 +199,94 @@ class Adapter:
         MemoryLimitError
             If the run would need more memory than the device has.
         """
-        stages = self._stages_for(domain)
-        engine = stages.engine
         check_choice("method", method, METHODS)
         check_choice("start", start, STARTS)
         check_choice("effort", effort, tuple(EFFORTS))
-        seed = check_integer("seed", seed, 0)
-        tol = check_number("tol", tol, least=0)
-        relaxation = Relaxation(
-            None if alpha is None else check_number("alpha", alpha, above=0),
-            check_number("k", k, above=0),
-        )
-        if error_target is not None:
-            error_target = check_number("error_target", error_target, above=0)
-        if max_steps is not None:
-            max_steps = check_integer("max_steps", max_steps, 0)
-        if n_cells is not None:
-            n_cells = check_integer("n_cells", n_cells, 1)
+        options = {
+            "method": method, "start": start, "effort": effort, "levels": levels,
+            "seed": check_integer("seed", seed, 0),
+            "tol": check_number("tol", tol, least=0),
+            "k": check_number("k", k, above=0),
+            "alpha": None if alpha is None else check_number("alpha", alpha, above=0),
+            "max_steps": None if max_steps is None else check_integer("max_steps", max_steps, 0),
+            "n_cells": None if n_cells is None else check_integer("n_cells", n_cells, 1),
+            "error_target": None if error_target is None
+            else check_number("error_target", error_target, above=0),
+        }  # fmt: skip
         if callback is not None and not callable(callback):
             raise InputTypeError(
                 f"callback is {callback!r} of type {type(callback).__name__}, expected a function "
                 "of a row of the history"
             )
-        planned = method in ("adaptive", "exact")
+        with self._alone():
+            return self._run(domain, size, points, options, callback)
+
+    def _run(
+        self,
+        domain: Box,
+        size: object,
+        points: np.ndarray | None,
+        options: dict[str, Any],
+        callback: Callable[[np.void], object] | None,
+    ) -> Result:
+        """Build mesh and plan, and carry the plan out; the options are checked."""
+        stages = self._stages_for(domain)
+        engine, method, n_cells = stages.engine, options["method"], options["n_cells"]
+        planned = method not in PUBLISHED
         host = None if points is None else check_points(points, domain)
         if host is not None and not planned and n_cells not in (None, len(host)):
             raise InputError(
-                f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} keeps their number; "
-                "leave n_cells out, or use method='adaptive'"
+                f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} "
+                "keeps their number; leave n_cells out, or use method='adaptive'"
             )
         sizing = Sizing(engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
         asked = count_cells(sizing, domain) if host is None or planned else float(len(host))
         target = n_cells if n_cells is not None else max(1, round(asked))
         check_memory(engine, max(target, 0 if host is None else len(host)))
-        factor = (asked / n_cells) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
-
-        if not planned:
-            level_count = 0
-        elif levels != "auto":
-            level_count = check_integer("levels", levels, 0)
-            most = int(np.log2(max(target, 1)) / domain.dim)
-            if host is None and level_count > most:
-                raise InputError(
-                    f"levels is {levels}, expected at most {most} for {target} cells, or 'auto': each level "
-                    f"has {2**domain.dim} times fewer"
-                )
-            finest = 0 if host is None else len(host) * 2.0 ** (domain.dim * min(level_count, 99))
-            check_memory(engine, finest)
-        elif host is None:
-            level_count = auto_levels(target, domain.dim)
-        else:
-            level_count = max(0, round(np.log(target / len(host)) / np.log(2**domain.dim)))
+        factor = (asked / target) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
+        levels = self._levels(options["levels"], engine, target, host) if planned else 0
         if host is None:
-            n = max(1, round(target / 2 ** (domain.dim * level_count)))
-            if start == "uniform":
-                host = sample_uniform(domain, n, seed, self.dtype)
+            n = max(1, round(target / 2 ** (domain.dim * levels)))
+            if options["start"] == "uniform":
+                host = sample_uniform(domain, n, options["seed"], self.dtype)
             else:
-                host = sample_density(sizing, domain, n, seed, self.dtype)
+                host = sample_density(sizing, domain, n, options["seed"], self.dtype)
         plan: list[Action]
         if planned:
-            plan = plan_adaptive(
-                EFFORTS[effort], level_count, method == "exact", error_target, points is not None
-            )
+            effort, aim = EFFORTS[options["effort"]], options["error_target"]
+            plan = plan_adaptive(effort, levels, method == "exact", aim, warm=points is not None)
         else:
-            plan = plan_steps(
-                make_method(method, relaxation), STEPS if max_steps is None else max_steps
-            )
+            relaxation = Relaxation(options["alpha"], options["k"])
+            steps = STEPS if options["max_steps"] is None else options["max_steps"]
+            plan = plan_steps(make_method(method, relaxation), steps)
         origin, scale = domain.frame
         with _Naming(host, domain, self.dtype):
-            mesh = Mesh(
-                stages, domain, sizing, engine.upload((host - origin) / scale),
-                coarsening=factor * 2.0**level_count,
-            )  # fmt: skip
-        settings = {
-            "method": method, "n_cells": n_cells, "start": "points" if points is not None else start,
-            "max_steps": max_steps, "tol": tol, "alpha": alpha, "k": k, "seed": seed,
-            "dtype": self.dtype.name, "effort": effort, "levels": level_count,
-            "error_target": error_target,
-        }  # fmt: skip
-        loop = Loop(mesh, plan, level_count, max_steps, None if planned else tol, callback)
+            unsorted = engine.upload((host - origin) / scale)
+            mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
+        tol = None if planned else options["tol"]
+        loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
+        settings = {**options, "levels": levels, "dtype": self.dtype.name}
+        if points is not None:
+            settings["start"] = "points"
         return loop.run(n_cells if planned else None, settings)
+
+    @staticmethod
+    def _levels(levels: int | str, engine: Engine, target: int, host: np.ndarray | None) -> int:
+        """Return the number of coarser levels that lead to `target` cells, from points `host` or from a sample."""
+        dim = engine.dim
+        if levels == "auto":
+            if host is None:
+                return auto_levels(target, dim)
+            return max(0, round(np.log2(target / len(host)) / dim))
+        count = check_integer("levels", levels, 0)
+        most = int(np.log2(max(target, 1)) / dim)
+        if host is None and count > most:
+            raise InputError(
+                f"levels is {levels}, expected at most {most} for {target} cells, or 'auto': each "
+                f"level has {2**dim} times fewer"
+            )
+        check_memory(engine, 0 if host is None else len(host) * 2.0 ** (dim * min(count, 99)))
+        return count
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

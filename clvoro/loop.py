@@ -45,6 +45,7 @@ class Loop:
         callback: Callable[[np.void], object] | None,
     ) -> None:
         self.mesh, self.plan, self.level = mesh, plan, levels
+        self.n_start = mesh.n
         self.done = work_of(plan, levels, mesh.engine.dim)
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.rows: list[np.ndarray] = []
@@ -196,6 +197,7 @@ class Loop:
             self.last.displace(mesh)
             final = self.displacements()
         diagram = mesh.diagram()
+        labels = np.sort(mesh.labels.get())
         return Result(
             points=diagram.points,
             diagram=diagram,
@@ -209,4 +211,5 @@ class Loop:
             final=final,
             size_factor=mesh.coarsening,
             settings=settings,
+            origin=np.where(labels < self.n_start, labels, -1).astype(np.int32),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import pyopencl.array as cla
@@ -32,54 +32,35 @@ SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ev
 
 
 class Stages:
-    """The stages of one engine, compiled when first used, their buffers reused by every mesh."""
+    """The stages of one engine, each compiled when first used, their buffers reused by every mesh."""
+
+    bins: Bins
+    cells: Cells
+    metric: Metric
+    density: Density
+    poisson: Poisson
+    projection: Projection
+    shape: Shape
+    motion: Motion
+    refinement: Refinement
+    population: PopulationControl
+    gather: Gather
+
+    _CLASSES: ClassVar = {
+        "bins": Bins, "cells": Cells, "metric": Metric, "density": Density, "poisson": Poisson,
+        "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
+        "population": PopulationControl, "gather": Gather,
+    }  # fmt: skip
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
 
-    @cached_property
-    def bins(self) -> Bins:
-        return Bins(self.engine)
-
-    @cached_property
-    def cells(self) -> Cells:
-        return Cells(self.engine)
-
-    @cached_property
-    def metric(self) -> Metric:
-        return Metric(self.engine)
-
-    @cached_property
-    def density(self) -> Density:
-        return Density(self.engine)
-
-    @cached_property
-    def poisson(self) -> Poisson:
-        return Poisson(self.engine)
-
-    @cached_property
-    def projection(self) -> Projection:
-        return Projection(self.engine)
-
-    @cached_property
-    def shape(self) -> Shape:
-        return Shape(self.engine)
-
-    @cached_property
-    def motion(self) -> Motion:
-        return Motion(self.engine)
-
-    @cached_property
-    def refinement(self) -> Refinement:
-        return Refinement(self.engine)
-
-    @cached_property
-    def population(self) -> PopulationControl:
-        return PopulationControl(self.engine)
-
-    @cached_property
-    def gather(self) -> Gather:
-        return Gather(self.engine)
+    def __getattr__(self, name: str) -> object:
+        if name not in Stages._CLASSES:
+            raise AttributeError(name)
+        stage = Stages._CLASSES[name](self.engine)
+        setattr(self, name, stage)
+        return stage
 
 
 def check_memory(engine: Engine, n: float) -> None:

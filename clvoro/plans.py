@@ -1,6 +1,7 @@
 """Plans: in which order a run takes its steps, from the coarsest level to the finest.
 
-    density start ─► couple ─► [ reorganise ─► glide ] x sweeps ─► refine ─► couple ─► [...] ... ─► settle ─► polish (─► project)
+    density start ─► couple ─► [ reorganise ─► glide ] x sweeps
+        ─► refine ─► couple ─► [...] ... ─► settle ─► polish (─► project)
 
 *couple*      weighted Lloyd and Poisson: from any start to nearly the right sizes
 *reorganise*  insert and delete generators: dislocations climb, the count meets the field
@@ -109,7 +110,7 @@ Action = Step | Reorganise | Refine | Rest | Settle
 
 
 def auto_levels(n: float, dim: int) -> int:
-    """Number of coarser levels for a mesh of `n` cells."""
+    """Return the number of coarser levels for a mesh of `n` cells."""
     return max(0, round(math.log(max(n, 1) / COARSEST, 2**dim)))
 
 

@@ -1,4 +1,4 @@
-"""Insertion and deletion of generators: dislocations climb under strain, and the count meets the field (`population.cl`)."""
+"""Insertion and deletion of generators: dislocations climb, the count meets the field (`population.cl`)."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ HISTORY_DTYPE = np.dtype(
         ("iterations", "i4"),  # of the linear solver in this step
         ("residual", "f8"),  # its relative residual at the end
         ("changed", "i4"),  # cells whose set of neighbours changed in this step
-        ("ever_changed", "f8"),  # share of cells whose set of neighbours has changed so far
+        ("ever_changed", "f8"),  # share of cells whose set of neighbours has changed on this level
         ("inserted", "i4"),
         ("deleted", "i4"),
         ("progress", "f8"),  # share of the planned work that is done
@@ -119,6 +119,9 @@ class Result:
         fit (methods "adaptive" and "exact"); else 1.
     settings : dict
         What is needed to repeat the run.
+    origin : (n,) int32 or None
+        Index, in the points that the run began with, of the generator that each row continues; -1 where it was
+        inserted. Rows stand in this order, inserted ones last. What is not listed was deleted.
     """
 
     points: np.ndarray
@@ -133,6 +136,7 @@ class Result:
     final: Displacements | None = None
     size_factor: float = 1.0
     settings: dict[str, Any] = field(default_factory=dict)
+    origin: np.ndarray | None = None
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the mesh to `path`: `.npz` (reload with `clvoro.load`) or `.vtu`, or any format meshio knows."""

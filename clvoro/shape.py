@@ -1,4 +1,4 @@
-"""Descent of cell quality itself (`shape.cl`): for the last steps, where Lloyd's centroids no longer tell good from best."""
+"""Descent of cell quality itself (`shape.cl`), for the last steps, where Lloyd's centroids no longer help."""
 
 from __future__ import annotations
 
