@@ -9,7 +9,7 @@ from clvoro.domain import Box
 
 
 def walk(binned, n, dim):
-    """Return the leaves as (first, count, origin, edge, level), from grid 0 down; each bin's place is in its grid's row."""
+    """Return the leaves as (first, count, origin, edge, level, place in its grid, bins of the grid)."""
     bins = binned.bins.get().reshape(-1, 2)
     frames = binned.grid_frames.get().reshape(-1, 4).astype(float)
     shapes = binned.grid_shapes.get().reshape(-1, 4)
@@ -76,7 +76,9 @@ def sets(dim, box):
         "random": square,
         "graded": lower + rng.random((900, dim)) ** 5 * extent,
         "corners": np.concatenate([corners, square[:50]]),
-        "clusters": np.concatenate([tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-8, 1e-12)]),
+        "clusters": np.concatenate(
+            [tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-8, 1e-12)]
+        ),
         "one place": np.repeat(square[:1], 400, axis=0),
         "few places": np.repeat(square[:5], [1, 90, 11, 3000, 10], axis=0)[rng.permutation(3112)],
         "line": lower + np.linspace(0, 1, 501)[:, None] * extent,

@@ -45,14 +45,18 @@ def gradient(host, psi):
 
 
 def solve(host, rhs, density=None):
-    A = graphs.laplacian_matrix(host.points, host.starts, host.neighbours, host.face_measures, density)
+    A = graphs.laplacian_matrix(
+        host.points, host.starts, host.neighbours, host.face_measures, density
+    )
     return np.linalg.lstsq(A.toarray(), rhs, rcond=None)[0]
 
 
 def test_published_displacements(stages):
     """Lloyd: centroid - x. Poisson: -div grad psi = e, its volume-weighted mean removed, u = alpha grad psi."""
     mesh, host = make_mesh(stages)
-    method = PublishedMethod(Relaxation(alpha=1.7, k=0.4, tolerance=1e-12), lloyd=True, poisson=True)
+    method = PublishedMethod(
+        Relaxation(alpha=1.7, k=0.4, tolerance=1e-12), lloyd=True, poisson=True
+    )
     solution = method.displace(mesh)
     assert solution.converged
     assert mesh.lloyd.get() == pytest.approx(host.offsets)
@@ -81,7 +85,9 @@ def test_alpha_is_the_dimension_by_default(stages):
     assert mesh.correction.get() == pytest.approx(2 * one, rel=1e-2, abs=1e-3 * np.abs(one).max())
 
 
-@pytest.mark.parametrize(("name", "a", "b"), [("lloyd", 1, 0), ("poisson", 0, 1), ("coupled", 1, 1)])
+@pytest.mark.parametrize(
+    ("name", "a", "b"), [("lloyd", 1, 0), ("poisson", 0, 1), ("coupled", 1, 1)]
+)
 def test_published_moves(stages, name, a, b):
     mesh, host = make_mesh(stages)
     method = make_method(name, Relaxation(k=0.3))
@@ -156,7 +162,9 @@ def test_projected_displacements(stages):
         mesh.t, mesh.reach, w.gradient, w.excess, stages.engine.upload(expected), correction, mesh.quality,
         eps=0.2, lenience=0.1, bound=0.3, max_iterations=25,
     )  # fmt: skip
-    ProjectedMethod("lloyd", 1.3, 0.6, eps=0.2, lenience=0.1, bound=0.3, iterations=25).displace(mesh)
+    ProjectedMethod("lloyd", 1.3, 0.6, eps=0.2, lenience=0.1, bound=0.3, iterations=25).displace(
+        mesh
+    )
     assert mesh.lloyd.get() == pytest.approx(expected, abs=1e-15)
     assert np.array_equal(mesh.correction.get(), correction.get())
     assert np.abs(r).max() > 0.1
@@ -168,7 +176,12 @@ def test_penalty_is_steered_to_the_error_aimed_at(stages):
     h = FIELD(host.points)
     error = np.abs(np.log(np.sqrt(host.volumes) / h)).mean()
     assert mesh.mean_log_error() == pytest.approx(error, rel=1e-9)
-    for aim, factor in ((error / 1.2, 1 / 1.2), (error / 50, 0.75), (1.1 * error, 1.1), (50 * error, 1.33)):
+    for aim, factor in (
+        (error / 1.2, 1 / 1.2),
+        (error / 50, 0.75),
+        (1.1 * error, 1.1),
+        (50 * error, 1.33),
+    ):
         method = ProjectedMethod(eps=0.1, aim=aim)
         for _ in range(3):
             method.displace(mesh)

@@ -45,7 +45,9 @@ def test_definitions(engine):
         length = np.sqrt(cell.area)
         smaller = min(length, h[i])
         both.add(length < h[i])
-        assert error[i] == pytest.approx((length - h[i]) / smaller, abs=close["rel"] * length / smaller)
+        assert error[i] == pytest.approx(
+            (length - h[i]) / smaller, abs=close["rel"] * length / smaller
+        )
         assert reach[i] == pytest.approx(smaller, **close)
         perimeter = np.hypot(*(np.roll(cell.polygon, -1, axis=0) - cell.polygon).T).sum()
         n = len(cell.neighbours)
@@ -59,7 +61,9 @@ def test_squares(engine):
     """A square is as good as four sides allow, Q = 1; its energy is h^4 / 6."""
     a = 0.125
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
-    error, quality, energy, _ = evaluate(engine, patch.tessellate(engine, (xy + 0.5) * a), np.full(48, a))
+    error, quality, energy, _ = evaluate(
+        engine, patch.tessellate(engine, (xy + 0.5) * a), np.full(48, a)
+    )
     eps = float(np.finfo(engine.real).eps)
     assert np.abs(error).max() < 16 * eps
     assert np.abs(quality - 1).max() < 16 * eps
@@ -94,7 +98,9 @@ def test_three_dimensions(ctx):
 def neighbour_sets(t, labels):
     host = patch.fetch(t)
     return {
-        labels[i]: {labels[j] if j >= 0 else j for j in host.neighbours[host.starts[i] : host.starts[i + 1]]}
+        labels[i]: {
+            labels[j] if j >= 0 else j for j in host.neighbours[host.starts[i] : host.starts[i + 1]]
+        }
         for i in range(t.n)
     }
 
@@ -109,7 +115,9 @@ def test_compare_neighbours(ctx):
 
     def compare(points, labels, first):
         t = patch.tessellate(engine, points)
-        metric.compare_neighbours(t, engine.upload(labels, np.int32), first, signatures, changed, ever)
+        metric.compare_neighbours(
+            t, engine.upload(labels, np.int32), first, signatures, changed, ever
+        )
         return neighbour_sets(t, labels), changed.get(), ever.get()
 
     before, now, so_far = compare(points, labels, True)
@@ -137,7 +145,9 @@ def test_order_and_numbering_are_no_change(ctx):
     metric.compare_neighbours(t, engine.upload(labels, np.int32), True, signatures, changed, ever)
     moved = engine.upload(signatures.get()[order], np.uint64)
     t = patch.tessellate(engine, points[order])
-    metric.compare_neighbours(t, engine.upload(labels[order], np.int32), False, moved, changed, ever)
+    metric.compare_neighbours(
+        t, engine.upload(labels[order], np.int32), False, moved, changed, ever
+    )
     assert not changed.get().any()
     metric.compare_neighbours(t, engine.upload(labels, np.int32), False, moved, changed, ever)
     assert changed.get().all(), "other names are other neighbours"

@@ -61,7 +61,9 @@ class Sweep:
         assert np.array_equal(born, self.first_new + np.arange(new.inserted))
         assert patch.BOX.contains(self.new_points).all()
         row = {label: i for i, label in enumerate(self.labels)}
-        self.rows = np.array([row[label] for label in labels[old]], int)  # the row before, of each that was
+        self.rows = np.array(
+            [row[label] for label in labels[old]], int
+        )  # the row before, of each that was
         self.deleted = np.setdiff1d(np.arange(self.n), self.rows)
         assert len(self.deleted) == new.deleted
         moved = (self.new_points[old] != self.points[self.rows]).any(axis=1)
@@ -92,7 +94,7 @@ class Sweep:
 
 
 def dislocated(a, stretch):
-    """A hexagonal lattice with one dislocation (a 7-sided cell under a 5-sided one) in the middle, stretched along x."""
+    """A hexagonal lattice, one dislocation (a 7-sided cell under a 5-sided) in it, stretched along x."""
     points = patch.hexagons(a, Box((0, 0), (1.4, 1.15))) - 0.2
     centre = np.array([0.5, 0.375]) + a * np.array([0.25, 0.2])
     d = points - centre
@@ -145,7 +147,7 @@ def test_unstrained_pair_stays(engine):
 
 
 def test_count_overrules_strain(engine):
-    """One pair cannot climb where the count is right; where it is not, the pair gives way to it before other cells do."""
+    """One pair cannot climb where the count is right; where it is not, the pair gives way first."""
     assert Sweep(engine, dislocated(A, 0.06), H, 0.0, theta=QUIET).new is None
     against = Sweep(engine, dislocated(A, 0.0), H, 1.0, theta=QUIET)
     assert against.moved.tolist() == [the_pair(against)[1]]
@@ -160,7 +162,12 @@ def test_two_pairs_of_opposite_strain_both_climb(engine):
         d = points - [x + 0.25 * a, 0.375 + 0.2 * a]
         angle = np.arctan2(d[:, 1], d[:, 0])
         shift[:, 0] += sign * a / (2 * np.pi) * (angle + np.sin(2 * angle) * 3 / 8)
-        shift[:, 1] -= sign * a / (2 * np.pi) * (np.log((d**2).sum(axis=1) / a**2) / 8 + np.cos(2 * angle) * 3 / 8)
+        shift[:, 1] -= (
+            sign
+            * a
+            / (2 * np.pi)
+            * (np.log((d**2).sum(axis=1) / a**2) / 8 + np.cos(2 * angle) * 3 / 8)
+        )
     points = points + shift
     wide = 1 + 0.06 * np.sin(2 * np.pi * points[:, 0])
     points[:, 0] -= 0.06 / (2 * np.pi) * np.cos(2 * np.pi * points[:, 0])
@@ -223,7 +230,7 @@ def test_few_cells(engine, n, total, climb):
 
 
 def test_alike_cells_are_told_apart(engine):
-    """All cells of a lattice have the same excess, far beyond the scale of scores: still as many as asked for are split."""
+    """Cells of a lattice have the same excess, far beyond all scores: still as many are split as asked."""
     xy = np.stack(np.meshgrid(np.arange(16), np.arange(12), indexing="ij"), -1).reshape(-1, 2)
     sweep = Sweep(engine, (xy + 0.5) / 16, 1e-3, 3.0, climb=False)
     assert sweep.new.inserted == 3
@@ -235,8 +242,12 @@ def test_limit_keeps_the_strongest(engine):
     spans = [10**6, 300, 40, 1]
     for trial in range(24):
         n = int(rng.integers(1, 400))
-        bits = np.float32(rng.uniform(0.1, 4)).view(np.uint32) + rng.integers(0, spans[trial % 4], n)
-        keys = (bits.astype(np.uint64) << np.uint64(32)) | (0x7FFFFFFF - np.arange(n)).astype(np.uint64)
+        bits = np.float32(rng.uniform(0.1, 4)).view(np.uint32) + rng.integers(
+            0, spans[trial % 4], n
+        )
+        keys = (bits.astype(np.uint64) << np.uint64(32)) | (0x7FFFFFFF - np.arange(n)).astype(
+            np.uint64
+        )
         keys[rng.random(n) < 0.3] = 0
         most = int(rng.integers(0, n + 3))
         chosen = engine.upload(keys, np.uint64)
@@ -274,7 +285,12 @@ def test_pairs_are_made_where_the_lattice_is_strained(engine):
         # Its site is one of its ends, all of whose edges are shorter (longer).
         ends = [np.flatnonzero((sweep.points == p).all(axis=1))[0] for p in edges[k]]
         around = [
-            lengths[[np.array_equal(p, sweep.points[e]) or np.array_equal(q, sweep.points[e]) for p, q in edges]]
+            lengths[
+                [
+                    np.array_equal(p, sweep.points[e]) or np.array_equal(q, sweep.points[e])
+                    for p, q in edges
+                ]
+            ]
             for e in ends
         ]
         best = [(own.max() if longest else own.min()) for own in around]
@@ -288,7 +304,9 @@ def test_pairs_are_made_where_the_lattice_is_strained(engine):
 
 
 def test_no_pairs_in_an_unstrained_lattice(engine):
-    assert Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, theta=QUIET).new is None
+    assert (
+        Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, theta=QUIET).new is None
+    )
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])

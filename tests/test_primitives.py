@@ -48,7 +48,9 @@ def test_scan_in_place(scan, n):
 def test_summaries(engine, n):
     values = np.random.default_rng(n + 5).normal(0.01, 1, n).astype(engine.real)
     summaries = Summaries(engine, ("a", "b"))
-    array = engine.upload(np.concatenate([values, [1e9]]))  # what lies behind the n is not looked at
+    array = engine.upload(
+        np.concatenate([values, [1e9]])
+    )  # what lies behind the n is not looked at
     summaries.collect("b", array, n)
     summaries.collect("a", engine.upload(-values), n)
     a, b = (summaries.read()[name] for name in "ab")

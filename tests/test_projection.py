@@ -1,4 +1,4 @@
-"""The derivative of the volumes against finite differences of Qhull's, its transpose, and the projection against NumPy."""
+"""The derivative of the volumes against differences of Qhull's, and the projection against NumPy."""
 
 import numpy as np
 import patch
@@ -196,7 +196,9 @@ def test_single_precision(ctx, points):
     gradient, nothing = np.tile(SLOPE, (N, 1)), np.zeros((N, 2))
     options = {"eps": 0.05, "max_iterations": 60}
     u, solution = project(engine, points, sizes(points), gradient, r, nothing, **options)
-    exact, _ = project(patch.make_engine(ctx), points, sizes(points), gradient, r, nothing, **options)
+    exact, _ = project(
+        patch.make_engine(ctx), points, sizes(points), gradient, r, nothing, **options
+    )
     assert solution.residual < 1e-5
     assert np.abs(u - exact).max() < 1e-4 * np.abs(exact).max()
 

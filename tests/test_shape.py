@@ -101,6 +101,8 @@ def test_a_regular_mesh_stays(ctx):
 def test_degenerate(ctx, real, points):
     n = len(points)
     some = np.full(n, 0.5)
-    u = descend(patch.make_engine(ctx, real), np.array(points, float), np.full(n, 0.3), 5.0, quality=some)
+    u = descend(
+        patch.make_engine(ctx, real), np.array(points, float), np.full(n, 0.3), 5.0, quality=some
+    )
     assert np.isfinite(u).all()
     assert np.linalg.norm(u, axis=1).max() <= 0.2 * 0.3 * 1.001
