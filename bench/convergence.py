@@ -143,7 +143,7 @@ COLUMNS = {
     "field": lambda r: r["field"],
     "cells": show("cells", ".0f"),
     "mean |e|": show("mean_error", ".5f"),
-    "max |e|": show("max_error", ".4f"),
+    "max |e|": show("max_error", ".5f"),
     "mean Q": show("mean_quality", ".4f"),
     "min Q": show("min_quality", ".3f"),
     "all Q": lambda r: (
