@@ -8,7 +8,7 @@ from clvoro.bins import MAX_LEVELS, SPLIT_COUNT, Bins
 from clvoro.domain import Box
 
 
-def walk(binned, n, dim):
+def walk(binned, n, dim, eps):
     """Return the leaves as (first, count, origin, edge, level, place in its grid, bins of the grid)."""
     bins = binned.bins.get().reshape(-1, 2)
     frames = binned.grid_frames.get().reshape(-1, 4).astype(float)
@@ -30,6 +30,8 @@ def walk(binned, n, dim):
             if grid == next_grid:
                 leaves.append((start, count, origin, edge, level, index, sides))
             else:
+                assert frames[grid, :dim] == pytest.approx(origin, abs=8 * eps)
+                assert shapes[grid][1] / frames[grid, 3] == pytest.approx(edge, rel=8 * eps)
                 inside = open_grid(grid, level + 1)
                 assert inside == count, "a divided bin does not hold what its grid holds"
             held += count
@@ -41,7 +43,7 @@ def walk(binned, n, dim):
 
 def check(binned, points, dim, eps):
     n = len(points)
-    leaves = walk(binned, n, dim)
+    leaves = walk(binned, n, dim, eps)
     items = binned.items.get()[:n]
     assert np.array_equal(np.sort(items), np.arange(n)), "not every generator is in one place"
     assert np.array_equal(binned.points.get().reshape(-1, dim)[:n], points[items])
@@ -124,7 +126,7 @@ def test_uniform_sets_stay_on_one_level(ctx):
     """Of a random set hardly a bin holds more than SPLIT_COUNT: Poisson with mean 2 exceeds 10 in one of 1e5 bins."""
     engine = patch.make_engine(ctx)
     points = patch.random_points(20000, 202)
-    leaves = walk(Bins(engine).build(patch.BOX, engine.upload(points), 20000), 20000, 2)
+    leaves = walk(Bins(engine).build(patch.BOX, engine.upload(points), 20000), 20000, 2, 2e-16)
     assert np.mean([leaf[4] > 0 for leaf in leaves]) < 1e-3
     assert 0.4 * 20000 < len(leaves) < 0.6 * 20000 + 300
 
@@ -163,3 +165,27 @@ def test_capacity_grows(ctx):
         patch.random_points(3, 1),
     ):
         check(bins.build(patch.BOX, engine.upload(points), len(points)), points, 2, 2e-16)
+
+
+def test_leaves_are_sorted_whatever_order_atomics_leave(ctx):
+    """On a CPU they mostly arrive in order: mix the leaves up, and sort them again."""
+    engine = patch.make_engine(ctx)
+    points = sets(2, patch.BOX)["few places"]
+    n, bins = len(points), Bins(engine)
+    binned = bins.build(patch.BOX, engine.upload(points), n)
+    leaves = walk(binned, n, 2, 2e-16)
+    expected = binned.items.get()
+    mixed, rng = expected.copy(), np.random.default_rng(56)
+    for start, count, *_ in leaves:
+        mixed[start : start + count] = rng.permutation(mixed[start : start + count])
+    assert (mixed != expected).sum() > 2000
+    items = engine.upload(mixed, np.int32)
+    engine.run_each(
+        bins._kernels.sort_bins,
+        len(bins._bins) // 2 - 1,
+        bins._bins,
+        bins._grid_of,
+        bins._shapes,
+        items,
+    )
+    assert np.array_equal(items.get(), expected)

@@ -121,16 +121,53 @@ def test_warm_start(adapter, method):
     assert ten.settings["start"] == "points"
 
 
-def test_generators_that_stay_keep_their_order(adapter):
-    """Inserted ones come after the caller's, which keep near their places: a mesh that fits is hardly changed."""
+def test_origin_names_the_callers_generators(adapter):
+    """Those that stay come first, in their order and near their places; inserted ones are -1."""
     first = adapter.run(BOX, F1, seed=31, effort="fast")
-    result = adapter.run(BOX, F1, first.points, effort="fast")
-    kept = len(first.points) - result.history["deleted"].sum()
-    assert kept > 0.9 * len(first.points)
-    if result.history["deleted"].sum() == 0:
-        moved = np.linalg.norm(result.points[:kept] - first.points, axis=1)
-        assert np.median(moved / result.size[:kept]) < 1
+    result = adapter.run(BOX, F1, first.points, effort="fast", n_cells=len(first.points) + 9)
+    origin = result.origin
+    kept = origin >= 0
+    inserted, deleted = (result.history[name].sum() for name in ("inserted", "deleted"))
+    assert kept.sum() >= len(first.points) - deleted
+    assert (~kept).sum() == len(result.points) - kept.sum() <= inserted
+    assert kept[: kept.sum()].all()
+    assert (np.diff(origin[kept]) > 0).all()
+    moved = np.linalg.norm(result.points[kept] - first.points[origin[kept]], axis=1)
+    assert np.median(moved / result.size[kept]) < 0.5
+    shuffled = np.random.default_rng(1).permutation(first.points)
+    far = np.linalg.norm(result.points[kept] - shuffled[origin[kept]], axis=1)
+    assert np.median(far / result.size[kept]) > 2, "the test would see a wrong order"
     check(result, F1)
+
+
+def test_origin_of_methods_that_keep_all(adapter):
+    result = adapter.run(BOX, F1, random_points(200, 3), method="coupled", max_steps=4)
+    assert np.array_equal(result.origin, np.arange(200))
+
+
+def test_one_call_at_a_time(adapter):
+    """A callback that uses the adapter would overwrite the mesh at work."""
+    with pytest.raises(InputError, match="another Adapter"):
+        adapter.run(BOX, F1, callback=lambda row: adapter.diagram(BOX, random_points(50, 1)))
+    other = clvoro.Adapter()
+    plain = adapter.run(BOX, F1, method="coupled", max_steps=4)
+    drawn = adapter.run(
+        BOX, F1, method="coupled", max_steps=4,
+        callback=lambda row: len(other.diagram(BOX, random_points(50, 1))) == 0,
+    )  # fmt: skip
+    assert np.array_equal(plain.points, drawn.points)
+
+
+def test_threads_take_turns(adapter):
+    from concurrent.futures import ThreadPoolExecutor
+
+    def run(seed):
+        return adapter.run(BOX, F1, method="coupled", max_steps=6, seed=seed).points
+
+    expected = [run(seed) for seed in range(30, 34)]
+    with ThreadPoolExecutor(4) as pool:
+        for points, alone in zip(pool.map(run, range(30, 34)), expected, strict=True):
+            assert np.array_equal(points, alone)
 
 
 @pytest.mark.parametrize(
