@@ -6,11 +6,32 @@
 
 #define NONE (-1)
 
-/* Weights in the multigrid's precision, which may be less than the operator's. */
-kernel void convert(int m, global const SOURCE *weights, global REAL *out)
+/* The largest weight, one partial value per group of work-items. */
+kernel void largest(int m, global const SOURCE *weights, global SOURCE *partial)
+{
+    const int me = get_global_id(0), all = get_global_size(0);
+    SOURCE most = 0;
+    for (int k = me; k < m; k += all) most = fmax(most, weights[k]);
+    partial[me] = most;
+}
+
+/* Weights times 2^exponent in the multigrid's precision, whose range may be less than the operator's. */
+kernel void convert(int m, int exponent, global const SOURCE *weights, global REAL *out)
 {
     const int k = get_global_id(0);
-    if (k < m) out[k] = (REAL)weights[k];
+    if (k < m) out[k] = (REAL)ldexp(weights[k], exponent);
+}
+
+/* inverse[i] = 1 / (sum of i's weights), 0 without any. */
+kernel void inverse_sums(
+    int n, global const int *starts, global const int *columns, global const REAL *weights, global REAL *inverse)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    REAL sum = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k)
+        if (columns[k] != i) sum += weights[k];
+    inverse[i] = sum > 0 ? 1 / sum : 0;
 }
 
 /* A weight times 1 + less than a thousandth, by chance but the same from both sides: it breaks the ties of regular
@@ -24,10 +45,12 @@ inline REAL preference(REAL weight, int i, int j)
     return weight * (1 + (key & 0xFFFFu) * R(1.5e-8));
 }
 
-/* Cell i without a mate looks at its heaviest neighbour, among those without a mate (`mated` 0) or with one (1). */
+/* Cell i without a mate looks at the neighbour it is tied to most, among those without a mate (`mated` 0) or with one (1).
+   A tie's strength is w (1/d_i + 1/d_j), d the sums of the cells' weights: the same from both sides, and the same everywhere
+   on a mesh whose weights grow steadily. By weight alone all cells of such a mesh would look uphill, and few find a mate. */
 kernel void propose(
     int n, int mated, global const int *starts, global const int *columns, global const REAL *weights,
-    global const int *mate, global int *choice)
+    global const REAL *inverse_sums, global const int *mate, global int *choice)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
@@ -37,7 +60,7 @@ kernel void propose(
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
             if (j == i || (mate[j] != NONE) != mated) continue;
-            const REAL p = preference(weights[k], i, j);
+            const REAL p = preference(weights[k] * (inverse_sums[i] + inverse_sums[j]), i, j);
             if (p > most) {
                 most = p;
                 best = j;
@@ -151,7 +174,8 @@ kernel void merge_rows(
     lengths[g] = end - begin;
 }
 
-/* The rows one behind the other, times a factor. */
+/* The rows one behind the other, times a factor. Of the two sums of a pair of groups, which differ by rounding, the lower
+   group's is taken, so that the graph is symmetric to the last bit. */
 kernel void pack_rows(
     int groups, REAL factor, global const int *bounds, global const int *starts, global const int *loose_columns,
     global const REAL *loose_weights, global int *columns, global REAL *weights)
@@ -160,8 +184,14 @@ kernel void pack_rows(
     if (g >= groups) return;
     const int shift = bounds[g] - starts[g];
     for (int k = starts[g]; k < starts[g + 1]; ++k) {
-        columns[k] = loose_columns[k + shift];
-        weights[k] = factor * loose_weights[k + shift];
+        const int h = loose_columns[k + shift];
+        int l = k + shift;
+        if (h < g) {
+            l = bounds[h];
+            while (loose_columns[l] != g) ++l;
+        }
+        columns[k] = h;
+        weights[k] = factor * loose_weights[l];
     }
 }
 
@@ -187,12 +217,17 @@ kernel void compose_groups(int n, global const int *inner, global const int *out
     if (i < n) group[i] = outer[inner[i]];
 }
 
-/* Pairwise Jacobi: u = B^-1 r, B the operator's diagonal, with its 2 x 2 blocks for cells that are each other's heaviest
-   neighbours. A tight pair moves as one against the others, which the diagonal alone would take many steps to see.
-   u_i = same[i] r_i + other[i] r_partner[i]; no eigenvalue of B^-1 A is above 2, as 2 B - A is a sum of squares. */
+/* Pairwise Jacobi: u = B^-1 r, B the operator's diagonal, with its 2 x 2 blocks for cells that are each other's first
+   choice. A tight pair moves as one against the others, which the diagonal alone would take many steps to see. No
+   eigenvalue of B^-1 A is above 2, as 2 B - A is a sum of squares.
+
+       u_i = own_i r_i + both_i (r_i + r_partner_i)
+
+   in these terms, all >= 0 (but for a pair without neighbours), because the entries of the block's inverse differ by less than rounding when the pair is
+   tight: rounded on their own they can make the inverse indefinite. both is the same to the last bit for the two. */
 kernel void pair_inverse(
     int n, global const int *starts, global const int *columns, global const REAL *weights, global const int *mate,
-    global int *partner, global REAL *same, global REAL *other)
+    global int *partner, global REAL *own, global REAL *both)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
@@ -208,20 +243,19 @@ kernel void pair_inverse(
     if (j != NONE)
         for (int k = starts[j]; k < starts[j + 1]; ++k)
             if (columns[k] != j && columns[k] != i) theirs += weights[k];
-    /* The block is [mine + between, -between; -between, theirs + between]; without neighbours outside it is singular,
-       and half the difference is the answer. */
+    /* The block is [mine + between, -between; -between, theirs + between]. Without neighbours outside it is singular, and
+       its pseudo-inverse the answer. */
     REAL a = 0, c = 0;
     if (j == NONE || between <= 0)
         a = mine > 0 ? 1 / mine : 0;
     else if (mine + theirs <= 0) {
-        a = R(0.25) / between;
-        c = -a;
+        a = R(0.5) / between;
+        c = -R(0.5) * a;
     } else {
-        const REAL share = between / (mine + theirs + (mine / between) * theirs);
-        c = share / between;
-        a = c * (1 + theirs / between);
+        c = 1 / (mine + theirs + (fmin(mine, theirs) / between) * fmax(mine, theirs));
+        a = c * (theirs / between);
     }
     partner[i] = j == NONE ? i : j;
-    same[i] = a;
-    other[i] = c;
+    own[i] = a;
+    both[i] = c;
 }

@@ -8,22 +8,22 @@
 
 /* b = r, x = omega B^-1 b: the first step from a start of zero. On the finest level b is rounded from `r`. */
 kernel void first_rounded(
-    int n, REAL omega, global const int *partner, global const REAL *same, global const REAL *other,
+    int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
     global const SOURCE *r, global REAL *b, global REAL *x)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
     const REAL bi = (REAL)r[i];
     b[i] = bi;
-    x[i] = omega * (same[i] * bi + other[i] * (REAL)r[partner[i]]);
+    x[i] = omega * (own[i] * bi + both[i] * (bi + (REAL)r[partner[i]]));
 }
 
 kernel void first(
-    int n, REAL omega, global const int *partner, global const REAL *same, global const REAL *other,
+    int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
     global const REAL *b, global REAL *x)
 {
     const int i = get_global_id(0);
-    if (i < n) x[i] = omega * (same[i] * b[i] + other[i] * b[partner[i]]);
+    if (i < n) x[i] = omega * (own[i] * b[i] + both[i] * (b[i] + b[partner[i]]));
 }
 
 /* t = b - A x. */
@@ -37,20 +37,20 @@ kernel void defect(
 
 /* x += omega B^-1 t. */
 kernel void correct(
-    int n, REAL omega, global const int *partner, global const REAL *same, global const REAL *other,
+    int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
     global const REAL *t, global REAL *x)
 {
     const int i = get_global_id(0);
-    if (i < n) x[i] += omega * (same[i] * t[i] + other[i] * t[partner[i]]);
+    if (i < n) x[i] += omega * (own[i] * t[i] + both[i] * (t[i] + t[partner[i]]));
 }
 
 /* u = x + omega B^-1 t in the caller's precision: the cycle's last step. */
 kernel void correct_out(
-    int n, REAL omega, global const int *partner, global const REAL *same, global const REAL *other,
+    int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
     global const REAL *t, global const REAL *x, global SOURCE *u)
 {
     const int i = get_global_id(0);
-    if (i < n) u[i] = x[i] + omega * (same[i] * t[i] + other[i] * t[partner[i]]);
+    if (i < n) u[i] = x[i] + omega * (own[i] * t[i] + both[i] * (t[i] + t[partner[i]]));
 }
 
 /* b of a group = sum of its members' t. */
@@ -71,55 +71,61 @@ kernel void prolong(int n, global const int *group, global const REAL *e, global
     if (i < n) x[i] += e[group[i]];
 }
 
-/* One group: inverse of A + (t/n) 1 1^T, t = its mean diagonal (and a millionth of t against rows that hang together with
-   no other), by Gauss and Jordan without exchange of rows, as the matrix is positive definite. */
-kernel void invert(
-    int n, global const int *starts, global const int *columns, global const REAL *weights, global REAL *inverse)
+/* One group of work-items: cells are eliminated one by one, which leaves a graph of the others,
+
+       w_jk += w_ij w_ik / d_i        d_i = sum_k w_ik over those not yet eliminated
+
+   so that A = L D L^T with L^-1 = Z, whose entry (i, k) is the share of k's right side that has come to i when it is its
+   turn. As d is summed anew from the weights, nothing is ever subtracted, and Z and D are right to the last digits whatever
+   the weights are. A cell without anyone left (the last one, or the last of a part on its own) has 1 / d = 0.
+
+   factor: Z (n, n), then the weights left (n, n), then 1 / d (n). */
+kernel void eliminate(
+    int n, global const int *starts, global const int *columns, global const REAL *weights, global REAL *factor)
 {
     const int me = get_local_id(0);
-    local REAL mean;
+    global REAL *z = factor, *w = factor + n * n, *inverse = factor + 2 * n * n;
     for (int i = me; i < n; i += GROUP_SIZE) {
-        REAL sum = 0;
-        for (int j = 0; j < n; ++j) inverse[i * n + j] = 0;
-        for (int k = starts[i]; k < starts[i + 1]; ++k) {
-            if (columns[k] == i) continue;
-            inverse[i * n + columns[k]] -= weights[k];
-            sum += weights[k];
+        for (int j = 0; j < n; ++j) {
+            w[i * n + j] = 0;
+            z[i * n + j] = i == j;
         }
-        inverse[i * n + i] = sum;
+        for (int k = starts[i]; k < starts[i + 1]; ++k)
+            if (columns[k] != i) w[i * n + columns[k]] += weights[k];
     }
-    barrier(CLK_GLOBAL_MEM_FENCE);
-    if (me == 0) {
-        REAL sum = 0;
-        for (int i = 0; i < n; ++i) sum += inverse[i * n + i];
-        mean = sum > 0 ? sum / n : 1;
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    const REAL shift = mean;
-    for (int q = me; q < n * n; q += GROUP_SIZE) inverse[q] += shift / n + (q / n == q % n ? R(1e-6) * shift : 0);
     barrier(CLK_GLOBAL_MEM_FENCE);
     for (int p = 0; p < n; ++p) {
-        /* Rows other than p, then row p itself, then column p: nothing is read after it has changed. */
-        const REAL pivot = 1 / inverse[p * n + p];
-        for (int i = me; i < n; i += GROUP_SIZE) {
-            if (i == p) continue;
-            const REAL factor = inverse[i * n + p] * pivot;
-            for (int j = 0; j < n; ++j)
-                if (j != p) inverse[i * n + j] -= factor * inverse[p * n + j];
-            inverse[i * n + p] = -factor;
+        REAL sum = 0;
+        for (int j = p + 1; j < n; ++j) sum += w[p * n + j];
+        const REAL pivot = sum > 0 ? 1 / sum : 0;
+        if (me == 0) inverse[p] = pivot;
+        for (int i = p + 1 + me; i < n; i += GROUP_SIZE) {
+            const REAL share = w[p * n + i] * pivot;
+            if (share == 0) continue;
+            for (int j = p + 1; j < n; ++j)
+                if (j != i) w[i * n + j] += share * w[p * n + j];
+            for (int k = 0; k <= p; ++k) z[i * n + k] += share * z[p * n + k];
         }
-        barrier(CLK_GLOBAL_MEM_FENCE);
-        for (int j = me; j < n; j += GROUP_SIZE) inverse[p * n + j] = j == p ? pivot : inverse[p * n + j] * pivot;
         barrier(CLK_GLOBAL_MEM_FENCE);
     }
 }
 
-/* x = inverse b, on the coarsest level. */
-kernel void solve_dense(int n, global const REAL *inverse, global const REAL *b, global REAL *x)
+/* t = D^-1 Z b, then x = Z^T t: the coarsest level. Such a product is positive semidefinite whatever is rounded in it, as
+   an inverse matrix in one piece is not. */
+kernel void solve_down(int n, global const REAL *factor, global const REAL *b, global REAL *t)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
     REAL sum = 0;
-    for (int j = 0; j < n; ++j) sum += inverse[i * n + j] * b[j];
-    x[i] = sum;
+    for (int k = 0; k <= i; ++k) sum += factor[i * n + k] * b[k];
+    t[i] = sum * factor[2 * n * n + i];
+}
+
+kernel void solve_up(int n, global const REAL *factor, global const REAL *t, global REAL *x)
+{
+    const int k = get_global_id(0);
+    if (k >= n) return;
+    REAL sum = 0;
+    for (int i = k; i < n; ++i) sum += factor[i * n + k] * t[i];
+    x[k] = sum;
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,11 +69,14 @@ class Groups:
 
 @dataclass(frozen=True)
 class PairInverse:
-    """Inverse of diagonal and 2 x 2 blocks: u_i = same_i r_i + other_i r_partner_i, each (n,)."""
+    """Inverse of diagonal and 2 x 2 blocks, each (n,).
+
+    u_i = own_i r_i + both_i (r_i + r_partner_i).
+    """
 
     partner: cla.Array
-    same: cla.Array
-    other: cla.Array
+    own: cla.Array
+    both: cla.Array
 
 
 class Room:
@@ -93,9 +97,10 @@ class Room:
 class Coarsening:
     """Makes a graph a few times smaller by two passes of matching.
 
-    In a pass each cell looks at its heaviest free neighbour, and two that look at each other are
-    joined; after `ROUNDS` rounds the rest joins its heaviest neighbour's pair. Two passes make
-    groups of between four and five.
+    In a pass each cell looks at the free neighbour it is tied to most, and two that look at each
+    other are joined; after `ROUNDS` rounds the rest joins the pair it is tied to most. A tie is
+    w (1/d_i + 1/d_j), d the sums of weights: what counts is the share of a cell's weights, as on
+    meshes with a density all heavy neighbours lie one way. Two passes make groups of four to five.
 
     Parameters
     ----------
@@ -113,10 +118,17 @@ class Coarsening:
         self.engine.run(kernel, whole_groups(size), *args)
 
     def convert(self, graph: Graph, level: int) -> Graph:
-        """Return `graph` with its weights in this engine's precision."""
+        """Return `graph` with its weights in this engine's precision, times a power of two.
+
+        The largest becomes 1 at most, so that weights of any unit and their inverses are in range.
+        """
         m = len(graph.weights)
-        weights = self._room(level, "weights", size=m)
-        self._run(self._kernels.convert, m, np.int32(m), graph.weights, weights)
+        size, weights = np.int32(m), self._room(level, "weights", size=m)
+        partial = cla.empty(self.engine.queue, 16 * GROUP, graph.weights.dtype)
+        self.engine.run(self._kernels.largest, len(partial), size, graph.weights, partial)
+        most = float(partial.get().max())
+        exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
+        self._run(self._kernels.convert, m, size, np.int32(exponent), graph.weights, weights)
         return Graph(graph.starts, graph.columns, weights)
 
     def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Groups, Graph]:
@@ -136,14 +148,24 @@ class Coarsening:
         """Return the smoother's blocks alone, for the coarsest graph."""
         n, room = len(graph), self._room
         mate = room("mate", size=n, dtype=np.int32).fill(-1)
-        self._round(graph, mate, room("choice", size=n, dtype=np.int32))
+        self._round(graph, self._sums(graph), mate, room("choice", size=n, dtype=np.int32))
         return self._pair_inverse(graph, mate, level)
 
-    def _round(self, graph: Graph, mate: cla.Array, choice: cla.Array) -> None:
+    def _sums(self, graph: Graph) -> cla.Array:
+        """Inverse sums of the rows' weights."""
+        n = len(graph)
+        sums = self._room("inverse sums", size=n)
+        self._run(
+            self._kernels.inverse_sums, n, np.int32(n), graph.starts, graph.columns, graph.weights,
+            sums,
+        )  # fmt: skip
+        return sums
+
+    def _round(self, graph: Graph, sums: cla.Array, mate: cla.Array, choice: cla.Array) -> None:
         run, k, n = self._run, self._kernels, len(graph)
         size = np.int32(n)
         run(
-            k.propose, n, size, np.int32(0), graph.starts, graph.columns, graph.weights, mate,
+            k.propose, n, size, np.int32(0), graph.starts, graph.columns, graph.weights, sums, mate,
             choice,
         )  # fmt: skip
         run(k.marry, n, size, choice, mate)
@@ -152,12 +174,12 @@ class Coarsening:
         n, room = len(graph), self._room
         pairs = PairInverse(
             room(level, "partner", size=n, dtype=np.int32),
-            room(level, "same", size=n),
-            room(level, "other", size=n),
+            room(level, "own", size=n),
+            room(level, "both", size=n),
         )
         self._run(
             self._kernels.pair_inverse, n, np.int32(n), graph.starts, graph.columns, graph.weights,
-            mate, pairs.partner, pairs.same, pairs.other,
+            mate, pairs.partner, pairs.own, pairs.both,
         )  # fmt: skip
         return pairs
 
@@ -171,13 +193,13 @@ class Coarsening:
 
         mate, choice = ints("mate", count=n), ints("choice", count=n)
         mate.fill(-1)
-        inverse = None
+        inverse, sums = None, self._sums(graph)
         for turn in range(ROUNDS):
-            self._round(graph, mate, choice)
+            self._round(graph, sums, mate, choice)
             if turn == 0 and pairs:
                 inverse = self._pair_inverse(graph, mate, name[0])
         rows = (graph.starts, graph.columns, graph.weights)
-        run(k.propose, n, size, one, *rows, mate, choice)
+        run(k.propose, n, size, one, *rows, sums, mate, choice)
 
         root, numbers = ints("root", count=n), ints("numbers", count=n + 1)
         run(k.join, n, size, mate, choice, root, numbers)

@@ -35,7 +35,8 @@ class Solution:
         Whether `residual` is within the tolerance.
     reason : str
         ``"converged"``, ``"zero right side"``, ``"stagnated"`` (the precision allows no less) or
-        ``"max_iterations"``.
+        ``"max_iterations"``; followed by ``" (Jacobi after ...)"`` where the preconditioner asked
+        for was given up on the way. Iterations and residuals are then those of both.
     """
 
     iterations: int
@@ -43,6 +44,20 @@ class Solution:
     residuals: np.ndarray
     converged: bool
     reason: str
+
+
+class BreakdownError(SolverError):
+    """The operator or the preconditioner was found not to be positive definite, or not finite.
+
+    Attributes
+    ----------
+    residuals : (iterations + 1,) float64
+        As in `Solution`. The iterate is that of the last good iteration.
+    """
+
+    def __init__(self, message: str, residuals: list[float]) -> None:
+        super().__init__(message)
+        self.residuals = np.array(residuals)
 
 
 class ConjugateGradient:
@@ -107,7 +122,9 @@ class ConjugateGradient:
         Raises
         ------
         SolverError
-            If a number is not finite, or the operator or preconditioner is not positive definite.
+            If a number of the right side, start or operator is not finite.
+        BreakdownError
+            If the operator or preconditioner is not positive definite: a SolverError, too.
         """
         n = len(rhs)
         self._reserve(n, max_iterations)
@@ -215,7 +232,7 @@ class ConjugateGradient:
             for k, row in enumerate(rows, start=done):
                 residual = math.sqrt(row[_NORM] / self._norm_b)
                 if row[_RUNNING] == 0 or not row[_CURVATURE] > 0:
-                    self._judge(k, row, residual, tolerance)
+                    self._judge(k, row, residual, tolerance, history)
                     return k
                 history.append(residual)
             done = end
@@ -224,7 +241,9 @@ class ConjugateGradient:
             ahead = int(min(max(left, 2), lookahead))
         return done
 
-    def _judge(self, k: int, row: np.ndarray, residual: float, tolerance: float) -> None:
+    def _judge(
+        self, k: int, row: np.ndarray, residual: float, tolerance: float, history: list[float]
+    ) -> None:
         """Tell a stop at the tolerance, or at the precision's limit, from a breakdown at k."""
         if residual <= tolerance:
             return
@@ -232,11 +251,12 @@ class ConjugateGradient:
         if k > 0 and residual < 1e-3:
             return
         curvature = row[_CURVATURE] if row[_RUNNING] else math.nan
-        raise SolverError(
+        raise BreakdownError(
             f"conjugate gradients broke down at iteration {k}: (r, M^-1 r) = {row[1]:.3g}, "
             f"curvature (p, A p) = {curvature:.3g}, relative residual {residual:.3g}; the first "
             "two must be positive and finite: the operator or its preconditioner is not "
-            "positive definite"
+            "positive definite",
+            [*history, residual],
         )
 
     def _reserve(self, n: int, max_iterations: int) -> None:

@@ -15,8 +15,6 @@ from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, Room, who
 
 _COARSEST = 64
 _MOST_LEVELS = 30
-_TWICE = (2,)
-"""Levels visited twice by a cycle: the third costs little and keeps the count from growing."""
 # Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as damping factors of two steps. What lies
 # below is left to the coarse levels.
 _LOWEST = 0.35
@@ -49,10 +47,16 @@ class _Bound:
 class Multigrid:
     """Aggregation multigrid cycle as a preconditioner: symmetric positive definite, deterministic.
 
-    Groups of four to five cells joined by heavy weights (see `Coarsening`), constant interpolation,
+    Groups of four to five cells that are tied together (see `Coarsening`), constant interpolation,
     coarse weights scaled by the ratio of lengths, pairwise-Jacobi Chebyshev smoothing of degree 2,
-    an inverse matrix on the coarsest level of at most 64 groups. It works in float32, whatever the
+    elimination on the coarsest level of at most 64 groups. It works in float32, whatever the
     engine's precision: half the memory to read, and the outer iteration sets the accuracy.
+
+    With S the smoother's polynomial and C a level's coarse correction, a cycle is
+    M^-1 = 2 S - S A S + (1 - S A) C (1 - A S), positive definite for whatever weights: S A has its
+    eigenvalues within [0, 1], and it does not matter by how much C, positive semidefinite itself,
+    overshoots. This does not hold for a level visited twice, 2 C - C A C: coarse weights scaled
+    down make C A exceed 2 where weights vary much. Hence the V-cycle.
 
     Parameters
     ----------
@@ -69,7 +73,7 @@ class Multigrid:
         self._programme: tuple[cla.Array, cla.Array, list[_Bound]] | None = None
         self._room = Room(self._single)
         self._levels: list[_Level] = []
-        self._inverse: cla.Array | None = None
+        self._factor: cla.Array | None = None
 
     @property
     def sizes(self) -> list[int]:
@@ -87,14 +91,14 @@ class Multigrid:
             Symmetric, >= 0. The arrays must not change until the last use.
         """
         graph = self._coarsening.convert(Graph(starts, columns, weights), 0)
-        self._levels, self._inverse = [], None
+        self._levels, self._factor = [], None
         while True:
             depth, n = len(self._levels), len(graph)
             vectors = [self._room(depth, name, size=n) for name in "bxt"]
             if n <= _COARSEST:
                 pairs = self._coarsening.pairs(graph, depth)
                 self._levels.append(_Level(graph, pairs, None, *vectors))
-                self._invert(graph)
+                self._eliminate(graph)
                 break
             pairs, groups, coarse = self._coarsening.coarsen(graph, depth)
             if len(groups) > 0.8 * n or depth == _MOST_LEVELS:
@@ -105,13 +109,13 @@ class Multigrid:
             graph = coarse
         self._programme = None
 
-    def _invert(self, graph: Graph) -> None:
+    def _eliminate(self, graph: Graph) -> None:
         n = len(graph)
-        self._inverse = self._room("inverse", size=n * n)
-        kernel = self._kernels.invert
+        self._factor = self._room("factor", size=(2 * n + 1) * n)
+        kernel = self._kernels.eliminate
         kernel.set_args(
             np.int32(n), graph.starts.data, graph.columns.data, graph.weights.data,
-            self._inverse.data,
+            self._factor.data,
         )  # fmt: skip
         group = (self._single.group_size,)
         cl.enqueue_nd_range_kernel(self.engine.queue, kernel, group, group)
@@ -141,23 +145,21 @@ class Multigrid:
                 bound[key] = _Bound(self._single, kernel, size, np.int32(size), *args)
             launches.append(bound[key])
 
-        def visit(depth: int, again: bool = False) -> None:
-            """Improve x of a level: from zero, or again from where it is."""
+        def visit(depth: int) -> None:
+            """Set x of a level, from its b."""
             level = self._levels[depth]
             n, b, x, t = len(level.graph), level.b, level.x, level.t
-            blocks = (level.pairs.partner, level.pairs.same, level.pairs.other)
+            blocks = (level.pairs.partner, level.pairs.own, level.pairs.both)
             if depth == 0:
                 bind(0, "first_rounded", n, late, *blocks, r, b, x)
-            if level.groups is None and self._inverse is not None:
-                bind(depth, "solve_dense", n, self._inverse, b, x)
+            if level.groups is None and self._factor is not None:
+                bind(depth, "solve_down", n, self._factor, b, t)
+                bind(depth, "solve_up", n, self._factor, t, x)
                 if depth == 0:
                     bind(0, "correct_out", n, np.float32(0), *blocks, b, x, u)
                 return
             rows = (level.graph.starts, level.graph.columns, level.graph.weights)
-            if again:
-                bind(depth, "defect", n, *rows, b, x, t)
-                bind(depth, "correct", n, late, *blocks, t, x, variant=1)
-            elif depth > 0:
+            if depth > 0:
                 bind(depth, "first", n, late, *blocks, b, x)
             bind(depth, "defect", n, *rows, b, x, t)
             bind(depth, "correct", n, early, *blocks, t, x)
@@ -167,8 +169,6 @@ class Multigrid:
                 lists = (groups.starts, groups.members)
                 bind(depth, "restrict_sum", len(groups), *lists, t, coarse.b)
                 visit(depth + 1)
-                if depth + 1 in _TWICE and coarse.groups is not None:
-                    visit(depth + 1, again=True)
                 bind(depth, "prolong", n, groups.group, coarse.x, x)
             bind(depth, "defect", n, *rows, b, x, t)
             bind(depth, "correct", n, early, *blocks, t, x)

@@ -1,4 +1,4 @@
-"""The metric correction's Poisson equation on the neighbour graph, the paper's (2.7) to (2.9)."""
+"""The metric correction's Poisson equation on the neighbour graph, the paper's (3.2)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,24 @@ import pyopencl.array as cla
 from ._program import Engine
 from .coarsening import Room
 from .errors import InputError
-from .krylov import CURVATURE, ConjugateGradient, Launch, Solution
+from .krylov import CURVATURE, BreakdownError, ConjugateGradient, Launch, Solution
 from .multigrid import Multigrid
 
+_MOST_CYCLES = 200
 _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
-_MULTIGRID_FROM = 2000
-"""Cells from which on the multigrid's set-up pays (measured with PoCL on two cores)."""
+
+
+def expected_costs(n: int, dim: int, tolerance: float) -> tuple[float, float]:
+    """Return the expected cost of a solve with Jacobi's method and with multigrid, its set-up included.
+
+    In milliseconds of processor time with PoCL on two cores, from fits to random and adapted
+    meshes of 500 to 10^6 cells; on other devices the parts (enqueueing, cells) are larger or
+    smaller alike. Jacobi's iterations grow with the mesh's width in cells, multigrid's do not.
+    """
+    digits, thousands = max(-math.log10(tolerance), 0.0), n / 1000
+    jacobi = n ** (1 / dim) * (1.2 + 0.7 * digits) * (0.04 + 0.0085 * thousands)
+    multigrid = 6 + 0.5 * thousands + (2 + 1.8 * digits) * (0.3 + 0.05 * thousands)
+    return jacobi, multigrid
 
 
 @dataclass(frozen=True)
@@ -143,7 +155,7 @@ class Poisson:
         max_iterations: int | None = None,
         preconditioner: str = "auto",
     ) -> Solution:
-        """Solve A phi = b, the paper's (2.9); phi has mean zero.
+        """Solve A phi = b, the paper's (3.2) integrated over the cells; phi has mean zero.
 
         Parameters
         ----------
@@ -157,8 +169,12 @@ class Poisson:
             smooth right side: the solve then ends as ``"stagnated"``, with the residual reached.
         max_iterations : int, optional
         preconditioner : ``"auto"``, ``"jacobi"`` or ``"multigrid"``
-            Multigrid leaves 15 to 20 iterations whatever the size; its set-up costs about as much
-            as five of them. ``"auto"`` takes it from 2000 cells on.
+            Multigrid leaves 15 to 22 iterations whatever the size; its set-up costs about as much
+            as ten of them. ``"auto"`` takes what is expected to cost less (`expected_costs`):
+            multigrid from about 2000 cells on at a tolerance of 1e-8, from 6000 at 1e-2. Should
+            multigrid break down, stagnate early, or not converge in 200 iterations where
+            `max_iterations` is not given, Jacobi's method takes over from there;
+            `Solution.reason` says so.
 
         Returns
         -------
@@ -169,7 +185,7 @@ class Poisson:
         InputError
             If an argument has the wrong size or value.
         SolverError
-            If the iteration breaks down.
+            If a number is not finite, or the iteration breaks down with Jacobi's method.
         """
         n = len(laplacian)
         _check("rhs", rhs, (n,))
@@ -180,21 +196,53 @@ class Poisson:
             )
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        if preconditioner == "multigrid" or (preconditioner == "auto" and n >= _MULTIGRID_FROM):
-            multigrid = self.set_up_multigrid(laplacian)
-            precondition, lookahead, most = multigrid.apply, 4, 200
-        else:
-            precondition, lookahead, most = laplacian.inverse_diagonal, 64, 500 + 30 * math.isqrt(n)
-        return self._krylov.solve(
-            self._operator(laplacian),
-            rhs,
-            potential,
-            precondition=precondition,
-            tolerance=tolerance,
-            max_iterations=most if max_iterations is None else max_iterations,
-            fused=True,
-            centre=True,
-            lookahead=lookahead,
+        operator = self._operator(laplacian)
+
+        def run(precondition: object, most: int, lookahead: int) -> Solution:
+            return self._krylov.solve(
+                operator,
+                rhs,
+                potential,
+                precondition=precondition,
+                tolerance=tolerance,
+                max_iterations=most,
+                fused=True,
+                centre=True,
+                lookahead=lookahead,
+            )
+
+        default = 500 + 30 * math.isqrt(n)
+        if preconditioner == "auto":
+            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance)
+            preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
+        if preconditioner == "jacobi":
+            most = default if max_iterations is None else max_iterations
+            return run(laplacian.inverse_diagonal, most, 64)
+        try:
+            most = _MOST_CYCLES if max_iterations is None else max_iterations
+            first = run(self.set_up_multigrid(laplacian).apply, most, 4)
+            # Far above what the precision allows it is the preconditioner, in float32, that is stuck.
+            stuck = self.engine.real == np.float64 and first.residual > 1e-8
+            if first.reason == "stagnated" and stuck:
+                cause = "multigrid stagnated"
+            elif first.reason == "max_iterations" and max_iterations is None:
+                cause = f"{most} iterations with multigrid"
+            else:
+                return first
+            residuals = first.residuals
+        except BreakdownError as breakdown:
+            residuals, cause = breakdown.residuals, "multigrid broke down"
+        if not residuals[-1] <= 1:
+            potential.fill(0)
+        done = len(residuals) - 1
+        most = default if max_iterations is None else max(max_iterations - done, 0)
+        second = run(laplacian.inverse_diagonal, most, 64)
+        return Solution(
+            done + second.iterations,
+            second.residual,
+            np.concatenate([residuals[:-1], second.residuals]),
+            second.converged,
+            f"{second.reason} (Jacobi after {cause})",
         )
 
     def _operator(self, laplacian: Laplacian) -> Callable[[cla.Array, cla.Array], None]:
