@@ -139,10 +139,13 @@ class ProjectedMethod:
         Of CG in each projection.
     k : float
         Bound of the displacement over h.
-    emphasis : float
-        Weight of bad cells in the shape descent.
+    emphasis, rate : float
+        Weight of bad cells in the shape descent, and its step; see `Shape`.
     aim : float
         Mean |log(L / h)| that `eps` is steered to; 0 leaves it.
+    keep_mean : bool
+        Also correct the mean of the excess, by moving generators to where h is larger or smaller. Only for a mean that is
+        small: the count is what should correct it.
     sampled_gradient : bool
         Take grad log h from the field itself, by differences over a fifth of a cell, not from the neighbours' h: at a
         kink of h the neighbours' fit can keep the exact projection from converging.
@@ -157,8 +160,10 @@ class ProjectedMethod:
     iterations: int = 30
     k: float = 0.4
     emphasis: float = 20.0
+    rate: float = 0.1
     aim: float = 0.0
     sampled_gradient: bool = False
+    keep_mean: bool = False
     steps: int = 0
 
     def displace(self, mesh: Mesh) -> Solution:
@@ -174,10 +179,13 @@ class ProjectedMethod:
             mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, mesh.source, w.gradient)
         mesh.lloyd = w.lloyd
         if self.descent == "shape":
-            stages.shape.descend(t, mesh.reach, mesh.quality, mesh.lloyd, emphasis=self.emphasis)
+            stages.shape.descend(
+                t, mesh.reach, mesh.quality, mesh.lloyd, emphasis=self.emphasis, rate=self.rate
+            )
         stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
         stages.motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        stages.density.remove_mean(w)
+        if not self.keep_mean:
+            stages.density.remove_mean(w)
         solution = stages.projection.project(
             t, mesh.reach, w.gradient, w.excess, mesh.lloyd, mesh.correction, mesh.quality,
             eps=self.eps, lenience=self.lenience, bound=self.bound,

@@ -43,6 +43,9 @@ class Effort:
         Of the gliding.
     nuclei : float
         Share of the cells where pairs may be made, every third sweep.
+    emphasis, lenience, bound : float
+        Of the polishing: weight of bad cells; -log Q from which on a cell may be off its size for its shape; and excess,
+        over the mean that is aimed at, from which on it may not.
     """
 
     start: int
@@ -56,21 +59,20 @@ class Effort:
     momentum: float = 0.7
     eps: float = 0.3
     nuclei: float = 0.0
+    emphasis: float = 20.0
+    lenience: float = 0.03
+    bound: float = 12.0
 
 
 EFFORTS = {
     "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0),
     "default": Effort(60, 5, 3, (4, 18, 20, 20), glide=7, polish=18, aim=0.0017),
     "best": Effort(
-        60, 5, 10, (60, 40, 30, 30), glide=7, polish=40, aim=0.0037, relaxation=1.5, momentum=0.8,
-        eps=0.7, nuclei=0.0018,
+        60, 5, 10, (60, 40, 30, 30), glide=7, polish=60, aim=0.0038, relaxation=1.5, momentum=0.8,
+        eps=0.7, nuclei=0.0018, emphasis=60.0, lenience=0.02, bound=16.0,
     ),
 }  # fmt: skip
 
-LENIENCE = 0.03
-"""-log Q from which on a cell may be off its size for its shape."""
-BOUND = 12.0
-"""Excess, over the mean that is aimed at, from which on it may not."""
 COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
@@ -162,8 +164,9 @@ def _adaptive(
     yield Settle()
     yield Rest()
     polish = ProjectedMethod(
-        "shape", eps=effort.eps, lenience=LENIENCE, bound=BOUND * aim, k=0.3, aim=aim
-    )
+        "shape", eps=effort.eps, lenience=effort.lenience, bound=effort.bound * aim, k=0.3, aim=aim,
+        emphasis=effort.emphasis,
+    )  # fmt: skip
     for step in range(effort.polish):
         if step == 3:
             yield Reorganise(theta=COUNT_THETA)
@@ -171,8 +174,9 @@ def _adaptive(
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
-            "shape", eps=1e-3, iterations=EXACT_ITERATIONS, k=0.3, sampled_gradient=True
-        )
+            "shape", eps=1e-3, iterations=EXACT_ITERATIONS, k=0.3, sampled_gradient=True,
+            keep_mean=True,
+        )  # fmt: skip
         # The last two only project: Newton's steps on the sizes.
         newton = replace(project, relaxation=0.0, momentum=0.0)
         yield from [Step(project)] * (EXACT_STEPS - 2)
