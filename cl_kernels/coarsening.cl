@@ -3,16 +3,16 @@
 
    Everything is decided by each cell or group for itself from the last kernel's result, so there is one outcome. */
 #include "common/real.h"
+#include "common/blocks.h"
 
 #define NONE (-1)
 
-/* The largest weight, one partial value per group of work-items. */
+/* The largest weight, one partial value per work-item. */
 kernel void largest(int m, global const SOURCE *weights, global SOURCE *partial)
 {
-    const int me = get_global_id(0), all = get_global_size(0);
     SOURCE most = 0;
-    for (int k = me; k < m; k += all) most = fmax(most, weights[k]);
-    partial[me] = most;
+    for (BLOCK_LOOP(k, m)) most = fmax(most, weights[k]);
+    partial[get_global_id(0)] = most;
 }
 
 /* Weights times 2^exponent in the multigrid's precision, whose range may be less than the operator's. */

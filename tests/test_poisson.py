@@ -11,7 +11,7 @@ from clvoro import create_context
 from clvoro._program import Engine
 from clvoro.errors import InputError, SolverError
 from clvoro.krylov import ConjugateGradient
-from clvoro.poisson import Poisson
+from clvoro.poisson import Poisson, expected_costs
 
 REALS = [np.float64, np.float32]
 
@@ -222,6 +222,23 @@ def test_one_and_two_cells(make, real):
     assert solution.converged
     # w = 1 / 0.5, so 2 (phi_0 - phi_1) = 1.
     assert np.allclose(phi.get(), [0.25, -0.25], rtol=1e-6)
+
+
+def test_auto_takes_what_costs_less(make):
+    """Jacobi on few cells; from some thousand on, sooner for more digits, multigrid."""
+    for dim in (2, 3):
+        for tolerance in (1e-1, 1e-2, 1e-5, 1e-8):
+            costs = [expected_costs(n, dim, tolerance) for n in (200, 10**5, 10**7)]
+            assert [jacobi < multigrid for jacobi, multigrid in costs] == [True, False, False]
+    assert np.argmin(expected_costs(3000, 2, 1e-1)) == 0
+    assert np.argmin(expected_costs(3000, 2, 1e-8)) == 1
+    for n, jacobi in ((600, True), (8000, False)):
+        engine = make()
+        poisson, laplacian = assembled(engine, graphs.random_graph(n, seed=14))
+        b = engine.upload(np.random.default_rng(15).standard_normal(n))
+        solution = poisson.solve(laplacian, b, engine.zeros(n), tolerance=1e-2)
+        assert solution.reason == "converged"
+        assert (solution.iterations > 20) == jacobi
 
 
 def test_warm_start(make):
