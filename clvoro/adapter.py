@@ -264,7 +264,7 @@ class Adapter:
             unsorted = engine.upload((host - origin) / scale)
             mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
         tol = None if planned else options["tol"]
-        loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
+        loop = Loop(mesh, plan, levels, target, options["max_steps"], tol, callback)
         settings = {**options, "levels": levels, "dtype": self.dtype.name}
         if points is not None:
             settings["start"] = "points"

@@ -27,6 +27,8 @@ class Loop:
     plan : list of Action
     levels : int
         Coarser levels that the plan begins with.
+    expected : float
+        Cells that the finest level should have.
     max_steps : int or None
     tol : float or None
         Share by which error or quality must improve over a window of steps; 0 takes all steps. None: the plan ends where
@@ -40,12 +42,13 @@ class Loop:
         mesh: Mesh,
         plan: list[Action],
         levels: int,
+        expected: float,
         max_steps: int | None,
         tol: float | None,
         callback: Callable[[np.void], object] | None,
     ) -> None:
         self.mesh, self.plan, self.level = mesh, plan, levels
-        self.n_start = mesh.n
+        self.n_start, self.expected = mesh.n, expected
         self.done = work_of(plan, levels, mesh.engine.dim)
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.rows: list[np.ndarray] = []
@@ -74,7 +77,7 @@ class Loop:
                 elif isinstance(action, Reorganise):
                     self.reorganise(action)
                 elif isinstance(action, Settle):
-                    self.settle()
+                    self.settle(action.share)
                 elif isinstance(action, Refine):
                     self.refine()
                 elif isinstance(action, Rest):
@@ -125,17 +128,21 @@ class Loop:
         self.inserted += inserted
         self.deleted += deleted
 
-    def settle(self) -> None:
-        """Bring the count to the one that is held, to the last cell."""
-        if self.held is None:
+    def settle(self, share: float = 0.0) -> None:
+        """Bring the count to within `share` of what the level should have; without it, to the one that is held."""
+        target = self.held
+        if share:
+            target = max(1, round(self.expected / 2.0 ** (self.mesh.engine.dim * self.level)))
+        if target is None:
             return
-        while self.mesh.n != self.held:
-            inserted, deleted = self.mesh.reorganise(0, self.held, climb=False)
+        while abs(self.mesh.n - target) > share * target:
+            inserted, deleted = self.mesh.reorganise(0, target, climb=False)
             self.inserted += inserted
             self.deleted += deleted
-            if inserted == deleted == 0:
+            if inserted == deleted:
                 break
-        self.mesh.match_size()
+        if self.held is not None:
+            self.mesh.match_size()
 
     def refine(self) -> None:
         """Go to the next finer level."""

@@ -93,6 +93,8 @@ class WeightedMethod:
     k: float = 0.5
     poisson: bool = True
     tolerance: float = 1e-2
+    cautious: bool = False
+    """Clip to k min(L, h): where a coarse target has only just come upon small cells, h is too far to go."""
 
     def displace(self, mesh: Mesh) -> Solution:
         """Evaluate the weighted Lloyd displacement and the correction."""
@@ -114,7 +116,7 @@ class WeightedMethod:
         """Apply both, at most k h."""
         mesh.stages.motion.move_generators(
             mesh.domain, mesh.points, mesh.lloyd, 1.0, mesh.correction, float(self.poisson),
-            mesh.reach, mesh.velocity, clip=self.k,
+            mesh.reach if self.cautious else mesh.h, mesh.velocity, clip=self.k,
         )  # fmt: skip
 
 

@@ -105,7 +105,9 @@ class Rest:
 
 @dataclass(frozen=True)
 class Settle:
-    """Bring the count to the one that was asked for."""
+    """Bring the count to the one that was asked for or, with `share`, to within that share of what is expected."""
+
+    share: float = 0.0
 
 
 Action = Step | Reorganise | Refine | Rest | Settle
@@ -142,6 +144,8 @@ def _adaptive(
     effort: Effort, levels: int, exact: bool, aim: float, warm: bool
 ) -> Iterator[Action]:
     glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
+    if warm:
+        yield Settle(share=0.05)
     for level in range(levels, -1, -1):
         if level < levels:
             yield Refine()
@@ -150,7 +154,7 @@ def _adaptive(
             couple = effort.couple_finest
         else:
             couple = effort.start if level else effort.start // 2
-        yield from [Step(WeightedMethod())] * couple
+        yield from [Step(WeightedMethod(cautious=True))] * couple
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
         if levels == 0:
             # The only level has no coarser one to have done the work.

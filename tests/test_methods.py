@@ -114,14 +114,16 @@ def test_weighted_displacements(stages):
     assert np.array_equal(mesh.lloyd.get(), w.lloyd.get())
 
 
+@pytest.mark.parametrize("cautious", [True, False])
 @pytest.mark.parametrize("poisson", [True, False])
-def test_weighted_moves_at_most_k(stages, poisson):
-    """Each generator is clipped on its own, at k times the lesser of h and L."""
+def test_weighted_moves_at_most_k(stages, poisson, cautious):
+    """Each generator is clipped on its own, at k h or, if cautious, at k times the lesser of h and L."""
     mesh, host = make_mesh(stages, patch.random_points(N, 11))
-    method = WeightedMethod(k=0.25, poisson=poisson)
+    method = WeightedMethod(k=0.25, poisson=poisson, cautious=cautious)
     method.displace(mesh)
     d = mesh.lloyd.get() + poisson * mesh.correction.get()
-    longest = 0.25 * np.minimum(FIELD(host.points), np.sqrt(host.volumes))
+    h = FIELD(host.points)
+    longest = 0.25 * (np.minimum(h, np.sqrt(host.volumes)) if cautious else h)
     length = np.linalg.norm(d, axis=1)
     assert 3 < (length > longest).sum() < N
     expected = host.points + d * np.minimum(1, longest / length)[:, None]
