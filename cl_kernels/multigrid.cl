@@ -79,7 +79,7 @@ kernel void prolong(int n, global const int *group, global const REAL *e, global
    turn. As d is summed anew from the weights, nothing is ever subtracted, and Z and D are right to the last digits whatever
    the weights are. A cell without anyone left (the last one, or the last of a part on its own) has 1 / d = 0.
 
-   factor: Z (n, n), then the weights left (n, n), then 1 / d (n). */
+   factor: Z (n, n), then the weights left (n, n), then 1 / d (n), then the means of Z's rows (n). */
 kernel void eliminate(
     int n, global const int *starts, global const int *columns, global const REAL *weights, global REAL *factor)
 {
@@ -108,16 +108,24 @@ kernel void eliminate(
         }
         barrier(CLK_GLOBAL_MEM_FENCE);
     }
+    for (int i = me; i < n; i += GROUP_SIZE) {
+        REAL sum = 0;
+        for (int k = 0; k <= i; ++k) sum += z[i * n + k];
+        inverse[n + i] = sum / n;
+    }
 }
 
-/* t = D^-1 Z b, then x = Z^T t: the coarsest level. Such a product is positive semidefinite whatever is rounded in it, as
-   an inverse matrix in one piece is not. */
+/* t = D^-1 Z (b - mean b), then x = Z^T t less its mean: the coarsest level. Such a product is positive semidefinite
+   whatever is rounded in it, as an inverse matrix in one piece is not. Without the means the last cell would be the one at
+   zero, and the constant by which all others differ from it leave its roundings in the scalar products of the iteration. */
 kernel void solve_down(int n, global const REAL *factor, global const REAL *b, global REAL *t)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
-    REAL sum = 0;
-    for (int k = 0; k <= i; ++k) sum += factor[i * n + k] * b[k];
+    REAL mean = 0, sum = 0;
+    for (int k = 0; k < n; ++k) mean += b[k];
+    mean /= n;
+    for (int k = 0; k <= i; ++k) sum += factor[i * n + k] * (b[k] - mean);
     t[i] = sum * factor[2 * n * n + i];
 }
 
@@ -125,7 +133,9 @@ kernel void solve_up(int n, global const REAL *factor, global const REAL *t, glo
 {
     const int k = get_global_id(0);
     if (k >= n) return;
-    REAL sum = 0;
+    global const REAL *means = factor + 2 * n * n + n;
+    REAL sum = 0, mean = 0;
+    for (int i = 0; i < n; ++i) mean += means[i] * t[i];
     for (int i = k; i < n; ++i) sum += factor[i * n + k] * t[i];
-    x[k] = sum;
+    x[k] = sum - mean;
 }

@@ -111,7 +111,7 @@ class Multigrid:
 
     def _eliminate(self, graph: Graph) -> None:
         n = len(graph)
-        self._factor = self._room("factor", size=(2 * n + 1) * n)
+        self._factor = self._room("factor", size=(2 * n + 2) * n)
         kernel = self._kernels.eliminate
         kernel.set_args(
             np.int32(n), graph.starts.data, graph.columns.data, graph.weights.data,

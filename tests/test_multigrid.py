@@ -142,10 +142,11 @@ def reference_cycle(multigrid, depth, b):
     n, sparse = len(A), sp.csr_matrix(A)
     partner, own, both = (a.get() for a in (level.pairs.partner, level.pairs.own, level.pairs.both))
     if level.groups is None:
-        # All but the last value, which is set to zero.
+        # The mean is taken away from both sides; in between the last value is zero.
         x = np.zeros(b.shape)
+        b = b - b.mean(axis=0)
         x[:-1] = np.linalg.solve(A[:-1, :-1], b[:-1]) if n > 1 else 0
-        return x
+        return x - x.mean(axis=0)
     cells = np.arange(n)
     S = sp.csr_matrix((both.astype(float), (cells, partner)), (n, n)) + sp.diags(
         own + np.where(partner == cells, 0, both.astype(float))
