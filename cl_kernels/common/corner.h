@@ -1,28 +1,28 @@
 #include "common/real.h"
 
-/* Corner between the faces a and b (in this order) of generator i, relative to x_i. It is computed from the generators
-   in the order of their indices, so that the cells that share the corner agree on it to a rounding. */
+/* The point as far from u and from v as from 0; u2 and v2 are their squares. */
+inline REAL2 circumcentre(REAL2 u, REAL2 v, REAL u2, REAL v2)
+{
+    const REAL inverse = R(0.5) / difference_of_products(u.s0, v.s1, u.s1, v.s0);
+    return (REAL2)(difference_of_products(u2, v.s1, v2, u.s1) * inverse,
+                   difference_of_products(v2, u.s0, u2, v.s0) * inverse);
+}
+
+/* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators themselves: the
+   cells that share the corner agree on it to a rounding. */
 inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower,
                     const REAL *upper)
 {
     if (a >= 0 && b >= 0) {
-        /* Circumcentre of the triangle, relative to the generator o opposite its longest side: then neither the
-           differences nor the squares below cancel, also if two of the three are an ulp apart. */
-        const int r = min(i, min(a, b)), t = max(i, max(a, b)), s = i + a + b - r - t;
-        const REAL2 xr = (REAL2)(points[2 * r], points[2 * r + 1]);
-        const REAL2 xs = (REAL2)(points[2 * s], points[2 * s + 1]);
-        const REAL2 xt = (REAL2)(points[2 * t], points[2 * t + 1]);
-        const REAL rs = dot(xs - xr, xs - xr), rt = dot(xt - xr, xt - xr), st = dot(xt - xs, xt - xs);
-        const bool at_r = st >= rs && st >= rt;
-        const bool at_s = !at_r && rt >= rs;
-        const REAL2 xo = at_r ? xr : (at_s ? xs : xt);
-        const REAL2 u = (at_r ? xs : xr) - xo;
-        const REAL2 v = (at_r || at_s ? xt : xs) - xo;
-        const REAL ox = xo.s0, oy = xo.s1, ux = u.s0, uy = u.s1, vx = v.s0, vy = v.s1;
-        const REAL u2 = dot(u, u), v2 = dot(v, v);
-        const REAL twice = 2 * difference_of_products(ux, vy, uy, vx);
-        return (REAL2)(difference_of_products(u2, vy, v2, uy) / twice + (ox - x[0]),
-                       difference_of_products(v2, ux, u2, vx) / twice + (oy - x[1]));
+        const REAL2 xa = (REAL2)(points[2 * a], points[2 * a + 1]);
+        const REAL2 xb = (REAL2)(points[2 * b], points[2 * b + 1]);
+        const REAL2 u = xa - (REAL2)(x[0], x[1]), v = xb - (REAL2)(x[0], x[1]), w = xb - xa;
+        const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
+        /* The circumcentre of the triangle, relative to x_i; where the other two are near each other its squares would
+           cancel, and it is taken relative to one of those. */
+        if (w2 > R(1e-3) * u2)
+            return circumcentre(u, v, u2, v2);
+        return circumcentre(w, -u, w2, u2) + u;
     }
     if (a < 0 && b < 0) {
         /* Two walls: a corner of the box, one wall across each axis. */
