@@ -7,9 +7,11 @@
 
 #define NONE (-1)
 
-/* The largest weight, one partial value per work-item. */
-kernel void largest(int m, global const SOURCE *weights, global SOURCE *partial)
+/* The largest weight, one partial value per work-item. Arrays may have room behind the last row: what is there counts for
+   nothing. */
+kernel void largest(int n, global const int *starts, global const SOURCE *weights, global SOURCE *partial)
 {
+    const int m = starts[n];
     SOURCE most = 0;
     for (BLOCK_LOOP(k, m)) most = fmax(most, weights[k]);
     partial[get_global_id(0)] = most;

@@ -126,7 +126,8 @@ class Coarsening:
         size, weights = np.int32(m), self._room(level, "weights", size=m)
         items = self.engine.groups * self.engine.group_size
         partial = self._room("largest", size=items, dtype=graph.weights.dtype)
-        self.engine.run_blocks(self._kernels.largest, size, graph.weights, partial)
+        rows = (np.int32(len(graph)), graph.starts)
+        self.engine.run_blocks(self._kernels.largest, *rows, graph.weights, partial)
         most = float(partial.get().max())
         exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
         self._run(self._kernels.convert, m, size, np.int32(exponent), graph.weights, weights)

@@ -429,6 +429,23 @@ def test_repeats_bit_by_bit(make):
     assert np.array_equal(one.residuals, two.residuals)
 
 
+@pytest.mark.parametrize("rest", [np.nan, 1e300])
+def test_what_is_behind_the_last_row_counts_for_nothing(make, rest):
+    engine = make()
+    n = 500
+    starts, columns, weights = upload(engine, random_weights(n, seed=76))
+    r = engine.upload(np.random.default_rng(80).standard_normal(n))
+    u, v = engine.zeros(n), engine.zeros(n)
+    multigrid = Multigrid(engine)
+    multigrid.set_up(starts, columns, weights)
+    multigrid.apply(r, u)
+    columns = engine.upload(np.concatenate([columns.get(), np.full(77, 3)]), np.int32)
+    weights = engine.upload(np.concatenate([weights.get(), np.full(77, rest)]))
+    multigrid.set_up(starts, columns, weights)
+    multigrid.apply(r, v)
+    assert np.array_equal(u.get(), v.get())
+
+
 def test_set_up_again_for_another_graph(make):
     """Room of a larger graph is used again for a smaller one."""
     engine = make()
