@@ -17,37 +17,37 @@ inline REAL squared_distance(global const REAL *points, int i, int j)
     return d2;
 }
 
-/* Per generator i: own[i] = dr_i/dx_i, weights w_ij, and the inverse of the diagonal of J W J^T + eps, W = h^2, which
-   preconditions the solve. */
+/* Per generator i: own[i] = dr_i/dx_i; for each face the derivatives across it, rows[k] = dr_i/dx_j and
+   columns[k] = dr_j/dx_i, in single precision (the operator of an inexact Newton step: memory traffic is its cost, and 1e-7
+   is far below what the step leaves); and the inverse of the diagonal of J W J^T + eps, W = h^2, which preconditions. */
 kernel void assemble_derivative(const int size, global const int *starts, global const int *neighbours,
                                 global const REAL *face_measures, global const REAL *face_centroids,
                                 global const REAL *volumes, global const REAL *points, global const REAL *gradient,
-                                global const REAL *h, global const REAL *eps, global REAL *weights, global REAL *own,
-                                global REAL *inverse_diagonal)
+                                global const REAL *h, global const REAL *eps, global float *rows,
+                                global float *columns, global REAL *own, global REAL *inverse_diagonal)
 {
     WORK_ITEM(i);
     REAL self[DIM];
     for (int a = 0; a < DIM; ++a)
         self[a] = 0;
     REAL diagonal = 0;
+    const REAL volume = volumes[i];
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
-        REAL w = 0;
-        if (j >= 0) {
-            w = face_measures[k] / sqrt(squared_distance(points, i, j));
-            REAL square = 0;
-            for (int a = 0; a < DIM; ++a) {
-                const REAL m = face_centroids[DIM * k + a];
-                const REAL other = points[DIM * j + a] - points[DIM * i + a] - m;
-                square += other * other;
-                self[a] += w * m;
-            }
-            diagonal += w * w * square * h[j] * h[j];
+        if (j < 0)
+            continue;
+        const REAL w = face_measures[k] / sqrt(squared_distance(points, i, j));
+        REAL square = 0;
+        for (int a = 0; a < DIM; ++a) {
+            const REAL m = face_centroids[DIM * k + a];
+            const REAL other = w * (points[DIM * j + a] - points[DIM * i + a] - m) / volume;
+            square += other * other;
+            self[a] += w * m;
+            rows[DIM * k + a] = (float)other;
+            columns[DIM * k + a] = (float)(-w * m / volumes[j]);
         }
-        weights[k] = w;
+        diagonal += square * h[j] * h[j];
     }
-    const REAL volume = volumes[i];
-    diagonal /= volume * volume;
     REAL square = 0;
     for (int a = 0; a < DIM; ++a) {
         const REAL s = self[a] / volume - DIM * gradient[DIM * i + a];
@@ -57,10 +57,10 @@ kernel void assemble_derivative(const int size, global const int *starts, global
     inverse_diagonal[i] = 1 / (diagonal + square * h[i] * h[i] + eps[i]);
 }
 
-/* Per generator i: u = W J^T y, u_i = h_i^2 (own_i y_i - sum_j w_ij m_ij y_j / V_j). */
-kernel void apply_transpose(const int size, global const int *starts, global const int *neighbours, global const REAL *weights,
-                            global const REAL *face_centroids, global const REAL *volumes, global const REAL *own,
-                            global const REAL *h, global const REAL *y, global REAL *u)
+/* Per generator i: u = W J^T y, u_i = h_i^2 (own_i y_i + sum_j dr_j/dx_i y_j). */
+kernel void apply_transpose(const int size, global const int *starts, global const int *neighbours,
+                            global const float *columns, global const REAL *own, global const REAL *h,
+                            global const REAL *y, global REAL *u)
 {
     WORK_ITEM(i);
     REAL sum[DIM];
@@ -70,35 +70,31 @@ kernel void apply_transpose(const int size, global const int *starts, global con
         const int j = neighbours[k];
         if (j < 0)
             continue;
-        const REAL f = weights[k] * y[j] / volumes[j];
+        const REAL yj = y[j];
         for (int a = 0; a < DIM; ++a)
-            sum[a] -= f * face_centroids[DIM * k + a];
+            sum[a] += columns[DIM * k + a] * yj;
     }
     for (int a = 0; a < DIM; ++a)
         u[DIM * i + a] = h[i] * h[i] * sum[a];
 }
 
 /* Per generator i: out = J u + eps y. */
-kernel void apply_derivative(const int size, global const int *starts, global const int *neighbours, global const REAL *weights,
-                             global const REAL *face_centroids, global const REAL *volumes,
-                             global const REAL *points, global const REAL *own, global const REAL *u,
+kernel void apply_derivative(const int size, global const int *starts, global const int *neighbours,
+                             global const float *rows, global const REAL *own, global const REAL *u,
                              global const REAL *eps, global const REAL *y, global REAL *out)
 {
     WORK_ITEM(i);
-    REAL sum = 0;
+    REAL sum = eps[i] * y[i];
+    for (int a = 0; a < DIM; ++a)
+        sum += own[DIM * i + a] * u[DIM * i + a];
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
         if (j < 0)
             continue;
-        REAL product = 0;
         for (int a = 0; a < DIM; ++a)
-            product += (points[DIM * j + a] - points[DIM * i + a] - face_centroids[DIM * k + a]) * u[DIM * j + a];
-        sum += weights[k] * product;
+            sum += rows[DIM * k + a] * u[DIM * j + a];
     }
-    sum /= volumes[i];
-    for (int a = 0; a < DIM; ++a)
-        sum += own[DIM * i + a] * u[DIM * i + a];
-    out[i] = sum + eps[i] * y[i];
+    out[i] = sum;
 }
 
 /* Per generator i: eps[i] = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of

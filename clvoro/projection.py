@@ -5,6 +5,7 @@ The paper's Poisson step approximates this, as an approximate projection does in
 
 from __future__ import annotations
 
+import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
@@ -34,7 +35,8 @@ class Projection:
             self._inverse, self._rhs, self._y, self._eps = (engine.empty(n) for _ in range(4))
         if m > self._m:
             self._m = m
-            self._weights = self.engine.empty(m)
+            self._rows = self.engine.empty((m, self.engine.dim), np.float32)
+            self._columns = self.engine.empty((m, self.engine.dim), np.float32)
 
     def project(
         self,
@@ -76,20 +78,20 @@ class Projection:
         )  # fmt: skip
         engine.run_each(
             k.assemble_derivative, n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
-            t.volumes, t.points, gradient, h, self._eps, self._weights, self._own, self._inverse,
+            t.volumes, t.points, gradient, h, self._eps, self._rows, self._columns, self._own,
+            self._inverse,
         )  # fmt: skip
 
         def derivative(u: cla.Array, y: cla.Array, out: cla.Array) -> None:
             engine.run_each(
-                k.apply_derivative, n, t.starts, t.neighbours, self._weights, t.face_centroids,
-                t.volumes, t.points, self._own, u, self._eps, y, out,
+                k.apply_derivative, n, t.starts, t.neighbours, self._rows, self._own, u, self._eps,
+                y, out,
             )  # fmt: skip
 
         def transpose(y: cla.Array, u: cla.Array) -> None:
             engine.run_each(
-                k.apply_transpose, n, t.starts, t.neighbours, self._weights, t.face_centroids,
-                t.volumes, self._own, h, y, u,
-            )  # fmt: skip
+                k.apply_transpose, n, t.starts, t.neighbours, self._columns, self._own, h, y, u
+            )
 
         def apply(y: cla.Array, out: cla.Array) -> None:
             transpose(y, self._u)

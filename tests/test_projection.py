@@ -42,7 +42,7 @@ class Assembled:
         engine.run_each(
             self.kernels.assemble_derivative, self.n, t.starts, t.neighbours, t.face_measures,
             t.face_centroids, t.volumes, t.points, engine.upload(gradient), self.on_device, self.eps,
-            p._weights, p._own, p._inverse,
+            p._rows, p._columns, p._own, p._inverse,
         )  # fmt: skip
 
     def derivative(self, u, y=None):
@@ -50,8 +50,8 @@ class Assembled:
         p, t, out = self.projection, self.t, self.engine.empty(self.n)
         y = np.zeros(self.n) if y is None else y
         self.engine.run_each(
-            self.kernels.apply_derivative, self.n, t.starts, t.neighbours, p._weights, t.face_centroids,
-            t.volumes, t.points, p._own, self.engine.upload(u), self.eps, self.engine.upload(y), out,
+            self.kernels.apply_derivative, self.n, t.starts, t.neighbours, p._rows, p._own,
+            self.engine.upload(u), self.eps, self.engine.upload(y), out,
         )  # fmt: skip
         return out.get()
 
@@ -59,8 +59,8 @@ class Assembled:
         """W J^T y."""
         p, t, out = self.projection, self.t, self.engine.empty((self.n, 2))
         self.engine.run_each(
-            self.kernels.apply_transpose, self.n, t.starts, t.neighbours, p._weights, t.face_centroids,
-            t.volumes, p._own, self.on_device, self.engine.upload(y), out,
+            self.kernels.apply_transpose, self.n, t.starts, t.neighbours, p._columns, p._own,
+            self.on_device, self.engine.upload(y), out,
         )  # fmt: skip
         return out.get()
 
@@ -120,7 +120,8 @@ def test_penalty_and_diagonal(assembled):
     J = assembled.matrix()
     W = np.repeat(assembled.h**2, 2)
     diagonal = np.einsum("ij,j,ij->i", J, W, J) + eps
-    assert assembled.projection._inverse.get() == pytest.approx(1 / diagonal, rel=1e-10)
+    # The dense matrix is made of the faces' derivatives in single precision, the diagonal is not.
+    assert assembled.projection._inverse.get() == pytest.approx(1 / diagonal, rel=1e-6)
 
 
 def project(engine, points, h, gradient, r, displacement, **options):
