@@ -8,7 +8,9 @@
 #define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
 
 #define KEEP_WORDS ((ROW_CAPACITY + 31) / 32)
-#define MAX_DEPTH 8 /* levels of bins; bins.py's MAX_LEVELS */
+#ifndef MAX_DEPTH
+#error "build with -DMAX_DEPTH=levels that the bins may have"
+#endif
 
 inline void raise_flag(global int *flags, int flag, int generator)
 {
@@ -24,9 +26,9 @@ inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
     return distance > 0 ? distance : 0;
 }
 
-/* Clip the cell of the generator at place `own` by every generator in the bins that the square of half-width w covers and the square of
-   half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice the farthest
-   corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or 0. */
+/* Clip the cell of the generator at place `own` by every generator in the bins that the square of half-width w covers
+   and the square of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
+   the farthest corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or 0. */
 inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, bool warm,
                         global const REAL *points, global const REAL *binned, global const int *items,
                         global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
@@ -166,7 +168,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     while (flag == 0) {
         flag = clip_by_bins(&cell, x, p, w, inner, warm, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
-        if (need <= w)
+        if (!(need > w)) /* ends with a NaN, too */
             break;
         inner = w;
         w = fmin(need, 2 * w);
@@ -190,9 +192,8 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
 
 /* Per generator i: bit k of keep[i * KEEP_WORDS ...] marks a neighbour that also lists i. Rounding may let one of two
    cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
-   the graph is symmetric. If
-   what it cuts off is more than rounding, generators are too close to tell apart (from far away, two an ulp apart have
-   the same bisector), and that is flagged. */
+   the graph is symmetric. If what it cuts off is more than rounding, generators are too close to tell apart (from far
+   away, two an ulp apart have the same bisector), and that is flagged. */
 kernel void match_faces(const int size, global const int *rows, global const int *row_counts, global const REAL *points,
                         const REAL4 box_lower, const REAL4 box_upper, global uint *keep, global int *counts,
                         global int *flags)

@@ -26,11 +26,11 @@ class BinnedPoints:
 
     Attributes
     ----------
-    items : (n,) int32
+    items : (>= n,) int32
         Generator indices in bin order, ascending within a bin.
-    points : (n, d) real
+    points : (>= n, d) real
         Positions in the same order.
-    reach : (n,) float32
+    reach : (>= n,) float32
         Edge of the leaf that holds the generator, in the same order.
     bins : (b, 2) int32
     grid_frames : (g, 4) real
@@ -68,15 +68,12 @@ class Bins:
             self._keys = engine.empty(n, np.int32)
             self._ranks = engine.empty(n, np.int32)
             self._items = engine.empty(n, np.int32)
-            self._points = engine.zeros((n + 3, d))  # read four at a time
+            self._points = engine.empty((n, d))
             self._reach = engine.empty(n, np.float32)
         if bins > self._capacity[1]:
-            old = self._capacity[1]
-            for name, width in (("counts", 1), ("bins", 2), ("grid_of", 1)):
-                grown = engine.zeros(bins * width, np.int32)
-                if old:
-                    grown[: old * width] = getattr(self, f"_{name}")[: old * width]
-                setattr(self, f"_{name}", grown)
+            self._counts = self._grown("_counts", bins, np.int32)
+            self._bins = self._grown("_bins", bins * 2, np.int32)
+            self._grid_of = self._grown("_grid_of", bins, np.int32)
             # A divided bin holds more than SPLIT_COUNT generators, so grids are far fewer than bins.
             self._frames = self._grown("_frames", (bins // 4 + 1) * 4, engine.real)
             self._shapes = self._grown("_shapes", (bins // 4 + 1) * 4, np.int32)
@@ -120,8 +117,8 @@ class Bins:
                 k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags,
                 self._sizes,
             )  # fmt: skip
-            for values, first in ((self._flags, 0), (self._sizes, 0)):
-                self._scan.exclusive(values, values, size, first)
+            for values in (self._flags, self._sizes):
+                self._scan.exclusive(values, values, size)
             self._scan.exclusive(self._counts, self._starts, size, first=begin)
             engine.run_each(
                 k.place_bins, size, self._starts, np.int32(begin), self._grid_of, self._shapes,

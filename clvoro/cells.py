@@ -9,12 +9,15 @@ import pyopencl.array as cla
 
 from ._primitives import Scan
 from ._program import Engine
-from .bins import BinnedPoints
+from .bins import MAX_LEVELS, BinnedPoints
 from .domain import Box
-from .errors import ClvoroError, InputError
+from .errors import ClvoroError, InputError, MemoryLimitError
 
 CELL_CAPACITY = 24
+"""Faces that a cell may have while it is clipped."""
 ROW_CAPACITY = 20
+"""Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
+LARGEST_ROW = 512
 FULL, COINCIDE, COLLAPSED = 1, 2, 4
 
 
@@ -59,12 +62,19 @@ class Cells:
         self._capacity = 0
         self._turn = 0
         self._n = 0
+        self._rows, self._keep = engine.empty(1, np.int32), engine.empty(1, np.uint32)
+        self._flags = engine.empty(2, np.int32)
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         self._kernels = self.engine.kernels(
-            "cells", {"CELL_CAPACITY": cell_capacity, "ROW_CAPACITY": row_capacity}
+            "cells",
+            {
+                "CELL_CAPACITY": cell_capacity,
+                "ROW_CAPACITY": row_capacity,
+                "MAX_DEPTH": MAX_LEVELS,
+            },
         )
 
     def _reserve(self, n: int) -> None:
@@ -73,10 +83,7 @@ class Cells:
         engine, d = self.engine, self.engine.dim
         # A planar graph has at most 3 n - 6 edges, and every cell at most one face on each wall it touches.
         m = 7 * n + 8
-        self._rows = engine.empty(n * self.row_capacity, np.int32)
         self._row_counts = engine.empty(n, np.int32)
-        self._keep = engine.empty(n * ((self.row_capacity + 31) // 32), np.uint32)
-        self._flags = engine.empty(2, np.int32)
         # Two sets in turn: the previous diagram stays valid, for a warm start and to compare neighbours.
         self._sets = [
             {
@@ -121,14 +128,22 @@ class Cells:
         ------
         InputError
             If two generators coincide or are too close for the precision; names the first.
+        MemoryLimitError
+            If the rows of faces are too many for 32-bit indices.
+        ClvoroError
+            If a cell has more than `LARGEST_ROW` faces, or a little more.
         """
-        engine, k = self.engine, self._kernels
+        engine = self.engine
+        if self.row_capacity > ROW_CAPACITY and n * self.row_capacity > self._rows.size:
+            # One mesh had a cell of very many faces; a larger one need not pay for that.
+            self._build(CELL_CAPACITY, ROW_CAPACITY)
+        self._reserve_rows(n)
         self._reserve(n)
+        k = self._kernels
         lower, upper = box.device_corners(engine.real)
         if n != self._n:
             self._views_for(n)
         arrays = self._views[self._turn]
-        self._turn = 1 - self._turn
         warm = previous is not None and previous.n == n
         old = (
             (previous.starts, previous.neighbours)
@@ -149,30 +164,46 @@ class Cells:
             flags, generator = (int(v) for v in self._flags.get())
             if not flags & FULL:
                 break
-            self._enlarge()
+            self._enlarge(n)
             k = self._kernels
         if flags:
-            self._refuse(flags, generator, points)
+            self._refuse(flags, generator)
         self._scan.exclusive(arrays["starts"], arrays["starts"], n)
         engine.run_each(
             k.measure_cells, n, self._rows, self._row_counts, self._keep, arrays["starts"], points,
             lower, upper, arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
             arrays["volumes"], arrays["offsets"], arrays["covariances"],
         )  # fmt: skip
+        # Only now: a call that was broken off leaves the previous diagram as it is.
+        self._turn = 1 - self._turn
         return Tessellation(n=n, points=points, **arrays)
 
-    def _enlarge(self) -> None:
-        if self.row_capacity >= 512:
+    def _reserve_rows(self, n: int) -> None:
+        """Make room for `n` rows of faces of the present capacity."""
+        entries = n * self.row_capacity
+        if entries >= 2**31:
+            raise MemoryLimitError(
+                f"{n} cells of up to {self.row_capacity} faces need {entries:.3g} entries, expected "
+                "fewer than 2^31, which 32-bit indices can tell apart; use fewer cells, or perturb "
+                "generators that lie on a common circle"
+            )
+        if entries > self._rows.size:
+            self._rows = self.engine.empty(entries, np.int32)
+        words = n * ((self.row_capacity + 31) // 32)
+        if words > self._keep.size:
+            self._keep = self.engine.empty(words, np.uint32)
+
+    def _enlarge(self, n: int) -> None:
+        """Double the capacities, for `n` cells."""
+        if self.row_capacity >= LARGEST_ROW:
             raise ClvoroError(
                 f"a cell has more than {self.row_capacity} faces; so many cocircular generators "
                 "are not supported: remove or perturb some"
             )
-        n = self._capacity
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
-        self._rows = self.engine.empty(n * self.row_capacity, np.int32)
-        self._keep = self.engine.empty(n * ((self.row_capacity + 31) // 32), np.uint32)
+        self._reserve_rows(n)
 
-    def _refuse(self, flags: int, generator: int, points: cla.Array) -> None:
+    def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"
         raise InputError(
             f"generator {generator} {what} in {self.engine.real}; expected distinct generators: "

@@ -11,12 +11,13 @@
 #define FRAME REAL4
 #define FRAME_INVERSE(f) ((f).s3)
 
-/* Bin index along one axis: monotone in x also after rounding, so that a range of x covers its bins. */
+/* Bin index along one axis: monotone in x also after rounding, so that a range of x covers its bins. A NaN is put into
+   bin 0: an index must not leave the grid. */
 inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
 {
     const REAL t = (x - origin) * inverse;
     /* The comparison in REAL keeps far-away x from overflowing the int. */
-    return t <= 0 ? 0 : (t >= (REAL)side ? side - 1 : (int)t);
+    return t > 0 ? (t >= (REAL)side ? side - 1 : (int)t) : 0;
 }
 
 /* Bin of generator x in one grid. */
