@@ -1,21 +1,19 @@
 /* The size field at points: h' = h / scale and, on request, grad log h, in normalised coordinates.
    `size_at` and its data come from the host (see common/size_fields.h). Work-item i serves point i;
-   points are (n, DIM). `bad` keeps the smallest index with an h that is not positive and finite:
+   points are (size, DIM). `bad` keeps the smallest index with an h that is not positive and finite:
    a minimum of integers, so the order of the atomics does not matter. */
 #include "common/real.h"
 
-void note_bad(REAL h, int i, __global int *bad)
+inline void note_bad(REAL h, int i, global int *bad)
 {
     if (!(h > 0 && h <= REAL_MAX))
         atomic_min(bad, i);
 }
 
-__kernel void evaluate(int n, __global const REAL *restrict points, __global const REAL *restrict data,
-                       __global REAL *restrict h_out, __global int *bad)
+kernel void evaluate(const int size, global const REAL *restrict points, global const REAL *restrict data,
+                     global REAL *restrict h_out, global int *bad)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     REAL x[DIM];
     for (int a = 0; a < DIM; ++a)
         x[a] = points[i * DIM + a];
@@ -27,14 +25,11 @@ __kernel void evaluate(int n, __global const REAL *restrict points, __global con
 /* grad_a log h = (h(x + s e_a) - h(x - s e_a)) / (2 s h), s = GRADIENT_STEP * h. Both sample points are kept inside
    the domain's bounding box `box` (lower, upper), where alone the field must be defined; 2 s is then the distance
    that was really stepped. */
-__kernel void evaluate_with_gradient(int n, __global const REAL *restrict points,
-                                     __global const REAL *restrict data,
-                                     __global const REAL *restrict box, __global REAL *restrict h_out,
-                                     __global REAL *restrict gradient, __global int *bad)
+kernel void evaluate_with_gradient(const int size, global const REAL *restrict points,
+                                   global const REAL *restrict data, global const REAL *restrict box,
+                                   global REAL *restrict h_out, global REAL *restrict gradient, global int *bad)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     REAL x[DIM];
     for (int a = 0; a < DIM; ++a)
         x[a] = points[i * DIM + a];

@@ -31,8 +31,8 @@ class Loop:
         Cells that the finest level should have.
     max_steps : int or None
     tol : float or None
-        Share by which error or quality must improve over a window of steps; 0 takes all steps. None: the plan ends where
-        the run has converged.
+        Share by which error or quality must improve over a window of steps; 0 takes all steps. None: the run has
+        converged where the plan ends.
     callback : callable or None
         Takes the new row of the history; the run stops if it returns True.
     """
@@ -60,8 +60,8 @@ class Loop:
     def run(self, n_cells: int | None, settings: dict[str, Any]) -> Result:
         """Carry out the plan.
 
-        `n_cells` holds the finest level's count, and a common factor on the size field follows; with None the size field
-        decides.
+        `n_cells` holds the finest level's count, and a common factor on the size field follows; with None the size
+        field decides.
         """
         self.n_cells = n_cells
         converged, reason = False, "plan completed"
@@ -146,10 +146,10 @@ class Loop:
 
     def refine(self) -> None:
         """Go to the next finer level."""
-        before = self.mesh.n
-        self.mesh = self.mesh.refine()
-        self.inserted += self.mesh.n - before
-        self.level -= 1
+        finer = self.mesh.refine()
+        self.inserted += finer.n - self.mesh.n
+        # Together: an interruption between them would refine once too often.
+        self.mesh, self.level = finer, self.level - 1
 
     def record(self, progress: float) -> bool:
         """Append a row to the history; True if the callback wants to stop."""
@@ -160,7 +160,6 @@ class Loop:
         """Append a row to the history."""
         mesh = self.mesh
         s, n = mesh.assess(), mesh.n
-        mesh.sizing.check(mesh.points, mesh.h)
         row = np.zeros(1, HISTORY_DTYPE)
         row["step"], row["level"], row["cells"], row["progress"] = self.steps, self.level, n, progress
         row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak

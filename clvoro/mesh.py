@@ -112,10 +112,35 @@ class Mesh:
         `reach` is the lesser of h and L, by which motion is limited.
     source, potential : (n,) real
         Right side of the latest Poisson solve, and its solution: the next one's start.
-    lloyd, correction, velocity : (n, d) real
-        The two halves of the latest step, and the step itself. Lengths of the halves over h:
-        `lloyd_speed`, `correction_speed` (n,).
+    lloyd, correction : (n, d) real
+        The two halves of the latest step. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
+    velocity : (n, d) real
+        The latest step as it was made.
+    signatures : (n,) uint64
+        Of the sets of neighbours; see `Metric.compare_neighbours`.
+    changed, ever : (n,) real
+        1 where the set of neighbours has changed in the latest step, on this level at all; else 0.
     """
+
+    n: int
+    points: cla.Array
+    labels: cla.Array
+    velocity: cla.Array
+    signatures: cla.Array
+    ever: cla.Array
+    h: cla.Array
+    error: cla.Array
+    quality: cla.Array
+    energy: cla.Array
+    reach: cla.Array
+    source: cla.Array
+    changed: cla.Array
+    potential: cla.Array
+    lloyd: cla.Array
+    correction: cla.Array
+    lloyd_speed: cla.Array
+    correction_speed: cla.Array
+    tessellation: Tessellation | None
 
     def __init__(
         self,
@@ -146,23 +171,30 @@ class Mesh:
         signatures: cla.Array,
         ever: cla.Array,
     ) -> None:
-        """Take other generators for the present ones, sort them by bin so that neighbours are near in memory."""
+        """Take other generators for the present ones, sort them by bin so that neighbours are near in memory.
+
+        Raises
+        ------
+        SizeFieldError
+            If the size of one is not positive and finite.
+        """
         engine, stages = self.engine, self.stages
         first = not hasattr(self, "tessellation")
         n = len(points)
         items = stages.bins.build(self.domain, points, n).items[:n].copy()
-        rows = stages.gather.rows
-        sorted_rows = [rows(items, a) for a in (points, labels, velocity, signatures, ever)]
-        self.n = n
-        self.points, self.labels, self.velocity, self.signatures, self.ever = sorted_rows
-        shape = points.shape
-        self.h, self.error, self.quality, self.energy = (engine.empty(n) for _ in range(4))
-        self.reach = engine.empty(n)
-        self.source, self.potential = engine.empty(n), engine.zeros(n)
-        self.lloyd, self.correction = engine.zeros(shape), engine.zeros(shape)
-        self.lloyd_speed, self.correction_speed = engine.zeros(n), engine.zeros(n)
-        self.changed = engine.empty(n)
-        self.tessellation: Tessellation | None = None
+        kept = {
+            "points": points, "labels": labels, "velocity": velocity, "signatures": signatures,
+            "ever": ever,
+        }  # fmt: skip
+        new = {name: stages.gather.rows(items, array) for name, array in kept.items()}
+        for name in ("h", "error", "quality", "energy", "reach", "source", "changed"):
+            new[name] = engine.empty(n)
+        for name in ("potential", "lloyd_speed", "correction_speed"):
+            new[name] = engine.zeros(n)
+        for name in ("lloyd", "correction"):
+            new[name] = engine.zeros(points.shape)
+        # At one stroke: whoever interrupts the run finds arrays that fit each other.
+        self.__dict__.update(new, n=n, tessellation=None)
         self.update(first)
 
     @property
@@ -172,7 +204,15 @@ class Mesh:
         return self.tessellation
 
     def update(self, first: bool = False) -> None:
-        """Tessellate the generators where they are now, and evaluate size, error and quality."""
+        """Tessellate the generators where they are now, and evaluate size, error and quality.
+
+        Raises
+        ------
+        InputError
+            If generators have come too close to each other to be told apart.
+        SizeFieldError
+            If the size of one is not positive and finite.
+        """
         stages = self.stages
         binned = stages.bins.build(self.domain, self.points, self.n)
         self.tessellation = stages.cells.tessellate(
@@ -185,23 +225,27 @@ class Mesh:
         stages.metric.compare_neighbours(
             self.t, self.labels, first, self.signatures, self.changed, self.ever
         )
+        # Before anything is done with a bad size: the solver, say, would complain of something else.
+        self.sizing.check(self.points, self.h, self.coarsening)
 
     def _evaluate_metric(self) -> None:
         self.stages.metric.evaluate(
             self.t, self.h, self.error, self.quality, self.energy, self.reach
         )
 
-    def mean_log_error(self) -> float:
-        """Mean of |log(L / h)|."""
+    def _excess(self) -> Summary:
+        """Summarise the excess, log(V / h^d)."""
         w = self.stages.density.evaluate(self.t, self.h)
         self.summaries.collect("excess", w.excess, self.n)
-        return self.summaries.read()["excess"].magnitude / self.n / self.engine.dim
+        return self.summaries.read()["excess"]
+
+    def mean_log_error(self) -> float:
+        """Mean of |log(L / h)|."""
+        return self._excess().magnitude / self.n / self.engine.dim
 
     def match_size(self) -> None:
         """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""
-        w = self.stages.density.evaluate(self.t, self.h)
-        self.summaries.collect("excess", w.excess, self.n)
-        factor = math.exp(self.summaries.read()["excess"].sum / self.n / self.engine.dim)
+        factor = math.exp(self._excess().sum / self.n / self.engine.dim)
         self.coarsening *= factor
         metric = self.stages.metric
         metric.scale_sizes(factor, self.h)
@@ -218,9 +262,8 @@ class Mesh:
 
         The count goes to `n_cells` or, with None, to what the size field asks for.
         """
+        total = self._excess().sum if n_cells is None else float(n_cells - self.n)
         w = self.stages.density.evaluate(self.t, self.h)
-        self.summaries.collect("excess", w.excess, self.n)
-        total = self.summaries.read()["excess"].sum if n_cells is None else float(n_cells - self.n)
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(
             self.domain, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,

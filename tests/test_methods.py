@@ -6,6 +6,7 @@ import patch
 import pytest
 
 from clvoro import sizing
+from clvoro.errors import SizeFieldError
 from clvoro.mesh import Mesh, Stages
 from clvoro.methods import (
     PUBLISHED,
@@ -202,6 +203,19 @@ def test_mean_log_error_of_cells_that_are_right(stages):
     for _ in range(6):
         method.displace(mesh)
     assert np.isfinite(method.eps)
+
+
+@pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
+def test_a_bad_size_is_named_as_the_field_has_it(stages, value):
+    """Also on a coarse level, where h is a multiple of the field's."""
+    field = sizing.Expression(f"x > 0.7 && y > 0.5 ? {value} : 0.05")
+    points = np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]])
+    engine = stages.engine
+    printed = {"0.0": "0", "0.0/0.0": "nan"}.get(value, value)
+    with pytest.raises(SizeFieldError, match=rf"is -?{printed} at \(0\.8, 0\.6\)"):
+        Mesh(
+            stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points), coarsening=8
+        )
 
 
 def test_names():

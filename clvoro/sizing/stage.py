@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyopencl as cl
 
 from ..errors import SizeFieldError
 from .bind import bind
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from .._program import Engine
     from ..domain import Box
 
-_GROUP = 64
 _NONE_BAD = np.iinfo(np.int32).max
 
 # Central differences of step s = c h: rounding of h, about eps, shows as eps / (2 c h) in dh/dx,
@@ -102,7 +100,7 @@ class Sizing:
             h = self._on_host(self._physical(points[:n].get())) / self._scale
             h_out[:n].set(h.astype(self.engine.real))
             return
-        self._launch("evaluate", n, points, self.data, h_out, self._bad)
+        self.engine.run_each(self._kernels.evaluate, n, points, self.data, h_out, self._bad)
 
     def evaluate_with_gradient(
         self, points: cla.Array, n: int, h_out: cla.Array, grad_out: cla.Array
@@ -128,21 +126,16 @@ class Sizing:
             h_out[:n].set(h.astype(self.engine.real))
             grad_out[:n].set(gradient.astype(self.engine.real))
             return
-        self._launch(
-            "evaluate_with_gradient",
-            n,
-            points,
-            self.data,
-            self._box,
-            h_out,
-            grad_out,
+        self.engine.run_each(
+            self._kernels.evaluate_with_gradient, n, points, self.data, self._box, h_out, grad_out,
             self._bad,
-        )
+        )  # fmt: skip
 
-    def check(self, points: cla.Array, h: cla.Array) -> None:
+    def check(self, points: cla.Array, h: cla.Array, factor: float = 1.0) -> None:
         """Raise if an evaluation since the last check met a value that is not positive and finite.
 
-        Reads one integer from the device. `points` and `h` are those of the last evaluation.
+        Reads one integer from the device. `points` and `h` are those of the last evaluation; `h` may have been scaled
+        by `factor` since.
 
         Raises
         ------
@@ -156,7 +149,7 @@ class Sizing:
             return
         self._bad.fill(np.int32(_NONE_BAD))
         place = self._physical(points[first : first + 1].get())[0]
-        raise self._error(place, float(h[first : first + 1].get()[0]) * self._scale)
+        raise self._error(place, float(h[first : first + 1].get()[0]) / factor * self._scale)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return h at physical `points` (n, d), host to host, (n,) float64, by the device.
@@ -174,13 +167,6 @@ class Sizing:
         self.evaluate(x, len(normalised), h)
         self.check(x, h)
         return h.get().astype(float) * self._scale
-
-    def _launch(self, name: str, n: int, *arrays: cla.Array) -> None:
-        """Run a kernel over `n` points in groups of 64: drivers may compile anew for each size."""
-        kernel = getattr(self._kernels, name)
-        kernel.set_args(np.int32(n), *(a.data for a in arrays))
-        size = max(-(-n // _GROUP), 1) * _GROUP
-        cl.enqueue_nd_range_kernel(self.engine.queue, kernel, (size,), (_GROUP,))
 
     def _physical(self, normalised: np.ndarray) -> np.ndarray:
         """Return physical coordinates, kept inside the domain's bounding box against rounding."""
