@@ -4,9 +4,8 @@
 
    A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell (charge -1
    and +1). One that sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the
-   5-sided one goes. One that has come to a wall ends there. The
-   same moves carry the count of generators to what the size field asks for. Sites act at the same time only if they are
-   RINGS rings of cells apart. */
+   5-sided one goes. One that has come to a wall ends there. The same moves carry the count of generators to what the
+   size field asks for. Sites act at the same time only if they are several rings of cells apart. */
 
 #define LATTICE_2 R(1.1547005383792515) /* (neighbour distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
 

@@ -32,10 +32,10 @@ class Scan:
         `out` may be `values` if it has room and `first` is 0.
         """
         k, engine = self._kernels, self.engine
-        first, n = np.int32(first), np.int32(n)
-        engine.run_each(k.chunk_sums, self.width, values, first, self._sums, n, group=1)
+        begin, count = np.int32(first), np.int32(n)
+        engine.run_each(k.chunk_sums, self.width, values, begin, self._sums, count, group=1)
         engine.run_each(k.scan_sums, 1, self._sums, np.int32(self.width), group=1)
-        engine.run_each(k.scan_chunks, self.width, values, first, self._sums, out, n, group=1)
+        engine.run_each(k.scan_chunks, self.width, values, begin, self._sums, out, count, group=1)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Summaries:
         )  # fmt: skip
 
     def read(self) -> dict[str, Summary]:
-        """Fetch every slot: the one transfer of a step."""
+        """Fetch every slot, in one transfer."""
         host = self.values.get()
         return {name: Summary(*map(float, host[slot])) for name, slot in self.slots.items()}
 

@@ -144,10 +144,10 @@ class ProjectedMethod:
     emphasis, rate : float
         Weight of bad cells in the shape descent, and its step; see `Shape`.
     aim : float
-        Mean |log(L / h)| that `eps` is steered to; 0 leaves it.
+        Mean |log(L / h)| that `eps` is steered to, after the first three steps; 0 leaves it.
     keep_mean : bool
-        Also correct the mean of the excess, by moving generators to where h is larger or smaller. Only for a mean that is
-        small: the count is what should correct it.
+        Also correct the mean of the excess, by moving generators to where h is larger or smaller. Only for a mean
+        that is small: the count is what should correct it.
     sampled_gradient : bool
         Take grad log h from the field itself, by differences over a fifth of a cell, not from the neighbours' h: at a
         kink of h the neighbours' fit can keep the exact projection from converging.

@@ -37,15 +37,18 @@ class Effort:
     glide : int
         Steps in a sweep.
     polish : int
+        Steps of polishing, at the end.
     aim : float
         Mean |log(L / h)| that polishing aims at.
     relaxation, momentum : float
         Of the gliding.
+    eps : float
+        Penalty with which polishing begins.
     nuclei : float
         Share of the cells where pairs may be made, every third sweep.
     emphasis, lenience, bound : float
-        Of the polishing: weight of bad cells; -log Q from which on a cell may be off its size for its shape; and excess,
-        over the mean that is aimed at, from which on it may not.
+        Of the polishing: weight of bad cells; -log Q from which on a cell may be off its size for its shape; and
+        excess, over the mean that is aimed at, from which on it may not.
     """
 
     start: int

@@ -24,7 +24,7 @@ PAIR_RINGS, NUCLEUS_RINGS, EXCESS_RINGS = 4, 6, 3
 ROUNDS = 3
 """Rounds of choosing sites; each takes the strongest that are left."""
 SHIFTS, SHIFT_STEP = 51, 0.01
-HISTOGRAM = 128  # a power of two: bins are cut finer by shifts
+HISTOGRAM = 128  # a power of two: its bins are divided evenly down to single keys
 SPLIT_DISTANCE = 0.3
 """Half the distance over h at which the two halves of a split cell start."""
 LARGEST_CHANGE = 0.05
