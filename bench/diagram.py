@@ -33,13 +33,13 @@ from typing import Any
 
 import numpy as np
 from _common import Report, counts, heading, make_adapter, markdown, names, parser
-from _profile import Profile, profiled_queue
 
 import clvoro
 from clvoro._primitives import Gather
 from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
+from clvoro.profile import Profile, profiled_queue
 
 BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
 SEED = 7919
@@ -144,15 +144,16 @@ class Tessellator:
         )
 
 
-def kernel_times(function: Callable[[], object], repeat: int) -> dict[str, float]:
+def kernel_times(queue: Any, repeat: int, function: Callable[[], object]) -> dict[str, float]:
     """Median device times of the kernels of "diagram"."""
     function()
     times: dict[str, list[float]] = {"clip": [], "match": [], "measure": []}
     for _ in range(repeat):
-        with Profile() as profile:
+        with Profile(queue) as profile:
             function()
         for name, seen in times.items():
-            seen.append(sum(t for (_, k), t in profile.seconds.items() if k.startswith(name)))
+            costs = (cost for (_, kernel), cost in profile.costs.items() if kernel.startswith(name))
+            seen.append(sum(cost.seconds for cost in costs))
     return {name: statistics.median(seen) for name, seen in times.items()}
 
 
@@ -176,9 +177,9 @@ def measure(
     queue = profiled_queue(adapter.ctx)
     timed = Tessellator(Engine(adapter.ctx, queue, 2, adapter.dtype), points)
     timed.bin()
-    cold_kernels = kernel_times(timed.diagram, repeat)
+    cold_kernels = kernel_times(queue, repeat, timed.diagram)
     timed.prepare_warm(rng)
-    warm_kernels = kernel_times(timed.diagram_warm, repeat)
+    warm_kernels = kernel_times(queue, repeat, timed.diagram_warm)
     del timed
 
     n = len(points)

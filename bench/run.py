@@ -37,9 +37,14 @@ from _common import (
     test_field,
     work,
 )
-from _profile import SOLVERS, TESSELLATION, Profile, profiled_adapter
 
 import clvoro
+from clvoro.profile import Profile
+
+SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
+"""Programs that solve linear systems."""
+TESSELLATION = ("bins", "cells", "primitives")
+"""Programs of the diagram; the scans and the reductions of the figures are in "primitives"."""
 
 CELLS_OF_F2 = 22972
 """Integral of h^-2 of F2."""
@@ -59,7 +64,7 @@ def run_once(
 
 
 def measure(
-    adapter: clvoro.Adapter, profiled: clvoro.Adapter | None, n: int, effort: str, method: str
+    adapter: clvoro.Adapter, profiled: bool, n: int, effort: str, method: str
 ) -> dict[str, Any]:
     result, seconds = run_once(adapter, n, effort, method)
     history = result.history
@@ -74,10 +79,10 @@ def measure(
         **figures(result.diagram, result.size, result.quality), **cost,
         "iterations": int(history["iterations"].sum()),
     }  # fmt: skip
-    if profiled is not None:
-        with Profile() as profile:
-            _, again = run_once(profiled, n, effort, method)
-        total = profile.total()
+    if profiled:
+        with Profile(adapter) as profile:
+            _, again = run_once(adapter, n, effort, method)
+        total = profile.device
         record |= {
             "seconds_profiled": again,
             "kernels": total,
@@ -86,8 +91,7 @@ def measure(
             "solve_share": profile.of(*SOLVERS) / total,
             "diagram_share": profile.of(*TESSELLATION) / total,
             "programs": {
-                name: profile.of(name) / total
-                for name in sorted({program for program, _ in profile.seconds})
+                name: cost.seconds / total for name, cost in sorted(profile.stages().items())
             },
         }
     return record
@@ -157,16 +161,13 @@ def main() -> None:
     options = options_of.parse_args()
 
     adapter = make_adapter(options)
-    profiled = profiled_adapter(adapter) if options.profile else None
     report = Report(options.json, COLUMNS)
     for method in options.methods:
         for effort in options.efforts:
-            for warming in (adapter, profiled):
-                if warming is not None:
-                    run_once(warming, 3000, effort, method)
+            run_once(adapter, 3000, effort, method)
             for n in options.sizes:
                 try:
-                    record = measure(adapter, profiled, n, effort, method)
+                    record = measure(adapter, options.profile, n, effort, method)
                 except clvoro.ClvoroError as error:
                     print(f"{method} {effort} {n:,}: {error}", file=sys.stderr)
                     continue

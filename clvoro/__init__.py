@@ -1,6 +1,6 @@
 """Voronoi meshes that meet a size field, adapted with OpenCL."""
 
-from . import sizing
+from . import profile, sizing
 from .adapter import Adapter
 from .device import create_context, list_devices
 from .domain import Box
@@ -20,5 +20,6 @@ __all__ = [
     "create_context",
     "list_devices",
     "load",
+    "profile",
     "sizing",
 ]

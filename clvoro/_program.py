@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from .errors import BuildError
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
 _programs: dict[tuple, cl.Program] = {}
+_building = 0.0
 
 
 def kernel_folder() -> Path:
@@ -57,18 +59,26 @@ def build_program(
     BuildError
         With the compiler's log, if the source does not compile.
     """
+    global _building
     text = prelude + "\n" + source_text(name)
     options = tuple(f"-D{key}={value}" for key, value in sorted(defines.items()))
     key = (ctx.int_ptr, text, options)
     with _lock:
         if key not in _programs:
+            began = time.perf_counter()
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", cl.CompilerWarning)
                     _programs[key] = cl.Program(ctx, text).build(options=list(options))
             except cl.Error as error:
                 raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
+            _building += time.perf_counter() - began
         return _programs[key]
+
+
+def build_seconds() -> float:
+    """Return the time that this process has spent on building programs."""
+    return _building
 
 
 @dataclass(frozen=True)
@@ -105,11 +115,17 @@ class Engine:
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
     ) -> SimpleNamespace:
-        """Build `cl_kernels/<stage>.cl` and return its kernels as attributes, each with arguments of its own."""
+        """Build `cl_kernels/<stage>.cl` and return its kernels as attributes, each with arguments of its own.
+
+        Each kernel knows its `stage`, for a profile.
+        """
         real = "double" if self.real == np.float64 else "float"
         full = {"DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size, **(defines or {})}
         program = build_program(self.ctx, f"{stage}.cl", full, prelude)
-        return SimpleNamespace(**{k.function_name: k for k in program.all_kernels()})
+        kernels = program.all_kernels()
+        for kernel in kernels:
+            kernel.stage = stage  # type: ignore[attr-defined]
+        return SimpleNamespace(**{k.function_name: k for k in kernels})
 
     def run(
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None

@@ -63,6 +63,7 @@ class Adapter:
         self._stages: dict[int, Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
+        self._watch: Callable[[np.void], None] | None = None
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -77,6 +78,36 @@ class Adapter:
                 yield
             finally:
                 self._owner = None
+
+    @contextmanager
+    def watched(self, queue: cl.CommandQueue, watch: Callable[[np.void], None]) -> Iterator[None]:
+        """Work on `queue`, and show each new row of a history to `watch` before the caller's callback (see `profile`).
+
+        Another queue than the adapter's own comes with buffers of its own.
+        """
+        with self._alone():
+            kept = self.queue, self._stages, self._watch
+            stages = self._stages if queue is self.queue else {}
+            self.queue, self._stages, self._watch = queue, stages, watch
+        try:
+            yield
+        finally:
+            with self._alone():
+                self.queue, self._stages, self._watch = kept
+
+    def _shown(
+        self, callback: Callable[[np.void], object] | None
+    ) -> Callable[[np.void], object] | None:
+        """Return what to call with each row."""
+        watch = self._watch
+        if watch is None:
+            return callback
+
+        def both(row: np.void) -> object:
+            watch(row)
+            return callback is not None and callback(row)
+
+        return both
 
     def _stages_for(self, domain: Box) -> Stages:
         if not isinstance(domain, Box):
@@ -219,7 +250,7 @@ class Adapter:
                 "of a row of the history"
             )
         with self._alone():
-            return self._run(domain, size, points, options, callback)
+            return self._run(domain, size, points, options, self._shown(callback))
 
     def _run(
         self,

@@ -75,6 +75,9 @@ def build_parser() -> argparse.ArgumentParser:
         choices=("png", "pdf", "svg"),
         help="kind of picture files, may be repeated (default: png)",
     )
+    run.add_argument(
+        "--profile", action="store_true", help="print where the time goes, by stage and by kernel"
+    )
     run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
 
@@ -140,6 +143,7 @@ def _run(arguments: argparse.Namespace) -> int:
         formats=tuple(arguments.format or ["png"]),
         quiet=arguments.quiet,
         as_json=arguments.json,
+        profile=arguments.profile,
     )
     return INTERRUPTED if job.run() else OK
 

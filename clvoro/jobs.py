@@ -17,6 +17,7 @@ import numpy as np
 from .cases import Case
 from .errors import ClvoroError, InputError
 from .io import check_writable, save, write_history
+from .profile import Profile
 from .results import Result
 from .summary import summary
 
@@ -44,6 +45,8 @@ class Job:
         Kinds of picture files.
     quiet, as_json : bool
         No progress and no summary; one JSON object per finished run on the standard output.
+    profile : bool
+        Whether to time every kernel, and print where the time went.
     """
 
     case: Case
@@ -53,6 +56,7 @@ class Job:
     formats: tuple[str, ...] = ("png",)
     quiet: bool = False
     as_json: bool = False
+    profile: bool = False
     interrupted: bool = field(default=False, init=False)
 
     def run(self) -> bool:
@@ -77,13 +81,18 @@ class Job:
         device = adapter.ctx.devices[0]
         where = f"{device.platform.name.strip()} / {device.name.strip()}"
         results: dict[str, Result] = {}
+        profiles: dict[str, Profile] = {}
         with self._stopping_cleanly():
             try:
                 for method in self.case.methods:  # the same seed gives all the same start
-                    result = self._run_one(adapter, size, method, dict(arguments))
+                    profile = Profile(adapter) if self.profile else None
+                    with profile or nullcontext():
+                        result = self._run_one(adapter, size, method, dict(arguments))
                     name = str(method or result.settings.get("method", "default"))
                     results[name] = result
-                    self._announce(name, result, where)
+                    if profile is not None:
+                        profiles[name] = profile
+                    self._announce(name, result, where, profile)
                     if self.interrupted:
                         break
             except ClvoroError:
@@ -91,7 +100,7 @@ class Job:
                     self._write(adapter, size, results, where)
                 raise
             self._write(adapter, size, results, where)
-        self._summarise(results, where)
+        self._summarise(results, where, profiles)
         return self.interrupted
 
     def _run_one(
@@ -198,7 +207,7 @@ class Job:
         points = np.clip(main.initial.points, self.case.domain.lower, self.case.domain.upper)
         return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
 
-    def _announce(self, name: str, result: Result, where: str) -> None:
+    def _announce(self, name: str, result: Result, where: str, profile: Profile | None) -> None:
         """Print the run as JSON if that was asked for."""
         if self.as_json:
             entry = {
@@ -209,9 +218,13 @@ class Job:
                 **summary(result),
                 "settings": result.settings,
             }
+            if profile is not None:
+                entry["profile"] = profile.as_dict()
             print(json.dumps(entry, default=_plain), flush=True)
 
-    def _summarise(self, results: dict[str, Result], where: str) -> None:
+    def _summarise(
+        self, results: dict[str, Result], where: str, profiles: dict[str, Profile]
+    ) -> None:
         """Print a table for people."""
         if self.quiet or self.as_json:
             return
@@ -229,6 +242,8 @@ class Job:
             )
         first = "report.html" if self.report else "mesh.vtu"
         print(f"written: {self.out / first} and what lies beside it")
+        for name, profile in profiles.items():
+            print(f"\nwhere the time of {name} went:\n{profile.table()}")
 
 
 def check_folder(folder: Path) -> None:

@@ -1,0 +1,399 @@
+"""Where the time of a run goes: every kernel's own time, from the device's events.
+
+Every command is timed, by whichever stage it is enqueued (see `_hooks`). A run without a profile keeps no events.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+
+from . import _hooks
+from ._program import build_program, build_seconds
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .adapter import Adapter
+
+PENDING = 2048
+"""Most events that are kept: the older half is then read and let go, while the newer ones run."""
+SMALL = 0.005
+"""Share of the device's time below which a table puts kernels together."""
+LARGE = 256 << 20
+"""Bytes of the buffer that is copied to measure the bandwidth: more than any cache holds."""
+
+_bandwidths: dict[int, float] = {}
+
+
+@dataclass
+class Cost:
+    """What a kernel has cost, or several together.
+
+    Attributes
+    ----------
+    calls : int
+    seconds : float
+        Device time, from start to end of each call.
+    bytes : int
+        Sizes of the buffers that were bound to the calls, each buffer once a call. An estimate of
+        what they move. It is rather too high, since buffers may be longer than what a call needs of
+        them and a cache may hold them; it is too low where something is both read and written, or
+        read again after it has left the cache.
+    seconds_known : float
+        Time of those calls whose buffers are known.
+    """
+
+    calls: int = 0
+    seconds: float = 0.0
+    bytes: int = 0
+    seconds_known: float = 0.0
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(
+            self.calls + other.calls,
+            self.seconds + other.seconds,
+            self.bytes + other.bytes,
+            self.seconds_known + other.seconds_known,
+        )
+
+    @property
+    def rate(self) -> float | None:
+        """Bytes per second; None where no call's buffers are known."""
+        return self.bytes / self.seconds_known if self.seconds_known else None
+
+
+@dataclass
+class Span:
+    """The time between two rows of a run's history.
+
+    Attributes
+    ----------
+    step, level, cells : int or None
+        Of the row that ended it: step 0 is all that comes before the first step. None: what came after the last row.
+    wall : float
+        Seconds by the clock.
+    stages : Counter
+        Device time per stage.
+    """
+
+    began: float
+    step: int | None = None
+    level: int | None = None
+    cells: int | None = None
+    wall: float = 0.0
+    stages: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def host(self) -> float:
+        """Seconds that the device did not work."""
+        return self.wall - self.stages.total()
+
+
+class Profile:
+    """Times everything that an adapter does on the device while the profile is open.
+
+    The adapter works on another queue of its context meanwhile, one whose events know their times,
+    with buffers of its own. A first run also compiles; profile a second one to leave that out.
+
+    Parameters
+    ----------
+    target : Adapter or pyopencl.CommandQueue
+        A queue must have been made with profiling enabled (`profiled_queue`).
+
+    Attributes
+    ----------
+    costs : dict of (str, str) to Cost
+        Per stage and kernel; a stage is a file of kernels. Complete once the profile is closed.
+    spans : list of Span
+        The history's rows, each with the time that led to it, and what came after the last.
+    wall, building : float
+        Seconds by the clock between opening and closing, and those of them that went into building programs.
+
+    Raises
+    ------
+    InputError
+        If the queue has no profiling.
+
+    Examples
+    --------
+    >>> with Profile(adapter) as profile:  # doctest: +SKIP
+    ...     adapter.run(domain, size)
+    >>> print(profile.table())  # doctest: +SKIP
+    """
+
+    def __init__(self, target: Adapter | cl.CommandQueue) -> None:
+        enabled = cl.command_queue_properties.PROFILING_ENABLE
+        if isinstance(target, cl.CommandQueue):
+            if not target.properties & enabled:
+                raise InputError(
+                    "target is a queue without profiling, expected one made with PROFILING_ENABLE; "
+                    "use clvoro.profile.profiled_queue(ctx)"
+                )
+            self._adapter, self.queue = None, target
+        else:
+            own = target.queue
+            self._adapter = target
+            self.queue = own if own.properties & enabled else profiled_queue(target.ctx)
+        self.costs: dict[tuple[str, str], Cost] = {}
+        self.spans: list[Span] = []
+        self.wall = self.building = 0.0
+        self._pending: list[tuple[cl.Event, tuple[str, str], int | None, Span]] = []
+        self._closing = ExitStack()
+
+    def __enter__(self) -> Profile:
+        if self._adapter is not None:
+            self._closing.enter_context(self._adapter.watched(self.queue, self._end_span))
+        self._closing.enter_context(_hooks.watching(self.queue, self._add))
+        self.building -= build_seconds()
+        self._began = time.perf_counter()
+        self._span = Span(self._began)
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            self._collect(len(self._pending))
+        except cl.Error:
+            if kind is None:  # otherwise the run has failed, and has said why
+                raise
+        finally:
+            self._pending.clear()
+            now = time.perf_counter()
+            self.wall += now - self._began
+            self.building += build_seconds()
+            self._span.wall = now - self._span.began
+            self.spans.append(self._span)
+            self._closing.close()
+
+    # What the hooks and the loop call.
+
+    def _add(
+        self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
+    ) -> None:
+        """Note a command; `moved` are its bytes if they are known, `done` tells that it has ended."""
+        entry = (event, (stage, name), moved, self._span)
+        if done:
+            self._count(*entry)
+            return
+        self._pending.append(entry)
+        if len(self._pending) >= PENDING:
+            self._collect(PENDING // 2)
+
+    def _end_span(self, row: np.void) -> None:
+        span, now = self._span, time.perf_counter()
+        span.step, span.level, span.cells = (int(row[name]) for name in ("step", "level", "cells"))
+        span.wall = now - span.began
+        self.spans.append(span)
+        self._span = Span(now)
+
+    def _collect(self, count: int) -> None:
+        """Wait for the oldest `count` events, read their times, let them go."""
+        if count:
+            self._pending[count - 1][0].wait()
+        for entry in self._pending[:count]:
+            self._count(*entry)
+        del self._pending[:count]
+
+    def _count(self, event: cl.Event, key: tuple[str, str], moved: int | None, span: Span) -> None:
+        event.wait()
+        times = event.profile
+        seconds = 1e-9 * (times.end - times.start)
+        cost = self.costs.setdefault(key, Cost())
+        cost.calls += 1
+        cost.seconds += seconds
+        if moved is not None:
+            cost.bytes += moved
+            cost.seconds_known += seconds
+        span.stages[key[0]] += seconds
+
+    # What came of it.
+
+    @property
+    def launches(self) -> int:
+        """Number of kernels and other commands."""
+        return sum(cost.calls for cost in self.costs.values())
+
+    @property
+    def device(self) -> float:
+        """Seconds that the device worked."""
+        return sum(cost.seconds for cost in self.costs.values())
+
+    @property
+    def host(self) -> float:
+        """Seconds that it did not: the host's own work, building programs, launches, waiting."""
+        return self.wall - self.device
+
+    @property
+    def steps(self) -> list[Span]:
+        """The spans of steps."""
+        return [span for span in self.spans if span.step]
+
+    @property
+    def bandwidth(self) -> float:
+        """Bytes per second that a copy of a large buffer reads and writes; measured once per device."""
+        device = self.queue.device.int_ptr
+        if device not in _bandwidths:
+            _bandwidths[device] = copy_bandwidth(self.queue.context)
+        return _bandwidths[device]
+
+    def of(self, *stages: str) -> float:
+        """Return the device time of these stages' kernels, in seconds."""
+        return sum(cost.seconds for (stage, _), cost in self.costs.items() if stage in stages)
+
+    def stages(self) -> dict[str, Cost]:
+        """Return the sum over each stage's kernels, the longest first."""
+        sums: dict[str, Cost] = {}
+        for (stage, _), cost in self.costs.items():
+            sums[stage] = sums.get(stage, Cost()) + cost
+        return dict(sorted(sums.items(), key=lambda item: -item[1].seconds))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as numbers, strings, lists and dicts; times in seconds, shares of `wall`."""
+        self._require_closed()
+
+        def figures(cost: Cost) -> dict[str, Any]:
+            rate = cost.rate
+            return {
+                "calls": cost.calls,
+                "seconds": cost.seconds,
+                "share": cost.seconds / self.wall,
+                "bytes_bound": cost.bytes if rate is not None else None,
+                "share_of_bandwidth": None if rate is None else rate / self.bandwidth,
+            }
+
+        return {
+            "wall": self.wall,
+            "device": self.device,
+            "host": self.host,
+            "building": self.building,
+            "bandwidth": self.bandwidth,
+            "stages": [{"stage": name, **figures(cost)} for name, cost in self.stages().items()],
+            "kernels": [
+                {"stage": stage, "kernel": name, **figures(cost)}
+                for (stage, name), cost in self._ranked()
+            ],
+            "spans": [
+                {"step": s.step, "level": s.level, "cells": s.cells, "wall": s.wall,
+                 "stages": dict(s.stages)}
+                for s in self.spans
+            ],
+        }  # fmt: skip
+
+    def table(self) -> str:
+        """Return stages and kernels as tables in plain text."""
+        self._require_closed()
+        levels = sorted({s.level for s in self.steps if s.level is not None}, reverse=True)
+        groups = {f"level {level}": [s for s in self.steps if s.level == level] for level in levels}
+        columns = {"ms/step": self.steps} if self.steps else {}
+        if len(levels) > 1:
+            columns |= groups
+
+        def per_step(seconds: Callable[[Span], float]) -> list[str]:
+            return [f"{1e3 * sum(map(seconds, s)) / len(s):.2f}" for s in columns.values()]
+
+        def time_of(seconds: float) -> list[str]:
+            return [f"{1e3 * seconds:.1f}", f"{seconds / self.wall:.1%}"]
+
+        def moving(cost: Cost) -> list[str]:
+            rate = cost.rate
+            if rate is None:
+                return ["-", "-"]
+            return [f"{1e-9 * rate:.1f}", f"{rate / self.bandwidth:.0%}"]
+
+        stages = [["stage", "calls", "ms", "share", "GB/s", "of copy", *columns]]
+        for name, cost in self.stages().items():
+            row = [name, str(cost.calls), *time_of(cost.seconds), *moving(cost)]
+            stages.append([*row, *per_step(lambda s, name=name: s.stages[name])])
+        stages.append(["host", "", *time_of(self.host), "", "", *per_step(lambda s: s.host)])
+        whole = ["wall", str(self.launches), *time_of(self.wall), "", ""]
+        stages.append([*whole, *per_step(lambda s: s.wall)])
+
+        kernels = [["kernel", "calls", "ms", "share", "GB/s", "of copy", "us/call", "MB/call"]]
+        small = Cost()
+        for (stage, name), cost in self._ranked():
+            if cost.seconds < SMALL * self.device:
+                small += cost
+                continue
+            kernels.append([f"{stage}.{name}", *_kernel_row(cost, time_of, moving)])
+        if small.calls:
+            name = f"{len(self.costs) + 1 - len(kernels)} smaller ones"
+            kernels.append([name, *_kernel_row(small, time_of, moving)])
+        notes = [
+            f"host: the clock less the device's time; {1e3 * self.building:.0f} ms of it built "
+            "programs; this profile's own work is in it",
+            f"copy: {1e-9 * self.bandwidth:.1f} GB/s, read and written by copying a large buffer",
+            "GB/s, MB: as if a call passed once over every buffer bound to it; an estimate, rather "
+            "too high",
+        ]
+        for name, spans in groups.items():
+            cells = max(s.cells or 0 for s in spans)
+            notes.append(f"{name}: {len(spans)} steps, up to {cells} cells")
+        return "\n".join([_aligned(stages), "", _aligned(kernels), "", *notes])
+
+    def _require_closed(self) -> None:
+        if not self.spans or self.spans[-1].step is not None:
+            raise InputError(
+                "the profile is open or has never been opened, expected a closed one; ask for its "
+                "figures after the `with` block"
+            )
+
+    def _ranked(self) -> list[tuple[tuple[str, str], Cost]]:
+        return sorted(self.costs.items(), key=lambda item: -item[1].seconds)
+
+
+def profiled_queue(ctx: cl.Context) -> cl.CommandQueue:
+    """Return a queue whose events know their times."""
+    return cl.CommandQueue(ctx, properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+
+def copy_bandwidth(ctx: cl.Context, repeat: int = 5) -> float:
+    """Return the bytes per second that are read and written by copying a large buffer on the device.
+
+    The better of the driver's own copy, which on a CPU may use one core only, and a kernel's; the
+    best of `repeat` calls.
+    """
+    queue = profiled_queue(ctx)
+    device = queue.device
+    size = min(LARGE, device.max_mem_alloc_size // 4, device.global_mem_size // 8) // 4096 * 4096
+    source, target = (cl.Buffer(ctx, cl.mem_flags.READ_WRITE, size) for _ in range(2))
+    cl.enqueue_fill(queue, source, np.int8(1), size)  # pages exist once they have been written
+    kernel = build_program(ctx, "copy.cl", {}, "").all_kernels()[0]
+    kernel.set_args(source, target)
+    best = float("inf")
+    for _ in range(repeat):
+        for event in (
+            cl.enqueue_copy(queue, target, source, byte_count=size),
+            cl.enqueue_nd_range_kernel(queue, kernel, (size // 16,), (64,)),
+        ):
+            event.wait()
+            best = min(best, 1e-9 * (event.profile.end - event.profile.start))
+    source.release()
+    target.release()
+    return 2 * size / best
+
+
+def _kernel_row(
+    cost: Cost, time_of: Callable[[float], list[str]], moving: Callable[[Cost], list[str]]
+) -> list[str]:
+    calls = max(cost.calls, 1)
+    moved = "-" if cost.rate is None else f"{1e-6 * cost.bytes / calls:.3f}"
+    per_call = [f"{1e6 * cost.seconds / calls:.1f}", moved]
+    return [str(cost.calls), *time_of(cost.seconds), *moving(cost), *per_call]
+
+
+def _aligned(rows: list[list[str]]) -> str:
+    """Return `rows` as text: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join([
+            row[0].ljust(widths[0]),
+            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
+        ])
+        for row in rows
+    )  # fmt: skip
