@@ -214,7 +214,7 @@ class Adapter:
             Coarser levels that "adaptive" and "exact" begin with: 2^levels h. From the caller's `points` it is the
             number of refinements that lead from them to the finest level.
         error_target : float, optional
-            Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0017 (.0035 for "fast", .0038 for
+            Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0025 (.0035 for "fast", .0038 for
             "best"). The larger, the better the cells' shape.
 
         Returns
@@ -295,7 +295,7 @@ class Adapter:
             unsorted = engine.upload((host - origin) / scale)
             mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
         tol = None if planned else options["tol"]
-        loop = Loop(mesh, plan, levels, target, options["max_steps"], tol, callback)
+        loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
         settings = {**options, "levels": levels, "dtype": self.dtype.name}
         if points is not None:
             settings["start"] = "points"

@@ -27,8 +27,6 @@ class Loop:
     plan : list of Action
     levels : int
         Coarser levels that the plan begins with.
-    expected : float
-        Cells that the finest level should have.
     max_steps : int or None
     tol : float or None
         Share by which error or quality must improve over a window of steps; 0 takes all steps. None: the run has
@@ -42,13 +40,12 @@ class Loop:
         mesh: Mesh,
         plan: list[Action],
         levels: int,
-        expected: float,
         max_steps: int | None,
         tol: float | None,
         callback: Callable[[np.void], object] | None,
     ) -> None:
         self.mesh, self.plan, self.level = mesh, plan, levels
-        self.n_start, self.expected = mesh.n, expected
+        self.n_start = mesh.n
         self.done = work_of(plan, levels, mesh.engine.dim)
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.rows: list[np.ndarray] = []
@@ -123,20 +120,23 @@ class Loop:
 
     def reorganise(self, action: Reorganise) -> None:
         """Insert and delete generators."""
+        if action.least and abs(self.missing()) <= action.least * self.mesh.n:
+            return
         nuclei = round(action.nuclei * self.mesh.n)
         inserted, deleted = self.mesh.reorganise(nuclei, self.held, theta=action.theta)
         self.inserted += inserted
         self.deleted += deleted
 
+    def missing(self) -> float:
+        """Cells that are missing: to the count that is held, or to what the size field asks for."""
+        return self.mesh.missing() if self.held is None else float(self.held - self.mesh.n)
+
     def settle(self, share: float = 0.0) -> None:
-        """Bring the count to within `share` of what the level should have; without it, to the one that is held."""
-        target = self.held
-        if share:
-            target = max(1, round(self.expected / 2.0 ** (self.mesh.engine.dim * self.level)))
-        if target is None:
-            return
-        while abs(self.mesh.n - target) > share * target:
-            inserted, deleted = self.mesh.reorganise(0, target, climb=False)
+        """Bring the count to within `share` of what the size field asks for; without it, to the one that is held."""
+        while True:
+            if (share == 0 and self.held is None) or abs(self.missing()) <= share * self.mesh.n:
+                break
+            inserted, deleted = self.mesh.reorganise(0, self.held, climb=False)
             self.inserted += inserted
             self.deleted += deleted
             if inserted == deleted:

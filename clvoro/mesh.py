@@ -28,7 +28,7 @@ from .sizing import Sizing
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess")
+SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight")
 
 
 class Stages:
@@ -243,6 +243,15 @@ class Mesh:
         """Mean of |log(L / h)|."""
         return self._excess().magnitude / self.n / self.engine.dim
 
+    def missing(self) -> float:
+        """Generators that the size field asks for beside those that there are (negative: too many).
+
+        The sum of V rho, not that of log(V rho), which would be biased by how much the cells' sizes scatter.
+        """
+        w = self.stages.density.evaluate(self.t, self.h)
+        self.summaries.collect("weight", w.weight, self.n)
+        return self.summaries.read()["weight"].sum - self.n
+
     def match_size(self) -> None:
         """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""
         factor = math.exp(self._excess().sum / self.n / self.engine.dim)
@@ -262,7 +271,7 @@ class Mesh:
 
         The count goes to `n_cells` or, with None, to what the size field asks for.
         """
-        total = self._excess().sum if n_cells is None else float(n_cells - self.n)
+        total = self.missing() if n_cells is None else float(n_cells - self.n)
         w = self.stages.density.evaluate(self.t, self.h)
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(

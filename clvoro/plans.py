@@ -69,13 +69,19 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0),
-    "default": Effort(60, 5, 3, (4, 18, 20, 20), glide=7, polish=18, aim=0.0017),
+    "default": Effort(60, 5, 3, (4, 18, 20, 20), glide=7, polish=18, aim=0.0025),
     "best": Effort(
         60, 5, 10, (60, 40, 30, 30), glide=7, polish=60, aim=0.0038, relaxation=1.5, momentum=0.8,
         eps=0.7, nuclei=0.0018, emphasis=60.0, lenience=0.02, bound=16.0,
     ),
 }  # fmt: skip
 
+SINGLE_AIM = 0.0017
+"""Mean |log(L / h)| that polishing aims at most at, where there is one level only."""
+COUNT_SHARE = 0.03
+"""Share of the generators by which the count may be off before the climb takes care of it."""
+COUNT_LEAST = 1e-3
+"""The same while polishing: a cell that comes late has few steps left to get its shape."""
 COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
@@ -90,10 +96,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Reorganise:
-    """Insert and delete generators; `nuclei` is the share of the cells where pairs may be made."""
+    """Insert and delete generators.
+
+    `nuclei` is the share of the cells where pairs may be made, `theta` the strain from which on pairs climb, `least` the
+    share by which the count must be off for anything to be done.
+    """
 
     nuclei: float = 0.0
     theta: float = THETA
+    least: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -108,7 +119,7 @@ class Rest:
 
 @dataclass(frozen=True)
 class Settle:
-    """Bring the count to the one that was asked for or, with `share`, to within that share of what is expected."""
+    """Bring the count to the one that is held or, with `share`, to within that share of what the size field asks for."""
 
     share: float = 0.0
 
@@ -140,7 +151,10 @@ def plan_adaptive(
     warm : bool
         The start is a mesh already, not a random sample.
     """
-    return list(_adaptive(effort, levels, exact, effort.aim if aim is None else aim, warm))
+    if aim is None:
+        # A mesh that is small enough for one level can be had nearer to its size.
+        aim = effort.aim if levels else min(effort.aim, SINGLE_AIM)
+    return list(_adaptive(effort, levels, exact, aim, warm))
 
 
 def _adaptive(
@@ -148,7 +162,7 @@ def _adaptive(
 ) -> Iterator[Action]:
     glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
     if warm:
-        yield Settle(share=0.05)
+        yield Settle(COUNT_SHARE)
     for level in range(levels, -1, -1):
         if level < levels:
             yield Refine()
@@ -158,6 +172,7 @@ def _adaptive(
         else:
             couple = effort.start if level else effort.start // 2
         yield from [Step(WeightedMethod(cautious=True))] * couple
+        yield Settle(COUNT_SHARE)
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
         if levels == 0:
             # The only level has no coarser one to have done the work.
@@ -176,7 +191,7 @@ def _adaptive(
     )  # fmt: skip
     for step in range(effort.polish):
         if step == 3:
-            yield Reorganise(theta=COUNT_THETA)
+            yield Reorganise(theta=COUNT_THETA, least=COUNT_LEAST)
             yield Settle()
         yield Step(polish)
     if exact:
