@@ -5,7 +5,7 @@
 Right side: white noise of mean zero; relative residual 1e-8 (1e-5 in float32). Times are the best of `--repeat`
 solves on a running process (kernels built), the peers' the best of one or two. Peers run where installed, up to
 `--peers-up-to` cells; direct solves up to a tenth of that.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 

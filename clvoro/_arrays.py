@@ -70,7 +70,9 @@ def check_integer(name: str, value: object, least: int) -> int:
     return int(value)
 
 
-def check_number(name: str, value: object, *, above: float = -np.inf, least: float = -np.inf) -> float:
+def check_number(
+    name: str, value: object, *, above: float = -np.inf, least: float = -np.inf
+) -> float:
     """Return `value` as a finite float above `above` and not under `least`."""
     try:
         number = float(value)  # type: ignore[arg-type]

@@ -141,9 +141,7 @@ class Bins:
             begin, size, grids = end, new_bins, grids + new_grids
         total = begin + size
         engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
-        engine.run_each(
-            k.sort_bins, total, self._bins, self._grid_of, self._shapes, self._items
-        )
+        engine.run_each(k.sort_bins, total, self._bins, self._grid_of, self._shapes, self._items)
         engine.run_each(
             k.gather_items, n, self._items, points, self._keys, self._grid_of, self._frames,
             self._points, self._reach,

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .domain import Box
 
 _HALVED = 0.5 ** np.arange(64)
+_ALL = slice(None)
 _BITS = {2: 31, 3: 21}  # of a place per axis in a Morton key of 64 bits
 
 
@@ -94,11 +95,11 @@ class Boxes:
     def __len__(self) -> int:
         return len(self.level)
 
-    def edges(self, chosen: object = slice(None)) -> np.ndarray:
+    def edges(self, chosen: slice | np.ndarray = _ALL) -> np.ndarray:
         """Return the physical edge lengths (m, d)."""
         return self.root * _HALVED[self.level[chosen]][:, None]
 
-    def points(self, at: np.ndarray, chosen: object = slice(None)) -> np.ndarray:
+    def points(self, at: np.ndarray, chosen: slice | np.ndarray = _ALL) -> np.ndarray:
         """Return the points (m, p, d) at relative positions `at` (p, d) or (m, p, d) in [0, 1]."""
         step = _HALVED[self.level[chosen]][:, None, None]
         x = self.origin + self.root * (self.corner[chosen][:, None, :] + step * at)

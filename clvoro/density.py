@@ -55,7 +55,9 @@ class Density:
                 *(engine.empty(n) for _ in range(3)), *(engine.empty((n, d)) for _ in range(2))
             )
         w = self._weighting
-        engine.run_each(k.evaluate_density, n, t.volumes, h, w.density, w.weight, w.excess, self._log_h)
+        engine.run_each(
+            k.evaluate_density, n, t.volumes, h, w.density, w.weight, w.excess, self._log_h
+        )
         engine.run_each(
             k.fit_gradient, n, t.starts, t.neighbours, t.points, self._log_h, w.gradient
         )

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import DTypeLike
 
 from . import _probe, _runtimes
 from ._probe import has_fp64, one_line
@@ -203,7 +204,7 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
     return "\n".join(lines)
 
 
-def require_fp64(where: cl.Context | cl.Device, dtype: object = np.float64) -> None:
+def require_fp64(where: cl.Context | cl.Device, dtype: DTypeLike = np.float64) -> None:
     """Check that a context's first device (or a device) computes in `dtype`.
 
     Raises

@@ -76,4 +76,4 @@ class Box:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool."""
-        return ((points >= self.lower) & (points <= self.upper)).all(axis=1)
+        return np.all((points >= self.lower) & (points <= self.upper), axis=1)

@@ -60,7 +60,11 @@ class _Fetched:
     def slots(self) -> np.ndarray:
         """Place in the device's arrays of each face of the result, (m,)."""
         m = len(self.owners)
-        return self.starts[self.owners] + np.arange(m) - self.neighbour_starts()[self.ranks[self.owners]]
+        return (
+            self.starts[self.owners]
+            + np.arange(m)
+            - self.neighbour_starts()[self.ranks[self.owners]]
+        )
 
     @cached_property
     def ranks(self) -> np.ndarray:

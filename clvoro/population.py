@@ -201,9 +201,7 @@ class PopulationControl:
         engine, n = self.engine, t.n
         into, other = engine.empty(n, np.uint64), engine.empty(n, np.uint64)
         for _ in range(rings):
-            engine.run_each(
-                self._kernels.spread_keys, n, t.starts, t.neighbours, source, into
-            )
+            engine.run_each(self._kernels.spread_keys, n, t.starts, t.neighbours, source, into)
             source, into, other = into, other, into
         return source
 

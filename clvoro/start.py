@@ -6,6 +6,7 @@ from collections.abc import Callable
 from numbers import Integral, Real
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from .domain import Box
 from .errors import InputError, InputTypeError
@@ -49,7 +50,7 @@ def sample_density(
     domain: Box,
     n: int,
     seed: int,
-    real: object = None,
+    real: DTypeLike | None = None,
 ) -> np.ndarray:
     """Return `n` points distributed as h^-d.
 
@@ -102,7 +103,7 @@ def sample_density(
     return _distinct(draw, domain, n, np.dtype(precision))
 
 
-def sample_uniform(domain: Box, n: int, seed: int, real: object = np.float64) -> np.ndarray:
+def sample_uniform(domain: Box, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
     """Return `n` independent uniform random points, the paper's start.
 
     Parameters
@@ -139,7 +140,7 @@ def _evaluator(field: object) -> Callable[[np.ndarray], np.ndarray]:
     return field if hasattr(field, "real") and callable(field) else as_field(field)
 
 
-def _checked(n: object, seed: object) -> tuple[int, int]:
+def _checked(n: int, seed: int) -> tuple[int, int]:
     for name, value, least in (("n", n, 1), ("seed", seed, 0)):
         if not isinstance(value, Integral) or isinstance(value, bool):
             raise InputTypeError(f"{name} is {value!r}, expected an integer")

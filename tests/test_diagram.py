@@ -92,7 +92,10 @@ def check_invariants(diagram, eps):
     following[starts[1:] - 1] = starts[:-1]
     edge = corners[following] - corners
     assert np.abs(np.hypot(*edge.T) - diagram.face_measures).max() <= 64 * eps * scale
-    assert np.abs((corners[following] + corners) / 2 - diagram.face_centroids).max() <= 64 * eps * scale
+    assert (
+        np.abs((corners[following] + corners) / 2 - diagram.face_centroids).max()
+        <= 64 * eps * scale
+    )
     a = corners - diagram.points[i]
     b = corners[following] - diagram.points[i]
     turn = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
@@ -106,7 +109,9 @@ def check_invariants(diagram, eps):
         for side, wall in enumerate((box.lower[axis], box.upper[axis])):
             on = j == -1 - (2 * axis + side)
             assert np.abs(diagram.face_centroids[on, axis] - wall).max() <= 4 * eps * scale
-            assert diagram.face_measures[on].sum() == pytest.approx(box.extent[1 - axis], rel=64 * eps)
+            assert diagram.face_measures[on].sum() == pytest.approx(
+                box.extent[1 - axis], rel=64 * eps
+            )
 
 
 def test_invariants(adapter, points):
@@ -216,7 +221,14 @@ def test_bad_points(adapter64, points, message):
 def test_same_bits_twice(adapter):
     points = POINTS["graded"]
     a, b = adapter.diagram(BOX, points), adapter.diagram(BOX, points)
-    for name in ("volumes", "centroids", "neighbours", "face_measures", "vertices", "cell_vertices"):
+    for name in (
+        "volumes",
+        "centroids",
+        "neighbours",
+        "face_measures",
+        "vertices",
+        "cell_vertices",
+    ):
         assert (getattr(a, name) == getattr(b, name)).all(), name
 
 

@@ -23,7 +23,7 @@ def write_history(result: Result, path: str | PathLike[str]) -> None:
     with atomic_file(path) as file:
         text = io.TextIOWrapper(file, encoding="ascii", newline="")
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(result.history.dtype.names)
+        writer.writerow(result.history.dtype.names or ())
         writer.writerows(result.history.tolist())
         text.flush()
         text.detach()

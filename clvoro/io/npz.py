@@ -235,9 +235,12 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
     history = np.zeros(len(stored), HISTORY_DTYPE)
     for column in set(stored.dtype.names or ()) & set(HISTORY_DTYPE.names or ()):
         history[column] = stored[column]
+    stored_fields: dict[str, Any] = {
+        name: arrays[name] for name in _FIELDS if name in arrays and name != "history"
+    }
     return Result(
         **values,
-        **{name: arrays[name] for name in _FIELDS if name in arrays and name != "history"},
+        **stored_fields,
         diagram=Diagram(domain, _part(arrays, "diagram")),
         history=history,
         initial=_displacements(arrays, "initial"),

@@ -10,6 +10,8 @@ from .._program import source_text
 from ..errors import InputError
 
 if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
+
     from ..domain import Box
     from .field import Field
 
@@ -67,7 +69,7 @@ class Binder:
         return np.clip(packed, -largest, largest).astype(self.real)
 
 
-def bind(field: Field, domain: Box, real: object = np.float64) -> tuple[str, np.ndarray]:
+def bind(field: Field, domain: Box, real: DTypeLike = np.float64) -> tuple[str, np.ndarray]:
     """Return `field` as OpenCL for the normalised coordinates of `domain`.
 
     Geometry is converted to those coordinates in float64, so that float32 is as accurate far from

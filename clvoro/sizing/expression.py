@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -84,7 +84,7 @@ class _Node(NamedTuple):
     """One operation; `arguments` are indices of earlier nodes, so a list is read in order."""
 
     kind: str  # "number", "axis", "negate", "not", "choose", "binary", "call"
-    value: object
+    value: Any
     arguments: tuple[int, ...] = ()
 
 
@@ -127,7 +127,7 @@ class Expression(Field):
         self.dim = 3 if self._axes == 3 else None
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
-        values: list[np.ndarray] = []
+        values: list[Any] = []
         with np.errstate(all="ignore"):
             for kind, value, arguments in self._nodes:
                 a = [values[i] for i in arguments]
@@ -209,13 +209,13 @@ class _Parser:
                 rest = self.text[position:]
                 column = position + len(rest) - len(rest.lstrip())
                 self._refuse(column)
-            kind = match.lastgroup
+            kind = match.lastgroup or ""
             found.append((kind, match[kind], match.start(kind)))
             position = match.end()
         found.append(("end", "", end))
         return found
 
-    def _refuse(self, column: int) -> None:
+    def _refuse(self, column: int) -> NoReturn:
         rest = self.text[column:]
         number = re.match(r"\.?\d[\w.]*", rest, re.ASCII)
         if number:
@@ -228,7 +228,7 @@ class _Parser:
     def _word(self) -> str:
         return self.tokens[self.at][1]
 
-    def _fail(self, what: str, column: int | None = None) -> None:
+    def _fail(self, what: str, column: int | None = None) -> NoReturn:
         column = self.tokens[self.at][2] if column is None else column
         begin = max(0, column - 20)
         near = self.text[begin : column + 20]

@@ -96,7 +96,7 @@ class Field:
     def __mul__(self, factor: object) -> Field:
         if not isinstance(factor, Real):
             return NotImplemented
-        return Scaled(self, factor)
+        return Scaled(self, float(factor))
 
     __rmul__ = __mul__
 
@@ -289,7 +289,7 @@ def as_field(size: object) -> Field:
     if isinstance(size, np.ndarray) and size.ndim == 0:
         size = size.item()
     if isinstance(size, Real) and not isinstance(size, (bool, np.bool_)):
-        return Constant(size)
+        return Constant(float(size))
     if callable(size):
         return Function(size)
     hint = ""
