@@ -161,7 +161,8 @@ class Loop:
         mesh = self.mesh
         s, n = mesh.assess(), mesh.n
         row = np.zeros(1, HISTORY_DTYPE)
-        row["step"], row["level"], row["cells"], row["progress"] = self.steps, self.level, n, progress
+        row["step"], row["level"], row["cells"] = self.steps, self.level, n
+        row["progress"] = progress
         row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
         row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
         row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
@@ -193,9 +194,7 @@ class Loop:
             mesh.values(mesh.correction, scale),
         )
 
-    def result(
-        self, converged: bool, reason: str, settings: dict[str, Any]
-    ) -> Result:
+    def result(self, converged: bool, reason: str, settings: dict[str, Any]) -> Result:
         """Fetch what the run has come to."""
         mesh = self.mesh
         final = None

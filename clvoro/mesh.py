@@ -28,7 +28,9 @@ from .sizing import Sizing
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-SUMMARIES = ("error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight")
+SUMMARIES = (
+    "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
+)  # fmt: skip
 
 
 class Stages:
@@ -244,7 +246,7 @@ class Mesh:
         return self._excess().magnitude / self.n / self.engine.dim
 
     def missing(self) -> float:
-        """Generators that the size field asks for beside those that there are (negative: too many).
+        """Return how many generators the size field asks for beside those that there are (negative: too many).
 
         The sum of V rho, not that of log(V rho), which would be biased by how much the cells' sizes scatter.
         """

@@ -98,8 +98,8 @@ class Step:
 class Reorganise:
     """Insert and delete generators.
 
-    `nuclei` is the share of the cells where pairs may be made, `theta` the strain from which on pairs climb, `least` the
-    share by which the count must be off for anything to be done.
+    `nuclei` is the share of the cells where pairs may be made, `theta` the strain from which on pairs climb, `least`
+    the share by which the count must be off for anything to be done.
     """
 
     nuclei: float = 0.0
@@ -119,7 +119,10 @@ class Rest:
 
 @dataclass(frozen=True)
 class Settle:
-    """Bring the count to the one that is held or, with `share`, to within that share of what the size field asks for."""
+    """Bring the count to the one that is held.
+
+    With `share`, to within that share of what the size field asks for.
+    """
 
     share: float = 0.0
 
@@ -157,9 +160,7 @@ def plan_adaptive(
     return list(_adaptive(effort, levels, exact, aim, warm))
 
 
-def _adaptive(
-    effort: Effort, levels: int, exact: bool, aim: float, warm: bool
-) -> Iterator[Action]:
+def _adaptive(effort: Effort, levels: int, exact: bool, aim: float, warm: bool) -> Iterator[Action]:
     glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
     if warm:
         yield Settle(COUNT_SHARE)

@@ -69,7 +69,7 @@ class PopulationControl:
         reach: cla.Array,
         excess: cla.Array,
         rows: Population,
-        total_excess: float,
+        missing: float,
         next_label: int,
         nuclei: int = 0,
         climb: bool = True,
@@ -84,8 +84,9 @@ class PopulationControl:
             Length by which a generator may be moved: the lesser of h and L.
         rows : Population
             The present generators.
-        total_excess : float
-            Sum of the excess: how many generators are missing or, negative, too many.
+        missing : float
+            How many generators the size field, or the count that is held, asks for beside those that there are;
+            negative: too many.
         next_label : int
             First label for the new ones.
         nuclei : int
@@ -101,7 +102,7 @@ class PopulationControl:
         """
         n = t.n
         # Less than 0.7 of a generator is left to strain; a large change is made in several calls.
-        need = math.trunc(total_excess + math.copysign(0.3, total_excess))
+        need = math.trunc(missing + math.copysign(0.3, missing))
         most = max(4, int(LARGEST_CHANGE * n))
         need = max(-most, min(most, need))
         marks = _Marks.clean(self.engine, n)
