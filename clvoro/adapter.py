@@ -229,6 +229,8 @@ class Adapter:
             If h is not positive and finite somewhere; names the place.
         MemoryLimitError
             If the run would need more memory than the device has.
+        SolverError
+            If a linear solve breaks down.
         """
         check_choice("method", method, METHODS)
         check_choice("start", start, STARTS)

@@ -42,6 +42,7 @@ class Diagram:
 
     Attributes
     ----------
+    domain : Box
     points : (n, d) float
         Generators.
     volumes : (n,) float
@@ -88,7 +89,15 @@ class Diagram:
 
 @dataclass(frozen=True)
 class Displacements:
-    """The two halves of one step, before they are combined: the paper's Figure 6."""
+    """The two halves of one step, before they are combined: the paper's Figure 6.
+
+    Attributes
+    ----------
+    points : (n, d) float
+        Generators before the step.
+    lloyd, poisson : (n, d) float
+        Displacement towards the centroids, and the metric correction; lengths in the domain's unit.
+    """
 
     points: np.ndarray
     lloyd: np.ndarray
