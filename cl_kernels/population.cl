@@ -61,9 +61,9 @@ inline ulong site_key(REAL magnitude, int i)
     return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
 }
 
-/* Per cell i of charge -1: the pull s = b.S.b - t.S.t on its pair with the neighbour of charge +1 where |s| is largest, t
-   from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if wanted, come
-   first: they can go altogether. */
+/* Per cell i of negative charge: the pull s = b.S.b - t.S.t on its pair with the neighbour of positive charge where |s| is
+   largest, t from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if wanted,
+   come first: they can go altogether. So do those of a cell with a charge of 2, the worst cells that there are. */
 kernel void score_pairs(const int size, global const int *starts, global const int *neighbours,
                         global const REAL *points, global const int2 *kinds, global const REAL4 *strain,
                         const int at_walls, global int *partners, global REAL *pull, global ulong *keys)
@@ -72,10 +72,10 @@ kernel void score_pairs(const int size, global const int *starts, global const i
     REAL best = 0, rank = 0;
     int partner = -1;
     const int2 kind = kinds[i];
-    if (kind.s0 == -1 && (kind.s1 == 0 || at_walls))
+    if (kind.s0 < 0 && (kind.s1 == 0 || at_walls))
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbours[k];
-            if (j < 0 || kinds[j].s0 != 1)
+            if (j < 0 || kinds[j].s0 < 1)
                 continue;
             const bool one_wall = (kind.s1 > 0) != (kinds[j].s1 > 0);
             if ((kind.s1 > 0 && kinds[j].s1 > 0) || (one_wall && !at_walls))
@@ -85,7 +85,8 @@ kernel void score_pairs(const int size, global const int *starts, global const i
             const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
             const REAL value = (across - along) / dot(d, d);
-            const REAL value_rank = fabs(value) + (one_wall ? R(WALL_THETA) : R(0));
+            const bool first = one_wall || kind.s0 < -1 || kinds[j].s0 > 1;
+            const REAL value_rank = fabs(value) + (first ? R(WALL_THETA) : R(0));
             if (partner < 0 || value_rank > rank) {
                 best = value;
                 rank = value_rank;
@@ -156,9 +157,14 @@ kernel void flag_sites(const int size, global const ulong *chosen, global int *f
 
 /* What a pair does to the count of generators, 1 if it is split, -1 if it is deleted. Thresholds give way as the count needs:
    shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A pair with one cell at a wall ends there, unless the
-   strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. */
+   strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. An inner cell of four
+   sides always goes, one of eight is always split. */
 inline int pair_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
 {
+    if (minus.s0 < -1 && minus.s1 == 0)
+        return -1;
+    if (plus.s0 > 1 && plus.s1 == 0)
+        return 1;
     if (minus.s1 > 0)
         return pull < R(WALL_THETA) ? -1 : 0;
     if (plus.s1 > 0)
