@@ -214,7 +214,7 @@ class Adapter:
             Coarser levels that "adaptive" and "exact" begin with: 2^levels h. From the caller's `points` it is the
             number of refinements that lead from them to the finest level.
         error_target : float, optional
-            Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0025 (.0035 for "fast", .0038 for
+            Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0025 (.0035 for "fast", .0039 for
             "best"). The larger, the better the cells' shape.
 
         Returns
