@@ -14,7 +14,7 @@ from . import device
 from ._arrays import check_integer, check_number, check_points, coincident_pair
 from ._program import Engine
 from .domain import Box
-from .errors import InputError, InputTypeError
+from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
 from .loop import Loop
 from .mesh import Mesh, Stages, check_memory
@@ -76,6 +76,11 @@ class Adapter:
             self._owner = threading.get_ident()
             try:
                 yield
+            except cl.MemoryError as error:
+                raise MemoryLimitError(
+                    f"{self.queue.device.name.strip()} is out of memory ({error}); use a larger size, n_cells, "
+                    "dtype='float32' or another device"
+                ) from error
             finally:
                 self._owner = None
 
@@ -140,6 +145,8 @@ class Adapter:
         ------
         InputError
             If the points are not as expected, or too close together for the precision.
+        MemoryLimitError
+            If the device has not enough memory.
         """
         with self._alone():
             return self._diagram(domain, points)
@@ -148,6 +155,7 @@ class Adapter:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
+        check_memory(engine, n)
         origin, scale = domain.frame
         binned = stages.bins.build(domain, engine.upload((host - origin) / scale), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()

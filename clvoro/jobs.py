@@ -140,7 +140,7 @@ class Job:
 
         def stop(number: int, _: object) -> None:
             if self.interrupted:
-                raise KeyboardInterrupt
+                raise SystemExit(130)  # not KeyboardInterrupt, which a run takes as a wish to stop
             self.interrupted = True
             print(
                 "\nclvoro: stopping after this step; once more to quit without writing",
