@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from .errors import BuildError, ClvoroError, DeviceError, InputError, InputTypeError
+from .errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(error, NO_DEVICE)
     except (ClvoroError, OSError) as error:
         return _complain(error, FAILED)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Aborted):
         return _complain("interrupted, nothing more has been written", INTERRUPTED)
 
 

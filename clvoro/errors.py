@@ -31,3 +31,7 @@ class SizeFieldError(InputError):
 
 class SolverError(ClvoroError, ArithmeticError):
     """A linear solve broke down (not positive definite, or not finite)."""
+
+
+class Aborted(BaseException):
+    """The user wants to quit at once; unlike KeyboardInterrupt, which a run answers with what it has so far."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .cases import Case
-from .errors import ClvoroError, InputError
+from .errors import Aborted, ClvoroError, InputError
 from .io import check_writable, save, write_history
 from .profile import Profile
 from .results import Result
@@ -140,7 +140,7 @@ class Job:
 
         def stop(number: int, _: object) -> None:
             if self.interrupted:
-                raise SystemExit(130)  # not KeyboardInterrupt, which a run takes as a wish to stop
+                raise Aborted
             self.interrupted = True
             print(
                 "\nclvoro: stopping after this step; once more to quit without writing",
