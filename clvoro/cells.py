@@ -18,7 +18,7 @@ CELL_CAPACITY = 24
 ROW_CAPACITY = 20
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
 LARGEST_ROW = 512
-FULL, COINCIDE, COLLAPSED = 1, 2, 4
+FULL, COINCIDE = 1, 2  # of the bits in cells.cl; any other means cells that collapsed
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from ._primitives import Gather, Summaries, Summary
 from ._program import Engine
 from .bins import Bins
 from .cells import Cells, Tessellation
-from .density import Density
+from .density import Density, Weighting
 from .domain import Box
 from .errors import MemoryLimitError
 from .fetch import fetch_diagram
@@ -235,28 +235,31 @@ class Mesh:
             self.t, self.h, self.error, self.quality, self.energy, self.reach
         )
 
-    def _excess(self) -> Summary:
+    def weigh(self) -> Weighting:
+        """Evaluate density, excess and weighted centroids of the present cells; valid until the next call."""
+        return self.stages.density.evaluate(self.t, self.h)
+
+    def _excess(self, w: Weighting) -> Summary:
         """Summarise the excess, log(V / h^d)."""
-        w = self.stages.density.evaluate(self.t, self.h)
         self.summaries.collect("excess", w.excess, self.n)
         return self.summaries.read()["excess"]
 
-    def mean_log_error(self) -> float:
-        """Mean of |log(L / h)|."""
-        return self._excess().magnitude / self.n / self.engine.dim
+    def mean_log_error(self, w: Weighting) -> float:
+        """Mean of |log(L / h)|, by a weighting that has just been made."""
+        return self._excess(w).magnitude / self.n / self.engine.dim
 
-    def missing(self) -> float:
+    def missing(self, w: Weighting | None = None) -> float:
         """Return how many generators the size field asks for beside those that there are (negative: too many).
 
         The sum of V rho, not that of log(V rho), which would be biased by how much the cells' sizes scatter.
         """
-        w = self.stages.density.evaluate(self.t, self.h)
+        w = self.weigh() if w is None else w
         self.summaries.collect("weight", w.weight, self.n)
         return self.summaries.read()["weight"].sum - self.n
 
     def match_size(self) -> None:
         """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""
-        factor = math.exp(self._excess().sum / self.n / self.engine.dim)
+        factor = math.exp(self._excess(self.weigh()).sum / self.n / self.engine.dim)
         self.coarsening *= factor
         metric = self.stages.metric
         metric.scale_sizes(factor, self.h)
@@ -273,8 +276,8 @@ class Mesh:
 
         The count goes to `n_cells` or, with None, to what the size field asks for.
         """
-        total = self.missing() if n_cells is None else float(n_cells - self.n)
-        w = self.stages.density.evaluate(self.t, self.h)
+        w = self.weigh()
+        total = self.missing(w) if n_cells is None else float(n_cells - self.n)
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(
             self.domain, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,

@@ -100,7 +100,7 @@ class WeightedMethod:
         """Evaluate the weighted Lloyd displacement and the correction."""
         stages, t = mesh.stages, mesh.t
         motion, poisson = stages.motion, stages.poisson
-        w = stages.density.evaluate(t, mesh.h)
+        w = mesh.weigh()
         mesh.lloyd = w.lloyd
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         laplacian = poisson.assemble(
@@ -171,12 +171,12 @@ class ProjectedMethod:
     def displace(self, mesh: Mesh) -> Solution:
         """Evaluate the descent, with momentum, and its projection."""
         stages, t = mesh.stages, mesh.t
+        w = mesh.weigh()
         if self.aim and self.steps > 2:
-            off = mesh.mean_log_error()
+            off = mesh.mean_log_error(w)
             change = self.aim / max(off, 1e-9)  # every cell may be exactly right
             self.eps = min(3.0, max(1e-3, self.eps * min(1.33, max(0.75, change))))
         self.steps += 1
-        w = stages.density.evaluate(t, mesh.h)
         if self.sampled_gradient:
             mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, mesh.source, w.gradient)
         mesh.lloyd = w.lloyd
