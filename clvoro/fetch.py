@@ -17,7 +17,7 @@ from .vertices import VertexNumbering, Vertices
 def fetch_diagram(engine: Engine, domain: Box, t: Tessellation, labels: cla.Array) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for."""
     fetched = _Fetched(engine, domain, t, labels)
-    names = (name for name in Diagram._NAMES if not name.startswith("_"))
+    names = (name for name in Diagram._NAMES if hasattr(_Fetched, name))
     return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
 
 

@@ -61,11 +61,21 @@ class Diagram:
     cell_vertex_starts : (n + 1,) int32, 2D only
     cell_vertices : (m,) int32, 2D only
         Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1.
+    face_vertex_starts : (m + 1,) int32, 3D only
+    face_vertices : (k,) int32, 3D only
+        Corners of face f of the graph, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``,
+        counter-clockwise as seen from outside of the cell to whose row the face belongs.
+
+    Raises
+    ------
+    AttributeError
+        For the arrays that the diagram's dimension does not have.
     """
 
     _NAMES = (
         "points", "volumes", "centroids", "neighbour_starts", "neighbours", "face_measures",
-        "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices",
+        "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
+        "face_vertices",
     )  # fmt: skip
 
     def __init__(self, domain: Box, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]):
@@ -75,6 +85,8 @@ class Diagram:
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in Diagram._NAMES:
             raise AttributeError(name)
+        if name not in self._arrays:
+            raise AttributeError(f"{name}: a diagram in {self.domain.dim}D has none")
         value = self._arrays[name]
         if callable(value):
             value = self._arrays[name] = value()
@@ -148,7 +160,10 @@ class Result:
     origin: np.ndarray | None = None
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the mesh to `path`: `.npz` (reload with `clvoro.load`) or `.vtu`, or any format meshio knows."""
+        """Write the mesh to `path`: `.npz` (reload with `clvoro.load`), `.vtu`, OpenFOAM's `polyMesh`, ...
+
+        See `clvoro.io.save` for all formats.
+        """
         from .io import save
 
         save(self, path)

@@ -42,7 +42,7 @@ _SHAPES = {
     "diagram.points": "nd", "diagram.volumes": "n", "diagram.centroids": "nd",
     "diagram.neighbour_starts": "N", "diagram.neighbours": "m", "diagram.face_measures": "m",
     "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
-    "diagram.cell_vertices": "c",
+    "diagram.cell_vertices": "c", "diagram.face_vertex_starts": "M", "diagram.face_vertices": "f",
     "initial.points": "nd", "initial.lloyd": "nd", "initial.poisson": "nd",
     "final.points": "nd", "final.lloyd": "nd", "final.poisson": "nd",
 }  # fmt: skip
@@ -190,23 +190,25 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
             if array.ndim != 1 or array.dtype.names is None:
                 raise _FileError(f"history has shape {array.shape} and dtype {array.dtype}")
             continue
-        integer = axes in ("N", "m", "c") and name != "diagram.face_measures"
+        integer = axes in ("N", "m", "c", "M", "f") and name != "diagram.face_measures"
         if array.dtype.kind not in ("iu" if integer else "f"):
             raise _FileError(f"{name} has dtype {array.dtype}")
         expected = tuple(sizes.setdefault(a, s) for a, s in zip(axes, array.shape, strict=False))
         if array.ndim != len(axes) or array.shape != expected:
             raise _FileError(f"{name} has shape {array.shape}, which does not fit the other arrays")
-    for starts, items, bound in (
-        ("diagram.neighbour_starts", "diagram.neighbours", sizes["n"]),
-        ("diagram.cell_vertex_starts", "diagram.cell_vertices", sizes.get("v", 0)),
+    for starts, items, rows, bound in (
+        ("diagram.neighbour_starts", "diagram.neighbours", ("cell", "n"), sizes["n"]),
+        ("diagram.cell_vertex_starts", "diagram.cell_vertices", ("cell", "n"), sizes.get("v", 0)),
+        ("diagram.face_vertex_starts", "diagram.face_vertices", ("face", "m"), sizes.get("v", 0)),
     ):
         if (starts in arrays) != (items in arrays):
             raise _FileError(f"it lacks {starts if items in arrays else items}")
         if starts not in arrays:
             continue
         s, j = arrays[starts], arrays[items]
-        if len(s) != sizes["n"] + 1 or s[0] != 0 or s[-1] != len(j) or (np.diff(s) < 0).any():
-            raise _FileError(f"{starts} does not cut {items} into one piece per cell")
+        piece, count = rows[0], sizes.get(rows[1], 0)
+        if len(s) != count + 1 or s[0] != 0 or s[-1] != len(j) or (np.diff(s) < 0).any():
+            raise _FileError(f"{starts} does not cut {items} into one piece per {piece}")
         lowest = 0 if items.endswith("vertices") else np.iinfo(j.dtype).min
         if j.size and not (lowest <= j.min() and j.max() < bound):
             raise _FileError(f"{items} points to what does not exist")
