@@ -11,6 +11,7 @@ from pathlib import Path
 from ..errors import InputTypeError
 from ..results import Result
 from .atomic import check_writable
+from .foam import write_foam
 from .formats import write_foreign
 from .history import write_history
 from .npz import load, write_npz
@@ -18,7 +19,7 @@ from .vtu import write_vtu
 
 __all__ = ["check_writable", "load", "save", "write_history"]
 
-_WRITERS = {".npz": write_npz, ".vtu": write_vtu}
+_WRITERS = {".npz": write_npz, ".vtu": write_vtu, ".foam": write_foam}
 
 
 def save(result: Result, path: str | PathLike[str]) -> None:
@@ -29,14 +30,16 @@ def save(result: Result, path: str | PathLike[str]) -> None:
     result : Result
     path : str or path
         ``.npz`` holds everything and is read back by `load`; ``.vtu`` is for ParaView and other VTK
-        programs (polygons with h, error, quality and more as cell data); ``.vtk``, ``.ply`` and
-        ``.obj`` are written through meshio (``pip install "clvoro[formats]"``), the latter two
-        without cell data.
+        programs (polygons or polyhedra with h, error, quality and more as cell data);
+        ``.../constant/polyMesh`` is a folder for OpenFOAM, and ``CASE/name.foam`` the same within a
+        case, for ParaView, too (2D: one layer of prisms between patches of type `empty`); ``.vtk``,
+        ``.ply`` and ``.obj`` hold 2D meshes and are written through meshio (``pip install
+        "clvoro[formats]"``), the latter two without cell data.
 
     Raises
     ------
     InputError
-        If the format is unknown or cannot hold polygons, or the file cannot be written. An existing
+        If the format is unknown or cannot hold the cells, or the file cannot be written. An existing
         file is then as before.
     """
     if not isinstance(result, Result):
@@ -45,4 +48,5 @@ def save(result: Result, path: str | PathLike[str]) -> None:
             "Adapter.run returned"
         )
     path = Path(path)
-    _WRITERS.get(path.suffix.lower(), write_foreign)(result, path)
+    writer = write_foam if path.name == "polyMesh" else _WRITERS.get(path.suffix.lower())
+    (writer or write_foreign)(result, path)

@@ -17,7 +17,7 @@ from .vtu import cell_data, in_space
 # more than a warning. The value tells whether cell data are kept, too.
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
-_SAFE = ".npz (everything), .vtu (ParaView), .vtk, .ply or .obj"
+_SAFE = ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .vtk, .ply or .obj"
 
 
 def write_foreign(result: Result, path: Path) -> None:
@@ -30,7 +30,7 @@ def write_foreign(result: Result, path: Path) -> None:
     if result.diagram.domain.dim != 2:
         raise InputError(
             f"cannot write {path}: the mesh has {result.diagram.domain.dim} dimensions, and only 2 "
-            f"are written to {suffix}; save it as .npz"
+            f"are written to {suffix}; save it as .vtu, .foam or .npz"
         )
     try:
         import meshio

@@ -15,36 +15,31 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..errors import InputError
-from ..results import Result
+from ..faces import face_corners, face_owners
+from ..results import Diagram, Result
 from .atomic import atomic_file
 
-_POLYGON = 7  # VTK_POLYGON
+_POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
 _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
 
 def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
-    """Write the cells as polygons with their data; the settings go along in a comment.
+    """Write the cells as polygons or polyhedra with their data; the settings go along in a comment.
 
-    Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides`, and the
-    vector `generator`, from the origin to the cell's generator.
+    Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces`, their number),
+    `label` (the cell's row in the result), and the vector `generator`, from the origin to the cell's generator.
     """
     diagram = result.diagram
-    if diagram.domain.dim != 2:
-        raise InputError(
-            f"cannot write {path}: the mesh has {diagram.domain.dim} dimensions, and only 2 are "
-            "written to .vtu; save it as .npz"
-        )
-    starts = diagram.cell_vertex_starts
     n = len(diagram)
     appended = _Appended(compress)
     points = appended.add(None, in_space(diagram.vertices))
-    cells = [
-        appended.add("connectivity", diagram.cell_vertices),
-        appended.add("offsets", starts[1:]),
-        appended.add("types", np.full(n, _POLYGON, np.uint8)),
-    ]
+    if diagram.domain.dim == 2:
+        kind, topology = _POLYGON, _polygons(diagram)
+    else:
+        kind, topology = _POLYHEDRON, _polyhedra(diagram)
+    topology["types"] = np.full(n, kind, np.uint8)
+    cells = [appended.add(name, array) for name, array in topology.items()]
     data = [appended.add(name, values) for name, values in cell_data(result).items()]
     compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
     head = f"""<?xml version="1.0"?>
@@ -73,20 +68,66 @@ _"""
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
+def _polygons(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return the cells' corners, counter-clockwise, and where each cell's end."""
+    return {
+        "connectivity": diagram.cell_vertices,
+        "offsets": diagram.cell_vertex_starts[1:],
+    }
+
+
+def _polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return the cells' corners and the streams that describe their faces.
+
+    `faces` has for each cell the number of its faces, then for each face the number of its corners and the
+    corners, counter-clockwise as seen from outside; `faceoffsets` tells where each cell's part ends.
+    """
+    n, v = len(diagram), len(diagram.vertices)
+    starts, corners = face_corners(diagram)
+    sides = np.diff(starts)
+    owner, sides = face_owners(diagram)[sides > 0], sides[sides > 0]
+    faces = np.bincount(owner, minlength=n)
+    ends = np.cumsum(1 + faces + np.bincount(owner, sides, minlength=n).astype(np.int64))
+    index = np.int32 if len(ends) == 0 or ends[-1] < 2**31 else np.int64
+    stream = np.empty(ends[-1] if n else 0, index)
+    counts = np.concatenate([[0], ends[:-1]])
+    # Before a face stand those of the same and of earlier cells, and the counts of these cells.
+    headers = np.cumsum(sides + 1) - (sides + 1) + owner + 1
+    rest = np.ones(len(stream), bool)
+    rest[counts] = rest[headers] = False
+    stream[counts], stream[headers], stream[rest] = faces, sides, corners
+
+    # Every corner of a cell is one of at least three of its faces, and listed once.
+    keys = np.repeat(owner.astype(np.int64) * v, sides) + corners
+    keys.sort()
+    keys = keys[np.concatenate([[True], keys[1:] != keys[:-1]])]
+    per_cell = np.bincount(keys // v, minlength=n)
+    return {
+        "connectivity": (keys % v).astype(np.int32),
+        "offsets": np.cumsum(per_cell).astype(index),
+        "faces": stream,
+        "faceoffsets": ends.astype(index),
+    }
+
+
 def cell_data(result: Result) -> dict[str, np.ndarray]:
     """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
+    diagram = result.diagram
     return {
         "size": result.size,
         "error": result.error,
         "quality": result.quality,
-        "volume": result.diagram.volumes,
-        "sides": np.diff(result.diagram.cell_vertex_starts).astype(np.int32),
+        "volume": diagram.volumes,
+        "sides" if diagram.domain.dim == 2 else "faces": np.diff(diagram.neighbour_starts).astype(
+            np.int32
+        ),
+        "label": np.arange(len(diagram), dtype=np.int32),
         "generator": in_space(result.points),
     }
 
 
 def in_space(points: np.ndarray) -> np.ndarray:
-    """Return points (n, 2) as (n, 3) with z = 0."""
+    """Return points (n, d) as (n, 3), in 2D with z = 0."""
     return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 

@@ -1,0 +1,186 @@
+"""OpenFOAM's polyMesh: points, faces between cells, and the walls as patches.
+
+In 2D the cells become prisms, one layer of them, between two patches of type `empty`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..domain import Box
+from ..errors import InputError
+from ..faces import faces_once, following, take_rows
+from ..results import Diagram, Result
+from .atomic import atomic_file, atomic_folder
+
+_FILES = {
+    "points": "vectorField",
+    "owner": "labelList",
+    "neighbour": "labelList",
+    "boundary": "polyBoundaryMesh",
+    "faces": "faceList",
+}
+
+
+@dataclass(frozen=True)
+class PolyMesh:
+    """A mesh as OpenFOAM describes it.
+
+    Attributes
+    ----------
+    points : (v, 3) float
+    starts : (f + 1,) int, corners : int
+        Corners of each face, counter-clockwise as seen from its neighbour or from outside.
+    owner : (f,) int
+        Cell behind each face.
+    neighbour : (inner,) int
+        Cell in front of each inner face; owner < neighbour. Inner faces come first, in upper-triangular
+        order: by owner, then by neighbour.
+    patches : list of (name, type, number of faces)
+        One after the other behind the inner faces.
+    """
+
+    points: np.ndarray
+    starts: np.ndarray
+    corners: np.ndarray
+    owner: np.ndarray
+    neighbour: np.ndarray
+    patches: list[tuple[str, str, int]]
+
+
+def poly_mesh(diagram: Diagram) -> PolyMesh:
+    """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
+
+    The patches are `xMin`, `xMax`, `yMin`, ...; in 2D also `back` and `front`, at z = 0 and at z = the mean size of
+    a cell.
+    """
+    faces = faces_once(diagram)
+    box = diagram.domain
+    walls = -1 - faces.neighbour[faces.inner :]
+    names = [f"{axis}{end}" for axis in "xyz"[: box.dim] for end in ("Min", "Max")]
+    counts = np.bincount(walls, minlength=len(names))
+    patches = [(name, "patch", int(k)) for name, k in zip(names, counts, strict=True)]
+    owner, neighbour = faces.owner, faces.neighbour[: faces.inner]
+    if box.dim == 2:
+        points, starts, corners = _extruded(diagram, faces.corners, box)
+        owner = np.concatenate([owner, *2 * [np.arange(len(diagram))]])
+        patches += [("back", "empty", len(diagram)), ("front", "empty", len(diagram))]
+    else:
+        points, starts, corners = diagram.vertices, faces.starts, faces.corners
+    used, corners = np.unique(corners, return_inverse=True)
+    return PolyMesh(points[used], starts, corners.ravel(), owner, neighbour, patches)
+
+
+def _extruded(
+    diagram: Diagram, sides: np.ndarray, box: Box
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points, starts and corners of the prisms' sides, then their bottoms, then their tops."""
+    flat, v = diagram.vertices, len(diagram.vertices)
+    thickness = float(np.sqrt(box.measure / len(diagram)))
+    points = np.concatenate([np.pad(flat, ((0, 0), (0, 1))), np.pad(flat, ((0, 0), (0, 1)))])
+    points[v:, 2] = thickness
+    a, b = sides.reshape(-1, 2).T
+    walls = np.stack([a, b, b + v, a + v], axis=1)
+    # Corners that are the same vertex twice are one.
+    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
+    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
+    kept = corners != corners[following(starts)]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cell[kept], minlength=len(diagram)))])
+    corners, everyone = corners[kept], np.arange(len(diagram))
+    _, bottoms = take_rows(starts, corners, everyone, np.ones(len(diagram), bool))
+    lengths = np.concatenate([np.full(len(walls), 4), np.diff(starts), np.diff(starts)])
+    return (
+        points,
+        np.concatenate([[0], np.cumsum(lengths)]),
+        np.concatenate([walls.ravel(), bottoms, corners + v]),
+    )
+
+
+def write_foam(result: Result, path: Path) -> None:
+    """Write a polyMesh.
+
+    Parameters
+    ----------
+    path : Path
+        The folder ``.../constant/polyMesh``, made if need be; its five files are replaced, others there are left.
+        Or a case's marker ``CASE/name.foam``, an empty file which ParaView opens, with the mesh in
+        ``CASE/constant/polyMesh``.
+    """
+    marker = path if path.suffix.lower() == ".foam" else None
+    folder = path if marker is None else path.parent / "constant" / "polyMesh"
+    if marker is not None:
+        with atomic_file(marker):  # first: it says whether the case's folder can be written
+            pass
+    _make(folder)
+    mesh = poly_mesh(result.diagram)
+    note = (
+        f"nPoints:{len(mesh.points)} nCells:{len(result.diagram)} nFaces:{len(mesh.owner)} "
+        f"nInternalFaces:{len(mesh.neighbour)}"
+    )
+    texts = {
+        "points": _vectors(mesh.points),
+        "faces": _faces(mesh.starts, mesh.corners),
+        "owner": _labels(mesh.owner),
+        "neighbour": _labels(mesh.neighbour),
+        "boundary": _boundary(mesh),
+    }
+    # `faces` is put in place last: a case without it is plainly incomplete.
+    with atomic_folder(folder / "faces") as target:
+        for name, kind in _FILES.items():
+            head = _header(name, kind, note if name in ("owner", "neighbour") else "")
+            target.with_name(name).write_text(head + texts[name], encoding="ascii", newline="\n")
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {folder}: no folder can be made there ({error.strerror}); choose "
+            "another place"
+        ) from error
+
+
+def _header(name: str, kind: str, note: str) -> str:
+    noted = f'    note        "{note}";\n' if note else ""
+    return (
+        "FoamFile\n{\n    version     2.0;\n    format      ascii;\n"
+        f"    class       {kind};\n{noted}"
+        f'    location    "constant/polyMesh";\n    object      {name};\n}}\n\n'
+    )
+
+
+def _list(count: int, body: str) -> str:
+    return f"{count}\n(\n{body})\n"
+
+
+def _labels(values: np.ndarray) -> str:
+    return _list(len(values), "%d\n" * len(values) % tuple(values.tolist()))
+
+
+def _vectors(values: np.ndarray) -> str:
+    # The shortest text that reads back as the same number.
+    return _list(len(values), "(%r %r %r)\n" * len(values) % tuple(values.ravel().tolist()))
+
+
+def _faces(starts: np.ndarray, corners: np.ndarray) -> str:
+    sides = np.diff(starts)
+    forms = [
+        f"{k}({' '.join(['%d'] * k)})\n" for k in range(int(sides.max(initial=0)) + 1)
+    ]  # by number of corners
+    form = "".join([forms[k] for k in sides.tolist()])
+    return _list(len(sides), form % tuple(corners.tolist()))
+
+
+def _boundary(mesh: PolyMesh) -> str:
+    body, start = "", len(mesh.neighbour)
+    for name, kind, count in mesh.patches:
+        body += (
+            f"    {name}\n    {{\n        type            {kind};\n"
+            f"        nFaces          {count};\n        startFace       {start};\n    }}\n"
+        )
+        start += count
+    return _list(len(mesh.patches), body)

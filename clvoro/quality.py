@@ -1,0 +1,125 @@
+"""Measures of a mesh that matter to finite-volume methods, from a `Diagram` on the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .faces import face_owners
+from .results import Diagram
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What `measure_mesh` finds: per cell (n,), or per face of the diagram's graph (m,).
+
+    The line between the generators x_i and x_j meets the plane of their face at a right angle and in its middle
+    (x_i + x_j) / 2, by the definition of a Voronoi diagram: with the unknowns at the generators a mesh has no
+    non-orthogonality. Behind a wall the generator's mirror image takes the place of x_j.
+
+    Attributes
+    ----------
+    quality : (n,) float
+        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon. 3D: the isoperimetric quotient
+        36 pi V^2 / S^3, 1 for a ball, .753 for a truncated octahedron, .524 for a cube.
+    skewness : (m,) float
+        Distance from the centroid of the face to the point where the line between the generators meets its
+        plane, over the distance of the generators; infinite for a generator on a wall. A linear interpolation
+        along the line is off the face's centroid by so much.
+    centroid_angle : (m,) float
+        Angle in degrees between the normal of the face and the line from centroid to centroid (to the face's
+        centroid on a wall): the non-orthogonality of solvers that keep their unknowns at the centroids.
+    face_ratio : (n,) float
+        Measure of the cell's smallest face over that of its largest.
+    volume_ratio : (m,) float
+        Larger over smaller volume of the two cells at the face; 1 on walls.
+    faces : (n,) int
+        Number of faces of the cell.
+    """
+
+    quality: np.ndarray
+    skewness: np.ndarray
+    centroid_angle: np.ndarray
+    face_ratio: np.ndarray
+    volume_ratio: np.ndarray
+    faces: np.ndarray
+
+    def worst_of_cell(self, name: str) -> np.ndarray:
+        """Return the largest value of `name`, a measure of faces, among the faces of each cell, (n,)."""
+        values, counts = getattr(self, name), self.faces
+        worst = np.zeros(len(counts))
+        some = counts > 0
+        starts = np.cumsum(counts) - counts
+        worst[some] = np.maximum.reduceat(values, starts[some]) if len(values) else 0.0
+        return worst
+
+    def summary(self) -> dict[str, float]:
+        """Return the mean and the worst of every measure, by name."""
+        return {
+            "mean_faces": float(self.faces.mean()),
+            "mean_quality": float(self.quality.mean()),
+            "min_quality": float(self.quality.min()),
+            "mean_skewness": float(self.skewness.mean()),
+            "max_skewness": float(self.skewness.max()),
+            "mean_centroid_angle": float(self.centroid_angle.mean()),
+            "max_centroid_angle": float(self.centroid_angle.max()),
+            "mean_face_ratio": float(self.face_ratio.mean()),
+            "min_face_ratio": float(self.face_ratio.min()),
+            "mean_volume_ratio": float(self.volume_ratio.mean()),
+            "max_volume_ratio": float(self.volume_ratio.max()),
+        }
+
+
+def measure_mesh(diagram: Diagram) -> Measures:
+    """Measure the cells and faces of a diagram in 2D or 3D.
+
+    Walls are those of the `Box`: wall 2 a is the lower one of axis a, wall 2 a + 1 the upper one.
+    """
+    owner, neighbour = face_owners(diagram), diagram.neighbours
+    points, centroids, volumes = diagram.points, diagram.centroids, diagram.volumes
+    areas, middles = diagram.face_measures, diagram.face_centroids
+    starts = diagram.neighbour_starts
+    inner = neighbour >= 0
+    other = np.where(inner, neighbour, 0)
+    line = points[other] - points[owner]
+    walls = np.flatnonzero(~inner)
+    normal_axis, side, gap = _walls(diagram, owner[walls], -1 - neighbour[walls])
+    line[walls] = 0.0
+    line[walls, normal_axis] = 2 * side * gap
+    distance = np.linalg.norm(line, axis=1)
+    meeting = points[owner] + 0.5 * line
+    with np.errstate(divide="ignore"):
+        skewness = np.linalg.norm(middles - meeting, axis=1) / distance
+
+    ends = np.where(inner[:, None], centroids[other], middles)
+    line[walls, normal_axis] = side  # a direction for generators on a wall, too
+    angle = _angles(line, ends - centroids[owner])
+
+    counts = np.diff(starts)
+    surface = np.add.reduceat(areas, starts[:-1])
+    largest, smallest = (f.reduceat(areas, starts[:-1]) for f in (np.maximum, np.minimum))
+    if diagram.domain.dim == 2:
+        quality = 4 * volumes * counts * np.tan(np.pi / counts) / surface**2
+    else:
+        quality = 36 * np.pi * volumes**2 / surface**3
+    here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
+    ratio = np.maximum(here, there) / np.minimum(here, there)
+    return Measures(quality, skewness, angle, smallest / largest, ratio, counts)
+
+
+def _walls(
+    diagram: Diagram, cells: np.ndarray, walls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return axis and direction (-1 or 1) of the normals of `walls`, and how far the generators are, (k,) each."""
+    planes = np.stack([diagram.domain.lower, diagram.domain.upper], axis=1).ravel()
+    axis = walls // 2
+    return axis, 2 * (walls % 2) - 1, np.abs(planes[walls] - diagram.points[cells, axis])
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles in degrees between vectors (m, d), to full precision also where they are small."""
+    a = a / np.linalg.norm(a, axis=1)[:, None]
+    b = b / np.linalg.norm(b, axis=1)[:, None]
+    halves = np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    return np.degrees(2 * halves)
