@@ -6,6 +6,12 @@
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #endif
 
+#define SIZE_JOIN_(a, b) a##b
+#define SIZE_JOIN(a, b) SIZE_JOIN_(a, b)
+#define SIZE_LARGEST_double DBL_MAX
+#define SIZE_LARGEST_float FLT_MAX
+#define SIZE_LARGEST SIZE_JOIN(SIZE_LARGEST_, REAL)
+
 /* Unlike fmin and fmax these hand a NaN on, so that a broken branch is seen and refused. */
 REAL size_min(REAL a, REAL b)
 {
@@ -67,29 +73,98 @@ REAL size_segment_distance2(const REAL *x, __global const REAL *item)
     return sum;
 }
 
-REAL size_item_distance2(const REAL *x, __global const REAL *item, int round)
+/* A triangle with a corner at a: a (3), its sides b - a and c - a (3 each), the vectors that give the coordinates
+   s and t of a point a + s (b - a) + t (c - a) in its plane (3 each), the unit normal (3; 0 if it is so thin that it is
+   its sides). */
+#define SIZE_TRIANGLE 18
+
+#if DIM == 3
+REAL size_dot(const REAL *a, __global const REAL *b)
 {
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/* Squared distance to a side of which v = x - begin and its vector d are known. */
+REAL size_side_distance2(const REAL *v, const REAL *d)
+{
+    const REAL length2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+    REAL t = v[0] * d[0] + v[1] * d[1] + v[2] * d[2], sum = 0;
+    t = length2 > 0 ? fmin(fmax(t / length2, (REAL)0), (REAL)1) : 0;
+    for (int a = 0; a < 3; ++a) {
+        const REAL w = v[a] - t * d[a];
+        sum += w * w;
+    }
+    return sum;
+}
+
+/* Where the foot of the perpendicular lies inside, s, t >= 0 and s + t <= 1, the nearest point is that foot. Else it
+   lies on a side that has the foot on its outer side: at the nearest point the way to the foot is a sum of outward
+   normals of the sides there, so the foot is beyond at least one of these. */
+REAL size_triangle_distance2(const REAL *x, __global const REAL *item)
+{
+    REAL v[3], side[3], best2 = SIZE_LARGEST;
+    for (int a = 0; a < 3; ++a)
+        v[a] = x[a] - item[a];
+    const REAL s = size_dot(v, item + 9), t = size_dot(v, item + 12);
+    const int thin = item[15] == 0 && item[16] == 0 && item[17] == 0;
+    if (!thin && s >= 0 && t >= 0 && s + t <= 1) {
+        const REAL height = size_dot(v, item + 15);
+        return height * height;
+    }
+    if (thin || s + t > 1) {
+        REAL w[3];
+        for (int a = 0; a < 3; ++a) {
+            side[a] = item[6 + a] - item[3 + a];
+            w[a] = v[a] - item[3 + a];
+        }
+        best2 = size_side_distance2(w, side);
+    }
+    if (thin || t < 0) {
+        for (int a = 0; a < 3; ++a)
+            side[a] = item[3 + a];
+        best2 = fmin(best2, size_side_distance2(v, side));
+    }
+    if (thin || s < 0) {
+        for (int a = 0; a < 3; ++a)
+            side[a] = item[6 + a];
+        best2 = fmin(best2, size_side_distance2(v, side));
+    }
+    return best2;
+}
+#endif
+
+/* What the kinds of items are; always a literal, so only one branch is compiled in. */
+#define SIZE_STRAIGHT 0
+#define SIZE_ROUND 1
+#define SIZE_FLAT 2
+
+REAL size_item_distance2(const REAL *x, __global const REAL *items, int i, int kind)
+{
+#if DIM == 3
+    if (kind == SIZE_FLAT)
+        return size_triangle_distance2(x, items + i * SIZE_TRIANGLE);
+#endif
+    __global const REAL *item = items + i * SIZE_ITEM;
     const REAL d2 = size_segment_distance2(x, item);
-    if (!round)
+    if (kind == SIZE_STRAIGHT)
         return d2;
     const REAL d = sqrt(d2) - item[2 * DIM + 1];
     return d * d;
 }
 
-/* h = min(h_min + slope * distance, h_max), the law all distances end in. law: h_min, slope, h_max. */
+/* The least of best2 and the squared distances to n items, by looking at all. data: the items. */
+REAL size_nearest_few(const REAL *x, __global const REAL *data, int n, int kind, REAL best2)
+{
+    for (int i = 0; i < n; ++i)
+        best2 = fmin(best2, size_item_distance2(x, data, i, kind));
+    return best2;
+}
+
+/* h = min(h_min + slope * distance, h_max), the law all distances end in. law: h_min, slope, h_max, and the square of
+   the distance at which h_max takes over, where the search begins. */
 REAL size_law(REAL distance2, __global const REAL *law)
 {
     return fmin(law[0] + law[1] * sqrt(distance2), law[2]);
-}
-
-/* The distance to the nearest of n items, by looking at all. `round` tells whether some have r > 0.
-   data: the law, the items. */
-REAL size_distance_few(const REAL *x, __global const REAL *data, int n, int round)
-{
-    REAL best2 = size_item_distance2(x, data + 3, round);
-    for (int i = 1; i < n; ++i)
-        best2 = fmin(best2, size_item_distance2(x, data + 3 + i * SIZE_ITEM, round));
-    return size_law(best2, data);
 }
 
 REAL size_box_distance2(const REAL *x, __global const REAL *box)
@@ -104,17 +179,15 @@ REAL size_box_distance2(const REAL *x, __global const REAL *box)
 
 /* The same through a binary tree of bounding boxes with 2^levels leaves: leaf l holds the items
    [l n / 2^levels, (l + 1) n / 2^levels), node k has the children 2 k + 1 and 2 k + 2. The nearer child is visited
-   first; a box that is farther than the best item found so far is skipped, and so is everything beyond the
-   distance at which h_max takes over.
-   data: the law, the square of that distance, the boxes (lower, upper) of 2^(levels + 1) - 1 nodes, the items. */
-REAL size_distance_tree(const REAL *x, __global const REAL *data, int n, int levels, int round)
+   first; a box that is farther than the best found so far is skipped.
+   data: the boxes (lower, upper) of 2^(levels + 1) - 1 nodes, the items. */
+REAL size_nearest_tree(const REAL *x, __global const REAL *data, int n, int levels, int kind, REAL best2)
 {
-    __global const REAL *boxes = data + 4;
+    __global const REAL *boxes = data;
     const int first_leaf = (1 << levels) - 1;
     __global const REAL *items = boxes + (2 * first_leaf + 1) * 2 * DIM;
     int waiting[24], top = 0, node = 0;
     REAL bound2[24];
-    REAL best2 = data[3];
     for (;;) {
         if (node < first_leaf) {
             int near = 2 * node + 1, far = near + 1;
@@ -139,11 +212,11 @@ REAL size_distance_tree(const REAL *x, __global const REAL *data, int n, int lev
             const long leaf = node - first_leaf;
             const int end = (int)(((leaf + 1) * n) >> levels);
             for (int i = (int)((leaf * n) >> levels); i < end; ++i)
-                best2 = fmin(best2, size_item_distance2(x, items + i * SIZE_ITEM, round));
+                best2 = fmin(best2, size_item_distance2(x, items, i, kind));
         }
         do {
             if (top == 0)
-                return size_law(best2, data);
+                return best2;
             --top;
         } while (!(bound2[top] < best2));
         node = waiting[top];

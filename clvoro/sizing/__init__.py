@@ -1,11 +1,13 @@
 """Size fields h(x), the wanted edge length of a cell, and the stage that evaluates them."""
 
 from .bind import bind
-from .distance import Circle, Distance, Polygon, Polyline, Segment, Sphere
+from .distance import Distance
 from .expression import Expression
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .raster import Raster
+from .shapes import Circle, Polygon, Polyline, Segment, Sphere
 from .stage import Sizing
+from .surface import Surface
 
 __all__ = [
     "Circle",
@@ -20,6 +22,7 @@ __all__ = [
     "Segment",
     "Sizing",
     "Sphere",
+    "Surface",
     "as_field",
     "bind",
     "maximum",
