@@ -43,8 +43,8 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of each face of the graph as ragged rows: starts (m + 1,) and vertices.
 
     In 2D a face runs from its first to its second corner, its cell to the left. In 3D the corners go around
-    the face counter-clockwise as seen from outside of its cell. A corner that comes twice in a row is given once; a face
-    that has then no measure (fewer than 2 corners in 2D, 3 in 3D) has an empty row.
+    the face counter-clockwise as seen from outside of its cell. A corner that comes twice in a row is given
+    once; a face that has then no measure (fewer than 2 corners in 2D, 3 in 3D) has an empty row.
     """
     if diagram.domain.dim == 2:
         starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices

@@ -19,7 +19,7 @@ from .errors import Aborted, ClvoroError, InputError
 from .io import check_writable, save, write_history
 from .profile import Profile
 from .results import Result
-from .summary import summary
+from .summary import measures_line, summary
 
 _REPEATED = (
     "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
@@ -240,6 +240,9 @@ class Job:
                 f"{s['max_error']:10.3f}{s['mean_quality']:9.4f}{s['min_quality']:8.3f}"
                 f"{s['seconds']:9.2f}  {s['stop_reason']}"
             )
+        for name, result in results.items():
+            if result.diagram.domain.dim == 3:
+                print(f"{name}: {measures_line(result)}")
         first = "report.html" if self.report else "mesh.vtu"
         print(f"written: {self.out / first} and what lies beside it")
         for name, profile in profiles.items():

@@ -28,14 +28,16 @@ class Measures:
         plane, over the distance of the generators; infinite for a generator on a wall. A linear interpolation
         along the line is off the face's centroid by so much.
     centroid_angle : (m,) float
-        Angle in degrees between the normal of the face and the line from centroid to centroid (to the face's
-        centroid on a wall): the non-orthogonality of solvers that keep their unknowns at the centroids.
+        Angle in degrees between the normal of the face and the line from centroid to centroid: the
+        non-orthogonality of solvers that keep their unknowns at the centroids. 0 on walls.
     face_ratio : (n,) float
         Measure of the cell's smallest face over that of its largest.
     volume_ratio : (m,) float
         Larger over smaller volume of the two cells at the face; 1 on walls.
     faces : (n,) int
         Number of faces of the cell.
+    inner : (m,) bool
+        Which faces are between two cells.
     """
 
     quality: np.ndarray
@@ -44,6 +46,7 @@ class Measures:
     face_ratio: np.ndarray
     volume_ratio: np.ndarray
     faces: np.ndarray
+    inner: np.ndarray
 
     def worst_of_cell(self, name: str) -> np.ndarray:
         """Return the largest value of `name`, a measure of faces, among the faces of each cell, (n,)."""
@@ -55,19 +58,26 @@ class Measures:
         return worst
 
     def summary(self) -> dict[str, float]:
-        """Return the mean and the worst of every measure, by name."""
+        """Return the mean and the worst of every measure, by name.
+
+        Means of `centroid_angle` and `volume_ratio` are over the faces between cells.
+        """
+        angle, ratio = (
+            values[self.inner] if self.inner.any() else values
+            for values in (self.centroid_angle, self.volume_ratio)
+        )
         return {
             "mean_faces": float(self.faces.mean()),
             "mean_quality": float(self.quality.mean()),
             "min_quality": float(self.quality.min()),
             "mean_skewness": float(self.skewness.mean()),
             "max_skewness": float(self.skewness.max()),
-            "mean_centroid_angle": float(self.centroid_angle.mean()),
-            "max_centroid_angle": float(self.centroid_angle.max()),
+            "mean_centroid_angle": float(angle.mean()),
+            "max_centroid_angle": float(angle.max()),
             "mean_face_ratio": float(self.face_ratio.mean()),
             "min_face_ratio": float(self.face_ratio.min()),
-            "mean_volume_ratio": float(self.volume_ratio.mean()),
-            "max_volume_ratio": float(self.volume_ratio.max()),
+            "mean_volume_ratio": float(ratio.mean()),
+            "max_volume_ratio": float(ratio.max()),
         }
 
 
@@ -92,9 +102,8 @@ def measure_mesh(diagram: Diagram) -> Measures:
     with np.errstate(divide="ignore"):
         skewness = np.linalg.norm(middles - meeting, axis=1) / distance
 
-    ends = np.where(inner[:, None], centroids[other], middles)
-    line[walls, normal_axis] = side  # a direction for generators on a wall, too
-    angle = _angles(line, ends - centroids[owner])
+    angle = np.zeros(len(line))
+    angle[inner] = _angles(line[inner], centroids[neighbour[inner]] - centroids[owner[inner]])
 
     counts = np.diff(starts)
     surface = np.add.reduceat(areas, starts[:-1])
@@ -105,7 +114,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
         quality = 36 * np.pi * volumes**2 / surface**3
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
     ratio = np.maximum(here, there) / np.minimum(here, there)
-    return Measures(quality, skewness, angle, smallest / largest, ratio, counts)
+    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner)
 
 
 def _walls(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from .domain import Box
+    from .quality import Measures
 
 HISTORY_DTYPE = np.dtype(
     [
@@ -169,10 +171,20 @@ class Result:
         save(self, path)
 
     def plot(self, colour: str = "error", **options: Any) -> Any:
-        """Draw the cells coloured by `"error"`, `"quality"`, `"size"` or `"sides"`; returns the Matplotlib figure."""
-        from .report import plot_cells
+        """Draw the cells coloured by "error", "quality", "size", "sides" or "skewness"; returns the Matplotlib figure.
 
-        return plot_cells(self, colour, **options)
+        In 3D `view` is "slices" (default), "slice" or "cutaway"; see `clvoro.report` for further options.
+        """
+        from .report import plot_mesh
+
+        return plot_mesh(self, colour, **options)
+
+    @cached_property
+    def measures(self) -> Measures:
+        """Skewness, angles and ratios that matter to finite-volume methods; computed when first asked for."""
+        from .quality import measure_mesh
+
+        return measure_mesh(self.diagram)
 
     def __repr__(self) -> str:
         e, q = np.abs(self.error), self.quality

@@ -3,11 +3,17 @@
 from .cells import plot_cells, plot_size
 from .curves import plot_displacements, plot_history
 from .page import write_report
+from .solids import plot_cutaway, plot_distributions, plot_mesh, plot_slice, plot_slices
 
 __all__ = [
     "plot_cells",
+    "plot_cutaway",
     "plot_displacements",
+    "plot_distributions",
     "plot_history",
+    "plot_mesh",
     "plot_size",
+    "plot_slice",
+    "plot_slices",
     "write_report",
 ]

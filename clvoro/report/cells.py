@@ -1,120 +1,29 @@
-"""Pictures of cells: coloured by error, quality, size or number of sides."""
+"""Pictures of cells in the plane: coloured by error, quality, size, number of sides, or skewness."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import (
-    BoundaryNorm,
-    LinearSegmentedColormap,
-    ListedColormap,
-    LogNorm,
-    Normalize,
-)
+from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..results import Diagram, Result
-from .style import WIDTH, frame_domain, grid_height, interactive_figure, nice, styled
-
-# Up to four, five, six, seven, eight and more sides: neutral for six, warm below, cool above.
-_SIDES = ("#7F2704", "#E6762B", "#EDEDED", "#5AA6D1", "#08306B")
-_SIDES_LABELS = ("4 or fewer", "5", "6", "7", "8 or more")
-
-# Blue and red around white, without the darkest tenth at either end: faces must stay visible.
-_DIVERGING = LinearSegmentedColormap.from_list(
-    "error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65))
-)
-
-
-@dataclass(frozen=True)
-class Colouring:
-    """What a colour stands for.
-
-    Attributes
-    ----------
-    label : str
-        With its unit, for the colour bar.
-    values : function of a Result
-        One number per cell.
-    colour_map : str or colour map
-        Perceptually uniform; diverging around zero for a signed quantity.
-    limits : function of the values
-        The scale's two ends.
-    logarithmic : bool
-    """
-
-    label: str
-    values: Callable[[Result], np.ndarray]
-    colour_map: Any
-    limits: Callable[[np.ndarray], tuple[float, float]]
-    logarithmic: bool = False
-
-
-def _symmetric(values: np.ndarray) -> tuple[float, float]:
-    """Limits that 99 % of the values keep, the same on both sides of zero."""
-    bound = nice(float(np.quantile(np.abs(values), 0.99))) if values.size else 1.0
-    return -bound, bound
-
-
-def _up_to_one(values: np.ndarray) -> tuple[float, float]:
-    """Limits for a quality: from a round number below 99 % of the values up to 1."""
-    low = float(np.quantile(values, 0.01)) if values.size else 0.0
-    return min(np.floor(low * 20) / 20, 0.95), 1.0
-
-
-def _span(values: np.ndarray) -> tuple[float, float]:
-    low, high = float(values.min()), float(values.max())
-    return (low, high) if high > low * (1 + 1e-6) else (low * 0.99, low * 1.01)
-
-
-COLOURINGS = {
-    "error": Colouring(
-        "metric error $e$ [–]   (< 0 too small, > 0 too large)",
-        lambda r: r.error,
-        _DIVERGING,
-        _symmetric,
-    ),
-    "quality": Colouring("cell quality $Q$ [–]", lambda r: r.quality, "viridis", _up_to_one),
-    "size": Colouring(
-        "target size $h$ [units of length]", lambda r: r.size, "viridis", _span, logarithmic=True
-    ),
-    "sides": Colouring(
-        "number of sides",
-        lambda r: np.clip(np.diff(r.diagram.neighbour_starts), 4, 8),
-        ListedColormap(_SIDES),
-        lambda v: (3.5, 8.5),
-    ),
-}
-"""What `plot_cells` can colour by."""
-
-
-def colouring(name: str) -> Colouring:
-    """Return the colouring of that name, or raise InputError."""
-    if name not in COLOURINGS:
-        raise InputError(f"colour is {name!r}, expected one of {', '.join(COLOURINGS)}")
-    return COLOURINGS[name]
-
-
-def shared_limits(results: Sequence[Result], colour: str) -> tuple[float, float]:
-    """Return the scale that suits the cells of all `results` together."""
-    scheme = colouring(colour)
-    return scheme.limits(np.concatenate([scheme.values(r) for r in results]))
+from .colours import COLOURINGS, Colouring, cell_norm, colouring
+from .style import WIDTH, frame_domain, grid_height, interactive_figure, styled
 
 
 def require_plane(diagram: Diagram) -> None:
     """Raise InputError unless the diagram is two-dimensional."""
     if diagram.domain.dim != 2:
         raise InputError(
-            "cells are drawn in two dimensions only, and this mesh has three; "
-            "save it with result.save('mesh.vtu') and open it in ParaView"
+            "plot_cells draws in two dimensions, and this mesh has three; call result.plot(), plot_slice or "
+            "plot_cutaway, or save it with result.save('mesh.vtu') and open it in ParaView"
         )
 
 
@@ -134,8 +43,8 @@ def plot_cells(
     Parameters
     ----------
     result : Result
-    colour : {"error", "quality", "size", "sides"}
-        The paper's (3.1), its (4.1), the target size h, or the number of faces.
+    colour : {"error", "quality", "size", "sides", "skewness"}
+        The paper's (3.1), its (4.1), the target size h, the number of faces, or the worst face's skewness.
     ax : matplotlib axes, optional
         Drawn into; a new figure by default.
     limits : (low, high), optional
@@ -174,10 +83,8 @@ def plot_cells(
             draw_edges(ax, diagram, shown, np.subtract(upper, lower))
         if title is not None:
             ax.set_title(title)
-        if key and colour == "sides":
-            _add_side_key(ax, values)
-        elif key:
-            add_colour_bar(cells, ax, scheme, values, (low, high))
+        if key:
+            add_key(cells, ax, scheme, values, (low, high))
     return ax.figure
 
 
@@ -196,7 +103,7 @@ def draw_cells(
         polygons,
         array=values[shown],
         cmap=scheme.colour_map,
-        norm=_norm(scheme, limits),
+        norm=cell_norm(scheme, limits),
         # An outline in the cell's own colour hides the seams that smoothing leaves between cells.
         edgecolors="face",
         linewidths=0.25,
@@ -208,32 +115,57 @@ def draw_cells(
 
 def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, extent: np.ndarray) -> None:
     """Add each face once, as a line whose width follows the size of the cells beside it."""
-    box = ax.get_position()
-    width, height = ax.figure.get_size_inches() * (box.width, box.height) * 72
-    points_per_unit = min(width / extent[0], height / extent[1])
-    thickness = np.clip(0.045 * points_per_unit * np.sqrt(diagram.volumes), 0.0, 0.7)
     starts, neighbours = diagram.cell_vertex_starts, diagram.neighbours
     owner = np.repeat(np.arange(len(diagram)), np.diff(starts))
     inside = np.zeros(len(diagram), bool)
     inside[shown] = True
     # A wall has no thickness of its own: there the cell counts twice.
     beyond = np.where(neighbours >= 0, neighbours, owner)
-    thin = np.minimum(thickness[owner], thickness[beyond])
+    lengths = np.sqrt(diagram.volumes)
+    thin, colours = edge_style(ax, np.minimum(lengths[owner], lengths[beyond]), extent)
     once = np.flatnonzero((neighbours < owner) & inside[owner] & (thin > 0.06))
-    # The thinnest fade out: a sudden end of all lines would look like a feature of the mesh.
-    colours = np.full((len(once), 4), 0.1)
-    colours[:, 3] = np.clip((thin[once] - 0.06) / 0.14, 0, 1)
     following = np.arange(len(owner)) + 1
     following[starts[1:] - 1] = starts[:-1]
     corners = diagram.vertices[diagram.cell_vertices]
     lines = LineCollection(
         list(np.stack([corners[once], corners[following[once]]], axis=1)),
-        colors=colours,
+        colors=colours[once],
         linewidths=thin[once],
         capstyle="round",
         rasterized=len(once) > 9000,
     )
     ax.add_collection(lines, autolim=False)
+
+
+def edge_style(ax: Any, lengths: np.ndarray, extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return line widths in points and colours (n, 4) for edges of cells as long as `lengths`.
+
+    `extent` is what `ax` shows of the plane. Edges of cells too small to be seen have no width.
+    """
+    box = ax.get_position()
+    width, height = ax.figure.get_size_inches() * (box.width, box.height) * 72
+    points_per_unit = min(width / extent[0], height / extent[1])
+    widths = np.clip(0.045 * points_per_unit * lengths, 0.0, 0.7)
+    # The thinnest fade out: a sudden end of all lines would look like a feature of the mesh.
+    colours = np.full((len(widths), 4), 0.1)
+    colours[:, 3] = np.clip((widths - 0.06) / 0.14, 0, 1)
+    return widths, colours
+
+
+def add_key(
+    cells: Any,
+    axes: Any,
+    scheme: Colouring,
+    values: np.ndarray,
+    limits: tuple[float, float],
+    below: bool = False,
+) -> None:
+    """Say what the colours mean, beside or below `axes` (one or several): a colour bar, or the classes' shares."""
+    if scheme.classes:
+        _add_classes(axes, scheme, values, limits)
+    else:
+        options = {"location": "bottom", "shrink": 0.6, "aspect": 45} if below else {}
+        add_colour_bar(cells, axes, scheme, values, limits, **options)
 
 
 def add_colour_bar(
@@ -298,7 +230,7 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
             origin="lower",
             interpolation="bilinear",
             cmap=scheme.colour_map,
-            norm=_norm(scheme, (low, high)),
+            norm=cell_norm(scheme, (low, high)),
         )
         levels = [t for t in _round_numbers(low, high) if low * 1.02 < t < high * 0.98]
         if levels:
@@ -309,42 +241,40 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     return ax.figure
 
 
-def _norm(scheme: Colouring, limits: tuple[float, float]) -> Normalize:
-    """Return the map from values to [0, 1] that `scheme` asks for."""
-    low, high = limits
-    if isinstance(scheme.colour_map, ListedColormap):
-        classes = scheme.colour_map.N
-        return BoundaryNorm(np.linspace(low, high, classes + 1), classes)
-    return LogNorm(low, high) if scheme.logarithmic and high > 3 * low > 0 else Normalize(low, high)
-
-
 def _round_numbers(low: float, high: float) -> list[float]:
     """1, 2 and 5 times powers of ten from `low` to `high`, both ends a little widened."""
     numbers = [float(f"{m}e{p}") for p in range(-12, 13) for m in (1, 2, 5)]
     return [t for t in numbers if low * 0.999 <= t <= high * 1.001]
 
 
-def _add_side_key(ax: Any, values: np.ndarray) -> None:
+def _add_classes(
+    axes: Any, scheme: Colouring, values: np.ndarray, limits: tuple[float, float]
+) -> None:
     """Put the classes with their shares of all cells under the picture."""
+    first = round(limits[0] + 0.5)
     handles = [
         Patch(
             facecolor=colour,
             edgecolor="#1A1A1A",
             linewidth=0.4,
-            label=f"{label} sides: {np.mean(values == number):.1%}",
+            label=f"{label}: {np.mean(values == number):.1%}",
         )
-        for number, (colour, label) in enumerate(zip(_SIDES, _SIDES_LABELS, strict=True), start=4)
+        for number, (colour, label) in enumerate(
+            zip(scheme.colour_map.colors, scheme.classes, strict=True), start=first
+        )
         if (values == number).any()
     ]
-    ax.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.09),
-        ncols=len(handles),
-        frameon=False,
-        handlelength=1.2,
-        columnspacing=1.4,
-    )
+    options: dict[str, Any] = {
+        "handles": handles,
+        "ncols": len(handles),
+        "frameon": False,
+        "handlelength": 1.2,
+        "columnspacing": 1.4,
+    }
+    if isinstance(axes, (list, np.ndarray)):
+        axes[0].figure.legend(loc="outside lower center", **options)
+    else:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), **options)
 
 
 def _cells_in(diagram: Diagram, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

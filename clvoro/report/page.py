@@ -28,6 +28,7 @@ dt { color: #555; font-size: .8rem; } dd { margin: 0; font-size: 1.25rem;
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
 th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid #ddd; }
 th:first-child, td:first-child, th:last-child, td:last-child { text-align: left; }
+table.measures { width: auto; } table.measures td:last-child, table.measures th:last-child { text-align: right; }
 thead th { color: #555; font-weight: 600; font-size: .85rem; } tr.main td { font-weight: 600; }
 th { white-space: nowrap; }
 figure { margin: 1.5rem 0; break-inside: avoid; } img { max-width: 100%; height: auto; }
@@ -127,6 +128,7 @@ def _page(
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
         f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else
         f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
+        f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
         "<h2>Pictures</h2>",
     ]  # fmt: skip
     for caption, png in figures:
@@ -145,6 +147,32 @@ def _page(
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
         f"<title>{_safe(title)}</title><style>{_STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
+    )
+
+
+def _measures(name: str, result: Result) -> str:
+    """Return the table of `Result.measures`, and what they mean."""
+    s = result.measures.summary()
+    rows = (
+        ("faces per cell", s["mean_faces"], None),
+        ("skewness", s["mean_skewness"], s["max_skewness"]),
+        ("angle of centroids [°]", s["mean_centroid_angle"], s["max_centroid_angle"]),
+        ("smallest over largest face of a cell", s["mean_face_ratio"], s["min_face_ratio"]),
+        (
+            "volumes of neighbours, larger over smaller",
+            s["mean_volume_ratio"],
+            s["max_volume_ratio"],
+        ),
+    )
+    body = "".join(
+        f"<tr><td>{_safe(what)}</td><td>{mean:.4g}</td><td>{'' if worst is None else f'{worst:.3g}'}</td></tr>"
+        for what, mean, worst in rows
+    )
+    return (
+        f"<table class=measures><thead><tr><th>{_safe(name)}</th><th>mean</th><th>worst</th></tr></thead>"
+        f"<tbody>{body}</tbody></table><p class=what>With the unknowns at the generators there is no "
+        "non-orthogonality; the angle is what remains between a face's normal and the line from centroid to "
+        "centroid. Skewness: from a face's centroid to that line of the generators, over their distance.</p>"
     )
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..results import Result
 from . import cells as draw
+from .colours import colouring, shared_limits
 from .curves import displacements_height, plot_displacements, plot_history
+from .slices import focus, new_slices, plot_slice
+from .solids import cutaway_height, plot_cutaway, plot_distributions
 from .style import WIDTH, grid_height, new_figure, styled, window_around_smallest
 
 Picture = tuple[str, str, Callable[[], Any]]
@@ -34,7 +38,7 @@ def pictures_of(
     initial : Result, optional
         The mesh before the first step.
     size : callable, optional
-        The size field h(points (n, 2)); without it the sizes at the generators are shown.
+        The size field h(points (n, 2)); without it, and in 3D, the sizes at the generators are shown.
     """
     name, main = list(results.items())[-1]
     history: Picture = (
@@ -42,9 +46,9 @@ def pictures_of(
         "Metric error and cell quality against the step: mean (full) and worst cell (dashed).",
         lambda: plot_history(results, new_figure(WIDTH, 3.1)),
     )
-    if main.diagram.domain.dim != 2:
-        return [history]
     panels = {**({"initial": initial} if initial is not None else {}), **results}
+    if main.diagram.domain.dim != 2:
+        return _solid_pictures(panels, history)
     pictures: list[Picture] = [
         ("size", "Target size h.", lambda: _size(main, size)),
         ("cells", f"The mesh ({name}), coloured by metric error.", lambda: _one(main, "error")),
@@ -75,6 +79,77 @@ def pictures_of(
     return pictures
 
 
+def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Picture]:
+    """Return the pictures of 3D meshes: planes through them, and a view into the last one."""
+    name, main = list(panels.items())[-1]
+
+    def slices(colour: str) -> Callable[[], Any]:
+        return lambda: new_slices(main, colour)
+
+    pictures: list[Picture] = [
+        (
+            "size",
+            "Target size h at the generators, on planes amid the smallest cells.",
+            slices("size"),
+        ),
+        ("cells", f"The mesh ({name}), coloured by metric error.", slices("error")),
+        ("cutaway", f"A view into the mesh ({name}).", lambda: _cutaway(main)),
+        (
+            "quality",
+            f"The mesh ({name}), coloured by cell quality; 1 is a ball, .75 a truncated octahedron.",
+            slices("quality"),
+        ),
+    ]
+    if len(panels) > 1:
+        pictures += _comparisons(panels)
+    pictures += [
+        history,
+        (
+            "distributions",
+            f"Cells ({name}) by metric error, quality and number of faces; faces by skewness. "
+            "Dashed: the mean.",
+            lambda: plot_distributions(main, new_figure(WIDTH, 3.9)),
+        ),
+        ("sides", f"Cells by number of faces ({name}).", slices("sides")),
+    ]
+    if len(main.points) > 20_000:
+        pictures.append(
+            ("closer", f"Where the cells are smallest ({name}).", lambda: _closer_slice(main))
+        )
+    return pictures
+
+
+def _cutaway(result: Result) -> Any:
+    figure = new_figure(WIDTH, cutaway_height(result))
+    return plot_cutaway(result, "error", figure.add_subplot())
+
+
+def _closer_slice(result: Result) -> Any:
+    """Draw a square window around the smallest cell, on the plane of the largest section."""
+    normal = _largest_section(result)
+    axes = [a for a in range(3) if a != normal]
+    centre = result.points[np.argmin(result.size)]
+    box = result.diagram.domain
+    lower, upper = np.array(box.lower)[axes], np.array(box.upper)[axes]
+    across = 60
+    span = np.minimum(across * float(result.size.min()), upper - lower)
+    corner = np.clip(centre[axes] - span / 2, lower, upper - span)
+    with styled():
+        figure = new_figure(WIDTH, (WIDTH - 1.3) * float(span[1] / span[0]) + 0.6)
+    name = "xyz"[normal]
+    return plot_slice(
+        result, "quality", figure.add_subplot(), normal=name, through=centre,
+        window=(corner, corner + span),
+        title=f"{across} $h_\\mathrm{{min}}$ across, ${name} = {centre[normal]:.3g}$",
+    )  # fmt: skip
+
+
+def _largest_section(result: Result) -> int:
+    """Return the axis at right angles to the largest section of the domain; of several the last."""
+    extent = result.diagram.domain.extent
+    return int(np.flatnonzero(extent <= extent.min() * 1.001)[-1])
+
+
 def _comparisons(panels: Mapping[str, Result]) -> list[Picture]:
     """Return the pictures of several meshes side by side."""
     return [
@@ -85,7 +160,7 @@ def _comparisons(panels: Mapping[str, Result]) -> list[Picture]:
         ),
         (
             "diagrams_quality",
-            "Cell quality Q, one scale for all: 1 is a regular polygon.",
+            "Cell quality Q, one scale for all: 1 is a regular polygon (in 3D a ball).",
             lambda: _grid(panels, "quality"),
         ),
     ]
@@ -128,23 +203,28 @@ def _size(result: Result, size: Callable[[np.ndarray], np.ndarray] | None) -> An
 def _grid(panels: Mapping[str, Result], colour: str) -> Any:
     """Draw the meshes side by side with one scale."""
     results = list(panels.values())
-    scheme, limits = draw.colouring(colour), draw.shared_limits(results, colour)
+    box = results[0].diagram.domain
+    scheme, limits = colouring(colour, box.dim), shared_limits(results, colour)
     if (
         colour == "error"
     ):  # beyond this all is equally wrong, and what is nearly right shows no more
         limits = (max(limits[0], -1.0), min(limits[1], 1.0))
-    box = results[0].diagram.domain
+    plot: Callable[..., Any] = draw.plot_cells
+    lower, upper = np.array(box.lower), np.array(box.upper)
+    if box.dim == 3:
+        normal = _largest_section(results[-1])
+        plot = partial(plot_slice, normal="xyz"[normal], through=focus(results[-1]))
+        lower, upper = (np.delete(corner, normal) for corner in (lower, upper))
     columns = 1 if len(results) == 1 else 2
     rows = -(-len(results) // columns)
     with styled():
-        figure = new_figure(WIDTH, grid_height(box.lower, box.upper, rows, columns, 0.6, 0.28))
+        figure = new_figure(WIDTH, grid_height(lower, upper, rows, columns, 0.6, 0.28))
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for letter, ax, (name, result) in zip("abcdefghij", axes, panels.items(), strict=False):
             e, q = np.abs(result.error).mean(), result.quality.mean()
             title = f"({letter}) {name}: mean $|e|$ {e:.3g}, mean $Q$ {q:.3f}"
-            draw.plot_cells(result, colour, ax, limits=limits, key=False, title=title)
-            ax.set_xticks([])
-            ax.set_yticks([])
+            plot(result, colour, ax, limits=limits, key=False, title=title)
+            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
         for ax in axes[len(results) :]:
             ax.set_axis_off()
         values = np.concatenate([scheme.values(r) for r in results])
@@ -160,13 +240,13 @@ def _closer(result: Result) -> Any:
     with styled():
         figure = new_figure(WIDTH, WIDTH / 2 * 0.8 + 0.75)
         axes = figure.subplots(1, 2)
-        limits = draw.shared_limits([result], "quality")
+        limits = shared_limits([result], "quality")
         for ax, across in zip(axes, (160, 40), strict=True):
             lower, upper = window_around_smallest(result, across)
             draw.plot_cells(result, "quality", ax, limits=limits, window=(lower, upper), key=False)
             ax.locator_params(nbins=4)
             ax.set_title(f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest")
-        scheme = draw.colouring("quality")
+        scheme = colouring("quality")
         draw.add_colour_bar(
             axes[0].collections[0], axes, scheme, result.quality, limits,
             location="bottom", shrink=0.6, aspect=45,
