@@ -1,0 +1,348 @@
+/* A convex polyhedron around its generator, and its clip by the half-space nearer to the generator than to a neighbour.
+   Coordinates are relative to the generator: differences of close positions are exact, so cells stay accurate
+   whatever their size.
+
+   The polyhedron is simple: three faces meet in every vertex (where more do, vertices coincide). Its dual is a
+   triangulated sphere: a vertex is the triangle of its three faces, counter-clockwise seen from outside. A clip takes
+   out the triangles of the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new
+   face. Only that structure, never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
+#include "common/real.h"
+
+#ifndef FACE_CAPACITY
+#error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 4"
+#endif
+
+#define REAL8 CLVORO_JOIN(REAL, 8)
+#define VERTEX_CAPACITY (2 * FACE_CAPACITY) /* 2 F - 4, in whole vectors */
+#if VERTEX_CAPACITY <= 256
+#define INDEX uchar
+#define INDEX4 uchar4
+#else
+#define INDEX ushort
+#define INDEX4 ushort4
+#endif
+
+#define CLIP_MISSED 0    /* the bisector does not cut the cell */
+#define CLIP_CUT 1       /* it does */
+#define CLIP_FULL 2      /* it does, and there are too many faces */
+#define CLIP_COLLAPSED 3 /* rounding leaves nothing, or much on the wrong side */
+
+/* Arrays of vertices are filled up to whole vectors by zeros: the generator itself, which no bisector cuts off. */
+typedef struct {
+    int n;        /* vertices */
+    int slots;    /* faces, with those that are gone */
+    int spares;   /* faces that are gone, for new ones */
+    REAL reach2;  /* largest squared distance of a vertex from the generator */
+    REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
+    REAL8 beyond[VERTEX_CAPACITY / 8];        /* signed distances from a bisector, times |d| */
+    INDEX4 faces[VERTEX_CAPACITY];            /* of a vertex, counter-clockwise */
+    INDEX at[FACE_CAPACITY * FACE_CAPACITY];  /* [a][b]: the vertex whose faces are a, b, in this order, and another */
+    INDEX degree[FACE_CAPACITY];              /* vertices of a face; 0: it is gone */
+    INDEX spare[FACE_CAPACITY];
+    int labels[FACE_CAPACITY];                /* of a face: a generator, or -1 - wall */
+    REAL4 planes[FACE_CAPACITY];              /* of a face: d, level; the plane is y.d = level */
+} cell_t;
+
+#define X(cell) ((REAL *)(cell)->x)
+#define Y(cell) ((REAL *)(cell)->y)
+#define Z(cell) ((REAL *)(cell)->z)
+
+/* Note vertex v as the one between its faces. */
+inline void link_vertex(cell_t *cell, int v)
+{
+    const INDEX4 f = cell->faces[v];
+    cell->at[f.s0 * FACE_CAPACITY + f.s1] = v;
+    cell->at[f.s1 * FACE_CAPACITY + f.s2] = v;
+    cell->at[f.s2 * FACE_CAPACITY + f.s0] = v;
+}
+
+inline void find_reach(cell_t *cell)
+{
+    const int blocks = (cell->n + 7) / 8;
+    REAL8 far = cell->x[0] * cell->x[0] + cell->y[0] * cell->y[0] + cell->z[0] * cell->z[0];
+    for (int b = 1; b < blocks; ++b) {
+        const REAL8 r2 = cell->x[b] * cell->x[b] + cell->y[b] * cell->y[b] + cell->z[b] * cell->z[b];
+        far = r2 > far ? r2 : far;
+    }
+    const REAL4 half4 = far.lo > far.hi ? far.lo : far.hi;
+    const REAL2 half2 = half4.lo > half4.hi ? half4.lo : half4.hi;
+    cell->reach2 = half2.s0 > half2.s1 ? half2.s0 : half2.s1;
+}
+
+/* The whole box around generator x. Face w is wall w. */
+inline void start_cell(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
+{
+    cell->n = 8;
+    cell->slots = 6;
+    cell->spares = 0;
+    const REAL4 low = lower - x, high = upper - x;
+    cell->x[0] = (REAL8)(low.s0, high.s0, low.s0, high.s0, low.s0, high.s0, low.s0, high.s0);
+    cell->y[0] = (REAL8)(low.s1, low.s1, high.s1, high.s1, low.s1, low.s1, high.s1, high.s1);
+    cell->z[0] = (REAL8)(low.s2, low.s2, low.s2, low.s2, high.s2, high.s2, high.s2, high.s2);
+    for (int b = 1; b < VERTEX_CAPACITY / 8; ++b)
+        cell->x[b] = cell->y[b] = cell->z[b] = 0;
+    for (int v = 0; v < 8; ++v) {
+        const int fx = v & 1, fy = 2 + ((v >> 1) & 1), fz = 4 + (v >> 2);
+        /* Counter-clockwise where an even number of walls are lower ones. */
+        const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;
+        cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
+        link_vertex(cell, v);
+    }
+    for (int w = 0; w < 6; ++w) {
+        cell->labels[w] = -1 - w;
+        cell->degree[w] = 4;
+    }
+    cell->planes[0] = (REAL4)(-1, 0, 0, -low.s0);
+    cell->planes[1] = (REAL4)(1, 0, 0, high.s0);
+    cell->planes[2] = (REAL4)(0, -1, 0, -low.s1);
+    cell->planes[3] = (REAL4)(0, 1, 0, high.s1);
+    cell->planes[4] = (REAL4)(0, 0, -1, -low.s2);
+    cell->planes[5] = (REAL4)(0, 0, 1, high.s2);
+    find_reach(cell);
+}
+
+inline REAL4 cross_product(REAL4 a, REAL4 b)
+{
+    return (REAL4)(difference_of_products(a.s1, b.s2, a.s2, b.s1), difference_of_products(a.s2, b.s0, a.s0, b.s2),
+                   difference_of_products(a.s0, b.s1, a.s1, b.s0), 0);
+}
+
+/* The bisector with generator q instead of which that between p and q may be taken: where these two are near each other
+   beside their distance from the cell's own, the planes of both are nearly parallel, and their difference is not. */
+inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
+{
+    if (label_p < 0 || label_q < 0)
+        return q;
+    const REAL4 w = (REAL4)(points[3 * label_q] - points[3 * label_p], points[3 * label_q + 1] - points[3 * label_p + 1],
+                            points[3 * label_q + 2] - points[3 * label_p + 2], 0);
+    const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
+    if (w2 > R(2e-3) * p.s3) /* level is half a square */
+        return q;
+    return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + w2 / 2);
+}
+
+/* The point in which three planes meet, from the planes alone. */
+inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
+{
+    const REAL4 p = cell->planes[a];
+    const REAL4 q = better_row(cell->planes[b], p, cell->labels[b], cell->labels[a], points);
+    const REAL4 r0 = cell->planes[c];
+    REAL4 r = better_row(r0, p, cell->labels[c], cell->labels[a], points);
+    if (r.s3 == r0.s3 && r.s0 == r0.s0)
+        r = better_row(r0, cell->planes[b], cell->labels[c], cell->labels[b], points);
+    const REAL4 qr = cross_product(q, r), rp = cross_product(r, p), pq = cross_product(p, q);
+    const REAL inverse = 1 / (p.s0 * qr.s0 + p.s1 * qr.s1 + p.s2 * qr.s2);
+    return (qr * p.s3 + rp * q.s3 + pq * r.s3) * inverse;
+}
+
+/* Restrict what lies beyond to one disc, grown from the farthest vertex by a triangle at a time; the rest, which rounding
+   has put beyond, is moved back. Returns the largest distance that was. */
+inline REAL keep_disc(cell_t *cell, REAL depth)
+{
+    REAL *s = (REAL *)cell->beyond;
+    bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* of the disc: vertices, faces */
+    int worst = 0;
+    for (int v = 0; v < cell->n; ++v) {
+        inside[v] = false;
+        worst = s[v] > s[worst] ? v : worst;
+    }
+    for (int f = 0; f < cell->slots; ++f)
+        on[f] = false;
+    int added = worst;
+    while (added >= 0) {
+        const INDEX4 f = cell->faces[added];
+        inside[added] = on[f.s0] = on[f.s1] = on[f.s2] = true;
+        added = -1;
+        for (int v = 0; v < cell->n && added < 0; ++v) {
+            if (inside[v] || !(s[v] > depth))
+                continue;
+            const INDEX4 g = cell->faces[v];
+            const bool ab = inside[cell->at[g.s1 * FACE_CAPACITY + g.s0]];
+            const bool bc = inside[cell->at[g.s2 * FACE_CAPACITY + g.s1]];
+            const bool ca = inside[cell->at[g.s0 * FACE_CAPACITY + g.s2]];
+            const int shared = ab + bc + ca;
+            if (shared == 2 || (shared == 1 && !on[ab ? g.s2 : (bc ? g.s0 : g.s1)]))
+                added = v;
+        }
+    }
+    REAL left = 0;
+    for (int v = 0; v < cell->n; ++v)
+        if (!inside[v] && s[v] > depth) {
+            left = fmax(left, s[v]);
+            s[v] = 0;
+        }
+    return left;
+}
+
+/* The edges over which a bisector leaves the cell. */
+typedef struct {
+    int gone;                                            /* vertices beyond the bisector */
+    int n;                                               /* edges */
+    INDEX vertices[VERTEX_CAPACITY + 1];                 /* those beyond, ascending */
+    INDEX before[VERTEX_CAPACITY + 1], after[VERTEX_CAPACITY + 1]; /* faces of an edge, along the rim */
+    INDEX in[VERTEX_CAPACITY + 1], out[VERTEX_CAPACITY + 1];       /* its ends, kept and not */
+} rim_t;
+
+/* Find the rim; false if it is not one simple cycle. */
+inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
+{
+    const REAL *s = (const REAL *)cell->beyond;
+    int gone = 0, n = 0;
+    for (int v = 0; v < cell->n; ++v) {
+        rim->vertices[gone] = v;
+        gone += s[v] > depth;
+    }
+    rim->gone = gone;
+    for (int k = 0; k < gone; ++k) {
+        const int v = rim->vertices[k];
+        const INDEX4 f = cell->faces[v];
+        const int a[4] = {f.s0, f.s1, f.s2, f.s0};
+        for (int e = 0; e < 3; ++e) {
+            const int in = cell->at[a[e + 1] * FACE_CAPACITY + a[e]];
+            rim->before[n] = a[e];
+            rim->after[n] = a[e + 1];
+            rim->in[n] = in;
+            rim->out[n] = v;
+            n += !(s[in] > depth);
+            if (n > VERTEX_CAPACITY)
+                return false;
+        }
+    }
+    rim->n = n;
+    INDEX next[FACE_CAPACITY];
+    for (int k = 0; k < n; ++k)
+        next[rim->before[k]] = rim->after[k];
+    if (n < 3)
+        return false;
+    const int first = rim->before[0];
+    int face = next[first], steps = 1;
+    while (face != first && steps < n) {
+        face = next[face];
+        ++steps;
+    }
+    return face == first && steps == n;
+}
+
+/* How deep beyond the bisector with the neighbour at x + d, times |d|, a vertex must lie to be cut off: deeper than what
+   rounds in the vertex, and than what rounded in the positions of generators in the unit box, unless generators are so
+   near each other that they must differ by less. Cells of a lattice are thus not shredded. */
+#if IS_DOUBLE
+#define FINEST R(4e-11)
+#else
+#define FINEST R(2e-5)
+#endif
+
+inline REAL noise_length(REAL distance)
+{
+    return 4 * REAL_EPS * distance + fmin(4 * REAL_EPS, FINEST * distance);
+}
+
+/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before` the
+   neighbour may be a face of the cell already. */
+inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
+{
+    const REAL level = d2 / 2;
+    const int blocks = (cell->n + 7) / 8;
+    REAL8 far = -level;
+    for (int b = 0; b < blocks; ++b) {
+        const REAL8 s = cell->x[b] * d.s0 + cell->y[b] * d.s1 + cell->z[b] * d.s2 - level;
+        cell->beyond[b] = s;
+        far = s > far ? s : far;
+    }
+    const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
+    const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
+    const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
+    if (!(farthest > 4 * REAL_EPS * d2))
+        return CLIP_MISSED;
+    const REAL distance = sqrt(d2);
+    const REAL depth = distance * noise_length(distance);
+    if (!(farthest > depth))
+        return CLIP_MISSED;
+    if (seen_before)
+        for (int f = 0; f < cell->slots; ++f)
+            if (cell->labels[f] == label && cell->degree[f] > 0)
+                return CLIP_MISSED;
+
+    rim_t rim;
+    if (!find_rim(cell, depth, &rim)) {
+        if (rim.gone == cell->n)
+            return CLIP_COLLAPSED;
+        const REAL left = keep_disc(cell, depth);
+        if (left > distance * (4096 * REAL_EPS) * (distance + sqrt(cell->reach2)) + 512 * depth)
+            return CLIP_COLLAPSED;
+        if (!find_rim(cell, depth, &rim))
+            return CLIP_COLLAPSED;
+    }
+    if (cell->n + rim.n - rim.gone > VERTEX_CAPACITY || (cell->spares == 0 && cell->slots == FACE_CAPACITY))
+        return CLIP_FULL;
+    const int face = cell->spares > 0 ? cell->spare[--cell->spares] : cell->slots++;
+    cell->labels[face] = label;
+    cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
+
+    /* New vertices. Interpolation rounds by eps of the edge's length; where that may be much beside the distance of the
+       generators (while the cell is not closed yet, or near-duplicates), planes are intersected instead. */
+    REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
+    REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
+    const REAL *s = (const REAL *)cell->beyond;
+    if (cell->reach2 > 16 * d2) {
+        for (int k = 0; k < rim.n; ++k) {
+            const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
+            nx[k] = v.s0;
+            ny[k] = v.s1;
+            nz[k] = v.s2;
+        }
+    } else {
+        for (int k = 0; k < rim.n; ++k) {
+            const int in = rim.in[k], out = rim.out[k];
+            const REAL s_in = s[in] < 0 ? s[in] : 0;
+            const REAL t = s_in / (s_in - s[out]);
+            nx[k] = x[in] + t * (x[out] - x[in]);
+            ny[k] = y[in] + t * (y[out] - y[in]);
+            nz[k] = z[in] + t * (z[out] - z[in]);
+        }
+    }
+    for (int k = 0; k < rim.n; ++k) {
+        ++cell->degree[rim.before[k]];
+        ++cell->degree[rim.after[k]];
+    }
+    for (int k = 0; k < rim.gone; ++k) {
+        const INDEX4 f = cell->faces[rim.vertices[k]];
+        const int a[3] = {f.s0, f.s1, f.s2};
+        for (int e = 0; e < 3; ++e) {
+            const int left = cell->degree[a[e]] - 1;
+            cell->degree[a[e]] = left;
+            cell->spare[cell->spares] = a[e];
+            cell->spares += left == 0;
+        }
+    }
+    cell->degree[face] = rim.n;
+    /* They take the places of those that are gone, then go behind the last; places left over are filled from the end. */
+    for (int k = 0; k < rim.n; ++k) {
+        const int v = k < rim.gone ? rim.vertices[k] : cell->n++;
+        x[v] = nx[k];
+        y[v] = ny[k];
+        z[v] = nz[k];
+        cell->faces[v] = (INDEX4)(rim.before[k], rim.after[k], face, 0);
+        link_vertex(cell, v);
+    }
+    for (int k = rim.gone - 1; k >= rim.n; --k) {
+        const int v = rim.vertices[k], last = --cell->n;
+        if (v != last) {
+            x[v] = x[last];
+            y[v] = y[last];
+            z[v] = z[last];
+            cell->faces[v] = cell->faces[last];
+            link_vertex(cell, v);
+        }
+        x[last] = y[last] = z[last] = 0;
+    }
+    find_reach(cell);
+    return CLIP_CUT;
+}
+
+/* Of the vertex v of face f: the face that follows counter-clockwise around f, so that vertex at[f][that] follows v. */
+inline int face_after(const cell_t *cell, int v, int f)
+{
+    const INDEX4 g = cell->faces[v];
+    return g.s0 == f ? g.s2 : (g.s1 == f ? g.s0 : g.s1);
+}

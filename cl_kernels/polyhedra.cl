@@ -1,0 +1,444 @@
+#include "common/bins.h"
+#include "common/polyhedron.h"
+
+/* Bits of the word in which kernels report what went wrong. */
+#define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
+#define FLAG_COINCIDE 2  /* two generators at the same place; report[1] is the smallest index of one */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision; report[1] likewise */
+
+#define UNFINISHED INT_MIN /* count of a cell that was full: to be clipped again with more room */
+
+#ifndef MAX_DEPTH
+#error "build with -DMAX_DEPTH=levels that the bins may have"
+#endif
+
+#define BATCH 256  /* generators that are sorted by distance at a time */
+#define SHELLS 32
+
+inline void raise_flag(global int *report, int flag, int generator)
+{
+    atomic_or(report, flag);
+    atomic_min(report + 1, generator);
+}
+
+/* Where to look for neighbours. */
+typedef struct {
+    global const REAL *points, *binned;
+    global const int *items;
+    global const int2 *bins;
+    global const FRAME *grid_frames;
+    global const int4 *grid_shapes;
+} search_t;
+
+/* Generators that may cut a cell: places in bin order. */
+typedef struct {
+    int n;
+    int places[BATCH];
+    REAL d2[BATCH];
+} batch_t;
+
+/* Clip the cell by the generators of a batch, about the nearest first: by shells of 1 / `per_shell` in squared distance.
+   Returns FLAG_* or 0. */
+inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
+{
+    ushort ends[SHELLS], order[BATCH];
+    uchar shell[BATCH];
+    for (int k = 0; k < SHELLS; ++k)
+        ends[k] = 0;
+    for (int k = 0; k < batch->n; ++k) {
+        const REAL place = batch->d2[k] * per_shell;
+        shell[k] = place < SHELLS - 1 ? (uchar)place : (uchar)(SHELLS - 1);
+        ++ends[shell[k]];
+    }
+    for (int k = 0, sum = 0; k < SHELLS; ++k) {
+        const int count = ends[k];
+        ends[k] = sum;
+        sum += count;
+    }
+    for (int k = 0; k < batch->n; ++k)
+        order[ends[shell[k]]++] = k;
+    for (int k = 0; k < batch->n; ++k) {
+        const REAL d2 = batch->d2[order[k]];
+        if (!(d2 < 4 * cell->reach2))
+            continue;
+        const int q = batch->places[order[k]];
+        if (d2 == 0)
+            return FLAG_COINCIDE;
+        const REAL4 d = (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
+        const int what = clip_cell(cell, d, d2, in->items[q], warm, in->points);
+        if (what >= CLIP_FULL)
+            return what == CLIP_FULL ? FLAG_FULL : FLAG_COLLAPSED;
+    }
+    batch->n = 0;
+    return 0;
+}
+
+/* How far a row of bins is from y; a little less, as positions are put into bins with rounding. */
+inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
+{
+    const REAL below = origin + row * edge - y;
+    const REAL distance = (below > 0 ? below : -below - edge) - edge * (64 * REAL_EPS + R(1e-6));
+    return distance > 0 ? distance : 0;
+}
+
+/* Bins along one axis that [x - w, x + w] touches. */
+inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
+{
+    return (int2)(axis_bin(x - w, origin, inverse, side), axis_bin(x + w, origin, inverse, side));
+}
+
+/* Clip the cell of the generator at place `own` by every generator in the bins that the cube of half-width w covers
+   and the cube of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
+   the farthest vertex. Returns FLAG_* or 0. */
+inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
+{
+    /* The grids that are open, from the root down, and where each was left: row, part of the row, bin. */
+    int grids[MAX_DEPTH], rows[MAX_DEPTH], parts[MAX_DEPTH], bins_at[MAX_DEPTH];
+    bool inside[MAX_DEPTH]; /* was the grid's own bin opened for the inner cube? */
+    const REAL per_shell = SHELLS / (6 * w * w);
+    batch_t batch;
+    batch.n = 0;
+    int depth = 0;
+    grids[0] = rows[0] = parts[0] = 0;
+    bins_at[0] = -1;
+    inside[0] = inner >= 0;
+    while (depth >= 0) {
+        const FRAME frame = in->grid_frames[grids[depth]];
+        const int4 shape = in->grid_shapes[grids[depth]];
+        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
+        const int2 ys = bin_range(x.s1, w, frame.s1, inverse, shape.s2);
+        const int2 zs = bin_range(x.s2, w, frame.s2, inverse, shape.s3);
+        const int height = ys.s1 - ys.s0 + 1, row_count = height * (zs.s1 - zs.s0 + 1);
+        /* What the inner cube has taken. */
+        int2 done_x = (int2)(0, -1), done_y = done_x, done_z = done_x;
+        if (inside[depth]) {
+            done_x = bin_range(x.s0, inner, frame.s0, inverse, shape.s1);
+            done_y = bin_range(x.s1, inner, frame.s1, inverse, shape.s2);
+            done_z = bin_range(x.s2, inner, frame.s2, inverse, shape.s3);
+        }
+        int row = rows[depth], part = parts[depth], at = bins_at[depth];
+        int child = -1;
+        for (; row < row_count; ++row, part = 0, at = -1) {
+            const int iz = zs.s0 + row / height, iy = ys.s0 + row % height;
+            const REAL away_y = row_distance(x.s1, frame.s1, edge, iy);
+            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz);
+            const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
+            if (!(left2 > 0))
+                continue;
+            const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;
+            const int2 xs = bin_range(x.s0, span, frame.s0, inverse, shape.s1);
+            /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
+            const bool row_done = iy >= done_y.s0 && iy <= done_y.s1 && iz >= done_z.s0 && iz <= done_z.s1;
+            global const int2 *row_bins = in->bins + shape.s0 + (iz * shape.s2 + iy) * shape.s1;
+            while (part < 3 && child < 0) {
+                const int from = part == 0 ? xs.s0 : (part == 1 ? max(xs.s0, done_x.s0) : max(xs.s0, done_x.s1 + 1));
+                const int to = !row_done || part == 2 ? xs.s1 : min(xs.s1, part == 0 ? done_x.s0 - 1 : done_x.s1);
+                const int bin = max(at, from);
+                if (bin > to) {
+                    part = row_done ? part + 1 : 3;
+                    at = -1;
+                    continue;
+                }
+                /* A run of leaves beside each other is a run of items. */
+                const int2 first = row_bins[bin];
+                int2 end = row_bins[to + 1];
+                at = to + 1;
+                if (first.s1 != end.s1) {
+                    /* There are divided bins ahead: one bin at a time. */
+                    end = row_bins[bin + 1];
+                    at = bin + 1;
+                    if (first.s1 != end.s1) {
+                        child = first.s1;
+                        inside[depth + 1] = part == 1 && row_done;
+                        end.s0 = first.s0;
+                    }
+                }
+                if (part == 1 && row_done)
+                    end.s0 = first.s0;
+                int begin = first.s0;
+                while (begin < end.s0) {
+                    const int stop = min(end.s0, begin + BATCH - batch.n);
+                    const REAL limit = 4 * cell->reach2;
+                    int n = batch.n;
+                    for (int q = begin; q < stop; ++q) {
+                        const REAL dx = in->binned[3 * q] - x.s0;
+                        const REAL dy = in->binned[3 * q + 1] - x.s1;
+                        const REAL dz = in->binned[3 * q + 2] - x.s2;
+                        const REAL d2 = dx * dx + dy * dy + dz * dz;
+                        batch.places[n] = q;
+                        batch.d2[n] = d2;
+                        n += d2 < limit && q != own;
+                    }
+                    batch.n = n;
+                    begin = stop;
+                    if (n == BATCH) {
+                        const int flag = clip_by_batch(cell, x, &batch, per_shell, warm, in);
+                        if (flag != 0)
+                            return flag;
+                    }
+                }
+            }
+            if (child >= 0)
+                break;
+        }
+        if (child >= 0) {
+            rows[depth] = row;
+            parts[depth] = part;
+            bins_at[depth] = at;
+            ++depth;
+            grids[depth] = child;
+            rows[depth] = parts[depth] = 0;
+            bins_at[depth] = -1;
+        } else {
+            --depth;
+        }
+    }
+    return clip_by_batch(cell, x, &batch, per_shell, warm, in);
+}
+
+/* Clip by the neighbours in an earlier diagram. Returns FLAG_* or 0. */
+inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbours,
+                       global const REAL *points)
+{
+    const int end = starts[i + 1];
+    for (int k = starts[i]; k < end; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
+        const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
+        if (d2 == 0)
+            return FLAG_COINCIDE;
+        const int what = clip_cell(cell, d, d2, j, false, points);
+        if (what >= CLIP_FULL)
+            return what == CLIP_FULL ? FLAG_FULL : FLAG_COLLAPSED;
+    }
+    return 0;
+}
+
+/* Measures of a cell's faces and of the cell: where it writes them. */
+typedef struct {
+    global int *labels;
+    global REAL *measures, *centroids;
+} faces_t;
+
+inline REAL4 vertex_at(const cell_t *cell, int v)
+{
+    return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
+}
+
+inline REAL dot3(REAL4 a, REAL4 b)
+{
+    return a.s0 * b.s0 + a.s1 * b.s1 + a.s2 * b.s2;
+}
+
+inline REAL4 cross3(REAL4 a, REAL4 b)
+{
+    return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
+}
+
+/* Per place p in bin order: the cell of generator i = items[p], its faces and its measures.
+
+   V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
+   after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
+   cube of bins that it has seen covers that ball. With `warm` the neighbours of an earlier, similar diagram are
+   clipped first, and the search only has to confirm them.
+
+   A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
+   S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
+
+   row_places, row_counts (n,)   where in the arrays of faces the cell's are, and how many, negative if rounding leaves a
+                                 doubt; cells come in no particular order, the next kernels bring them into it
+   labels, measures, centroids   of the faces; report[2] counts them
+   volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
+kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
+                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
+                       global const int *old_starts, global const int *old_neighbours, const int again,
+                       const int room, global int *row_places, global int *row_counts, global int *labels,
+                       global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
+                       global REAL *covariances, global int *report)
+{
+    WORK_ITEM(p);
+    const int i = items[p];
+    if (again && row_counts[i] != UNFINISHED)
+        return;
+    const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
+    const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
+    cell_t cell;
+    start_cell(&cell, x, box_lower, box_upper);
+    int flag = 0;
+    REAL w = reach[p], inner = -1;
+    if (warm) {
+        flag = clip_by_row(&cell, i, x, old_starts, old_neighbours, points);
+        w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
+    }
+    while (flag == 0) {
+        flag = clip_by_bins(&cell, x, p, w, inner, warm, &in);
+        const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
+        if (!(need > w)) /* ends with a NaN, too */
+            break;
+        inner = w;
+        w = need < 4 * w ? need : 2 * w;
+    }
+    if (flag != 0) {
+        raise_flag(report, flag, i);
+        row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
+        return;
+    }
+
+    /* A vertex of every face, and how many faces there are. */
+    INDEX start[FACE_CAPACITY];
+    for (int v = 0; v < cell.n; ++v) {
+        const INDEX4 f = cell.faces[v];
+        start[f.s0] = start[f.s1] = start[f.s2] = v;
+    }
+    const int place = atomic_add(report + 2, cell.slots - cell.spares);
+    const bool fits = place + cell.slots - cell.spares <= room;
+    const REAL near2 = sqrt(REAL_EPS) * cell.reach2;
+    int count = 0;
+    bool doubtful = false;
+    REAL volume = 0;
+    REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
+    for (int f = 0; f < cell.slots; ++f) {
+        if (cell.degree[f] == 0)
+            continue;
+        const REAL4 plane = cell.planes[f];
+        const REAL d2 = plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2;
+        const REAL inverse = 1 / sqrt(d2);
+        const REAL4 normal = plane * inverse; /* and its distance */
+        int v = start[f];
+        int next = face_after(&cell, v, f);
+        const REAL4 a = vertex_at(&cell, v);
+        v = cell.at[f * FACE_CAPACITY + next];
+        REAL4 b = vertex_at(&cell, v);
+        REAL4 ab = b - a;
+        REAL area = 0;
+        REAL4 face_first = 0, face_square = 0, face_mixed = 0;
+        for (int k = 2; k < cell.degree[f]; ++k) {
+            next = face_after(&cell, v, f);
+            v = cell.at[f * FACE_CAPACITY + next];
+            const REAL4 c = vertex_at(&cell, v);
+            const REAL4 ac = c - a;
+            const REAL weight = dot3(cross3(ab, ac), normal);
+            const REAL4 s = a + b + c;
+            area += weight;
+            face_first += weight * s;
+            face_square += weight * (a * a + b * b + c * c + s * s);
+            face_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
+            b = c;
+            ab = ac;
+        }
+        volume += normal.s3 * area;
+        first += normal.s3 * face_first;
+        square += normal.s3 * face_square;
+        mixed += normal.s3 * face_mixed;
+        const int label = cell.labels[f];
+        if (label >= 0) {
+            /* Faces below rounding are none; smaller ones than a neighbour is sure to see, too, are doubtful. */
+            if (!(area > sqrt(REAL_EPS) * d2)) {
+                REAL width2 = 0;
+                v = start[f];
+                for (int k = 1; k < cell.degree[f]; ++k) {
+                    v = cell.at[f * FACE_CAPACITY + face_after(&cell, v, f)];
+                    const REAL4 e = vertex_at(&cell, v) - a;
+                    width2 = fmax(width2, dot3(e, e));
+                }
+                const REAL least = 8 * noise_length(1 / inverse);
+                if (!(area > 2 * least * sqrt(width2)))
+                    continue;
+                doubtful = true;
+            }
+            doubtful |= d2 < near2;
+        }
+        if (fits) {
+            const REAL third = area > 0 ? 1 / (3 * area) : 0;
+            labels[place + count] = label;
+            measures[place + count] = area / 2;
+            centroids[3 * (place + count)] = face_first.s0 * third;
+            centroids[3 * (place + count) + 1] = face_first.s1 * third;
+            centroids[3 * (place + count) + 2] = face_first.s2 * third;
+        }
+        ++count;
+    }
+    row_places[i] = place;
+    row_counts[i] = doubtful ? -count : count;
+    if (count < 4 || !(volume > 0))
+        raise_flag(report, FLAG_COLLAPSED, i);
+    const REAL inverse = 1 / volume;
+    first *= inverse / 4;
+    square = square * (inverse / 20) - first * first;
+    mixed = mixed * (inverse / 20) - first.yzxw * first.zxyw;
+    volumes[i] = volume / 6;
+    offsets[3 * i] = first.s0;
+    offsets[3 * i + 1] = first.s1;
+    offsets[3 * i + 2] = first.s2;
+    covariances[6 * i] = square.s0;
+    covariances[6 * i + 1] = mixed.s2;
+    covariances[6 * i + 2] = mixed.s1;
+    covariances[6 * i + 3] = square.s1;
+    covariances[6 * i + 4] = mixed.s0;
+    covariances[6 * i + 5] = square.s2;
+}
+
+/* Per generator i: kept[k] of each of its faces, and the number kept. Rounding may let one of two cells, which is then
+   doubtful, see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
+   If it is wider than rounding explains, generators are too close to tell apart (from far away, two an ulp apart have
+   the same bisector), and that is flagged. */
+kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
+                        global const int *labels, global const REAL *measures, global const REAL *points,
+                        global uchar *kept, global int *counts, global int *report)
+{
+    WORK_ITEM(i);
+    const int n = abs(row_counts[i]);
+    const bool doubtful = row_counts[i] < 0;
+    counts[i] = n;
+    if (!doubtful)
+        return;
+    int count = 0;
+    for (int k = row_places[i]; k < row_places[i] + n; ++k) {
+        const int j = labels[k];
+        bool mutual = j < 0;
+        if (!mutual) {
+            const int m = abs(row_counts[j]);
+            global const int *row = labels + row_places[j];
+            for (int q = 0; q < m && !mutual; ++q)
+                mutual = row[q] == i;
+            if (!mutual) {
+                const REAL dx = points[3 * j] - points[3 * i];
+                const REAL dy = points[3 * j + 1] - points[3 * i + 1];
+                const REAL dz = points[3 * j + 2] - points[3 * i + 2];
+                if (!(measures[k] < 2048 * REAL_EPS * sqrt(dx * dx + dy * dy + dz * dz)))
+                    raise_flag(report, FLAG_COLLAPSED, i);
+            }
+        }
+        kept[k] = mutual;
+        count += mutual;
+    }
+    counts[i] = count;
+    if (count < 4)
+        raise_flag(report, FLAG_COLLAPSED, i);
+}
+
+/* Per generator i: its faces, those kept, as row i of the graph.
+
+   neighbours, face_measures (m,), face_centroids (m, 3)  areas, and centroids relative to x_i */
+kernel void place_faces(const int size, global const int *row_places, global const int *row_counts,
+                        global const int *labels, global const REAL *measures, global const REAL *centroids,
+                        global const uchar *kept, global const int *starts, global int *neighbours,
+                        global REAL *face_measures, global REAL *face_centroids)
+{
+    WORK_ITEM(i);
+    const int n = abs(row_counts[i]), from = row_places[i];
+    const bool doubtful = row_counts[i] < 0;
+    int to = starts[i];
+    for (int k = from; k < from + n; ++k) {
+        if (doubtful && !kept[k])
+            continue;
+        neighbours[to] = labels[k];
+        face_measures[to] = measures[k];
+        for (int axis = 0; axis < 3; ++axis)
+            face_centroids[3 * to + axis] = centroids[3 * k + axis];
+        ++to;
+    }
+}

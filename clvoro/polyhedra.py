@@ -1,0 +1,175 @@
+"""The tessellation in 3D: every cell clipped by its neighbours and walls, its faces and moments (`polyhedra.cl`)."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Scan
+from ._program import Engine
+from .bins import MAX_LEVELS, BinnedPoints
+from .cells import COINCIDE, FULL, Tessellation
+from .domain import Box
+from .errors import ClvoroError, InputError, MemoryLimitError
+
+FACE_CAPACITY = 48
+"""Faces that a cell may have while it is clipped; doubled for those cells that have more."""
+MOST_FACES = 768
+FACES_PER_CELL = 16.5
+"""Room for faces at first: random cells have 15.54 of them on average; walls add some."""
+
+
+class Polyhedra:
+    """Tessellate a box in 3D. Buffers are reused: a `Tessellation` lives until the second call after it."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._programs: dict[int, SimpleNamespace] = {}
+        self._kernels(FACE_CAPACITY)
+        self._report = engine.empty(3, np.int32)
+        self._capacity = self._room = 0
+        self._turn = 0
+
+    def _kernels(self, capacity: int) -> SimpleNamespace:
+        if capacity not in self._programs:
+            defines = {"FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS}
+            self._programs[capacity] = self.engine.kernels("polyhedra", defines)
+        return self._programs[capacity]
+
+    def _reserve_cells(self, n: int) -> None:
+        """Make room for `n` cells."""
+        if n <= self._capacity:
+            return
+        engine = self.engine
+        self._row_places, self._row_counts = (engine.empty(n, np.int32) for _ in range(2))
+        # Two sets in turn: the previous diagram stays valid, for a warm start and to compare neighbours.
+        self._cells = [
+            {
+                "starts": engine.empty(n + 1, np.int32),
+                "volumes": engine.empty(n),
+                "offsets": engine.empty((n, 3)),
+                "covariances": engine.empty((n, 6)),
+            }
+            for _ in range(2)
+        ]
+        self._faces: list[dict[str, cla.Array]] = [{}, {}]
+        self._capacity = n
+
+    def _reserve_faces(self, m: int) -> None:
+        """Make room for `m` faces of a diagram at work, in no order yet."""
+        if m <= self._room:
+            return
+        if m >= 2**31 // 3:
+            raise MemoryLimitError(
+                f"the cells have {m:.3g} faces, expected fewer than {2**31 // 3:.3g}, which 32-bit "
+                "indices can tell apart; use fewer cells, or perturb generators that lie on a "
+                "common sphere"
+            )
+        engine = self.engine
+        self._labels, self._measures = engine.empty(m, np.int32), engine.empty(m)
+        self._centroids, self._kept = engine.empty((m, 3)), engine.empty(m, np.uint8)
+        self._room = m
+
+    def _set(self, n: int, m: int) -> dict[str, cla.Array]:
+        """Return the buffers whose turn it is, cut to `n` cells, with room for `m` faces."""
+        engine, faces = self.engine, self._faces[self._turn]
+        if not faces or len(faces["neighbours"]) < m:
+            faces["neighbours"] = engine.empty(m, np.int32)
+            faces["face_measures"] = engine.empty(m)
+            faces["face_centroids"] = engine.empty((m, 3))
+        lengths = {"starts": n + 1}
+        cells = self._cells[self._turn]
+        return {name: a[: lengths.get(name, n)] for name, a in cells.items()} | faces
+
+    def tessellate(
+        self,
+        box: Box,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | None = None,
+    ) -> Tessellation:
+        """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
+
+        Parameters
+        ----------
+        previous : Tessellation, optional
+            A diagram of the same generators at earlier positions: clipping starts from its neighbours.
+
+        Raises
+        ------
+        InputError
+            If two generators coincide or are too close for the precision; names the first.
+        MemoryLimitError
+            If the faces are too many for 32-bit indices.
+        ClvoroError
+            If a cell has more than `MOST_FACES` faces.
+        """
+        engine, k = self.engine, self._kernels(FACE_CAPACITY)
+        self._reserve_cells(n)
+        self._reserve_faces(max(self._room, round(FACES_PER_CELL * n + 6 * n ** (2 / 3)) + 64))
+        lower, upper = box.device_corners(engine.real)
+        arrays = self._set(n, self._room)
+        warm = previous is not None and previous.n == n
+        old = (
+            (previous.starts, previous.neighbours)
+            if previous is not None and warm
+            else (self._row_counts, self._row_counts)
+        )
+        capacity, again = FACE_CAPACITY, False
+        self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
+        while True:
+            engine.run_each(
+                self._kernels(capacity).clip_cells, n, binned.points, binned.items, binned.reach,
+                binned.bins, binned.grid_frames, binned.grid_shapes, points, lower, upper,
+                np.int32(warm), *old, np.int32(again), np.int32(self._room), self._row_places,
+                self._row_counts, self._labels, self._measures, self._centroids,
+                arrays["volumes"], arrays["offsets"], arrays["covariances"], self._report,
+            )  # fmt: skip
+            flags, generator, m = (int(v) for v in self._report.get())
+            if flags & ~FULL:
+                self._refuse(flags, generator)
+            if m > self._room:
+                # All anew: what did not fit was not kept.
+                self._reserve_faces(m + m // 32 + 64)
+                capacity, again = FACE_CAPACITY, False
+                self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
+            elif flags & FULL:
+                # Those cells alone, with more room.
+                capacity, again = 2 * capacity, True
+                if capacity > MOST_FACES:
+                    raise ClvoroError(
+                        f"the cell of generator {generator} has more than {MOST_FACES} faces; so "
+                        "many generators on a common sphere are not supported: remove or perturb "
+                        "some"
+                    )
+                self._report.set(np.array([0, 2**31 - 1, m], np.int32))
+            else:
+                break
+        arrays = self._set(n, m)
+        engine.run_each(
+            k.match_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
+            points, self._kept, arrays["starts"], self._report,
+        )  # fmt: skip
+        flags, generator, _ = (int(v) for v in self._report.get())
+        if flags:
+            self._refuse(flags, generator)
+        self._scan.exclusive(arrays["starts"], arrays["starts"], n)
+        engine.run_each(
+            k.place_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
+            self._centroids, self._kept, arrays["starts"], arrays["neighbours"],
+            arrays["face_measures"], arrays["face_centroids"],
+        )  # fmt: skip
+        # Only now: a call that was broken off leaves the previous diagram as it is.
+        self._turn = 1 - self._turn
+        return Tessellation(n=n, points=points, **arrays)
+
+    def _refuse(self, flags: int, generator: int) -> None:
+        what = "coincides with another" if flags & COINCIDE else "is too close to others"
+        raise InputError(
+            f"generator {generator} {what} in {self.engine.real}; expected distinct generators: "
+            "remove duplicates (numpy.unique(points, axis=0)) or use dtype='float64'"
+        )
