@@ -13,8 +13,9 @@ milliseconds:
   bins     the binning of ordered generators: what every step of a run does
   diagram  clipping, matching, scan, areas, centroids, faces, graph
 "clip", "match" and "measure" are the device's own times of the kernels in "diagram", by its
-events. Warm rows: the generators moved by up to a tenth of their spacing; clipping starts from
-the diagram before. Rates are millions of cells per second: of clipping alone; from binning to
+events. Warm rows: the generators moved by up to a tenth of the distance to the nearest other, and
+the diagram before is repaired ("clip": checking which neighbours stay, clipping the others);
+there is no binning. Rates are millions of cells per second: of clipping alone; from binning to
 graph; and the same with "order", which is a diagram of points in any order. With `--scipy`
 SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up to
 `--scipy-up-to` cells; "x SciPy" compares it with the last of the rates. The table ends with the
@@ -40,6 +41,7 @@ from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
 from clvoro.profile import Profile, profiled_queue
+from clvoro.repair import Repair
 
 BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
 SEED = 7919
@@ -82,6 +84,10 @@ def hexagonal(n: int, rng: np.random.Generator) -> np.ndarray:
 SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
 
 
+KERNELS = {"clip": ("clip", "check", "list", "place"), "match": ("match",), "measure": ("measure",)}
+"""How the names of the kernels begin that make up a column."""
+
+
 def median_time(queue: Any, repeat: int, function: Callable[[], object]) -> float:
     """Median seconds of `function`, from an idle queue to an idle queue, after a first call."""
     times = []
@@ -101,6 +107,7 @@ class Tessellator:
     def __init__(self, engine: Engine, points: np.ndarray) -> None:
         self.engine, self.n = engine, len(points)
         self.bins, self.cells, self.gather = Bins(engine), Cells(engine), Gather(engine)
+        self.repair = Repair(engine)
         self.given = engine.upload(points)
         self.points = self.order()
         self.turn = 0
@@ -120,39 +127,45 @@ class Tessellator:
         return self.t
 
     def prepare_warm(self, rng: np.random.Generator) -> None:
-        """Move the generators to and fro by a share of their spacing."""
+        """Move the generators to and fro by a share of the distance to the nearest other."""
         self.bin()
-        spacing = np.sqrt(self.diagram().volumes.get()[: self.n])
-        host = self.points.get()
-        moved = host + WARM_MOVE * spacing[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
+        t, host = self.diagram(), self.points.get()
+        starts = t.starts.get()
+        neighbours = t.neighbours.get()[: starts[-1]]
+        d = host[neighbours] - np.repeat(host, np.diff(starts), axis=0)
+        d = np.where(neighbours >= 0, np.hypot(*d.T), np.inf)
+        nearest = np.minimum.reduceat(d, starts[:-1])
+        moved = host + WARM_MOVE * nearest[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
         moved = np.clip(moved, 0, 1)
         self.places = [self.points, self.engine.upload(moved)]
-        self.warm_bins = [Bins(self.engine), Bins(self.engine)]
-        self.warm_binned = [
-            b.build(BOX, p, self.n) for b, p in zip(self.warm_bins, self.places, strict=True)
-        ]
-
-    def bin_moved(self) -> None:
-        """Bin the generators where they moved to: their order is no longer the bins'."""
-        self.warm_bins[1].build(BOX, self.places[1], self.n)
+        # Capacities grow where a mesh is made anew, not where one is repaired.
+        self.cells.tessellate(
+            BOX, self.places[1], self.n, self.bins.build(BOX, self.places[1], self.n)
+        )
+        self.t = self.cells.tessellate(
+            BOX, self.points, self.n, self.bins.build(BOX, self.points, self.n)
+        )
 
     def diagram_warm(self) -> None:
         """Tessellate where the generators moved to, from where they were, to and fro."""
         self.turn = 1 - self.turn
-        self.t = self.cells.tessellate(
-            BOX, self.places[self.turn], self.n, self.warm_binned[self.turn], self.t
-        )
+        t = self.repair.follow(self.cells, BOX, self.places[self.turn], self.t)
+        if t is None:
+            raise SystemExit("the generators moved too far for a repair")
+        self.t = t
 
 
 def kernel_times(queue: Any, repeat: int, function: Callable[[], object]) -> dict[str, float]:
     """Median device times of the kernels of "diagram"."""
     function()
-    times: dict[str, list[float]] = {"clip": [], "match": [], "measure": []}
+    times: dict[str, list[float]] = {name: [] for name in KERNELS}
     for _ in range(repeat):
         with Profile(queue) as profile:
             function()
         for name, seen in times.items():
-            costs = (cost for (_, kernel), cost in profile.costs.items() if kernel.startswith(name))
+            costs = (
+                c for (_, kernel), c in profile.costs.items() if kernel.startswith(KERNELS[name])
+            )
             seen.append(sum(cost.seconds for cost in costs))
     return {name: statistics.median(seen) for name, seen in times.items()}
 
@@ -170,7 +183,6 @@ def measure(
     bins = median_time(queue, repeat, plain.bin)
     cold = median_time(queue, repeat, plain.diagram)
     plain.prepare_warm(rng)
-    warm_bins = median_time(queue, repeat, plain.bin_moved)
     warm = median_time(queue, repeat, plain.diagram_warm)
     del plain
 
@@ -185,7 +197,7 @@ def measure(
     n = len(points)
     records = []
     for start, seconds, binning, kernels in (
-        ("cold", cold, bins, cold_kernels), ("warm", warm, warm_bins, warm_kernels),
+        ("cold", cold, bins, cold_kernels), ("warm", warm, 0.0, warm_kernels),
     ):  # fmt: skip
         record: dict[str, Any] = {
             "set": name, "cells": n, "start": start, "bins": binning, "diagram": seconds, **kernels,

@@ -1,22 +1,10 @@
 #include "common/bins.h"
 #include "common/corner.h"
-#include "common/polygon.h"
+#include "common/face_rows.h"
 
-/* Bits of the word in which kernels report what went wrong. */
-#define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY */
-#define FLAG_COINCIDE 2  /* two generators at the same place; flags[1] is the smallest index of one */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
-
-#define KEEP_WORDS ((ROW_CAPACITY + 31) / 32)
 #ifndef MAX_DEPTH
 #error "build with -DMAX_DEPTH=levels that the bins may have"
 #endif
-
-inline void raise_flag(global int *flags, int flag, int generator)
-{
-    atomic_or(flags, flag);
-    atomic_min(flags + 1, generator);
-}
 
 /* How far a row of bins is from y; a little less, as positions are put into bins with rounding. */
 inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
@@ -29,8 +17,8 @@ inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
 /* Clip the cell of the generator at place `own` by every generator in the bins that the square of half-width w covers
    and the square of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
    the farthest corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or 0. */
-inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, bool warm,
-                        global const REAL *points, global const REAL *binned, global const int *items,
+inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, global const REAL *points,
+                        global const REAL *binned, global const int *items,
                         global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
     /* The grids that are open, from the root down, and where each was left: row in outward order, part of the row, bin. */
@@ -102,7 +90,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
                         continue;
                     if (d2 == 0)
                         return FLAG_COINCIDE;
-                    if (!clip_cell(cell, d, d2, items[q], warm, points))
+                    if (!clip_cell(cell, d, d2, items[q], false, points))
                         return FLAG_FULL;
                 }
             }
@@ -131,15 +119,13 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
-   square of bins that it has seen covers that circle. With `warm` the neighbours of an earlier, similar diagram are
-   clipped first, and the search only has to confirm them.
+   square of bins that it has seen covers that circle.
 
    rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt */
 kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
-                       global const int *old_starts, global const int *old_neighbours, global int *rows,
-                       global int *row_counts, global int *flags)
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *rows,
+                       global int *row_counts, global int *places, global int *flags)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -150,76 +136,59 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     start_cell(&cell, i, x, lower, upper);
     int flag = 0;
     REAL w = reach[p], inner = -1;
-    if (warm) {
-        const int end = old_starts[i + 1];
-        for (int k = old_starts[i]; k < end && flag == 0; ++k) {
-            const int j = old_neighbours[k];
-            if (j < 0)
-                continue;
-            const REAL d[2] = {points[2 * j] - x[0], points[2 * j + 1] - x[1]};
-            const REAL d2 = d[0] * d[0] + d[1] * d[1];
-            if (d2 == 0)
-                flag = FLAG_COINCIDE;
-            else if (!clip_cell(&cell, d, d2, j, false, points))
-                flag = FLAG_FULL;
-        }
-        w = 2 * sqrt(cell.reach2);
-    }
     while (flag == 0) {
-        flag = clip_by_bins(&cell, x, p, w, inner, warm, points, binned, items, bins, grid_frames, grid_shapes);
+        flag = clip_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
         if (!(need > w)) /* ends with a NaN, too */
             break;
         inner = w;
         w = fmin(need, 2 * w);
     }
-    bool doubtful = false;
-    if (flag == 0) {
-        doubtful = is_doubtful(&cell, x, points);
-        if (doubtful)
-            drop_short_faces(&cell, 16 * REAL_EPS, x, points);
-        if (cell.n > ROW_CAPACITY)
-            flag = FLAG_FULL;
-    }
-    if (flag) {
-        raise_flag(flags, flag, i);
-        cell.n = 0;
-    }
-    for (int k = 0; k < cell.n; ++k)
-        rows[i * ROW_CAPACITY + k] = cell.faces[k];
-    row_counts[i] = doubtful ? -cell.n : cell.n;
+    store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
+    places[i] = i;
 }
 
-/* Per generator i: bit k of keep[i * KEEP_WORDS ...] marks a neighbour that also lists i. Rounding may let one of two
-   cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
+/* Per generator i: bit k of keep[KEEP_WORDS * its slot ...] marks a neighbour that also lists i. Rounding may let one of
+   two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
    the graph is symmetric. If what it cuts off is more than rounding, generators are too close to tell apart (from far
    away, two an ulp apart have the same bisector), and that is flagged. */
-kernel void match_faces(const int size, global const int *rows, global const int *row_counts, global const REAL *points,
-                        const REAL4 box_lower, const REAL4 box_upper, global uint *keep, global int *counts,
-                        global int *flags)
+kernel void match_faces(const int size, global const int *places, global const int *slots, global const int *slot_counts,
+                        global const int *old_starts, global const int *old_neighbours, global const REAL *points,
+                        const REAL4 box_lower, const REAL4 box_upper, const int repaired, global uint *keep,
+                        global int *counts, global int *flags)
 {
     WORK_ITEM(i);
-    const bool doubtful = row_counts[i] < 0;
-    const int n = abs(row_counts[i]);
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
+    int n;
+    global const int *row = face_row(&rows, i, &n);
+    const int place = places[i];
+    if (place < 0) {
+        counts[i] = n;
+        return;
+    }
+    const bool doubtful = slot_counts[place] < 0;
     uint word = 0;
     int count = 0;
     for (int k = 0; k < n; ++k) {
-        const int j = doubtful ? rows[i * ROW_CAPACITY + k] : -1;
-        bool mutual = j < 0 || !doubtful;
+        const int j = doubtful || repaired ? row[k] : -1;
+        bool mutual = j < 0;
         if (!mutual) {
-            const int m = abs(row_counts[j]);
+            int m;
+            global const int *other = face_row(&rows, j, &m);
             for (int q = 0; q < m && !mutual; ++q)
-                mutual = rows[j * ROW_CAPACITY + q] == i;
+                mutual = other[q] == i;
         }
         if (mutual) {
             word |= 1u << (k % 32);
             ++count;
+        } else if (!doubtful) {
+            raise_flag(flags, FLAG_COLLAPSED, i);
         } else {
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             const REAL lower[2] = {box_lower.s0, box_lower.s1};
             const REAL upper[2] = {box_upper.s0, box_upper.s1};
-            const int a = rows[i * ROW_CAPACITY + (k == 0 ? n - 1 : k - 1)];
-            const int b = rows[i * ROW_CAPACITY + (k == n - 1 ? 0 : k + 1)];
+            const int a = row[k == 0 ? n - 1 : k - 1];
+            const int b = row[k == n - 1 ? 0 : k + 1];
             const REAL2 tip = corner(i, x, a, b, points, lower, upper);
             const REAL2 u = corner(i, x, a, j, points, lower, upper) - tip;
             const REAL2 v = corner(i, x, j, b, points, lower, upper) - tip;
@@ -227,7 +196,7 @@ kernel void match_faces(const int size, global const int *rows, global const int
                 raise_flag(flags, FLAG_COLLAPSED, i);
         }
         if (k % 32 == 31 || k == n - 1) {
-            keep[i * KEEP_WORDS + k / 32] = word;
+            keep[place * KEEP_WORDS + k / 32] = word;
             word = 0;
         }
     }
@@ -244,8 +213,10 @@ kernel void match_faces(const int size, global const int *rows, global const int
    volumes (n,)              A_i
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
    covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area */
-kernel void measure_cells(const int size, global const int *rows, global const int *row_counts, global const uint *keep,
-                          global const int *starts, global const REAL *points, const REAL4 box_lower,
+kernel void measure_cells(const int size, global const int *places, global const int *slots,
+                          global const int *slot_counts, global const int *old_starts,
+                          global const int *old_neighbours, global const uint *keep, global const int *starts,
+                          global const REAL *points, const REAL4 box_lower,
                           const REAL4 box_upper, global int *neighbours, global REAL *face_measures,
                           global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
                           global REAL *covariances)
@@ -254,12 +225,14 @@ kernel void measure_cells(const int size, global const int *rows, global const i
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
+    const int place = places[i];
     int faces[ROW_CAPACITY];
-    int n = 0;
-    const int listed = abs(row_counts[i]);
+    int n = 0, listed;
+    global const int *row = face_row(&rows, i, &listed);
     for (int k = 0; k < listed; ++k)
-        if ((keep[i * KEEP_WORDS + k / 32] >> (k % 32)) & 1u)
-            faces[n++] = rows[i * ROW_CAPACITY + k];
+        if (place < 0 || ((keep[place * KEEP_WORDS + k / 32] >> (k % 32)) & 1u))
+            faces[n++] = row[k];
     const int start = starts[i];
     REAL area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
     if (n >= 3) {

@@ -53,6 +53,30 @@ class Tessellation:
     covariances: cla.Array
 
 
+@dataclass
+class FaceRows:
+    """Lists of faces while a diagram is made, on the device; see `common/face_rows.h`.
+
+    Attributes
+    ----------
+    slots : (>= s * row_capacity,) int32
+    counts : (n,) int32
+        Faces in each slot; negative where rounding leaves a doubt.
+    keep : uint32
+        Bits of the faces that both cells see.
+    places : (n,) int32
+        Slot of each row, or -1 if it is as before.
+    flags : (2,) int32
+        What went wrong, and the first generator concerned.
+    """
+
+    slots: cla.Array
+    counts: cla.Array
+    keep: cla.Array
+    places: cla.Array
+    flags: cla.Array
+
+
 class Cells:
     """Tessellate a box. Buffers are reused: a `Tessellation` lives until the second call after it."""
 
@@ -62,67 +86,56 @@ class Cells:
         self._capacity = 0
         self._turn = 0
         self._n = 0
-        self._rows, self._keep = engine.empty(1, np.int32), engine.empty(1, np.uint32)
-        self._flags = engine.empty(2, np.int32)
+        none = engine.empty(1, np.int32)
+        self.rows = FaceRows(
+            none, none, engine.empty(1, np.uint32), none, engine.empty(2, np.int32)
+        )
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
-        self._kernels = self.engine.kernels(
-            "cells",
-            {
-                "CELL_CAPACITY": cell_capacity,
-                "ROW_CAPACITY": row_capacity,
-                "MAX_DEPTH": MAX_LEVELS,
-            },
-        )
+        self._kernels = self.engine.kernels("cells", {**self.defines, "MAX_DEPTH": MAX_LEVELS})
+
+    @property
+    def defines(self) -> dict[str, int]:
+        """The capacities, as kernels that work on the rows must be built with."""
+        return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity}
 
     def _reserve(self, n: int) -> None:
-        if n <= self._capacity:
-            return
-        engine, d = self.engine, self.engine.dim
-        # A planar graph has at most 3 n - 6 edges, and every cell at most one face on each wall it touches.
-        m = 7 * n + 8
-        self._row_counts = engine.empty(n, np.int32)
-        # Two sets in turn: the previous diagram stays valid, for a warm start and to compare neighbours.
-        self._sets = [
-            {
-                "starts": engine.empty(n + 1, np.int32),
-                "neighbours": engine.empty(m, np.int32),
-                "face_measures": engine.empty(m),
-                "face_centroids": engine.empty((m, d)),
-                "volumes": engine.empty(n),
-                "offsets": engine.empty((n, d)),
-                "covariances": engine.empty((n, d * (d + 1) // 2)),
-            }
-            for _ in range(2)
-        ]
-        self._capacity = n
-        self._views_for(n)
+        if n > self._capacity:
+            engine, d = self.engine, self.engine.dim
+            # A planar graph has at most 3 n - 6 edges, and every cell at most one face on each wall it touches.
+            m = 7 * n + 8
+            self.rows.counts, self.rows.places = (
+                engine.empty(n, np.int32),
+                engine.empty(n, np.int32),
+            )
+            # Two sets in turn: the previous diagram stays valid, to be repaired and to compare neighbours.
+            self._sets = [
+                {
+                    "starts": engine.empty(n + 1, np.int32),
+                    "neighbours": engine.empty(m, np.int32),
+                    "face_measures": engine.empty(m),
+                    "face_centroids": engine.empty((m, d)),
+                    "volumes": engine.empty(n),
+                    "offsets": engine.empty((n, d)),
+                    "covariances": engine.empty((n, d * (d + 1) // 2)),
+                }
+                for _ in range(2)
+            ]
+            self._capacity = n
+            self._n = -1
+        if n != self._n:
+            # Cut the buffers to n cells (the faces' keep their spare room: their number is only known on the device).
+            lengths = {"starts": n + 1, "volumes": n, "offsets": n, "covariances": n}
+            self._views = [
+                {name: a[: lengths[name]] if name in lengths else a for name, a in arrays.items()}
+                for arrays in self._sets
+            ]
+            self._n = n
 
-    def _views_for(self, n: int) -> None:
-        """Cut the buffers to `n` cells (the faces' keep their spare room: their number is only known on the device)."""
-        lengths = {"starts": n + 1, "volumes": n, "offsets": n, "covariances": n}
-        self._views = [
-            {name: a[: lengths[name]] if name in lengths else a for name, a in arrays.items()}
-            for arrays in self._sets
-        ]
-        self._n = n
-
-    def tessellate(
-        self,
-        box: Box,
-        points: cla.Array,
-        n: int,
-        binned: BinnedPoints,
-        previous: Tessellation | None = None,
-    ) -> Tessellation:
+    def tessellate(self, box: Box, points: cla.Array, n: int, binned: BinnedPoints) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
-
-        Parameters
-        ----------
-        previous : Tessellation, optional
-            A diagram of the same generators at earlier positions: clipping starts from its neighbours.
 
         Raises
         ------
@@ -133,50 +146,70 @@ class Cells:
         ClvoroError
             If a cell has more than `LARGEST_ROW` faces, or a little more.
         """
-        engine = self.engine
-        if self.row_capacity > ROW_CAPACITY and n * self.row_capacity > self._rows.size:
+        engine, rows = self.engine, self.rows
+        if self.row_capacity > ROW_CAPACITY and n * self.row_capacity > rows.slots.size:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
         self._reserve_rows(n)
         self._reserve(n)
-        k = self._kernels
-        lower, upper = box.device_corners(engine.real)
-        if n != self._n:
-            self._views_for(n)
-        arrays = self._views[self._turn]
-        warm = previous is not None and previous.n == n
-        old = (
-            (previous.starts, previous.neighbours)
-            if previous is not None and warm
-            else (self._row_counts, self._row_counts)
-        )
         while True:
-            self._flags.set(np.array([0, 2**31 - 1], np.int32))
+            self.clear_flags()
             engine.run_each(
-                k.clip_cells, n, binned.points, binned.items, binned.reach, binned.bins,
-                binned.grid_frames, binned.grid_shapes, points, lower, upper, np.int32(warm),
-                *old, self._rows, self._row_counts, self._flags,
+                self._kernels.clip_cells, n, binned.points, binned.items, binned.reach, binned.bins,
+                binned.grid_frames, binned.grid_shapes, points, *box.device_corners(engine.real),
+                rows.slots, rows.counts, rows.places, rows.flags,
             )  # fmt: skip
-            engine.run_each(
-                k.match_faces, n, self._rows, self._row_counts, points, lower, upper, self._keep,
-                arrays["starts"], self._flags,
-            )  # fmt: skip
-            flags, generator = (int(v) for v in self._flags.get())
+            # Every row is new: there are none from before.
+            flags, generator = self._match(box, points, n, rows.places, rows.places)
             if not flags & FULL:
                 break
             self._enlarge(n)
-            k = self._kernels
         if flags:
             self._refuse(flags, generator)
-        self._scan.exclusive(arrays["starts"], arrays["starts"], n)
-        engine.run_each(
-            k.measure_cells, n, self._rows, self._row_counts, self._keep, arrays["starts"], points,
-            lower, upper, arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
-            arrays["volumes"], arrays["offsets"], arrays["covariances"],
+        return self._measure(box, points, n, rows.places, rows.places)
+
+    def complete(self, box: Box, points: cla.Array, previous: Tessellation) -> Tessellation | None:
+        """Return the diagram of `points` whose `rows` are those of `previous` or, where that has a place, new ones.
+
+        None if they do not make a diagram.
+        """
+        n, starts, neighbours = previous.n, previous.starts, previous.neighbours
+        if self._match(box, points, n, starts, neighbours)[0]:
+            return None
+        return self._measure(box, points, n, starts, neighbours)
+
+    def clear_flags(self) -> None:
+        """Nothing has gone wrong yet."""
+        self.rows.flags.set(np.array([0, 2**31 - 1], np.int32))
+
+    def _match(
+        self, box: Box, points: cla.Array, n: int, starts: cla.Array, neighbours: cla.Array
+    ) -> tuple[int, int]:
+        """Make the rows symmetric, count their faces; return the flags, and the first generator concerned."""
+        rows, counts = self.rows, self._views[self._turn]["starts"]
+        self.engine.run_each(
+            self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, starts, neighbours,
+            points, *box.device_corners(self.engine.real), np.int32(starts is not rows.places),
+            rows.keep, counts, rows.flags,
+        )  # fmt: skip
+        flags, generator = rows.flags.get()
+        return int(flags), int(generator)
+
+    def _measure(
+        self, box: Box, points: cla.Array, n: int, starts: cla.Array, neighbours: cla.Array
+    ) -> Tessellation:
+        """Write graph and measures of the rows."""
+        rows, new = self.rows, self._views[self._turn]
+        self._scan.exclusive(new["starts"], new["starts"], n)
+        self.engine.run_each(
+            self._kernels.measure_cells, n, rows.places, rows.slots, rows.counts, starts, neighbours,
+            rows.keep, new["starts"], points, *box.device_corners(self.engine.real),
+            new["neighbours"], new["face_measures"], new["face_centroids"], new["volumes"],
+            new["offsets"], new["covariances"],
         )  # fmt: skip
         # Only now: a call that was broken off leaves the previous diagram as it is.
         self._turn = 1 - self._turn
-        return Tessellation(n=n, points=points, **arrays)
+        return Tessellation(n=n, points=points, **new)
 
     def _reserve_rows(self, n: int) -> None:
         """Make room for `n` rows of faces of the present capacity."""
@@ -187,11 +220,11 @@ class Cells:
                 "fewer than 2^31, which 32-bit indices can tell apart; use fewer cells, or perturb "
                 "generators that lie on a common circle"
             )
-        if entries > self._rows.size:
-            self._rows = self.engine.empty(entries, np.int32)
+        if entries > self.rows.slots.size:
+            self.rows.slots = self.engine.empty(entries, np.int32)
         words = n * ((self.row_capacity + 31) // 32)
-        if words > self._keep.size:
-            self._keep = self.engine.empty(words, np.uint32)
+        if words > self.rows.keep.size:
+            self.rows.keep = self.engine.empty(words, np.uint32)
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for `n` cells."""

@@ -19,9 +19,11 @@ from .fetch import fetch_diagram
 from .metric import Metric
 from .motion import Motion
 from .poisson import Poisson
+from .polyhedra import Polyhedra
 from .population import THETA, Population, PopulationControl
 from .projection import Projection
 from .refinement import Refinement
+from .repair import Repair
 from .results import Diagram
 from .shape import Shape
 from .sizing import Sizing
@@ -37,7 +39,8 @@ class Stages:
     """The stages of one engine, each compiled when first used, their buffers reused by every mesh."""
 
     bins: Bins
-    cells: Cells
+    cells: Cells | Polyhedra
+    repair: Repair
     metric: Metric
     density: Density
     poisson: Poisson
@@ -49,7 +52,7 @@ class Stages:
     gather: Gather
 
     _CLASSES: ClassVar = {
-        "bins": Bins, "cells": Cells, "metric": Metric, "density": Density, "poisson": Poisson,
+        "bins": Bins, "cells": Cells, "repair": Repair, "metric": Metric, "density": Density, "poisson": Poisson,
         "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
         "population": PopulationControl, "gather": Gather,
     }  # fmt: skip
@@ -60,7 +63,8 @@ class Stages:
     def __getattr__(self, name: str) -> object:
         if name not in Stages._CLASSES:
             raise AttributeError(name)
-        stage = Stages._CLASSES[name](self.engine)
+        three = name == "cells" and self.engine.dim == 3
+        stage = (Polyhedra if three else Stages._CLASSES[name])(self.engine)
         setattr(self, name, stage)
         return stage
 
@@ -216,10 +220,7 @@ class Mesh:
             If the size of one is not positive and finite.
         """
         stages = self.stages
-        binned = stages.bins.build(self.domain, self.points, self.n)
-        self.tessellation = stages.cells.tessellate(
-            self.domain, self.points, self.n, binned, self.tessellation
-        )
+        self.tessellation = self._tessellate()
         self.sizing.evaluate(self.points, self.n, self.h)
         if self.coarsening != 1:
             stages.metric.scale_sizes(self.coarsening, self.h)
@@ -229,6 +230,16 @@ class Mesh:
         )
         # Before anything is done with a bad size: the solver, say, would complain of something else.
         self.sizing.check(self.points, self.h, self.coarsening)
+
+    def _tessellate(self) -> Tessellation:
+        """Tessellate: from the diagram before, where there is one and enough of it has stayed, else anew."""
+        stages = self.stages
+        if self.tessellation is not None and self.engine.dim == 2:
+            t = stages.repair.follow(stages.cells, self.domain, self.points, self.tessellation)
+            if t is not None:
+                return t
+        binned = stages.bins.build(self.domain, self.points, self.n)
+        return stages.cells.tessellate(self.domain, self.points, self.n, binned)
 
     def _evaluate_metric(self) -> None:
         self.stages.metric.evaluate(

@@ -171,8 +171,18 @@ inline REAL2 face_direction(int label, const REAL *x, global const REAL *points)
     return wall < 2 ? (REAL2)(sign, 0) : (REAL2)(0, sign);
 }
 
-/* Might rounding let a neighbour see this cell's faces otherwise? Only where a face is short beside the distance of its
-   generators, or a generator is near beside the cell (then far corners are ill-conditioned). */
+/* The rounding of positions in the unit box. */
+#define POSITION_NOISE (16 * REAL_EPS)
+
+/* Is a face of squared length e2, between generators at squared distance d2, no longer than rounding of positions? One
+   that is long beside the distance of its generators is real: in a cluster everything is tiny. */
+inline bool is_short(REAL e2, REAL d2)
+{
+    return e2 <= POSITION_NOISE * POSITION_NOISE && e2 <= R(1e-6) * d2;
+}
+
+/* Might rounding let a neighbour see this cell's faces otherwise? Only where a face is short, or a generator is near beside
+   the cell (then far corners are ill-conditioned). */
 inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *points)
 {
     bool doubtful = false;
@@ -186,16 +196,16 @@ inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *po
             const REAL2 d = face_direction(cell->faces[k], x, points);
             d2 = dot(d, d);
         }
-        doubtful |= ex * ex + ey * ey < REAL_EPS * d2 || d2 < near2;
+        const REAL e2 = ex * ex + ey * ey;
+        /* A hundred times what counts as short beside d: the neighbour's rounding is another. */
+        doubtful |= e2 < REAL_EPS * d2 || is_short(e2, R(100) * d2) || d2 < near2;
     }
     return doubtful;
 }
 
-/* Drop faces that are shorter than `noise`, the rounding of positions in the unit box: they arise where more than three
-   cells meet in one point, as in a lattice. A face that is long beside the distance of its generators is real (in a
-   cluster everything is tiny) and stays, and so does one whose two neighbours are so nearly parallel that they would
-   meet elsewhere. */
-inline void drop_short_faces(cell_t *cell, REAL noise, const REAL *x, global const REAL *points)
+/* Drop short faces: they arise where more than three cells meet in one point, as in a lattice. One whose two neighbours
+   are so nearly parallel that they would meet elsewhere stays. */
+inline void drop_short_faces(cell_t *cell, const REAL *x, global const REAL *points)
 {
     for (int k = cell->n - 1; k >= 0 && cell->n > 3; --k) {
         const int n = cell->n;
@@ -203,10 +213,10 @@ inline void drop_short_faces(cell_t *cell, REAL noise, const REAL *x, global con
         const REAL ex = cell->x[next] - cell->x[k];
         const REAL ey = cell->y[next] - cell->y[k];
         const REAL e2 = ex * ex + ey * ey;
-        if (e2 > noise * noise || cell->faces[k] < 0)
+        if (cell->faces[k] < 0)
             continue;
         const REAL2 d = face_direction(cell->faces[k], x, points);
-        if (e2 > R(1e-6) * dot(d, d))
+        if (!is_short(e2, dot(d, d)))
             continue;
         const REAL2 u = face_direction(cell->faces[k == 0 ? n - 1 : k - 1], x, points);
         const REAL2 v = face_direction(cell->faces[next], x, points);

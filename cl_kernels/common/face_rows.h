@@ -1,0 +1,72 @@
+/* Rows of faces while a diagram is made: those that stay as they were lie in the previous graph, the others in slots of
+   ROW_CAPACITY. */
+#include "common/polygon.h"
+
+#ifndef ROW_CAPACITY
+#error "build with -DROW_CAPACITY=faces that a cell may have in the end"
+#endif
+
+/* Bits of the word in which kernels report what went wrong. */
+#define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY */
+#define FLAG_COINCIDE 2  /* two generators at the same place; flags[1] is the smallest index of one */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
+
+inline void raise_flag(global int *flags, int flag, int generator)
+{
+    atomic_or(flags, flag);
+    atomic_min(flags + 1, generator);
+}
+
+#define KEEP_WORDS ((ROW_CAPACITY + 31) / 32)
+
+/* places[i]  slot of row i, or -1 if it is the previous graph's
+   counts[s]  faces in slot s, negative if rounding leaves a doubt */
+typedef struct {
+    global const int *places, *slots, *counts, *old_starts, *old_neighbours;
+} face_rows_t;
+
+inline face_rows_t face_rows(global const int *places, global const int *slots, global const int *counts,
+                             global const int *old_starts, global const int *old_neighbours)
+{
+    face_rows_t rows = {places, slots, counts, old_starts, old_neighbours};
+    return rows;
+}
+
+/* Row i and the number of its faces. */
+inline global const int *face_row(const face_rows_t *rows, int i, int *n)
+{
+    const int place = rows->places[i];
+    if (place < 0) {
+        const int start = rows->old_starts[i];
+        *n = rows->old_starts[i + 1] - start;
+        return rows->old_neighbours + start;
+    }
+    *n = abs(rows->counts[place]);
+    return rows->slots + place * ROW_CAPACITY;
+}
+
+/* Write the faces of a clipped cell to its slot, the least label first: a row depends on the cell alone, not on the order
+   in which it was clipped. Its count is negative if rounding might let a neighbour see the faces otherwise. */
+inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
+                       global int *counts, global int *flags)
+{
+    bool doubtful = false;
+    if (flag == 0) {
+        doubtful = is_doubtful(cell, x, points);
+        if (doubtful)
+            drop_short_faces(cell, x, points);
+        if (cell->n > ROW_CAPACITY)
+            flag = FLAG_FULL;
+    }
+    if (flag) {
+        raise_flag(flags, flag, cell->generator);
+        cell->n = 0;
+    }
+    const int n = cell->n;
+    int first = 0;
+    for (int k = 1; k < n; ++k)
+        first = cell->faces[k] < cell->faces[first] ? k : first;
+    for (int k = 0; k < n; ++k)
+        slots[place * ROW_CAPACITY + k] = cell->faces[first + k < n ? first + k : first + k - n];
+    counts[place] = doubtful ? -n : n;
+}

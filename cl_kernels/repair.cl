@@ -1,0 +1,215 @@
+#include "common/corner.h"
+#include "common/face_rows.h"
+
+/* The diagram of generators that have moved a little, from the one before, without a search.
+
+   The intersection C_i of the box and the half-planes of *any* generators holds the cell V_i of them all. If around every
+   corner of C_i the cells that meet there name each other as neighbours, in the order of that corner, the C_i fit together
+   without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbours from before, check
+   that every cell is still convex and fits its neighbours (`check_rows`), clip those that do not by all the neighbours
+   of their neighbours (`clip_marked`), check these (`check_clipped`), and so on until all fit. */
+
+/* Directions to as many neighbours are kept while a cell is checked; one with more is clipped anew each time. */
+#define CHECKED_FACES 16
+
+/* Do a corner of cell i and what cell `other` takes for the same corner, between its faces p and q, coincide but for
+   rounding? Where four or more cells meet in a point, cells may leave out different faces of no length. */
+inline bool same_corner(REAL2 mine, int i, int other, int p, int q, REAL d2, global const REAL *points,
+                        const REAL *lower, const REAL *upper)
+{
+    const REAL x[2] = {points[2 * other], points[2 * other + 1]};
+    const REAL2 from = (REAL2)(points[2 * i] - x[0], points[2 * i + 1] - x[1]);
+    const REAL2 gap = mine + from - corner(other, x, p, q, points, lower, upper);
+    const REAL gap2 = dot(gap, gap);
+    return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= R(1e-6) * d2;
+}
+
+/* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
+   `after`, at corners u and v; so in j's row i must stand between `after` and `before`. */
+inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
+                           global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    int q = 0;
+    while (q < n && row[q] != i)
+        ++q;
+    if (q == n) {
+        /* A face of no length, which i is then doubtful of, will be dropped. */
+        const REAL2 e = v - u;
+        return is_short(dot(e, e), d2);
+    }
+    const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
+    if (p == after && s == before)
+        return true;
+    return (p == after || same_corner(v, i, j, p, i, d2, points, lower, upper)) &&
+           (s == before || same_corner(u, i, j, i, s, d2, points, lower, upper));
+}
+
+/* Per generator i: marks[i] = 1, and its neighbours' at the face in question, where the neighbours from before no longer
+   enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; all who write one
+   write the same. */
+kernel void check_rows(const int size, global const int *starts, global const int *neighbours,
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *marks)
+{
+    WORK_ITEM(i);
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int start = starts[i], n = starts[i + 1] - start;
+    global const int *row = neighbours + start;
+    if (n < 3 || n > CHECKED_FACES) {
+        marks[i] = 1;
+        return;
+    }
+    REAL2 d[CHECKED_FACES];
+    for (int k = 0; k < n; ++k)
+        d[k] = face_direction(row[k], x, points);
+    /* Corner v lies before face k, w behind it. */
+    int a = row[n - 1];
+    REAL2 da = d[n - 1];
+    REAL2 v = corner(i, x, a, row[0], points, lower, upper);
+    REAL reach2 = 0, least2 = REAL_MAX;
+    int turns = 0;
+    bool bad = false;
+    for (int k = 0; k < n; ++k) {
+        const int face = row[k], b = row[k == n - 1 ? 0 : k + 1];
+        const REAL2 df = d[k], db = d[k == n - 1 ? 0 : k + 1];
+        const REAL2 w = corner(i, x, face, b, points, lower, upper);
+        const REAL2 e = w - v;
+        const REAL r2 = dot(w, w);
+        reach2 = fmax(reach2, r2);
+        const bool convex = difference_of_products(df.s0, db.s1, df.s1, db.s0) > 0;
+        turns += df.s1 < 0 && db.s1 >= 0;
+        const REAL d2 = face >= 0 ? dot(df, df) : r2;
+        bool good = convex && df.s0 * e.s1 - df.s1 * e.s0 > 0 && dot(e, e) >= REAL_EPS * d2;
+        if (face >= 0) {
+            least2 = fmin(least2, d2);
+            const int other = starts[face];
+            good = good && fits_neighbour(i, face, a, b, v, w, d2, neighbours + other, starts[face + 1] - other, points,
+                                          lower, upper);
+        }
+        if (!good) {
+            bad = true;
+            if (a >= 0)
+                marks[a] = 1;
+            if (face >= 0)
+                marks[face] = 1;
+            if (b >= 0)
+                marks[b] = 1;
+        }
+        a = face;
+        v = w;
+    }
+    if (bad || turns != 1 || least2 < sqrt(REAL_EPS) * reach2)
+        marks[i] = 1;
+}
+
+/* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */
+kernel void list_marked(const int size, global const int *marks, global const int *sums, global int *listed)
+{
+    WORK_ITEM(i);
+    if (marks[i])
+        listed[sums[i]] = i;
+}
+
+/* Clip by the generators of row i that are near enough. */
+inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n, global const REAL *points)
+{
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k];
+        if (j < 0 || j == cell->generator)
+            continue;
+        const REAL d[2] = {points[2 * j] - x[0], points[2 * j + 1] - x[1]};
+        const REAL d2 = d[0] * d[0] + d[1] * d[1];
+        if (d2 >= 4 * cell->reach2)
+            continue;
+        if (d2 == 0)
+            return FLAG_COINCIDE;
+        if (!clip_cell(cell, d, d2, j, true, points))
+            return FLAG_FULL;
+    }
+    return 0;
+}
+
+/* Per listed generator: its cell, clipped by its neighbours and theirs, into slot base + w. */
+kernel void clip_marked(const int size, global const int *listed, const int base, global const int *places,
+                        global int *slots, global int *slot_counts, global const int *old_starts,
+                        global const int *old_neighbours, global const REAL *points, const REAL4 box_lower,
+                        const REAL4 box_upper, global int *flags)
+{
+    WORK_ITEM(w);
+    const int i = listed[w];
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
+    cell_t cell;
+    start_cell(&cell, i, x, lower, upper);
+    int n, m;
+    global const int *row = face_row(&rows, i, &n);
+    int flag = clip_by_row(&cell, x, row, n, points);
+    for (int k = 0; k < n && flag == 0; ++k)
+        if (row[k] >= 0) {
+            global const int *other = face_row(&rows, row[k], &m);
+            flag = clip_by_row(&cell, x, other, m, points);
+        }
+    store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags);
+}
+
+/* Per listed generator: put its new row in the place of the old one. */
+kernel void place_clipped(const int size, global const int *listed, const int base, global int *places,
+                          global int *marks)
+{
+    WORK_ITEM(w);
+    places[listed[w]] = base + w;
+    marks[listed[w]] = 0;
+}
+
+/* Per listed generator: mark it and its neighbours where they do not fit together. Those who were not clipped have been
+   checked against each other before. */
+kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
+                          global const int *slot_counts, global const int *old_starts,
+                          global const int *old_neighbours, global const REAL *points, const REAL4 box_lower,
+                          const REAL4 box_upper, global int *marks)
+{
+    WORK_ITEM(w);
+    const int i = listed[w];
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
+    int n, m;
+    global const int *row = face_row(&rows, i, &n);
+    if (n == 0)
+        return;
+    REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k], a = row[k == 0 ? n - 1 : k - 1], b = row[k == n - 1 ? 0 : k + 1];
+        const REAL2 u = v;
+        v = corner(i, x, j, b, points, lower, upper);
+        if (j < 0)
+            continue;
+        const REAL2 d = face_direction(j, x, points);
+        global const int *other = face_row(&rows, j, &m);
+        if (!fits_neighbour(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
+            marks[i] = marks[j] = 1;
+    }
+    /* Whom the row from before names is told as well: he may still name i. */
+    const int end = old_starts[i + 1];
+    for (int k = old_starts[i]; k < end; ++k) {
+        const int j = old_neighbours[k];
+        if (j < 0)
+            continue;
+        bool here = false, there = false;
+        for (int q = 0; q < n && !here; ++q)
+            here = row[q] == j;
+        if (here)
+            continue;
+        global const int *other = face_row(&rows, j, &m);
+        if (places[j] >= 0 && slot_counts[places[j]] < 0)
+            continue; /* it is doubtful itself: its faces will be matched with its neighbours' */
+        for (int q = 0; q < m && !there; ++q)
+            there = other[q] == i;
+        if (there)
+            marks[i] = marks[j] = 1;
+    }
+}

@@ -1,0 +1,76 @@
+"""The diagram of generators that have moved a little, from the one before, without a search (`repair.cl`)."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Scan
+from ._program import Engine
+from .cells import Cells, Tessellation
+from .domain import Box
+
+MAX_ROUNDS = 6
+"""Rounds of clipping and checking, beyond which a diagram is made anew."""
+MAX_SHARE = 0.5
+"""Share of the cells that may have to be clipped: a diagram made anew costs less than one that is mostly repaired."""
+
+
+class Repair:
+    """Carry a diagram over to moved generators: keep the neighbours, check that the cells fit, clip those that do not.
+
+    The result is the Voronoi diagram itself, not an approximation: see the argument in `repair.cl`.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._kernels: dict[tuple[int, ...], SimpleNamespace] = {}
+        self._n = -1
+
+    def follow(
+        self, cells: Cells, box: Box, points: cla.Array, previous: Tessellation
+    ) -> Tessellation | None:
+        """Tessellate `box` by `points` (n, d), the generators of `previous` where they are now.
+
+        Returns None where too much has changed, or generators coincide: the diagram is then to be made anew.
+        """
+        engine, n, rows = self.engine, previous.n, cells.rows
+        key = tuple(cells.defines.values())
+        if key not in self._kernels:
+            self._kernels[key] = engine.kernels("repair", cells.defines)
+        k = self._kernels[key]
+        if n != self._n:
+            self._n = n
+            self._marks, self._listed = engine.empty(n, np.int32), engine.empty(n, np.int32)
+            self._sums = engine.empty(n + 1, np.int32)
+        corners = box.device_corners(engine.real)
+        old = (previous.starts, previous.neighbours)
+        cells.clear_flags()
+        self._marks.fill(0)
+        rows.places.fill(-1)
+        engine.run_each(k.check_rows, n, *old, points, *corners, self._marks)
+        base = 0
+        for _ in range(MAX_ROUNDS):
+            self._scan.exclusive(self._marks, self._sums, n)
+            count = int(self._sums[n].get())
+            if count == 0:
+                return cells.complete(box, points, previous)
+            if base + count > MAX_SHARE * n:
+                return None
+            engine.run_each(k.list_marked, n, self._marks, self._sums, self._listed)
+            engine.run_each(
+                k.clip_marked, count, self._listed, np.int32(base), rows.places, rows.slots,
+                rows.counts, *old, points, *corners, rows.flags,
+            )  # fmt: skip
+            engine.run_each(
+                k.place_clipped, count, self._listed, np.int32(base), rows.places, self._marks
+            )
+            engine.run_each(
+                k.check_clipped, count, self._listed, rows.places, rows.slots, rows.counts, *old,
+                points, *corners, self._marks,
+            )  # fmt: skip
+            base += count
+        return None
