@@ -1,0 +1,195 @@
+"""A diagram carried over to moved generators against one made anew, and what must not be carried over."""
+
+import numpy as np
+import patch
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clvoro.bins import Bins
+from clvoro.cells import Cells
+from clvoro.repair import Repair
+
+N = 700
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def engine(ctx, request):
+    return patch.make_engine(ctx, request.param)
+
+
+def square(n):
+    x, y = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n * 0.75)
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def point_sets():
+    rng = np.random.default_rng(40961)
+    random = patch.random_points(N, 40962)
+    corners = [[0, 0], [1, 0], [1, 0.75], [0, 0.75]]
+    walls = np.column_stack([rng.random(30), np.full(30, 0.75)])
+    turn = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    return {
+        "random": random,
+        "graded": random**3,
+        "clusters": np.concatenate([random[:300], 0.4 + 1e-4 * random[300:]]),
+        "hexagons": patch.hexagons(0.04),
+        "lattice": square(20),
+        "cocircular": 0.4 + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)]),
+        "walls": np.concatenate([corners, walls, random[:200]]),
+        "three": random[:3],
+        "two": random[:2],
+        "one": random[:1],
+    }
+
+
+POINTS = point_sets()
+
+
+class Carried:
+    """A diagram that is carried along, and how one of the same generators comes out anew."""
+
+    def __init__(self, engine, points):
+        self.engine, self.n = engine, len(points)
+        self.cells, self.bins, self.repair = Cells(engine), Bins(engine), Repair(engine)
+        self.t = self.anew(self.cells, points)
+
+    def anew(self, cells, points):
+        x = self.engine.upload(points)
+        return cells.tessellate(patch.BOX, x, self.n, self.bins.build(patch.BOX, x, self.n))
+
+    def move(self, points):
+        """Carry the diagram over to `points`; return it as NumPy arrays, and whether it was."""
+        x = self.engine.upload(points)
+        t = self.repair.follow(self.cells, patch.BOX, x, self.t)
+        self.t = self.anew(self.cells, points) if t is None else t
+        return patch.fetch(self.t), t is not None
+
+    def reference(self, points):
+        return patch.fetch(self.anew(Cells(self.engine), points))
+
+
+def spacing(points):
+    """Distance to the nearest other, (n, 1)."""
+    if len(points) == 1:
+        return np.full((1, 1), 0.3)
+    d = np.linalg.norm(points[:, None] - points[None], axis=2)
+    np.fill_diagonal(d, np.inf)
+    return d.min(axis=1)[:, None]
+
+
+def check(t, eps):
+    """The cells tile the box, and neighbours know each other."""
+    # In single precision the cluster's spacing is some hundred roundings of its position: corners
+    # of the cells around it are known that badly.
+    rel = 8 * eps if eps < 1e-10 else 1e-5
+    assert t.volumes.sum(dtype=float) == pytest.approx(patch.BOX.measure, rel=rel)
+    pairs = {
+        (i, j) for i, j in zip(t.owners.tolist(), t.neighbours.tolist(), strict=True) if j >= 0
+    }
+    assert pairs == {(j, i) for i, j in pairs}
+    inner = t.neighbours >= 0
+    x = t.points
+    # A face's centroid is as far from either generator; the bisector is where rounding of positions puts it.
+    near = np.linalg.norm(t.face_centroids[inner], axis=1)
+    across = x[t.owners[inner]] - x[t.neighbours[inner]] + t.face_centroids[inner]
+    assert np.allclose(near, np.linalg.norm(across, axis=1), rtol=1e-6, atol=32 * eps)
+
+
+@pytest.mark.parametrize("name", POINTS)
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
+def test_is_the_diagram_itself(engine, name, share):
+    """Ten small moves; the same bits as a diagram made anew wherever nothing is degenerate."""
+    rng = np.random.default_rng(40963)
+    eps = float(np.finfo(engine.real).eps)
+    points = POINTS[name].astype(engine.real)
+    carried = Carried(engine, points)
+    times = 0
+    for _ in range(10):
+        step = share * spacing(points) * (rng.random(points.shape) - 0.5)
+        points = np.clip(points + step, 0, [1, 0.75]).astype(engine.real)
+        t, was = carried.move(points)
+        times += was
+        check(t, eps)
+        expected = carried.reference(points)
+        if np.array_equal(t.starts, expected.starts):
+            assert np.array_equal(t.neighbours, expected.neighbours)
+            assert np.array_equal(t.volumes, expected.volumes)
+            assert np.array_equal(t.face_measures, expected.face_measures)
+        else:
+            # Only faces of no length may be there in one and not in the other.
+            noise = 256 * eps
+            assert np.allclose(t.volumes, expected.volumes, rtol=1e-3 if share else 0, atol=noise)
+            for a, b in ((t, expected), (expected, t)):
+                known = set(zip(b.owners.tolist(), b.neighbours.tolist(), strict=True))
+                faces = zip(a.owners.tolist(), a.neighbours.tolist(), a.face_measures, strict=True)
+                assert all(length < noise for i, j, length in faces if (i, j) not in known)
+    if share <= 0.02 and name not in ("clusters", "lattice", "cocircular"):
+        assert times == 10
+
+
+def test_many_changes_are_made_anew(engine):
+    carried = Carried(engine, POINTS["random"])
+    _, was = carried.move(patch.random_points(N, 40964))
+    assert not was
+
+
+def test_exchanged_generators(engine):
+    """Every cell is as before, but two have each other's generator."""
+    points = patch.relaxed_points(200, 40965).astype(engine.real)
+    carried = Carried(engine, points)
+    for i, j in [(0, 1), (17, 91)]:
+        points = points.copy()
+        points[[i, j]] = points[[j, i]]
+        t, _ = carried.move(points)
+        expected = carried.reference(points)
+        assert np.array_equal(t.neighbours, expected.neighbours)
+        assert np.array_equal(t.volumes, expected.volumes)
+
+
+def test_turned_inside_out(engine):
+    """Reflected, all cells stay convex and consistent, but run clockwise."""
+    points = POINTS["random"].astype(engine.real)
+    carried = Carried(engine, points)
+    mirrored = points.copy()
+    mirrored[:, 0] = 1 - mirrored[:, 0]
+    t, was = carried.move(mirrored)
+    assert not was
+    assert np.array_equal(t.volumes, carried.reference(mirrored).volumes)
+
+
+def test_far_jump(engine):
+    """One generator goes across the domain: its old and new surroundings change, nothing else."""
+    points = patch.relaxed_points(300, 40966).astype(engine.real)
+    carried = Carried(engine, points)
+    points = points.copy()
+    points[7] = points[250] + spacing(points)[250] * 0.4
+    t, _ = carried.move(points)
+    assert np.array_equal(t.neighbours, carried.reference(points).neighbours)
+
+
+def test_coinciding_generators_are_left_to_the_cells(engine):
+    points = POINTS["random"].astype(engine.real)
+    carried = Carried(engine, points)
+    points = points.copy()
+    points[3] = points[4]
+    x = engine.upload(points)
+    assert carried.repair.follow(carried.cells, patch.BOX, x, carried.t) is None
+
+
+@given(st.integers(0, 2**31), st.floats(1e-7, 1.0), st.integers(3, 60))
+@settings(max_examples=40)
+def test_any_motion(ctx, seed, share, n):
+    engine = patch.make_engine(ctx)
+    rng = np.random.default_rng(seed)
+    points = np.round(rng.random((n, 2)) * [1, 0.75], rng.integers(1, 5))
+    points = np.unique(points, axis=0)
+    carried = Carried(engine, points)
+    for _ in range(3):
+        step = share * spacing(points) * (rng.random(points.shape) - 0.5)
+        points = np.clip(points + step, 0, [1, 0.75])
+        t, _ = carried.move(points)
+        check(t, np.finfo(float).eps)
+        expected = carried.reference(points)
+        # As above: coordinates rounded to a grid make points cocircular.
+        assert np.allclose(t.volumes, expected.volumes, rtol=1e-9, atol=1e-15)
