@@ -135,26 +135,29 @@ inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const
     return (qr * p.s3 + rp * q.s3 + pq * r.s3) * inverse;
 }
 
-/* Restrict what lies beyond to one disc, grown from the farthest vertex by a triangle at a time; the rest, which rounding
-   has put beyond, is moved back. Returns the largest distance that was. */
-inline REAL keep_disc(cell_t *cell, REAL depth)
+/* Make what lies beyond one disc: grown from the farthest vertex by a triangle at a time, the farthest first, and where
+   that does not reach all that lies farther beyond than `doubt`, through vertices that lie in doubt. The distances of
+   vertices that do not belong where rounding has put them are changed. False if something stays out of reach. */
+inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 {
     REAL *s = (REAL *)cell->beyond;
     bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* of the disc: vertices, faces */
-    int worst = 0;
+    int added = 0, left = 0; /* left: vertices certainly beyond, and not in the disc yet */
     for (int v = 0; v < cell->n; ++v) {
         inside[v] = false;
-        worst = s[v] > s[worst] ? v : worst;
+        added = s[v] > s[added] ? v : added;
+        left += s[v] > doubt;
     }
     for (int f = 0; f < cell->slots; ++f)
         on[f] = false;
-    int added = worst;
     while (added >= 0) {
         const INDEX4 f = cell->faces[added];
         inside[added] = on[f.s0] = on[f.s1] = on[f.s2] = true;
+        left -= s[added] > doubt;
+        const REAL least = left > 0 ? -doubt : depth;
         added = -1;
-        for (int v = 0; v < cell->n && added < 0; ++v) {
-            if (inside[v] || !(s[v] > depth))
+        for (int v = 0; v < cell->n; ++v) {
+            if (inside[v] || !(s[v] > least) || (added >= 0 && !(s[v] > s[added])))
                 continue;
             const INDEX4 g = cell->faces[v];
             const bool ab = inside[cell->at[g.s1 * FACE_CAPACITY + g.s0]];
@@ -165,13 +168,13 @@ inline REAL keep_disc(cell_t *cell, REAL depth)
                 added = v;
         }
     }
-    REAL left = 0;
-    for (int v = 0; v < cell->n; ++v)
-        if (!inside[v] && s[v] > depth) {
-            left = fmax(left, s[v]);
+    for (int v = 0; v < cell->n; ++v) {
+        if (inside[v] && !(s[v] > depth))
+            s[v] = 2 * depth;
+        if (!inside[v] && s[v] > depth)
             s[v] = 0;
-        }
-    return left;
+    }
+    return left == 0;
 }
 
 /* The edges over which a bisector leaves the cell. */
@@ -267,10 +270,8 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     if (!find_rim(cell, depth, &rim)) {
         if (rim.gone == cell->n)
             return CLIP_COLLAPSED;
-        const REAL left = keep_disc(cell, depth);
-        if (left > distance * (4096 * REAL_EPS) * (distance + sqrt(cell->reach2)) + 512 * depth)
-            return CLIP_COLLAPSED;
-        if (!find_rim(cell, depth, &rim))
+        const REAL doubt = 64 * (depth + distance * REAL_EPS * sqrt(cell->reach2));
+        if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
             return CLIP_COLLAPSED;
     }
     if (cell->n + rim.n - rim.gone > VERTEX_CAPACITY || (cell->spares == 0 && cell->slots == FACE_CAPACITY))
@@ -284,21 +285,28 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
     REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
     const REAL *s = (const REAL *)cell->beyond;
+    for (int k = 0; k < rim.n; ++k) {
+        const int in = rim.in[k], out = rim.out[k];
+        const REAL s_in = s[in] < 0 ? s[in] : 0;
+        const REAL t = s_in / (s_in - s[out]);
+        nx[k] = x[in] + t * (x[out] - x[in]);
+        ny[k] = y[in] + t * (y[out] - y[in]);
+        nz[k] = z[in] + t * (z[out] - z[in]);
+    }
     if (cell->reach2 > 16 * d2) {
-        for (int k = 0; k < rim.n; ++k) {
-            const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
-            nx[k] = v.s0;
-            ny[k] = v.s1;
-            nz[k] = v.s2;
-        }
-    } else {
+        const REAL reach = distance * sqrt(cell->reach2);
         for (int k = 0; k < rim.n; ++k) {
             const int in = rim.in[k], out = rim.out[k];
-            const REAL s_in = s[in] < 0 ? s[in] : 0;
-            const REAL t = s_in / (s_in - s[out]);
-            nx[k] = x[in] + t * (x[out] - x[in]);
-            ny[k] = y[in] + t * (y[out] - y[in]);
-            nz[k] = z[in] + t * (z[out] - z[in]);
+            const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
+            /* But for planes that are nearly parallel to the edge: what they say is not within the rounding of both. */
+            const REAL slack = 1 + reach / (s[out] - s[in]);
+            const REAL off = fabs(v.s0 - nx[k]) + fabs(v.s1 - ny[k]) + fabs(v.s2 - nz[k]);
+            const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
+            if (off < R(1024) * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
+                nx[k] = v.s0;
+                ny[k] = v.s1;
+                nz[k] = v.s2;
+            }
         }
     }
     for (int k = 0; k < rim.n; ++k) {
