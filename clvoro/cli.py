@@ -12,7 +12,8 @@ from .errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, I
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 
 _EPILOG = """\
-exit codes: 0 done; 1 the run failed; 2 bad usage or input; 3 no usable device;
+exit codes: 0 done; 1 the run failed (check: the mesh is wrong); 2 bad usage or input (check: a file
+that cannot be read); 3 no usable device;
 130 interrupted (Ctrl-C; what there was has been written)
 
 examples:
@@ -20,6 +21,7 @@ examples:
   clvoro run airfoil --device gpu       a wing section on a GPU
   clvoro cases paper > my.toml          a case file to start from
   clvoro run my.toml --effort fast --out result
+  clvoro check result/mesh.vtu          is the mesh what it claims to be?
 """
 
 
@@ -81,6 +83,14 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
 
+    check = commands.add_parser(
+        "check",
+        help="verify meshes: volumes, graph, faces, the Voronoi property, error and quality",
+        description="Verify meshes that clvoro wrote, on the host alone: prints what does not hold, and where. "
+        "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
+    )
+    check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz or mesh.vtu")
+    check.add_argument("--json", action="store_true", help="print one JSON object per file")
     commands.add_parser("devices", help="list the OpenCL devices and whether they work")
     cases = commands.add_parser("cases", help="list the built-in cases, or print one")
     cases.add_argument("case", metavar="NAME", nargs="?", help="print this case's TOML text")
@@ -90,7 +100,9 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = build_parser().parse_args(argv)
-    command = {"run": _run, "devices": _devices, "cases": _cases}[arguments.command]
+    command = {"run": _run, "check": _check, "devices": _devices, "cases": _cases}[
+        arguments.command
+    ]
     try:
         return command(arguments)
     except (InputError, InputTypeError) as error:
@@ -151,6 +163,32 @@ def _run(arguments: argparse.Namespace) -> int:
 def _level_count(text: str | None) -> str | int | None:
     """Return the number in `text`; what is none is for the case's checks to refuse."""
     return int(text) if text is not None and text.isdecimal() else text
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    import json
+
+    from .io import load
+    from .io.vtu_read import load_vtu
+
+    code = OK
+    for name in arguments.files:
+        path = Path(name)
+        if path.suffix.lower() not in (".npz", ".vtu"):
+            raise InputError(
+                f"{name} is no mesh.npz and no mesh.vtu, which are what can be checked"
+            )
+        try:
+            report = (load if path.suffix.lower() == ".npz" else load_vtu)(path).check()
+        except InputError as error:  # the other files are looked at all the same
+            code = _complain(error, BAD_INPUT)
+            continue
+        if arguments.json:
+            print(json.dumps({"file": name, **report.as_dict()}), flush=True)
+        else:
+            print(f"{name}: {report}")
+        code = code or (OK if report else FAILED)
+    return code
 
 
 def _devices(_: argparse.Namespace) -> int:

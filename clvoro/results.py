@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from .check import Report
     from .domain import Box
     from .quality import Measures
 
@@ -94,6 +95,18 @@ class Diagram:
             value = self._arrays[name] = value()
         return value
 
+    def check(self) -> Report:
+        """Verify the diagram on the host: graph, faces, volumes, and that it is the Voronoi diagram of its generators.
+
+        Returns
+        -------
+        Report
+            True if nothing is wrong; ``print`` it, or call its ``demand()`` to have an error raised.
+        """
+        from .check import check_diagram
+
+        return check_diagram(self)
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -160,6 +173,12 @@ class Result:
     size_factor: float = 1.0
     settings: dict[str, Any] = field(default_factory=dict)
     origin: np.ndarray | None = None
+
+    def check(self) -> Report:
+        """Verify diagram, sizes, error, quality and history on the host (see `Diagram.check`)."""
+        from .check import check_result
+
+        return check_result(self)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the mesh to `path`: `.npz` (reload with `clvoro.load`), `.vtu`, OpenFOAM's `polyMesh`, ...

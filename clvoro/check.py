@@ -1,0 +1,395 @@
+"""Is a mesh what it claims to be? Everything that can be known of it is computed anew, by NumPy on the host.
+
+Nothing here comes from the device's code: cells are rebuilt from their corners, errors and quality from the paper's
+formulas, and the diagram's one defining property - no generator is nearer to a corner than the cell's own - is asked
+of a search tree over all generators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .errors import ClvoroError
+from .rebuilt import Rebuilt
+
+if TYPE_CHECKING:
+    from .results import Diagram, Result
+
+ROUNDINGS = 256
+"""How many roundings of a position (eps times the domain's size and its distance from 0) count as none."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong.
+
+    Attributes
+    ----------
+    name : str
+        Of the property that does not hold, such as ``"volumes sum"``.
+    message : str
+        What was found, what was expected, and where it is worst.
+    count : int
+        In how many places.
+    """
+
+    name: str
+    message: str
+    count: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.message}"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a check has found; true if that is nothing.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+    checked : tuple of str
+        Names of the properties that were looked at. The check stops early where arrays do not fit each other.
+    cells, faces : int
+    precision : str
+        The precision in which the mesh was made, told by its numbers; tolerances follow it.
+    """
+
+    findings: tuple[Finding, ...]
+    checked: tuple[str, ...]
+    cells: int
+    faces: int
+    precision: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.findings
+
+    def __bool__(self) -> bool:
+        return self.ok
+
+    def __str__(self) -> str:
+        head = f"{self.cells} cells, {self.faces} faces, {self.precision}"
+        if self.ok:
+            return f"{head}: {len(self.checked)} properties hold"
+        return "\n".join([f"{head}: {len(self.findings)} of {len(self.checked)} properties do not hold",
+                          *(f"  {finding}" for finding in self.findings)])  # fmt: skip
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {"ok": self.ok, **asdict(self)}
+
+    def demand(self) -> None:
+        """Raise if something is wrong.
+
+        Raises
+        ------
+        CheckError
+        """
+        if self.findings:
+            raise CheckError(str(self))
+
+
+class CheckError(ClvoroError):
+    """A mesh is not what it claims to be."""
+
+
+class _MisfitError(Exception):
+    """Arrays do not fit each other: what builds on them cannot be looked at."""
+
+
+class _Check:
+    """Collects findings about one diagram."""
+
+    def __init__(self, diagram: Diagram) -> None:
+        self.diagram = diagram
+        self.findings: list[Finding] = []
+        self.checked: list[str] = []
+
+    def note(
+        self, name: str, wrong: np.ndarray, say: Callable[[int], str], stop: bool = False
+    ) -> None:
+        """Record whether `name` holds: `wrong` (k,) is true (or large) where it does not."""
+        self.checked.append(name)
+        places = np.flatnonzero(wrong)
+        if places.size:
+            worst = int(places[np.argmax(np.asarray(wrong)[places])])
+            more = f" ({places.size} such)" if places.size > 1 else ""
+            self.findings.append(Finding(name, say(worst) + more, int(places.size)))
+            if stop:
+                raise _MisfitError
+
+    def shape(self, name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str = "f") -> None:
+        """Record whether an array has its shape, and finite numbers."""
+        fits = array.shape == shape and array.dtype.kind in kinds
+        self.note(
+            "shapes", np.array([not fits]),
+            lambda _: f"{name} is {array.dtype} {array.shape}, expected {shape}", stop=True,
+        )  # fmt: skip
+        if array.dtype.kind == "f":
+            bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
+            self.note("finite", bad, lambda i: f"{name}[{i}] is {array[i]}", stop=True)
+
+
+def check_diagram(diagram: Diagram) -> Report:
+    """Check a diagram in 2D or 3D; see `Diagram.check`."""
+    return _finish(_Check(diagram))
+
+
+def check_result(result: Result) -> Report:
+    """Check a result: its diagram, sizes, error (the paper's 3.1), quality (4.1) and history; see `Result.check`."""
+    check = _Check(result.diagram)
+    return _finish(check, lambda: _check_result(check, result))
+
+
+def _finish(check: _Check, more: Callable[[], None] | None = None) -> Report:
+    diagram, geometry = check.diagram, None
+    try:
+        _check_structure(check)
+        geometry = Rebuilt(diagram)
+        _check_geometry(check, geometry)
+        if more is not None:
+            more()
+    except _MisfitError:
+        pass
+    names = tuple(dict.fromkeys(check.checked))
+    real = "unknown precision" if geometry is None else geometry.real.name
+    faces = len(diagram.neighbours)
+    return Report(tuple(check.findings), names, len(diagram), faces, real)
+
+
+def _check_structure(check: _Check) -> None:
+    """Check that the arrays fit each other, and that the graph is one."""
+    d = check.diagram
+    dim, n = d.domain.dim, len(d.points)
+    m = len(d.neighbours)
+    check.shape("points", d.points, (n, dim))
+    check.shape("volumes", d.volumes, (n,))
+    check.shape("centroids", d.centroids, (n, dim))
+    check.shape("neighbour_starts", d.neighbour_starts, (n + 1,), "iu")
+    check.shape("neighbours", d.neighbours, (m,), "i")
+    check.shape("face_measures", d.face_measures, (m,))
+    check.shape("face_centroids", d.face_centroids, (m, dim))
+    check.shape("vertices", d.vertices, (len(d.vertices), dim))
+    _check_starts(check, "neighbour_starts", d.neighbour_starts, m)
+    if dim == 2:
+        check.shape("cell_vertex_starts", d.cell_vertex_starts, (n + 1,), "iu")
+        _check_starts(check, "cell_vertex_starts", d.cell_vertex_starts, len(d.cell_vertices))
+        check.note(
+            "shapes", d.cell_vertex_starts != d.neighbour_starts,
+            lambda i: f"cell_vertex_starts[{i}] is {d.cell_vertex_starts[i]}, expected as many corners "
+            f"as faces, {d.neighbour_starts[i]}", stop=True,
+        )  # fmt: skip
+        corners = d.cell_vertices
+    else:
+        check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
+        _check_starts(check, "face_vertex_starts", d.face_vertex_starts, len(d.face_vertices))
+        corners = d.face_vertices
+    check.note(
+        "corners exist", (corners < 0) | (corners >= len(d.vertices)),
+        lambda k: f"corner {k} is vertex {corners[k]} of {len(d.vertices)}", stop=True,
+    )  # fmt: skip
+    j = d.neighbours
+    check.note(
+        "neighbours exist", (j >= n) | (j < -2 * dim),
+        lambda f: f"face {f} leads to {j[f]}, expected a cell below {n} or a wall from {-2 * dim} to -1",
+        stop=True,
+    )  # fmt: skip
+    used = np.bincount(corners, minlength=len(d.vertices))
+    check.note("vertices used", used == 0, lambda v: f"vertex {v} is no cell's corner")
+
+    i = np.repeat(np.arange(n), np.diff(d.neighbour_starts))
+    check.note("neighbours", i == j, lambda f: f"cell {j[f]} is its own neighbour")
+    inner = np.flatnonzero(j >= 0)
+    there = np.sort(i[inner].astype(np.int64) * n + j[inner])
+    twice = np.flatnonzero(there[1:] == there[:-1])
+    check.note(
+        "neighbours", np.isin(np.arange(len(there)), twice),
+        lambda k: f"cell {there[k] // n} lists cell {there[k] % n} twice",
+    )  # fmt: skip
+    back = np.sort(j[inner].astype(np.int64) * n + i[inner])
+    lone = np.setdiff1d(there, back)
+    check.note(
+        "graph symmetric", np.ones(len(lone)),
+        lambda k: f"cell {lone[k] // n} lists cell {lone[k] % n}, which does not list it", stop=True,
+    )  # fmt: skip
+
+
+def _check_starts(check: _Check, name: str, starts: np.ndarray, total: int) -> None:
+    good = len(starts) > 0 and starts[0] == 0 and starts[-1] == total
+    rises = np.diff(starts.astype(np.int64)) if len(starts) else np.zeros(0)
+    check.note(
+        "shapes", np.array([not good or bool((rises < 0).any())]),
+        lambda _: f"{name} does not cut {total} entries into rows", stop=True,
+    )  # fmt: skip
+
+
+def _check_geometry(check: _Check, g: Rebuilt) -> None:
+    d = check.diagram
+    n, domain = len(d), d.domain
+    slack = ROUNDINGS * g.unit
+    check.note(
+        "generators inside", ~domain.contains(d.points),
+        lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
+    )  # fmt: skip
+    check.note(
+        "vertices inside", ~domain.contains(d.vertices),
+        lambda v: f"vertex {v} at {d.vertices[v]} lies outside {domain}",
+    )  # fmt: skip
+    check.note(
+        "volumes", ~(d.volumes > 0), lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0"
+    )
+    check.note(
+        "orientation", ~(g.volumes > -slack * g.perimeters),
+        lambda i: f"the corners of cell {i} go around clockwise (volume {g.volumes[i]:.4g})",
+    )  # fmt: skip
+    excess = np.abs(d.volumes - g.volumes) - slack * g.perimeters
+    check.note(
+        "volumes", np.maximum(excess, 0),
+        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
+    )  # fmt: skip
+    total = float(d.volumes.sum())
+    allowed = slack * (g.perimeters.sum() / np.sqrt(n) + _surface(domain.extent))
+    check.note(
+        "volumes sum", np.array([abs(total - domain.measure) > allowed]),
+        lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
+    )  # fmt: skip
+    _check_faces(check, g, slack)
+    off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
+    # A centroid is a quotient: where rounding is much of the cell, so it is of the centroid.
+    doubt = slack * (1 + g.perimeters * g.reach / np.maximum(g.volumes, 1e-300))
+    check.note(
+        "centroids", np.maximum(off - doubt, 0),
+        lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give "
+        f"{d.points[i] + g.centroids[i]}",
+    )  # fmt: skip
+    _check_nearest(check, g, slack)
+
+
+def _surface(extent: np.ndarray) -> float:
+    """Return the measure of a box' boundary."""
+    return float(2 * sum(np.prod(np.delete(extent, a)) for a in range(len(extent))))
+
+
+def _check_faces(check: _Check, g: Rebuilt, slack: float) -> None:
+    """Check faces: closed around each cell, measured right, outward, on their walls, the same from both sides."""
+    d = check.diagram
+    dim, n = d.domain.dim, len(d)
+    if dim == 3:
+        face, a, b = g.edges
+        key = (g.owner[face].astype(np.int64), np.minimum(a, b), np.maximum(a, b))
+        order = np.lexsort(key[::-1])
+        new = np.any([np.diff(k[order], prepend=-1) != 0 for k in key], axis=0)
+        group = np.cumsum(new) - 1
+        turns = np.bincount(group, np.where(a < b, 1, np.where(a > b, -1, 0))[order])
+        where = order[new]
+        check.note(
+            "faces closed", turns != 0,
+            lambda k: f"cell {g.owner[face[where[k]]]} is open, or its faces turn different ways, at the edge "
+            f"from vertex {a[where[k]]} to {b[where[k]]}",
+        )  # fmt: skip
+    gap = np.stack([np.bincount(g.owner, g.areas[:, k], minlength=n) for k in range(dim)], axis=1)
+    gap = np.linalg.norm(gap, axis=1)
+    bound = slack * (1 if dim == 2 else 2 * g.reach)
+    check.note(
+        "faces closed", np.maximum(gap - bound, 0), lambda i: f"the faces of cell {i} do not close"
+    )
+    width = slack if dim == 2 else slack * (g.reach[g.owner] + slack)
+    wrong = np.abs(d.face_measures - g.measures) - width
+    check.note(
+        "face measures", np.maximum(wrong, 0),
+        lambda f: f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
+        f"{g.measures[f]:.17g}",
+    )  # fmt: skip
+    middle = d.face_centroids - d.points[g.owner]
+    off = np.linalg.norm(middle - g.middles, axis=1)
+    if dim == 3:  # that of a face without area may be anywhere in it
+        off = np.minimum(off, off * g.measures / (slack * np.maximum(g.reach[g.owner], 1e-300)))
+    check.note(
+        "face centroids", np.maximum(off - 4 * slack, 0),
+        lambda f: f"face_centroids[{f}] of cell {g.owner[f]} is {d.face_centroids[f]}, its corners give "
+        f"{d.points[g.owner[f]] + g.middles[f]}",
+    )  # fmt: skip
+    inner, walls = np.flatnonzero(d.neighbours >= 0), np.flatnonzero(d.neighbours < 0)
+    across = np.zeros_like(g.areas)
+    across[inner] = d.points[d.neighbours[inner]] - d.points[g.owner[inner]]
+    axis, upper = (-1 - d.neighbours[walls]) // 2, (-1 - d.neighbours[walls]) % 2
+    across[walls, axis] = 2.0 * upper - 1
+    across /= np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
+    inward = -np.einsum("ij,ij->i", g.areas, across)
+    check.note(
+        "faces outward", np.maximum(inward - width, 0),
+        lambda f: f"face {f} of cell {g.owner[f]} does not look towards {d.neighbours[f]}",
+    )  # fmt: skip
+    level = np.array([d.domain.lower, d.domain.upper])[upper, axis]
+    height = np.abs(g.middles[walls, axis] + d.points[g.owner[walls], axis] - level)
+    check.note(
+        "walls", np.maximum(height - slack, 0),
+        lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
+    )  # fmt: skip
+    # The same face from both sides.
+    i, j = g.owner[inner].astype(np.int64), d.neighbours[inner].astype(np.int64)
+    here, there = inner[np.argsort(i * n + j)], inner[np.argsort(j * n + i)]
+    off = np.abs(d.face_measures[here] - d.face_measures[there])
+    wide = width if dim == 2 else np.maximum(width[here], width[there])
+    check.note(
+        "faces the same from both sides", np.maximum(off - 2 * wide, 0),
+        lambda k: f"the face of cells {g.owner[here[k]]} and {d.neighbours[here[k]]} measures "
+        f"{d.face_measures[here[k]]:.17g} and {d.face_measures[there[k]]:.17g}",
+    )  # fmt: skip
+
+
+def _check_nearest(check: _Check, g: Rebuilt, slack: float) -> None:
+    """Check what makes it a Voronoi diagram: no generator is nearer to a cell's corner than the cell's own."""
+    d = check.diagram
+    corners = d.vertices[g.corners]
+    own = np.linalg.norm(corners - d.points[g.cells], axis=1)
+    nearest = cKDTree(d.points).query(d.vertices)[0][g.corners]
+    check.note(
+        "nearest generators", np.maximum(own - nearest - slack, 0),
+        lambda k: f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by "
+        f"{own[k] - nearest[k]:.3g}",
+    )  # fmt: skip
+
+
+def _check_result(check: _Check, result: Result) -> None:
+    d = result.diagram
+    n, dim = len(d), d.domain.dim
+    for name in ("size", "error", "quality"):
+        check.shape(name, getattr(result, name), (n,))
+    check.shape("points", result.points, (n, dim))
+    h, e, q = result.size, result.error, result.quality
+    check.note(
+        "points", (result.points != d.points).any(axis=1),
+        lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
+    )  # fmt: skip
+    check.note("size", ~(h > 0), lambda i: f"size[{i}] is {h[i]}, expected > 0", stop=True)
+    eps = np.finfo(Rebuilt(d).real).eps
+    length = np.maximum(d.volumes, 0) ** (1 / dim)
+    with np.errstate(all="ignore"):
+        error = (length - h) / np.minimum(length, h)
+        counts = np.diff(d.neighbour_starts)
+        surface = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
+        if dim == 2:
+            quality = 4 * d.volumes * counts * np.tan(np.pi / counts) / surface**2
+        else:
+            quality = 36 * np.pi * d.volumes**2 / surface**3
+    check.note(
+        "error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
+        lambda i: f"error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
+    )  # fmt: skip
+    check.note(
+        "quality", np.maximum(np.abs(q - quality) - 64 * eps * (1 + quality), 0),
+        lambda i: f"quality[{i}] is {q[i]:.10g}, the cell gives {quality[i]:.10g}",
+    )  # fmt: skip
+    steps = result.history["step"]
+    check.note(
+        "history", np.diff(steps, prepend=-1) < 0,
+        lambda r: f"row {r} of the history is step {steps[r]}, after {steps[r - 1]}",
+    )  # fmt: skip

@@ -1,0 +1,285 @@
+"""Read back the `.vtu` files that `vtu.py` writes, without trusting them: for checks.
+
+The XML is read by a parser that refuses document types and entities, so that nothing expands and nothing is fetched;
+every array's size is known from the numbers of points and cells, or bounded by the file's, before memory is asked for.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+import zlib
+from collections.abc import Iterator
+from os import PathLike, fspath
+from typing import NoReturn
+from xml.parsers import expat
+
+import numpy as np
+
+from ..domain import Box
+from ..errors import InputError
+from ..rebuilt import rebuild
+from ..results import HISTORY_DTYPE, Diagram, Result
+
+_LONGEST_HEAD = 1 << 22
+_MARK = b'<AppendedData encoding="raw">\n_'
+_TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
+_BLOCK = 1 << 20
+EXPANSION = 256
+"""A file may not hold more than this many times its own size: meshes compress two- or threefold."""
+
+
+class _FileError(Exception):
+    """What is wrong with a file; `load_vtu` adds which one."""
+
+
+def load_vtu(path: str | PathLike[str]) -> Result:
+    """Read the cells and what is known of them from a `.vtu` file that `Result.save` wrote.
+
+    The domain is the vertices' bounding box. The graph is made anew from the corners that cells share; volumes, sizes,
+    errors and quality are the file's. The history is empty.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, cut off or not of clvoro's kind; names the file and what is wrong.
+    """
+    name = fspath(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_LONGEST_HEAD)
+            end = head.find(_MARK)
+            if end < 0:
+                raise _FileError("it has no appended raw data, as clvoro's have")
+            start = end + len(_MARK)
+            size = os.fstat(file.fileno()).st_size
+            arrays = _Reader(head[:end], start, size).read_all(file)
+        return _assemble(arrays)
+    except _FileError as problem:
+        raise InputError(f"cannot read {name}: {problem}") from problem
+    except (
+        zlib.error,
+        struct.error,
+        ValueError,
+        OverflowError,
+        KeyError,
+        expat.ExpatError,
+    ) as error:
+        raise InputError(f"cannot read {name}: it is damaged or foreign ({error})") from error
+    except OSError as error:
+        raise InputError(f"cannot read {name}: {error.strerror or error}") from error
+
+
+class _Reader:
+    """The head of a file: which arrays there are, and where."""
+
+    def __init__(self, head: bytes, start: int, size: int) -> None:
+        self.start, self.size = start, size
+        self.left = EXPANSION * size
+        self.points = self.cells = -1
+        self.compressed = False
+        self.entries: dict[str, tuple[str, int, int]] = {}
+        self._within: list[str] = []
+        parser = expat.ParserCreate()
+        parser.StartDoctypeDeclHandler = self._refuse
+        parser.EntityDeclHandler = self._refuse
+        parser.StartElementHandler = self._element
+        parser.EndElementHandler = lambda _: self._within.pop()
+        parser.Parse(head, False)
+        if min(self.points, self.cells) < 0:
+            raise _FileError("it has no piece with points and cells")
+
+    def _refuse(self, *_: object) -> NoReturn:
+        raise _FileError("it declares a document type or entities, which clvoro's never do")
+
+    def _element(self, tag: str, given: dict[str, str]) -> None:
+        if tag == "VTKFile":
+            native = f"{sys.byteorder.title()}Endian"
+            if given.get("type") != "UnstructuredGrid" or given.get("byte_order") != native:
+                raise _FileError(f"it is no UnstructuredGrid in {native}")
+            if given.get("header_type") != "UInt64":
+                raise _FileError("its header_type is not UInt64")
+            compressor = given.get("compressor")
+            if compressor not in (None, "vtkZLibDataCompressor"):
+                raise _FileError(f"its compressor is {compressor!r:.60}")
+            self.compressed = compressor is not None
+        elif tag == "Piece":
+            self.points, self.cells = int(given["NumberOfPoints"]), int(given["NumberOfCells"])
+        elif tag == "DataArray":
+            group = self._within[-1] if self._within else ""
+            name = given.get("Name", "") if group != "Points" else ""
+            if given.get("format") != "appended" or given["type"] not in _TYPES:
+                raise _FileError(f"its array {name!r:.60} is not appended, or of an unknown type")
+            width = int(given.get("NumberOfComponents", "1"))
+            if width not in (1, 3):
+                raise _FileError(f"its array {name!r:.60} has {width} components")
+            self.entries[f"{group}.{name}"] = (_TYPES[given["type"]], width, int(given["offset"]))
+        self._within.append(tag)
+
+    def read_all(self, file) -> dict[str, np.ndarray]:
+        """Return all arrays, by group and name."""
+        return {name: self._read(file, name, *entry) for name, entry in self.entries.items()}
+
+    def _read(self, file, name: str, kind: str, width: int, offset: int) -> np.ndarray:
+        if not 0 <= offset <= self.size - self.start - 8:
+            raise _FileError(f"{name} lies beyond the file's end")
+        file.seek(self.start + offset)
+        if self.compressed:
+            raw = b"".join(self._blocks(file, name))
+        else:
+            (length,) = struct.unpack("=Q", file.read(8))
+            raw = self._take(file, name, length)
+        array = np.frombuffer(raw, kind)  # raises if it is no whole number of items
+        if width > 1:
+            array = array.reshape(-1, width)
+        rows = {"Points": self.points, "CellData": self.cells}.get(name.split(".")[0])
+        if name in ("Cells.offsets", "Cells.types", "Cells.faceoffsets"):
+            rows = self.cells
+        if rows is not None and len(array) != rows:
+            raise _FileError(f"{name} has {len(array)} entries, expected {rows}")
+        return array
+
+    def _take(self, file, name: str, length: int) -> bytes:
+        """Read `length` bytes, of which there are that many."""
+        if length > self.size - file.tell():
+            raise _FileError(f"{name} is cut off")
+        return file.read(length)
+
+    def _blocks(self, file, name: str) -> Iterator[bytes]:
+        count, block, partial = struct.unpack("=3Q", self._take(file, name, 24))
+        if not 0 < block <= _BLOCK or partial >= block:
+            raise _FileError(f"{name} is in blocks of {block} bytes")
+        sizes = struct.unpack(f"={count}Q", self._take(file, name, 8 * min(count, self.size)))
+        for k, size in enumerate(sizes):
+            expected = partial if k == count - 1 and partial else block
+            self.left -= expected
+            if self.left < 0:
+                raise _FileError(f"it expands to more than {EXPANSION} times its size")
+            part = zlib.decompressobj()
+            data = part.decompress(self._take(file, name, size), expected)
+            if len(data) != expected or part.decompress(part.unconsumed_tail, 1):
+                raise _FileError(f"block {k} of {name} has not the length that its table says")
+            yield data
+
+
+def _assemble(arrays: dict[str, np.ndarray]) -> Result:
+    vertices = arrays["Points."].astype(float)
+    kinds = arrays["Cells.types"]
+    if not len(kinds) or not len(vertices) or not np.isfinite(vertices).all():
+        raise _FileError("it has no cells, or vertices that are not finite")
+    if (kinds == 7).all():
+        dim, (cell_starts, corners) = 2, _polygons(arrays, len(vertices))
+        face_starts = None
+    elif (kinds == 42).all():
+        dim, (cell_starts, face_starts, corners) = 3, _polyhedra(arrays, len(vertices))
+    else:
+        raise _FileError("its cells are neither all polygons nor all polyhedra")
+    lower, upper = vertices.min(axis=0)[:dim], vertices.max(axis=0)[:dim]
+    if not (lower < upper).all():
+        raise _FileError("its vertices lie on a line")
+    domain = Box(tuple(lower), tuple(upper))
+    x = np.ascontiguousarray(vertices[:, :dim])
+    points = arrays["CellData.generator"][:, :dim].astype(float)
+    owner = np.repeat(np.arange(len(kinds)), np.diff(cell_starts))
+    if face_starts is None:
+        following = np.arange(1, len(corners) + 1)
+        following[cell_starts[1:] - 1] = cell_starts[:-1]
+        loops = np.stack([corners, corners[following]], axis=1)
+        face = np.repeat(np.arange(len(corners)), 2)
+        flat, starts = loops.ravel(), 2 * np.arange(len(corners) + 1)
+    else:
+        flat, starts = corners, face_starts
+        face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    neighbours = _neighbours(owner, face, flat, starts, x, domain)
+    known = {
+        "points": points, "volumes": arrays["CellData.volume"].astype(float),
+        "neighbour_starts": cell_starts, "neighbours": neighbours, "vertices": x,
+    }  # fmt: skip
+    if face_starts is None:
+        known |= {"cell_vertex_starts": cell_starts, "cell_vertices": corners}
+    else:
+        known |= {"face_vertex_starts": face_starts, "face_vertices": corners}
+    # What the file does not hold is what its corners give.
+    diagram = Diagram(domain, {**known, **rebuild(Diagram(domain, known))})
+    values = {
+        name: arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
+    }
+    return Result(
+        points=points, diagram=diagram, **values, history=np.zeros(0, HISTORY_DTYPE),
+        converged=False, stop_reason="read from a .vtu file",
+    )  # fmt: skip
+
+
+def _indices(array: np.ndarray, bound: int, name: str) -> np.ndarray:
+    if array.dtype.kind not in "iu" or array.ndim != 1:
+        raise _FileError(f"{name} are no indices")
+    if len(array) and not (array.min() >= 0 and array.max() < bound):
+        raise _FileError(f"{name} point to what does not exist")
+    return array.astype(np.int64)
+
+
+def _starts(ends: np.ndarray, total: int, name: str) -> np.ndarray:
+    starts = np.concatenate([[0], _indices(ends, total + 1, name)])
+    if starts[-1] != total or (np.diff(starts) < 3).any():
+        raise _FileError(f"{name} do not cut the list into cells")
+    return starts
+
+
+def _polygons(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.ndarray]:
+    corners = _indices(arrays["Cells.connectivity"], v, "corners")
+    return _starts(arrays["Cells.offsets"], len(corners), "offsets"), corners
+
+
+def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Take the streams of faces apart: starts of cells in faces, of faces in corners, corners."""
+    stream = _indices(arrays["Cells.faces"], max(v, len(arrays["Cells.faces"])), "faces")
+    ends = _starts(arrays["Cells.faceoffsets"], len(stream), "faceoffsets")
+    cells, faces, pieces = [0], [0], []
+    for begin, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        at = begin + 1
+        for _ in range(int(stream[begin])):
+            if at >= end or at + 1 + stream[at] > end:
+                raise _FileError("faces do not fit their cells")
+            pieces.append(stream[at + 1 : at + 1 + int(stream[at])])
+            faces.append(faces[-1] + len(pieces[-1]))
+            at += 1 + int(stream[at])
+        if at != end:
+            raise _FileError("faces do not fit their cells")
+        cells.append(len(faces) - 1)
+    corners = np.concatenate(pieces) if pieces else np.zeros(0, np.int64)
+    return np.array(cells), np.array(faces), _indices(corners, v, "corners of faces")
+
+
+def _neighbours(
+    owner: np.ndarray,
+    face: np.ndarray,
+    corners: np.ndarray,
+    starts: np.ndarray,
+    x: np.ndarray,
+    domain: Box,
+) -> np.ndarray:
+    """Return the cell behind each face: the one whose face has the same corners; or else the wall it lies on."""
+    order = np.lexsort((corners, face))
+    ragged = corners[order]
+    sides = np.diff(starts)
+    result = np.full(len(sides), np.iinfo(np.int64).min)
+    for k in np.unique(sides):
+        rows = np.flatnonzero(sides == k)
+        if k < 2:
+            raise _FileError("a face has fewer corners than it takes")
+        keys = ragged[starts[rows][:, None] + np.arange(k)]
+        by = np.lexsort(keys.T[::-1])
+        same = (keys[by][1:] == keys[by][:-1]).all(axis=1)
+        a, b = rows[by[:-1][same]], rows[by[1:][same]]
+        result[a], result[b] = owner[b], owner[a]
+    alone = np.flatnonzero(result < 0)
+    middle = (
+        np.stack([np.bincount(face, x[corners, k], len(sides)) for k in range(x.shape[1])], axis=1)[
+            alone
+        ]
+        / sides[alone][:, None]
+    )
+    gaps = np.stack([middle - domain.lower, domain.upper - middle], axis=2).reshape(len(alone), -1)
+    result[alone] = -1 - gaps.argmin(axis=1)
+    return result

@@ -1,0 +1,183 @@
+"""A right mesh passes the check; whatever is done to it is found, and called by its name."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from solids import solid_diagram, solid_result
+
+import clvoro
+from clvoro import cli
+from clvoro.check import CheckError
+from clvoro.io.vtu_read import load_vtu
+from clvoro.results import Diagram
+
+BOX = clvoro.Box((-3.0, 7.0), (-0.5, 8.5))
+
+
+@pytest.fixture(scope="module")
+def flat(ctx):
+    points = np.random.default_rng(5417).uniform(BOX.lower, BOX.upper, (90, 2))
+    return clvoro.Adapter(ctx).run(BOX, 0.2, points=points, method="lloyd", max_steps=1)
+
+
+@pytest.fixture(scope="module")
+def solid():
+    points = np.random.default_rng(5419).random((60, 3))
+    return solid_result(solid_diagram((0, 0, 0), (1, 1, 1), points))
+
+
+def arrays_of(diagram):
+    names = (name for name in Diagram._NAMES if name in diagram._arrays)
+    return {name: getattr(diagram, name).copy() for name in names}
+
+
+def spoilt(result, **changes):
+    """The result with functions applied to arrays of its diagram."""
+    arrays = arrays_of(result.diagram)
+    for name, change in changes.items():
+        changed = change(arrays[name])
+        arrays[name] = arrays[name] if changed is None else changed
+    return Diagram(result.diagram.domain, arrays)
+
+
+def put(index, value):
+    def change(array):
+        array[index] = value
+
+    return change
+
+
+def add(index, value):
+    def change(array):
+        array[index] += value
+
+    return change
+
+
+def swap(a, b):
+    def change(array):
+        array[[a, b]] = array[[b, a]]
+
+    return change
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("n", [1, 2, 3, 700])
+def test_right_diagrams_pass(ctx, dtype, n):
+    points = np.random.default_rng(n).uniform(BOX.lower, BOX.upper, (n, 2))
+    report = clvoro.Adapter(ctx, dtype).diagram(BOX, points).check()
+    assert report, report
+    assert report.cells == n
+    assert n == 1 or report.precision == dtype
+
+
+def test_right_results_pass(flat, solid):
+    for result in (flat, solid):
+        report = result.check()
+        assert report.ok, report
+        assert {"volumes sum", "nearest generators", "error", "quality"} <= set(report.checked)
+        report.demand()
+
+
+COMMON = {
+    "volumes": ({"volumes": add(7, 1e-9)}, "volumes"),
+    "sum": ({"volumes": lambda v: v * (1 + 1e-9)}, "volumes sum"),
+    "centroid": ({"centroids": add((4, 1), 1e-7)}, "centroids"),
+    "measure": ({"face_measures": add(11, 1e-7)}, "face measures"),
+    "middle": ({"face_centroids": add((11, 0), 1e-6)}, "face centroids"),
+    "neighbour": ({"neighbours": lambda j: np.where(j == 3, 4, j)}, "graph symmetric"),
+    "far neighbour": ({"neighbours": put(5, 10_000)}, "neighbours exist"),
+    "no such wall": ({"neighbours": put(5, -9)}, "neighbours exist"),
+    "generators": ({"points": swap(8, 30)}, "nearest generators"),
+    "outside": ({"points": add(8, 100.0)}, "generators inside"),
+    "vertex": ({"vertices": add((20, 0), 1e-5)}, "nearest generators"),
+    "nan": ({"vertices": put((20, 0), np.nan)}, "finite"),
+    "starts": ({"neighbour_starts": put(3, 500)}, "shapes"),
+    "short": ({"volumes": lambda v: v[:-1]}, "shapes"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(COMMON))
+@pytest.mark.parametrize("kind", ["flat", "solid"])
+def test_what_is_wrong_is_named(case, kind, request):
+    changes, name = COMMON[case]
+    result = request.getfixturevalue(kind)
+    report = spoilt(result, **changes).check()
+    assert not report
+    assert name in {finding.name for finding in report.findings}, report
+    with pytest.raises(CheckError, match=name):
+        report.demand()
+
+
+def test_clockwise_cell_is_found(flat):
+    starts = flat.diagram.cell_vertex_starts
+
+    def turn(corners):
+        corners[starts[5] : starts[6]] = corners[starts[5] : starts[6]][::-1].copy()
+
+    names = {f.name for f in spoilt(flat, cell_vertices=turn).check().findings}
+    assert {"orientation", "faces outward"} <= names
+
+
+def test_inward_and_open_faces_are_found(solid):
+    starts = solid.diagram.face_vertex_starts
+
+    def turn(corners):
+        corners[starts[5] : starts[6]] = corners[starts[5] : starts[6]][::-1].copy()
+
+    names = {f.name for f in spoilt(solid, face_vertices=turn).check().findings}
+    assert {"faces closed", "faces outward", "volumes"} <= names
+
+
+def test_diagram_of_other_generators_is_found(ctx, flat):
+    # Closed, symmetric, of the right volumes: only not the Voronoi diagram of these generators.
+    moved = flat.diagram.points + 1e-4 * np.random.default_rng(77).standard_normal((90, 2))
+    names = {f.name for f in spoilt(flat, points=lambda _: moved).check().findings}
+    assert "nearest generators" in names
+
+
+@pytest.mark.parametrize("name", ["error", "quality", "size"])
+def test_numbers_of_a_result_are_recomputed(flat, solid, name):
+    for result in (flat, solid):
+        values = getattr(result, name).copy()
+        values[17] *= 1.001
+        report = dataclasses.replace(result, **{name: values}).check()
+        assert ("error" if name == "size" else name) in {f.name for f in report.findings}
+
+
+@pytest.mark.parametrize("kind", ["flat", "solid"])
+@pytest.mark.parametrize("suffix", ["npz", "vtu"])
+def test_files_pass_and_spoilt_ones_do_not(kind, suffix, request, tmp_path, capsys):
+    result = request.getfixturevalue(kind)
+    good, bad = str(tmp_path / f"good.{suffix}"), str(tmp_path / f"bad.{suffix}")
+    result.save(good)
+    diagram = spoilt(result, volumes=add(7, 1e-6), vertices=add((20, 0), 1e-5))
+    dataclasses.replace(result, diagram=diagram).save(bad)
+    assert cli.main(["check", good]) == 0
+    assert "hold" in capsys.readouterr().out
+    assert cli.main(["check", good, bad, "--json"]) == 1
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert first["ok"]
+    assert not second["ok"]
+    names = {finding["name"] for finding in second["findings"]}
+    assert {"volumes", "nearest generators"} <= names
+
+
+def test_vtu_gives_the_graph_back(flat, solid, tmp_path):
+    for result in (flat, solid):
+        result.save(tmp_path / "m.vtu")
+        again = load_vtu(tmp_path / "m.vtu").diagram
+        assert (again.neighbours == result.diagram.neighbours).all()
+        assert np.abs(again.face_measures - result.diagram.face_measures).max() < 1e-13
+
+
+def test_what_cannot_be_read_has_its_own_code(flat, tmp_path, capsys):
+    path = tmp_path / "m.npz"
+    flat.save(path)
+    path.write_bytes(path.read_bytes()[:-500])
+    assert cli.main(["check", str(path)]) == 2
+    assert cli.main(["check", str(tmp_path / "none.vtu")]) == 2
+    assert cli.main(["check", str(tmp_path / "mesh.stl")]) == 2
+    assert "cannot" in capsys.readouterr().err
