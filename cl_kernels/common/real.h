@@ -8,6 +8,12 @@
 /* Geometry relies on each operation being rounded as written; contraction is asked for by fma() only. */
 #pragma OPENCL FP_CONTRACT OFF
 
+/* Intel's CPU compiler runs several work-items as the lanes of one vector, and then gets private arrays in loops that
+   diverge wrong (seen in 2026.2: cells of negative area). One lane is as this is written. */
+#ifdef cl_intel_vec_len_hint
+#define kernel __attribute__((intel_vec_len_hint(1))) __kernel
+#endif
+
 #define CLVORO_JOIN_(a, b) a##b
 #define CLVORO_JOIN(a, b) CLVORO_JOIN_(a, b)
 #define CLVORO_IS_double 1
