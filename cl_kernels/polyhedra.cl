@@ -216,12 +216,6 @@ inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, g
     return 0;
 }
 
-/* Measures of a cell's faces and of the cell: where it writes them. */
-typedef struct {
-    global int *labels;
-    global REAL *measures, *centroids;
-} faces_t;
-
 inline REAL4 vertex_at(const cell_t *cell, int v)
 {
     return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
@@ -287,37 +281,34 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         return;
     }
 
-    /* A vertex of every face, and how many faces there are. */
+    /* A vertex of every face. */
     INDEX start[FACE_CAPACITY];
+    SHORT_LOOP
     for (int v = 0; v < cell.n; ++v) {
         const INDEX4 f = cell.faces[v];
         start[f.s0] = start[f.s1] = start[f.s2] = v;
     }
-    const int place = atomic_add(report + 2, cell.slots - cell.spares);
-    const bool fits = place + cell.slots - cell.spares <= room;
+    const int face_count = cell.n / 2 + 2; /* Euler's formula */
+    const int place = atomic_add(report + 2, face_count);
+    const bool fits = place + face_count <= room;
     const REAL near2 = sqrt(REAL_EPS) * cell.reach2;
     int count = 0;
     bool doubtful = false;
     REAL volume = 0;
     REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
-    for (int f = 0; f < cell.slots; ++f) {
-        if (cell.degree[f] == 0)
-            continue;
+    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
         const REAL4 plane = cell.planes[f];
         const REAL d2 = plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2;
         const REAL inverse = 1 / sqrt(d2);
         const REAL4 normal = plane * inverse; /* and its distance */
-        int v = start[f];
-        int next = face_after(&cell, v, f);
-        const REAL4 a = vertex_at(&cell, v);
-        v = cell.at[f * FACE_CAPACITY + next];
+        const int first_vertex = start[f];
+        const REAL4 a = vertex_at(&cell, first_vertex);
+        int v = vertex_after(&cell, first_vertex, f);
         REAL4 b = vertex_at(&cell, v);
         REAL4 ab = b - a;
         REAL area = 0;
         REAL4 face_first = 0, face_square = 0, face_mixed = 0;
-        for (int k = 2; k < cell.degree[f]; ++k) {
-            next = face_after(&cell, v, f);
-            v = cell.at[f * FACE_CAPACITY + next];
+        for (v = vertex_after(&cell, v, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
             const REAL4 c = vertex_at(&cell, v);
             const REAL4 ac = c - a;
             const REAL weight = dot3(cross3(ab, ac), normal);
@@ -338,9 +329,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
             /* Faces below rounding are none; smaller ones than a neighbour is sure to see, too, are doubtful. */
             if (!(area > sqrt(REAL_EPS) * d2)) {
                 REAL width2 = 0;
-                v = start[f];
-                for (int k = 1; k < cell.degree[f]; ++k) {
-                    v = cell.at[f * FACE_CAPACITY + face_after(&cell, v, f)];
+                for (v = vertex_after(&cell, first_vertex, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
                     const REAL4 e = vertex_at(&cell, v) - a;
                     width2 = fmax(width2, dot3(e, e));
                 }

@@ -14,9 +14,9 @@ from .cells import COINCIDE, FULL, Tessellation
 from .domain import Box
 from .errors import ClvoroError, InputError, MemoryLimitError
 
-FACE_CAPACITY = 48
+FACE_CAPACITY = 64
 """Faces that a cell may have while it is clipped; doubled for those cells that have more."""
-MOST_FACES = 768
+MOST_FACES = 512
 FACES_PER_CELL = 16.5
 """Room for faces at first: random cells have 15.54 of them on average; walls add some."""
 

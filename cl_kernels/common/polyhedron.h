@@ -9,7 +9,13 @@
 #include "common/real.h"
 
 #ifndef FACE_CAPACITY
-#error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 4"
+#error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 64"
+#endif
+/* Loops that are short as a rule: vectors of them cost more than they save. */
+#ifdef __clang__
+#define SHORT_LOOP _Pragma("clang loop vectorize(disable) interleave(disable) unroll(disable)")
+#else
+#define SHORT_LOOP
 #endif
 
 #define REAL8 CLVORO_JOIN(REAL, 8)
@@ -22,6 +28,43 @@
 #define INDEX4 ushort4
 #endif
 
+/* Sets of faces. */
+#define FACE_WORDS (FACE_CAPACITY / 64)
+#define WORD_OF(f) (FACE_WORDS == 1 ? 0 : (f) >> 6)
+
+inline bool has_face(const ulong *set, int f)
+{
+    return (set[WORD_OF(f)] >> (f & 63)) & 1;
+}
+
+inline void add_face(ulong *set, int f)
+{
+    set[WORD_OF(f)] |= (ulong)1 << (f & 63);
+}
+
+/* The first face that is not in the set, or FACE_CAPACITY. */
+inline int first_spare(const ulong *set)
+{
+    for (int w = 0; w < FACE_WORDS; ++w) {
+        const ulong spare = ~set[w];
+        if (spare != 0)
+            return 64 * w + 63 - (int)clz(spare & -spare);
+    }
+    return FACE_CAPACITY;
+}
+
+/* The first face of the set from f on, or FACE_CAPACITY. */
+inline int next_face(const ulong *set, int f)
+{
+    while (f < FACE_CAPACITY) {
+        const ulong rest = set[WORD_OF(f)] >> (f & 63);
+        if (rest != 0)
+            return f + 63 - (int)clz(rest & -rest);
+        f = (f | 63) + 1;
+    }
+    return FACE_CAPACITY;
+}
+
 #define CLIP_MISSED 0    /* the bisector does not cut the cell */
 #define CLIP_CUT 1       /* it does */
 #define CLIP_FULL 2      /* it does, and there are too many faces */
@@ -29,16 +72,13 @@
 
 /* Arrays of vertices are filled up to whole vectors by zeros: the generator itself, which no bisector cuts off. */
 typedef struct {
-    int n;        /* vertices */
-    int slots;    /* faces, with those that are gone */
-    int spares;   /* faces that are gone, for new ones */
-    REAL reach2;  /* largest squared distance of a vertex from the generator */
+    int n;                   /* vertices */
+    REAL reach2;             /* largest squared distance of a vertex from the generator */
+    ulong alive[FACE_WORDS]; /* set of the faces that there are */
     REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
     REAL8 beyond[VERTEX_CAPACITY / 8];        /* signed distances from a bisector, times |d| */
     INDEX4 faces[VERTEX_CAPACITY];            /* of a vertex, counter-clockwise */
     INDEX at[FACE_CAPACITY * FACE_CAPACITY];  /* [a][b]: the vertex whose faces are a, b, in this order, and another */
-    INDEX degree[FACE_CAPACITY];              /* vertices of a face; 0: it is gone */
-    INDEX spare[FACE_CAPACITY];
     int labels[FACE_CAPACITY];                /* of a face: a generator, or -1 - wall */
     REAL4 planes[FACE_CAPACITY];              /* of a face: d, level; the plane is y.d = level */
 } cell_t;
@@ -59,9 +99,9 @@ inline void link_vertex(cell_t *cell, int v)
 inline void find_reach(cell_t *cell)
 {
     const int blocks = (cell->n + 7) / 8;
-    REAL8 far = cell->x[0] * cell->x[0] + cell->y[0] * cell->y[0] + cell->z[0] * cell->z[0];
+    REAL8 far = fma(cell->x[0], cell->x[0], fma(cell->y[0], cell->y[0], cell->z[0] * cell->z[0]));
     for (int b = 1; b < blocks; ++b) {
-        const REAL8 r2 = cell->x[b] * cell->x[b] + cell->y[b] * cell->y[b] + cell->z[b] * cell->z[b];
+        const REAL8 r2 = fma(cell->x[b], cell->x[b], fma(cell->y[b], cell->y[b], cell->z[b] * cell->z[b]));
         far = r2 > far ? r2 : far;
     }
     const REAL4 half4 = far.lo > far.hi ? far.lo : far.hi;
@@ -73,8 +113,8 @@ inline void find_reach(cell_t *cell)
 inline void start_cell(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
     cell->n = 8;
-    cell->slots = 6;
-    cell->spares = 0;
+    for (int k = 0; k < FACE_WORDS; ++k)
+        cell->alive[k] = k == 0 ? 63 : 0;
     const REAL4 low = lower - x, high = upper - x;
     cell->x[0] = (REAL8)(low.s0, high.s0, low.s0, high.s0, low.s0, high.s0, low.s0, high.s0);
     cell->y[0] = (REAL8)(low.s1, low.s1, high.s1, high.s1, low.s1, low.s1, high.s1, high.s1);
@@ -88,10 +128,8 @@ inline void start_cell(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
         cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
         link_vertex(cell, v);
     }
-    for (int w = 0; w < 6; ++w) {
+    for (int w = 0; w < 6; ++w)
         cell->labels[w] = -1 - w;
-        cell->degree[w] = 4;
-    }
     cell->planes[0] = (REAL4)(-1, 0, 0, -low.s0);
     cell->planes[1] = (REAL4)(1, 0, 0, high.s0);
     cell->planes[2] = (REAL4)(0, -1, 0, -low.s1);
@@ -148,7 +186,7 @@ inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
         added = s[v] > s[added] ? v : added;
         left += s[v] > doubt;
     }
-    for (int f = 0; f < cell->slots; ++f)
+    for (int f = 0; f < FACE_CAPACITY; ++f)
         on[f] = false;
     while (added >= 0) {
         const INDEX4 f = cell->faces[added];
@@ -179,11 +217,12 @@ inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 
 /* The edges over which a bisector leaves the cell. */
 typedef struct {
-    int gone;                                            /* vertices beyond the bisector */
-    int n;                                               /* edges */
-    INDEX vertices[VERTEX_CAPACITY + 1];                 /* those beyond, ascending */
-    INDEX before[VERTEX_CAPACITY + 1], after[VERTEX_CAPACITY + 1]; /* faces of an edge, along the rim */
-    INDEX in[VERTEX_CAPACITY + 1], out[VERTEX_CAPACITY + 1];       /* its ends, kept and not */
+    int gone;                                              /* vertices beyond the bisector */
+    int n;                                                 /* edges */
+    ulong dead[FACE_WORDS];                                /* faces all of which is beyond */
+    INDEX vertices[VERTEX_CAPACITY + 1];                   /* those beyond, ascending */
+    INDEX before[FACE_CAPACITY + 4], after[FACE_CAPACITY + 4]; /* faces of an edge, along the rim */
+    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];   /* its ends, kept and not */
 } rim_t;
 
 /* Find the rim; false if it is not one simple cycle. */
@@ -191,39 +230,70 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
 {
     const REAL *s = (const REAL *)cell->beyond;
     int gone = 0, n = 0;
+    SHORT_LOOP
     for (int v = 0; v < cell->n; ++v) {
         rim->vertices[gone] = v;
         gone += s[v] > depth;
     }
     rim->gone = gone;
+    ulong touched[FACE_WORDS], around[FACE_WORDS];
+    for (int w = 0; w < FACE_WORDS; ++w)
+        touched[w] = around[w] = 0;
+    SHORT_LOOP
     for (int k = 0; k < gone; ++k) {
         const int v = rim->vertices[k];
         const INDEX4 f = cell->faces[v];
-        const int a[4] = {f.s0, f.s1, f.s2, f.s0};
-        for (int e = 0; e < 3; ++e) {
-            const int in = cell->at[a[e + 1] * FACE_CAPACITY + a[e]];
-            rim->before[n] = a[e];
-            rim->after[n] = a[e + 1];
-            rim->in[n] = in;
-            rim->out[n] = v;
-            n += !(s[in] > depth);
-            if (n > VERTEX_CAPACITY)
-                return false;
-        }
+        const int a = f.s0, b = f.s1, c = f.s2;
+        add_face(touched, a);
+        add_face(touched, b);
+        add_face(touched, c);
+        const int ab = cell->at[b * FACE_CAPACITY + a];
+        rim->before[n] = a;
+        rim->after[n] = b;
+        rim->in[n] = ab;
+        rim->out[n] = v;
+        n += !(s[ab] > depth);
+        const int bc = cell->at[c * FACE_CAPACITY + b];
+        rim->before[n] = b;
+        rim->after[n] = c;
+        rim->in[n] = bc;
+        rim->out[n] = v;
+        n += !(s[bc] > depth);
+        const int ca = cell->at[a * FACE_CAPACITY + c];
+        rim->before[n] = c;
+        rim->after[n] = a;
+        rim->in[n] = ca;
+        rim->out[n] = v;
+        n += !(s[ca] > depth);
+        if (n > FACE_CAPACITY)
+            return false;
     }
     rim->n = n;
-    INDEX next[FACE_CAPACITY];
+    SHORT_LOOP
     for (int k = 0; k < n; ++k)
-        next[rim->before[k]] = rim->after[k];
-    if (n < 3)
-        return false;
-    const int first = rim->before[0];
-    int face = next[first], steps = 1;
-    while (face != first && steps < n) {
-        face = next[face];
-        ++steps;
+        add_face(around, rim->before[k]);
+    int faces = 0, dead = 0;
+    for (int w = 0; w < FACE_WORDS; ++w) {
+        rim->dead[w] = touched[w] & ~around[w];
+        faces += (int)popcount(around[w]);
+        dead += (int)popcount(rim->dead[w]);
     }
-    return face == first && steps == n;
+    /* Simple cycles, and Euler's formula for a disc: enough up to six triangles. More may be a ring and a disc. */
+    if (faces != n || n != gone + 2 - 2 * dead)
+        return false;
+    if (gone > 6) {
+        INDEX next[FACE_CAPACITY];
+        SHORT_LOOP
+        for (int k = 0; k < n; ++k)
+            next[rim->before[k]] = rim->after[k];
+        int face = next[rim->before[0]], steps = 1;
+        while (face != rim->before[0]) {
+            face = next[face];
+            ++steps;
+        }
+        return steps == n;
+    }
+    return true;
 }
 
 /* How deep beyond the bisector with the neighbour at x + d, times |d|, a vertex must lie to be cut off: deeper than what
@@ -248,7 +318,7 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     const int blocks = (cell->n + 7) / 8;
     REAL8 far = -level;
     for (int b = 0; b < blocks; ++b) {
-        const REAL8 s = cell->x[b] * d.s0 + cell->y[b] * d.s1 + cell->z[b] * d.s2 - level;
+        const REAL8 s = fma(cell->x[b], d.s0, fma(cell->y[b], d.s1, fma(cell->z[b], d.s2, -level)));
         cell->beyond[b] = s;
         far = s > far ? s : far;
     }
@@ -262,8 +332,8 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     if (!(farthest > depth))
         return CLIP_MISSED;
     if (seen_before)
-        for (int f = 0; f < cell->slots; ++f)
-            if (cell->labels[f] == label && cell->degree[f] > 0)
+        for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1))
+            if (cell->labels[f] == label)
                 return CLIP_MISSED;
 
     rim_t rim;
@@ -274,9 +344,12 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
         if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
             return CLIP_COLLAPSED;
     }
-    if (cell->n + rim.n - rim.gone > VERTEX_CAPACITY || (cell->spares == 0 && cell->slots == FACE_CAPACITY))
+    for (int w = 0; w < FACE_WORDS; ++w)
+        cell->alive[w] &= ~rim.dead[w];
+    const int face = first_spare(cell->alive);
+    if (face == FACE_CAPACITY)
         return CLIP_FULL;
-    const int face = cell->spares > 0 ? cell->spare[--cell->spares] : cell->slots++;
+    add_face(cell->alive, face);
     cell->labels[face] = label;
     cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
 
@@ -285,6 +358,7 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
     REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
     const REAL *s = (const REAL *)cell->beyond;
+    SHORT_LOOP
     for (int k = 0; k < rim.n; ++k) {
         const int in = rim.in[k], out = rim.out[k];
         const REAL s_in = s[in] < 0 ? s[in] : 0;
@@ -309,22 +383,8 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
             }
         }
     }
-    for (int k = 0; k < rim.n; ++k) {
-        ++cell->degree[rim.before[k]];
-        ++cell->degree[rim.after[k]];
-    }
-    for (int k = 0; k < rim.gone; ++k) {
-        const INDEX4 f = cell->faces[rim.vertices[k]];
-        const int a[3] = {f.s0, f.s1, f.s2};
-        for (int e = 0; e < 3; ++e) {
-            const int left = cell->degree[a[e]] - 1;
-            cell->degree[a[e]] = left;
-            cell->spare[cell->spares] = a[e];
-            cell->spares += left == 0;
-        }
-    }
-    cell->degree[face] = rim.n;
     /* They take the places of those that are gone, then go behind the last; places left over are filled from the end. */
+    SHORT_LOOP
     for (int k = 0; k < rim.n; ++k) {
         const int v = k < rim.gone ? rim.vertices[k] : cell->n++;
         x[v] = nx[k];
@@ -333,6 +393,7 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
         cell->faces[v] = (INDEX4)(rim.before[k], rim.after[k], face, 0);
         link_vertex(cell, v);
     }
+    SHORT_LOOP
     for (int k = rim.gone - 1; k >= rim.n; --k) {
         const int v = rim.vertices[k], last = --cell->n;
         if (v != last) {
@@ -348,9 +409,10 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     return CLIP_CUT;
 }
 
-/* Of the vertex v of face f: the face that follows counter-clockwise around f, so that vertex at[f][that] follows v. */
-inline int face_after(const cell_t *cell, int v, int f)
+/* The vertex that follows v counter-clockwise around face f. */
+inline int vertex_after(const cell_t *cell, int v, int f)
 {
     const INDEX4 g = cell->faces[v];
-    return g.s0 == f ? g.s2 : (g.s1 == f ? g.s0 : g.s1);
+    const int next = g.s0 == f ? g.s2 : (g.s1 == f ? g.s0 : g.s1);
+    return cell->at[f * FACE_CAPACITY + next];
 }
