@@ -25,9 +25,9 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
 {
     WORK_ITEM(i);
     REAL m[DIM][DIM], b[DIM], g[DIM];
-    for (int p = 0; p < DIM; ++p) {
+    EACH_AXIS(p) {
         b[p] = g[p] = 0;
-        for (int q = 0; q < DIM; ++q)
+        EACH_AXIS(q)
             m[p][q] = 0;
     }
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -35,14 +35,14 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         if (j < 0)
             continue;
         REAL d[DIM], d2 = 0;
-        for (int a = 0; a < DIM; ++a) {
+        EACH_AXIS(a) {
             d[a] = points[DIM * j + a] - points[DIM * i + a];
             d2 += d[a] * d[a];
         }
         const REAL rise = log_h[j] - log_h[i];
-        for (int p = 0; p < DIM; ++p) {
+        EACH_AXIS(p) {
             b[p] += d[p] * rise / d2;
-            for (int q = 0; q < DIM; ++q)
+            EACH_AXIS(q)
                 m[p][q] += d[p] * d[q] / d2;
         }
     }
@@ -69,7 +69,7 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
                 b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) / det;
     }
 #endif
-    for (int a = 0; a < DIM; ++a)
+    EACH_AXIS(a)
         gradient[DIM * i + a] = g[a];
 }
 
@@ -82,7 +82,7 @@ kernel void weight_offsets(const int size, global const REAL *offsets, global co
 {
     WORK_ITEM(i);
     REAL g[DIM];
-    for (int a = 0; a < DIM; ++a)
+    EACH_AXIS(a)
         g[a] = -(DIM + 2) * gradient[DIM * i + a];
 #if DIM == 2
     const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];

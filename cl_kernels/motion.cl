@@ -16,16 +16,16 @@ kernel void follow_potential(const int size, global const int *starts, global co
         if (j < 0)
             continue;
         REAL d2 = 0;
-        for (int a = 0; a < DIM; ++a) {
+        EACH_AXIS(a) {
             const REAL d = points[DIM * j + a] - points[DIM * i + a];
             d2 += d * d;
         }
         const REAL flux = face_measures[k] / sqrt(d2) * (psi[j] - psi[i]);
-        for (int a = 0; a < DIM; ++a)
+        EACH_AXIS(a)
             sum[a] += flux * face_centroids[DIM * k + a];
     }
     REAL u2 = 0;
-    for (int a = 0; a < DIM; ++a) {
+    EACH_AXIS(a) {
         const REAL ua = sum[a] / volumes[i];
         u[DIM * i + a] = ua;
         u2 += ua * ua;
@@ -41,7 +41,7 @@ kernel void relax_globally(const int size, global const REAL *summaries, const i
     WORK_ITEM(i);
     const REAL fastest = summaries[4 * slot + 3];
     const REAL alpha = fastest * limit > k ? k / fastest : limit;
-    for (int a = 0; a < DIM; ++a)
+    EACH_AXIS(a)
         u[DIM * i + a] *= alpha;
     speed[i] *= alpha;
 }
@@ -51,7 +51,7 @@ kernel void measure_displacement(const int size, global const REAL *u, global co
 {
     WORK_ITEM(i);
     REAL u2 = 0;
-    for (int a = 0; a < DIM; ++a)
+    EACH_AXIS(a)
         u2 += u[DIM * i + a] * u[DIM * i + a];
     speed[i] = sqrt(u2) / h[i];
 }
@@ -67,13 +67,13 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
     const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
     REAL d[DIM];
     REAL d2 = 0;
-    for (int c = 0; c < DIM; ++c) {
+    EACH_AXIS(c) {
         d[c] = a * lloyd[DIM * i + c] + b * correction[DIM * i + c];
         d2 += d[c] * d[c];
     }
     const REAL longest = clip * h[i];
     const REAL scale = clip > 0 && d2 > longest * longest ? longest / sqrt(d2) : 1;
-    for (int c = 0; c < DIM; ++c) {
+    EACH_AXIS(c) {
         const REAL x = points[DIM * i + c];
         REAL y = x + scale * d[c];
         if (y < lower[c])
@@ -91,6 +91,6 @@ kernel void add_momentum(const int size, const REAL factor, global const REAL *v
                          global REAL *lloyd)
 {
     WORK_ITEM(i);
-    for (int a = 0; a < DIM; ++a)
+    EACH_AXIS(a)
         lloyd[DIM * i + a] = factor * lloyd[DIM * i + a] + share * velocity[DIM * i + a];
 }

@@ -26,7 +26,7 @@ kernel void assemble(
         REAL weight = 0;
         if (j >= 0 && j != i) {
             REAL square = 0, other = -1;
-            for (int a = 0; a < DIM; ++a) {
+            EACH_AXIS(a) {
                 const REAL d = points[i * DIM + a] - points[j * DIM + a];
                 square += d * d;
             }

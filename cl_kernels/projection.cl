@@ -1,135 +1,222 @@
 #include "common/real.h"
+#include "common/blocks.h"
+#include "common/reduce.h"
 
 /* The exact derivative of the cells' volumes by the generators,
 
      dV_i/dx_j = w_ij (x_j - m_ij),   dV_i/dx_i = sum_j w_ij (m_ij - x_i),   w_ij = l_ij / d_ij,
 
-   as the operator J = d r / d x of the excess r_i = log V_i - d log h(x_i), and its transpose. m_ij is stored relative
-   to x_i. A wall is fixed: its faces contribute nothing. */
+   as the operator J = d r / d x of the excess r_i = log V_i - d log h(x_i), in displacements over h, B = J h: without
+   units. m_ij is stored relative to x_i. A wall is fixed: its faces contribute nothing. The projection solves
+   (B B^T + eps) y = b by conjugate gradients, D the operator's diagonal,
 
-inline REAL squared_distance(global const REAL *points, int i, int j)
-{
-    REAL d2 = 0;
-    for (int a = 0; a < DIM; ++a) {
-        const REAL d = points[DIM * j + a] - points[DIM * i + a];
-        d2 += d * d;
-    }
-    return d2;
-}
+     z = D^-1 r    p = z + beta p    s = B^T p = B^T z + beta s    beta = (r, z) / (r, z)_before
+     q = B s + eps p    alpha = (r, z) / (p, q)    r -= alpha q    u -= alpha s
 
-/* Per generator i: own[i] = dr_i/dx_i; for each face the derivatives across it, rows[k] = dr_i/dx_j and
-   columns[k] = dr_j/dx_i, in single precision (the operator of an inexact Newton step: memory traffic is its cost, and 1e-7
-   is far below what the step leaves); and the inverse of the diagonal of J W J^T + eps, W = h^2, which preconditions. */
-kernel void assemble_derivative(const int size, global const int *starts, global const int *neighbours,
-                                global const REAL *face_measures, global const REAL *face_centroids,
-                                global const REAL *volumes, global const REAL *points, global const REAL *gradient,
-                                global const REAL *h, global const REAL *eps, global float *rows,
-                                global float *columns, global REAL *own, global REAL *inverse_diagonal)
-{
-    WORK_ITEM(i);
-    REAL self[DIM];
-    for (int a = 0; a < DIM; ++a)
-        self[a] = 0;
-    REAL diagonal = 0;
-    const REAL volume = volumes[i];
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int j = neighbours[k];
-        if (j < 0)
-            continue;
-        const REAL w = face_measures[k] / sqrt(squared_distance(points, i, j));
-        REAL square = 0;
-        for (int a = 0; a < DIM; ++a) {
-            const REAL m = face_centroids[DIM * k + a];
-            const REAL other = w * (points[DIM * j + a] - points[DIM * i + a] - m) / volume;
-            square += other * other;
-            self[a] += w * m;
-            rows[DIM * k + a] = (float)other;
-            columns[DIM * k + a] = (float)(-w * m / volumes[j]);
-        }
-        diagonal += square * h[j] * h[j];
-    }
-    REAL square = 0;
-    for (int a = 0; a < DIM; ++a) {
-        const REAL s = self[a] / volume - DIM * gradient[DIM * i + a];
-        own[DIM * i + a] = s;
-        square += s * s;
-    }
-    inverse_diagonal[i] = 1 / (diagonal + square * h[i] * h[i] + eps[i]);
-}
+   with (p, q) = |s|^2 + (p, eps p), which is known before q is: an iteration takes two kernels, `descend` and `update`, and
+   y itself is never needed. Each group leaves its part of a sum, and all groups add the same parts in the next kernel.
 
-/* Per generator i: u = W J^T y, u_i = h_i^2 (own_i y_i + sum_j dr_j/dx_i y_j). */
-kernel void apply_transpose(const int size, global const int *starts, global const int *neighbours,
-                            global const float *columns, global const REAL *own, global const REAL *h,
-                            global const REAL *y, global REAL *u)
-{
-    WORK_ITEM(i);
-    REAL sum[DIM];
-    for (int a = 0; a < DIM; ++a)
-        sum[a] = own[DIM * i + a] * y[i];
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int j = neighbours[k];
-        if (j < 0)
-            continue;
-        const REAL yj = y[j];
-        for (int a = 0; a < DIM; ++a)
-            sum[a] += columns[DIM * k + a] * yj;
-    }
-    for (int a = 0; a < DIM; ++a)
-        u[DIM * i + a] = h[i] * h[i] * sum[a];
-}
+   Derivatives across faces are in single precision, in which the two cells of a face agree well enough; vectors in STORE, which
+   is single too where the tolerance allows it: memory traffic is the cost. Sums are in REAL. */
 
-/* Per generator i: out = J u + eps y. */
-kernel void apply_derivative(const int size, global const int *starts, global const int *neighbours,
-                             global const float *rows, global const REAL *own, global const REAL *u,
-                             global const REAL *eps, global const REAL *y, global REAL *out)
-{
-    WORK_ITEM(i);
-    REAL sum = eps[i] * y[i];
-    for (int a = 0; a < DIM; ++a)
-        sum += own[DIM * i + a] * u[DIM * i + a];
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int j = neighbours[k];
-        if (j < 0)
-            continue;
-        for (int a = 0; a < DIM; ++a)
-            sum += rows[DIM * k + a] * u[DIM * j + a];
-    }
-    out[i] = sum;
-}
+#define ROW(q) (partial + (q) * get_num_groups(0))
+#define NORM(k) ((k) & 1)
+#define GAMMA(k) (2 + ((k) & 1))
+#define CURVATURE 4
 
-/* Per generator i: eps[i] = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of
-   its neighbours. Bad cells and those around them are let off their size a little, for they are what costs quality;
-   cells that are far off give way less than those that are nearly right, which caps the largest error. A lenience or
-   bound of 0 leaves its factor out. */
-kernel void set_penalty(const int size, global const int *starts, global const int *neighbours,
-                        global const REAL *quality, global const REAL *excess, const REAL penalty,
-                        const REAL lenience, const REAL bound, global REAL *eps)
+#define PUT(q, sum)                                              \
+    {                                                            \
+        const REAL put_ = group_sum((sum), scratch);             \
+        if (get_local_id(0) == 0) ROW(q)[get_group_id(0)] = put_; \
+    }
+
+/* One row of the record per iteration. */
+#define RECORD_NORM 0
+#define RECORD_GAMMA 1
+#define RECORD_RUNNING 2
+#define RECORD_CURVATURE 3
+
+/* eps = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of its neighbours, `worst`
+   the least Q of them. Bad cells and those around them are let off their size a little, for they are what costs quality; cells
+   that are far off give way less than those that are nearly right, which caps the largest error. A lenience or bound of 0
+   leaves its factor out. */
+inline float penalty_of(float penalty, float lenience, float worst, float bound, float excess)
 {
-    WORK_ITEM(i);
-    REAL e = penalty;
+    float e = penalty;
     if (lenience > 0) {
-        REAL worst = quality[i];
-        for (int k = starts[i]; k < starts[i + 1]; ++k)
-            if (neighbours[k] >= 0)
-                worst = fmin(worst, quality[neighbours[k]]);
-        const REAL q = log(fmax(worst, R(1e-6))) / lenience;
-        e = fmin(e * (1 + q * q), fmax(R(3), penalty));
+        const float q = log(fmax(worst, 1e-6f)) / lenience;
+        e = fmin(e * (1 + q * q), fmax(3.0f, penalty));
     }
-    const REAL r = bound > 0 ? excess[i] / bound : 0;
-    eps[i] = e / (1 + r * r);
+    const float r = bound > 0 ? excess / bound : 0;
+    return e / (1 + r * r);
 }
 
-/* Per generator i: what the projection takes from the displacement, correction = -W J^T y. */
-kernel void negate(const int size, global REAL *u)
+/* Per generator i: own[i] = dr_i/dx_i h_i; for each face the derivatives across it, rows[k] = dr_i/dx_j h_j and
+   columns[k] = dr_j/dx_i h_i; eps; the inverse of the diagonal of B B^T + eps; and the start of the iteration from u = 0,
+   r = b = excess + J displacement. Lengths are divided by h before they are rounded, so that any size is in range. */
+kernel void assemble(int n, global const int *starts, global const int *neighbours, global const REAL *face_measures,
+                     global const REAL *face_centroids, global const REAL *volumes, global const REAL *points,
+                     global const REAL *gradient, global const REAL *h, global const REAL *quality,
+                     global const REAL *excess, global const REAL *displacement, const REAL penalty,
+                     const REAL lenience, const REAL bound, global float *rows, global float *columns,
+                     global STORE *own, global STORE *eps, global STORE *inverse_diagonal, global STORE *r,
+                     global STORE *z, global STORE *p, global STORE *s, global STORE *u, global REAL *partial)
 {
-    WORK_ITEM(i);
-    for (int a = 0; a < DIM; ++a)
-        u[DIM * i + a] = -u[DIM * i + a];
+    local REAL scratch[GROUP_SIZE];
+    Sum norm = SUM_ZERO, gamma = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        REAL x[DIM];
+        float self[DIM], moved = 0;
+        const REAL hi = h[i], unit = 1 / hi, content = DIM == 2 ? hi * hi : hi * hi * hi;
+        const float shrink = content / volumes[i];
+        float diagonal = 0, worst = quality[i];
+        EACH_AXIS(a)
+        {
+            x[a] = points[DIM * i + a];
+            self[a] = 0;
+        }
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            const int j = neighbours[k];
+            if (j < 0)
+                continue;
+            float d[DIM], d2 = 0, square = 0;
+            EACH_AXIS(a)
+            {
+                d[a] = (points[DIM * j + a] - x[a]) * unit;
+                d2 += d[a] * d[a];
+            }
+            const float w = (float)(face_measures[k] * (DIM == 2 ? unit : unit * unit)) / sqrt(d2);
+            const float there = w * ((float)content / (float)volumes[j]), here = w * shrink, ratio = h[j] * unit;
+            EACH_AXIS(a)
+            {
+                const float m = face_centroids[DIM * k + a] * unit, other = here * (d[a] - m);
+                moved += other * (float)(displacement[DIM * j + a] * unit);
+                square += other * other;
+                self[a] += here * m;
+                rows[DIM * k + a] = other * ratio;
+                columns[DIM * k + a] = -there * m;
+            }
+            diagonal += square * ratio * ratio;
+            worst = fmin(worst, (float)quality[j]);
+        }
+        EACH_AXIS(a)
+        {
+            const float t = self[a] - DIM * (float)(gradient[DIM * i + a] * hi);
+            moved += t * (float)(displacement[DIM * i + a] * unit);
+            diagonal += t * t;
+            own[DIM * i + a] = t;
+            s[DIM * i + a] = 0;
+            u[DIM * i + a] = 0;
+        }
+        const float e = penalty_of(penalty, lenience, worst, bound, excess[i]);
+        const REAL inverse = 1 / (diagonal + e), b = excess[i] + moved;
+        eps[i] = e;
+        inverse_diagonal[i] = inverse;
+        r[i] = b;
+        z[i] = inverse * b;
+        p[i] = 0;
+        sum_add(&norm, b * b);
+        sum_add(&gamma, inverse * b * b);
+    }
+    PUT(NORM(0), norm.value);
+    PUT(GAMMA(0), gamma.value);
 }
 
-/* Per generator i: b += r. */
-kernel void add_excess(const int size, global const REAL *excess, global REAL *b)
+/* p = z + beta p and s = B^T z + beta s. From the iteration on that finds the residual at its target, or is the last (or finds
+   anything out of order, NaN included), record[k].running is 0 and nothing changes any more, so that the host may run ahead
+   without changing the result. */
+kernel void descend(int k, int n, int most, REAL tolerance, global const int *starts, global const int *neighbours,
+                    global const float *columns, global const STORE *own, global const STORE *eps,
+                    global const STORE *z, global STORE *p, global STORE *s, global REAL *partial, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    const int first = get_global_id(0) == 0;
+    global REAL *now = record + 4 * k;
+    global const REAL *last = now - 4;
+    if (k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0)) {
+        if (first) now[RECORD_RUNNING] = 0;
+        return;
+    }
+    const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
+    const REAL start = k > 0 ? record[RECORD_NORM] : norm;
+    const int running = k < most && norm > tolerance * tolerance * start && norm <= REAL_MAX && gamma > 0;
+    if (first) {
+        now[RECORD_NORM] = norm;
+        now[RECORD_GAMMA] = gamma;
+        now[RECORD_RUNNING] = running;
+    }
+    if (!running) return;
+    const STORE beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
+    Sum curvature = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        const STORE zi = z[i], pi = zi + beta * p[i];
+        STORE sum[DIM];
+        EACH_AXIS(a)
+            sum[a] = own[DIM * i + a] * zi + beta * s[DIM * i + a];
+        for (int f = starts[i]; f < starts[i + 1]; ++f) {
+            const int j = neighbours[f];
+            if (j < 0)
+                continue;
+            const STORE zj = z[j];
+            EACH_AXIS(a)
+                sum[a] += columns[DIM * f + a] * zj;
+        }
+        p[i] = pi;
+        REAL product = (REAL)eps[i] * pi * pi;
+        EACH_AXIS(a) {
+            s[DIM * i + a] = sum[a];
+            product += (REAL)sum[a] * sum[a];
+        }
+        sum_add(&curvature, product);
+    }
+    PUT(CURVATURE, curvature.value);
+}
+
+/* u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
+kernel void update(int k, int n, global const int *starts, global const int *neighbours, global const float *rows,
+                   global const STORE *own, global const STORE *eps, global const STORE *inverse_diagonal,
+                   global const STORE *p, global const STORE *s, global STORE *u, global STORE *r, global STORE *z,
+                   global REAL *partial, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    global REAL *now = record + 4 * k;
+    if (now[RECORD_RUNNING] == 0) return;
+    const REAL curvature = total_sum(ROW(CURVATURE), scratch);
+    if (get_global_id(0) == 0) now[RECORD_CURVATURE] = curvature;
+    if (!(curvature > 0)) return;
+    const STORE alpha = now[RECORD_GAMMA] / curvature;
+    Sum norm = SUM_ZERO, gamma = SUM_ZERO;
+    for (BLOCK_LOOP(i, n)) {
+        /* One sum per axis: a single one would have to wait for itself twice as long. */
+        STORE sum[DIM], q = eps[i] * p[i];
+        EACH_AXIS(a) {
+            const STORE si = s[DIM * i + a];
+            sum[a] = own[DIM * i + a] * si;
+            u[DIM * i + a] -= alpha * si;
+        }
+        for (int f = starts[i]; f < starts[i + 1]; ++f) {
+            const int j = neighbours[f];
+            if (j < 0)
+                continue;
+            EACH_AXIS(a)
+                sum[a] += rows[DIM * f + a] * s[DIM * j + a];
+        }
+        EACH_AXIS(a)
+            q += sum[a];
+        const STORE ri = r[i] - alpha * q, zi = inverse_diagonal[i] * ri;
+        r[i] = ri;
+        z[i] = zi;
+        sum_add(&norm, (REAL)ri * ri);
+        sum_add(&gamma, (REAL)ri * zi);
+    }
+    PUT(NORM(k + 1), norm.value);
+    PUT(GAMMA(k + 1), gamma.value);
+}
+
+/* Per generator i: what the projection takes from the displacement, correction = h u. */
+kernel void put_correction(const int size, global const STORE *u, global const REAL *h, global REAL *correction)
 {
     WORK_ITEM(i);
-    b[i] += excess[i];
+    EACH_AXIS(a)
+        correction[DIM * i + a] = h[i] * u[DIM * i + a];
 }

@@ -137,8 +137,9 @@ class ProjectedMethod:
         Penalty of the projection: the smaller, the more exact the sizes.
     lenience, bound : float
         Bad cells are let off, cells far off are not; see `Projection`.
-    iterations : int
-        Of CG in each projection.
+    iterations, tolerance : int, float
+        Of CG in each projection, at most, and its relative residual: the next step sees what is left. Measured, a
+        hundredth changes neither sizes nor shapes, for a third of the iterations.
     k : float
         Bound of the displacement over h.
     emphasis, rate : float
@@ -160,6 +161,7 @@ class ProjectedMethod:
     lenience: float = 0.0
     bound: float = 0.0
     iterations: int = 30
+    tolerance: float = 1e-2
     k: float = 0.4
     emphasis: float = 20.0
     rate: float = 0.1
@@ -191,7 +193,7 @@ class ProjectedMethod:
         solution = stages.projection.project(
             t, mesh.reach, w.gradient, w.excess, mesh.lloyd, mesh.correction, mesh.quality,
             eps=self.eps, lenience=self.lenience, bound=self.bound,
-            max_iterations=self.iterations,
+            max_iterations=self.iterations, tolerance=self.tolerance,
         )  # fmt: skip
         stages.motion.measure_displacement(mesh.correction, mesh.h, mesh.correction_speed)
         return solution

@@ -5,12 +5,20 @@ The paper's Poisson step approximates this, as an approximate projection does in
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
 from .cells import Tessellation
-from .krylov import ConjugateGradient, Solution
+from .errors import SolverError
+from .krylov import Launch, Solution
+
+SINGLE = 1e-4
+"""Tolerance from which on the iteration's vectors are in single precision."""
+_ROWS = 5
+_NORM, _RUNNING, _CURVATURE = 0, 2, 3
 
 
 class Projection:
@@ -19,24 +27,43 @@ class Projection:
     J is the derivative of the excess r (see `Density`) by the generators, W = diag(h^2). With eps = 0 the excess would
     vanish to first order; eps > 0 is a penalty that trades it for a shorter displacement, and damps the modes which J
     hardly sees.
+
+    Conjugate gradients with the diagonal as a preconditioner, from y = 0, in two kernels an iteration. The host
+    enqueues as many as the last solve took and then reads their record; the iterate is frozen on the device when the
+    tolerance is met, so the result does not depend on when the host looks.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernels = engine.kernels("projection")
-        self._krylov = ConjugateGradient(engine)
-        self._n = self._m = -1
+        self._partial = engine.empty(_ROWS * engine.groups)
+        self._record = engine.empty(4 * 64)
+        self._kernels: dict[np.dtype, SimpleNamespace] = {}
+        self._vectors: dict[np.dtype, SimpleNamespace] = {}
+        self._m = -1
+        self._ahead = 8
 
-    def _reserve(self, n: int, m: int) -> None:
-        if n != self._n:
-            self._n = n
-            engine = self.engine
-            self._own, self._u = engine.empty((n, engine.dim)), engine.empty((n, engine.dim))
-            self._inverse, self._rhs, self._y, self._eps = (engine.empty(n) for _ in range(4))
+    def _kernels_in(self, store: np.dtype) -> SimpleNamespace:
+        if store not in self._kernels:
+            name = "double" if store == np.float64 else "float"
+            self._kernels[store] = self.engine.kernels("projection", {"STORE": name})
+        return self._kernels[store]
+
+    def _reserve(self, n: int, m: int, store: np.dtype, most: int) -> SimpleNamespace:
+        """Return the iteration's vectors for `n` cells; make room for `m` faces and `most` iterations."""
+        engine, d = self.engine, self.engine.dim
         if m > self._m:
             self._m = m
-            self._rows = self.engine.empty((m, self.engine.dim), np.float32)
-            self._columns = self.engine.empty((m, self.engine.dim), np.float32)
+            self._rows = engine.empty((m, d), np.float32)
+            self._columns = engine.empty((m, d), np.float32)
+        if 4 * (most + 1) > len(self._record):
+            self._record = engine.empty(4 * (most + 1))
+        v = self._vectors.get(store)
+        if v is None or len(v.r) < n:
+            v = self._vectors[store] = SimpleNamespace(
+                **{name: engine.empty((n, d), store) for name in ("own", "s", "u")},
+                **{name: engine.empty(n, store) for name in ("eps", "inverse", "r", "z", "p")},
+            )
+        return v
 
     def project(
         self,
@@ -67,43 +94,72 @@ class Projection:
         bound : float
             Excess at which a cell's eps is half; 0: the same eps for all.
         max_iterations : int
-            Of Jacobi-preconditioned CG. Forty do: the high modes that are left weigh nothing.
+        tolerance : float
+            Of the relative residual, by the recurrence. From `SINGLE` on the vectors are in single precision.
+
+        Returns
+        -------
+        Solution
+            `residual` is the recurrence's, too.
+
+        Raises
+        ------
+        SolverError
+            If a number is not finite.
         """
-        engine, k, n = self.engine, self._kernels, t.n
+        engine, n = self.engine, t.n
         real = engine.real.type
-        self._reserve(n, t.neighbours.shape[0])
-        engine.run_each(
-            k.set_penalty, n, t.starts, t.neighbours, quality, excess, real(eps), real(lenience),
-            real(bound), self._eps,
+        store = np.dtype(np.float32) if tolerance >= SINGLE else engine.real
+        v = self._reserve(n, t.neighbours.shape[0], store, max_iterations)
+        k = self._kernels_in(store)
+        faces, partial, record = (t.starts, t.neighbours), self._partial, self._record
+        engine.run_blocks(
+            k.assemble, np.int32(n), *faces, t.face_measures, t.face_centroids, t.volumes,
+            t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
+            real(bound), self._rows, self._columns, v.own, v.eps, v.inverse, v.r, v.z, v.p, v.s,
+            v.u, partial,
         )  # fmt: skip
-        engine.run_each(
-            k.assemble_derivative, n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
-            t.volumes, t.points, gradient, h, self._eps, self._rows, self._columns, self._own,
-            self._inverse,
+        descend = Launch(
+            engine, k.descend, np.int32(0), np.int32(n), np.int32(max_iterations),
+            real(tolerance), *faces, self._columns, v.own, v.eps, v.z, v.p, v.s, partial, record,
         )  # fmt: skip
-
-        def derivative(u: cla.Array, y: cla.Array, out: cla.Array) -> None:
-            engine.run_each(
-                k.apply_derivative, n, t.starts, t.neighbours, self._rows, self._own, u, self._eps,
-                y, out,
-            )  # fmt: skip
-
-        def transpose(y: cla.Array, u: cla.Array) -> None:
-            engine.run_each(
-                k.apply_transpose, n, t.starts, t.neighbours, self._columns, self._own, h, y, u
-            )
-
-        def apply(y: cla.Array, out: cla.Array) -> None:
-            transpose(y, self._u)
-            derivative(self._u, y, out)
-
-        self._y.fill(0)
-        derivative(displacement, self._y, self._rhs)
-        engine.run_each(k.add_excess, n, excess, self._rhs)
-        solution = self._krylov.solve(
-            apply, self._rhs, self._y, precondition=self._inverse, tolerance=tolerance,
-            max_iterations=max_iterations,
+        update = Launch(
+            engine, k.update, np.int32(0), np.int32(n), *faces, self._rows, v.own, v.eps,
+            v.inverse, v.p, v.s, v.u, v.r, v.z, partial, record,
         )  # fmt: skip
-        transpose(self._y, correction)
-        engine.run_each(k.negate, n, correction)
+        solution = self._iterate(descend, update, tolerance, max_iterations)
+        engine.run_each(k.put_correction, n, v.u, h, correction)
         return solution
+
+    def _iterate(self, descend: Launch, update: Launch, tolerance: float, most: int) -> Solution:
+        """Iterate until the tolerance is met, or `most` times."""
+        descend()
+        done, ahead = 0, self._ahead
+        while True:
+            end = min(done + ahead, most)
+            for k in range(done, end):
+                for launch, number in ((update, k), (descend, k + 1)):
+                    launch.set_first(number)
+                    launch()
+            rows = self._record[: 4 * (end + 1)].get().reshape(-1, 4).astype(np.float64)
+            stopped = np.flatnonzero(rows[:, _RUNNING] == 0)
+            if stopped.size:
+                break
+            done, ahead = end, 4
+        iterations = int(stopped[0])
+        self._ahead = iterations + 2
+        flat = bool(iterations and not rows[iterations - 1, _CURVATURE] > 0)
+        iterations -= flat
+        norms, curvature = rows[: iterations + 1, _NORM], rows[iterations, _CURVATURE]
+        # A curvature of zero: what is left is too small for the precision.
+        if not np.isfinite(norms).all() or (flat and curvature != 0):
+            raise SolverError(
+                "the projection got an excess, displacement or diagram that is not finite: squared "
+                f"residuals {norms}, curvature {curvature}; check the input"
+            )
+        if norms[0] == 0:
+            return Solution(0, 0.0, np.zeros(1), True, "zero right side")
+        residuals = np.sqrt(norms / norms[0])
+        converged = bool(residuals[-1] <= tolerance)
+        reason = "converged" if converged else "stagnated" if flat else "max_iterations"
+        return Solution(iterations, float(residuals[-1]), residuals, converged, reason)

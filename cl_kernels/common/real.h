@@ -32,6 +32,8 @@
 #define REAL2 CLVORO_JOIN(REAL, 2)
 #define REAL3 CLVORO_JOIN(REAL, 3)
 #define REAL4 CLVORO_JOIN(REAL, 4)
+/* EACH_AXIS(a) ...: a loop over the axes, unrolled: PoCL keeps such loops, and with them every array of DIM values in memory. */
+#define EACH_AXIS(a) _Pragma("unroll") for (int a = 0; a < DIM; ++a)
 /* A literal in the working precision: R(0.5). */
 #define R(x) ((REAL)(x))
 
