@@ -27,7 +27,7 @@ _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": 
 def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
     """Write the cells as polygons or polyhedra with their data; the settings go along in a comment.
 
-    Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces`, their number),
+    Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces_of_cell`),
     `label` (the cell's row in the result), and the vector `generator`, from the origin to the cell's generator.
     """
     diagram = result.diagram
@@ -113,14 +113,13 @@ def _polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
 def cell_data(result: Result) -> dict[str, np.ndarray]:
     """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
     diagram = result.diagram
+    count = "sides" if diagram.domain.dim == 2 else "faces_of_cell"
     return {
         "size": result.size,
         "error": result.error,
         "quality": result.quality,
         "volume": diagram.volumes,
-        "sides" if diagram.domain.dim == 2 else "faces": np.diff(diagram.neighbour_starts).astype(
-            np.int32
-        ),
+        count: np.diff(diagram.neighbour_starts).astype(np.int32),
         "label": np.arange(len(diagram), dtype=np.int32),
         "generator": in_space(result.points),
     }
