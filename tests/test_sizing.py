@@ -69,6 +69,9 @@ PLANE_FIELDS = {
     "scaled": 2 * _CIRCLE,
     "halved": _CIRCLE / 2,
     "sum": _CIRCLE + 0.01 + sizing.Expression("0.1*(y - 100)"),
+    "product": _CIRCLE * sizing.Raster(_IMAGE * 10, (-1, 100), (2, 102)) * 2,
+    "quotient": 0.5 * _CIRCLE / sizing.Expression("1 + 0.3*sin(3*x)") / 3,
+    "reciprocal": 0.02 / (0.3 + _CIRCLE),
     "minimum": sizing.minimum(_CIRCLE, 0.1, sizing.Raster(_IMAGE, (-1, 100), (2, 102))),
     "maximum": sizing.maximum(_CIRCLE * 0.5, sizing.Expression("0.05*(y > 101)"), 0.03),
 }
@@ -80,6 +83,11 @@ SPACE_FIELDS = {
     "raster slab": sizing.Raster(_rng.uniform(1, 2, (5, 1, 7)), (0.5, -2.0, 3.0), (1.5, -1.2, 4)),
     "expression": sizing.Expression("0.1 + 0.01*(x*y*z > 0 ? x : z)"),
     "minimum": sizing.minimum(sizing.Expression("0.1*z"), 0.35) * 2,
+    "segment": sizing.Distance(sizing.Segment((0.6, -2, 3), (1.4, -1.3, 4)), 0.02, slope=0.3),
+    "product": sizing.Expression("1 + 0.1*x*z")
+    * sizing.Distance(sizing.Sphere((1, -1.6, 3.5), 0.25), 0.04, slope=0.3),
+    "quotient": 0.3 / (sizing.Expression("2 + sin(5*y)") / 2 + 1),
+    "box": sizing.Distance(Box((0.7, -1.9, 3.2), (1.4, -1.4, 4.1)), 0.01, growth=1.2),
 }
 CASES = [
     *(pytest.param(PLANE, f, id=f"2D {k}") for k, f in PLANE_FIELDS.items()),
@@ -251,6 +259,50 @@ def test_parts_of_a_mixed_field_run_on_the_device(make_engine, monkeypatch):
     # |grad h| is at most the largest slope, ln 1.1 or 0.1, halved; the rest is rounding.
     bound = 0.055 + (1e-6 if engine.real == np.float64 else 0.05)
     assert np.abs(slope.get() * h.get()[:, None]).max() < bound
+
+
+def test_operators_are_those_of_numbers(double):
+    a = sizing.Expression("1 + x")
+    b = sizing.Expression("2 + y*y")
+    domain = Box((0, 0), (3, 1))
+    x = np.random.default_rng(88).uniform(domain.lower, domain.upper, (60, 2))
+    u, v = 1 + x[:, 0], 2 + x[:, 1] ** 2
+    for field, expected in (
+        (a + b, u + v),
+        (a * b, u * v),
+        (a / b, u / v),
+        (b / a, v / u),
+        (2 * a, 2 * u),
+        (a * 2, 2 * u),
+        (a / 4, u / 4),
+        (3 / a, 3 / u),
+        (1 + a, 1 + u),
+        (a * (lambda p: p[:, 1] + 1), u * (x[:, 1] + 1)),
+        ((lambda p: p[:, 1] + 1) / a, (x[:, 1] + 1) / u),
+        (np.float32(0.5) * a, 0.5 * u),
+        (a * b + a / b * 2, u * v + 2 * u / v),
+    ):
+        assert field(x) == pytest.approx(expected, rel=1e-14)
+        assert sizing.Sizing(double(2), domain, field)(x) == pytest.approx(expected, rel=1e-13)
+
+
+def test_gradient_of_a_product_is_by_the_product_rule(double):
+    engine, domain = double(2), Box((0, 0), (3, 1))
+    field = (
+        sizing.Expression("1 + x*x")
+        * sizing.Expression("0.01*(2 + y)")
+        / (sizing.Expression("1 + x*y"))
+    )
+    x = np.random.default_rng(87).uniform((0.1, 0.1), (2.9, 0.9), (60, 2))
+    scale = domain.frame[1]
+    h, slope = engine.empty(60), engine.empty((60, 2))
+    sizing.Sizing(engine, domain, field).evaluate_with_gradient(
+        _device_points(engine, domain, x), 60, h, slope
+    )
+    a, b = x.T
+    expected = [2 * a / (1 + a * a) - b / (1 + a * b), 1 / (2 + b) - a / (1 + a * b)]
+    # Differences over 1e-3 of h, of the order of 1e-4: second order in that.
+    assert slope.get().T / scale == pytest.approx(np.array(expected), abs=1e-6)
 
 
 def test_distance_to_simple_shapes():
@@ -441,6 +493,8 @@ BAD_VALUES = {
     "infinite": (sizing.Expression("x > 1 ? 1/0 : 1"), "inf"),
     "nan under a minimum": (sizing.minimum(sizing.Expression("log(1 - x)*0 + 1"), 1), "nan"),
     "raster": (sizing.Raster([[1, -1]], (0, 0), (2, 1)), "-|0"),
+    "divided by zero": (1 / sizing.Expression("x > 1 ? 0 : 1"), "inf"),
+    "negative factor": (sizing.Expression("1 - x") * sizing.Constant(2), "-"),
     "callable": (sizing.Function(lambda p: 1 - p[:, 0]), "-"),
 }
 
@@ -537,6 +591,11 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
         (lambda: _CIRCLE * 0, InputError, "factor"),
         (lambda: _CIRCLE * "2", TypeError, "multiply"),
         (lambda: _CIRCLE + "2", TypeError, "operand"),
+        (lambda: _CIRCLE / 0, InputError, "divisor"),
+        (lambda: "2" / _CIRCLE, TypeError, "operand"),
+        (lambda: 0 / _CIRCLE, InputError, "positive"),
+        (lambda: np.ones(3) * _CIRCLE, TypeError, "operand"),
+        (lambda: _CIRCLE * sizing.Expression("z"), InputError, "dimensions"),
         (lambda: sizing.minimum(), InputError, "at least one"),
         (lambda: _CIRCLE(np.zeros((2, 5))), InputError, "pass points.T"),
         (lambda: _CIRCLE(np.zeros(2)), InputError, "expected"),

@@ -181,7 +181,9 @@ def test_closed_surfaces():
     assert whole.closed
     whole.require_closed()
     # The same as separate triangles, and with triangles that have shrunk to an edge.
-    apart = sizing.Surface(vertices[triangles].reshape(-1, 3), np.arange(triangles.size).reshape(-1, 3))
+    apart = sizing.Surface(
+        vertices[triangles].reshape(-1, 3), np.arange(triangles.size).reshape(-1, 3)
+    )
     assert apart.closed
     assert sizing.Surface(vertices, np.vstack([triangles, [[3, 3, 9]]])).closed
     holed = sizing.Surface(vertices, triangles[1:], name="part")
@@ -193,7 +195,9 @@ def test_closed_surfaces():
         holed.require_closed()
     with pytest.raises(InputError, match="open"):
         holed.contains([(0, 0, 0)])
-    fins = sizing.Surface(vertices, np.vstack([triangles, [[a, b, 30]], [[a, b, 30]], [[a, b, 30]]]))
+    fins = sizing.Surface(
+        vertices, np.vstack([triangles, [[a, b, 30]], [[a, b, 30]], [[a, b, 30]]])
+    )
     with pytest.raises(InputError, match="odd number of triangles"):
         fins.require_closed()
 
@@ -254,7 +258,7 @@ def test_crossing_in_one_plane_and_at_common_corners():
         (flat, np.array([[1, 0, 0], [0, 1, 0], [1, 1, 0]]), False),  # neighbours in a plane
         (flat, np.array([[1, 0, 0], [0, 1, 0], [0.1, 0.1, 0]]), True),  # folded over
         (flat, np.array([[1, 0, 0], [0, 1, 0], [1, 1, 0.5]]), False),  # neighbours at an angle
-        (flat, flat + (2, 0, 0), False),
+        (flat, flat + np.array([2, 0, 0]), False),
         (flat, np.array([[0, 0, 0], [1, 1, 0.5], [1, 1, -0.5]]), True),  # cuts from a common corner
         (flat, np.array([[0, 0, 0], [-1, -1, 0.5], [-1, -1, -0.5]]), False),
         (flat, np.array([[0.2, 0.2, 0], [1, 1, 0.5], [0, 1, 0.5]]), False),  # stands on it
@@ -282,7 +286,9 @@ def test_self_intersection_names_two_triangles():
                     expected.append([p, q])
     assert pairs.tolist() == expected
     p, q = expected[0]
-    with pytest.raises(InputError, match=rf"parts crosses itself: triangles {p}, .* and {q}, .*more"):
+    with pytest.raises(
+        InputError, match=rf"parts crosses itself: triangles {p}, .* and {q}, .*more"
+    ):
         surface.check()
 
 

@@ -4,6 +4,7 @@ from .bind import bind
 from .distance import Distance
 from .expression import Expression
 from .field import Constant, Field, Function, as_field, maximum, minimum
+from .graded import Graded
 from .raster import Raster
 from .shapes import Circle, Polygon, Polyline, Segment, Sphere
 from .stage import Sizing
@@ -16,6 +17,7 @@ __all__ = [
     "Expression",
     "Field",
     "Function",
+    "Graded",
     "Polygon",
     "Polyline",
     "Raster",

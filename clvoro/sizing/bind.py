@@ -12,6 +12,7 @@ from ..errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
+    from .._program import Engine
     from ..domain import Box
     from .field import Field
 
@@ -27,10 +28,13 @@ class Binder:
         The device sees x' = (x - origin) / scale and h' = h / scale.
     real : numpy.dtype
         Precision in which the device reads the numbers.
+    domain : Box
+    engine : Engine or None
+        Where a field that has to be computed first is computed; None for the default device.
     """
 
-    def __init__(self, domain: Box, real: np.dtype):
-        self.dim = domain.dim
+    def __init__(self, domain: Box, real: np.dtype, engine: Engine | None = None):
+        self.dim, self.domain, self.engine = domain.dim, domain, engine
         self.origin, self.scale = domain.frame
         self.real = np.dtype(real)
         self.statements: list[str] = []
@@ -69,7 +73,9 @@ class Binder:
         return np.clip(packed, -largest, largest).astype(self.real)
 
 
-def bind(field: Field, domain: Box, real: DTypeLike = np.float64) -> tuple[str, np.ndarray]:
+def bind(
+    field: Field, domain: Box, real: DTypeLike = np.float64, engine: Engine | None = None
+) -> tuple[str, np.ndarray]:
     """Return `field` as OpenCL for the normalised coordinates of `domain`.
 
     Geometry is converted to those coordinates in float64, so that float32 is as accurate far from
@@ -81,6 +87,9 @@ def bind(field: Field, domain: Box, real: DTypeLike = np.float64) -> tuple[str, 
     domain : Box
     real : dtype
         The engine's precision.
+    engine : Engine, optional
+        Where a field that has to be computed first (`Graded`) is computed; by default a new one on
+        the default device.
 
     Returns
     -------
@@ -97,7 +106,7 @@ def bind(field: Field, domain: Box, real: DTypeLike = np.float64) -> tuple[str, 
         If the field is of another dimension than the domain, or has no device form.
     """
     field.check_dim(domain.dim)
-    binder = Binder(domain, np.dtype(real))
+    binder = Binder(domain, np.dtype(real), engine)
     result = field._emit(binder)
     if binder._stored >= 2**31:
         raise InputError(

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..domain import Box
 from ..errors import InputError, InputTypeError
-from .field import Field, positive
+from .field import Field, positive, slope_of
 from .shapes import Circle, Polygon, Polyline, Segment
 from .surface import Surface, box_surface
 from .tree import Tree
@@ -80,17 +80,7 @@ class Distance(Field):
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")
-        if (growth is None) == (slope is None):
-            raise InputError(
-                f"Distance got growth={growth} and slope={slope}, expected exactly one of them"
-            )
-        if growth is not None:
-            if positive("Distance growth", growth) < 1:
-                raise InputError(f"Distance growth is {growth}, expected at least 1, such as 1.2")
-            slope = math.log(growth)
-        elif not (isinstance(slope, Real) and 0 <= slope < math.inf):
-            raise InputError(f"Distance slope is {slope!r}, expected a finite number >= 0")
-        self.slope = float(slope)
+        self.slope = slope_of("Distance", growth, slope)
         self.h_min = positive("Distance h_min", h_min)
         if not (isinstance(h_max, Real) and h_max >= self.h_min):
             raise InputError(f"Distance h_max is {h_max!r}, expected at least h_min = {self.h_min}")
@@ -173,7 +163,9 @@ class Distance(Field):
                 call = f"size_nearest_few(x, data + {at}, {tree.n}, {kind}, {best2})"
             else:
                 at = binder.store(tree.boxes, items)
-                call = f"size_nearest_tree(x, data + {at}, {tree.n}, {tree.levels}, {kind}, {best2})"
+                call = (
+                    f"size_nearest_tree(x, data + {at}, {tree.n}, {tree.levels}, {kind}, {best2})"
+                )
             best2 = binder.variable(call)
         return binder.variable(f"size_law({best2}, data + {law})")
 

@@ -20,8 +20,11 @@ class Field:
     """A size field h(x): called with points it gives sizes.
 
     Every field is evaluated on the host by calling it, in float64: slow, and the reference. Fields
-    with ``on_device`` true are also turned into OpenCL by `bind`. Fields combine: ``2 * f``, ``f /
-    2``, ``f + g``, ``f + 0.01``, `minimum`, `maximum`.
+    with ``on_device`` true are also turned into OpenCL by `bind`. Fields combine with each other,
+    with positive numbers and with callables: ``f + g``, ``f * g``, ``f / g``, ``2 * f``, ``1 / f``,
+    `minimum`, `maximum`. The combination is itself one function on the device, so that the gradient
+    of h is taken of it as a whole. Numbers are multiplied and divided as they stand, in the unit of
+    the coordinates: one of the factors is a plain number, such as a weight from a `Raster`.
 
     Attributes
     ----------
@@ -93,24 +96,38 @@ class Field:
         """Add the field to `binder` and return the name of the variable that holds h'."""
         raise NotImplementedError
 
-    def __mul__(self, factor: object) -> Field:
-        if not isinstance(factor, Real):
-            return NotImplemented
-        return Scaled(self, float(factor))
+    def __mul__(self, other: object) -> Field:
+        if isinstance(other, Real):
+            return Scaled(self, float(other))
+        return self._combine("*", self, other)
 
-    __rmul__ = __mul__
+    def __rmul__(self, other: object) -> Field:
+        if isinstance(other, Real):
+            return Scaled(self, float(other))
+        return self._combine("*", other, self)
 
-    def __truediv__(self, divisor: object) -> Field:
-        if not isinstance(divisor, Real):
-            return NotImplemented
-        return Scaled(self, 1.0 / positive("a divisor of a size field", divisor))
+    def __truediv__(self, other: object) -> Field:
+        if isinstance(other, Real):
+            return Scaled(self, 1.0 / positive("a divisor of a size field", other))
+        return self._combine("/", self, other)
+
+    def __rtruediv__(self, other: object) -> Field:
+        return self._combine("/", other, self)
 
     def __add__(self, other: object) -> Field:
-        if not isinstance(other, (Field, Real)) and not callable(other):
-            return NotImplemented
-        return Combined("+", self, as_field(other))
+        return self._combine("+", self, other)
 
-    __radd__ = __add__
+    def __radd__(self, other: object) -> Field:
+        return self._combine("+", other, self)
+
+    @staticmethod
+    def _combine(operation: str, *operands: object) -> Field:
+        if not all(isinstance(f, (Field, Real)) or callable(f) for f in operands):
+            return NotImplemented
+        return Combined(operation, *map(as_field, operands))
+
+    # NumPy leaves operators between its arrays and a field to the field, which then refuses them.
+    __array_ufunc__ = None
 
 
 class Constant(Field):
@@ -208,15 +225,18 @@ class Scaled(Field):
         return f"{self.factor!r} * {self.field!r}"
 
 
+# With h' = h / scale on the device, (h g)' = h' (g' scale) and (h / g)' = h' / (g' scale).
 _COMBINE = {
     "+": (np.add, "{} + {}"),
+    "*": (np.multiply, "{} * ({} * data[{scale}])"),
+    "/": (np.divide, "{} / ({} * data[{scale}])"),
     "min": (np.minimum, "size_min({}, {})"),
     "max": (np.maximum, "size_max({}, {})"),
 }
 
 
 class Combined(Field):
-    """Two or more fields under one of ``+``, ``min``, ``max``."""
+    """Two or more fields under one of ``+``, ``*``, ``/``, ``min``, ``max``, from left to right."""
 
     def __init__(self, operation: str, *fields: Field):
         dims = {f.dim for f in fields} - {None}
@@ -243,19 +263,21 @@ class Combined(Field):
         combine = _COMBINE[self.operation][0]
         result = self.fields[0]._evaluate(points)
         for f in self.fields[1:]:
-            result = combine(result, f._evaluate(points))
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                result = combine(result, f._evaluate(points))
         return result
 
     def _emit(self, binder: Binder) -> str:
         template = _COMBINE[self.operation][1]
         name = self.fields[0]._emit(binder)
+        scale = binder.store(binder.scale) if "scale" in template else None
         for f in self.fields[1:]:
-            name = binder.variable(template.format(name, f._emit(binder)))
+            name = binder.variable(template.format(name, f._emit(binder), scale=scale))
         return name
 
     def __repr__(self) -> str:
-        if self.operation == "+":
-            return "(" + " + ".join(map(repr, self.fields)) + ")"
+        if self.operation in "+*/":
+            return "(" + f" {self.operation} ".join(map(repr, self.fields)) + ")"
         return f"{self.operation}imum({', '.join(map(repr, self.fields))})"
 
 
@@ -310,3 +332,19 @@ def positive(what: str, value: object) -> float:
     if not (value > 0 and math.isfinite(value)):
         raise InputError(f"{what} is {value!r}, expected a positive, finite number")
     return float(value)
+
+
+def slope_of(what: str, growth: object, slope: object) -> float:
+    """Return dh/dx from exactly one of a growth rate per cell, ln(growth), and itself."""
+    if (growth is None) == (slope is None):
+        raise InputError(
+            f"{what} got growth={growth} and slope={slope}, expected exactly one of them"
+        )
+    if growth is not None:
+        rate = positive(f"{what} growth", growth)
+        if rate < 1:
+            raise InputError(f"{what} growth is {growth}, expected at least 1, such as 1.2")
+        return math.log(rate)
+    if not (isinstance(slope, Real) and 0 <= slope < math.inf):
+        raise InputError(f"{what} slope is {slope!r}, expected a finite number >= 0")
+    return float(slope)

@@ -63,7 +63,7 @@ class Sizing:
         self._gradient_step = gradient_step
         self.prelude, self.data, self._kernels = None, None, None
         if self.field.on_device:
-            self.prelude, numbers = bind(self.field, domain, engine.real)
+            self.prelude, numbers = bind(self.field, domain, engine.real, engine)
             self.data = engine.upload(numbers)
             self._box = engine.upload(self._walls.ravel())
             self._bad = engine.upload([_NONE_BAD], np.int32)

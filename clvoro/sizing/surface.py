@@ -303,7 +303,11 @@ class Surface:
         corners = ((self.corners - origin) / scale).astype(real)
         tree = Tree(corners.min(axis=1), corners.max(axis=1))
         corners = corners[tree.order].astype(float)
-        a, side1, side2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        a, side1, side2 = (
+            corners[:, 0],
+            corners[:, 1] - corners[:, 0],
+            corners[:, 2] - corners[:, 0],
+        )
         normal = np.cross(side1, side2)
         double_area = np.linalg.norm(normal, axis=1)
         longest = np.maximum.reduce(
