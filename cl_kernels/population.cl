@@ -1,12 +1,27 @@
 #include "common/real.h"
 
-/* Insertion and deletion of generators, in 2D: the paper's 2.3.1, where the lattice asks for it.
+/* Insertion and deletion of generators: the paper's 2.3.1, where the lattice (in 2D) and the count ask for it.
 
    A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell (charge -1
    and +1). One that sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the
    5-sided one goes. One that has come to a wall ends there. The same moves carry the count of generators to what the
    size field asks for. Sites act at the same time only if they are several rings of cells apart. */
 
+#if DIM == 2
+#define REGULAR_FACES 6
+#define FACE_WEIGHT R(0.2)
+#else
+#define REGULAR_FACES 14
+#define FACE_WEIGHT R(0.05)
+#endif
+
+/* A word that orders sites by magnitude, ties by index; 0 is no site. */
+inline ulong site_key(REAL magnitude, int i)
+{
+    return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
+}
+
+#if DIM == 2
 #define LATTICE_2 R(1.1547005383792515) /* (neighbour distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
 
 /* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5 at
@@ -55,12 +70,6 @@ kernel void average_strain(const int size, global const int *starts, global cons
     mean[i] = sum;
 }
 
-/* A word that orders sites by magnitude, ties by index; 0 is no site. */
-inline ulong site_key(REAL magnitude, int i)
-{
-    return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
-}
-
 /* Per cell i of negative charge: the pull s = b.S.b - t.S.t on its pair with the neighbour of positive charge where |s| is
    largest, t from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if wanted,
    come first: they can go altogether. So do those of a cell with a charge of 2, the worst cells that there are. */
@@ -97,6 +106,8 @@ kernel void score_pairs(const int size, global const int *starts, global const i
     pull[i] = best;
     keys[i] = partner < 0 ? 0 : site_key(rank, i);
 }
+
+#endif
 
 /* Per generator i: the largest key in itself and its neighbours. */
 kernel void spread_keys(const int size, global const int *starts, global const int *neighbours, global const ulong *keys,
@@ -155,6 +166,7 @@ kernel void flag_sites(const int size, global const ulong *chosen, global int *f
     flags[i] = chosen[i] != 0;
 }
 
+#if DIM == 2
 /* What a pair does to the count of generators, 1 if it is split, -1 if it is deleted. Thresholds give way as the count needs:
    shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A pair with one cell at a wall ends there, unless the
    strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. An inner cell of four
@@ -266,21 +278,49 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
     busy[i] = 1;
 }
 
+#endif
+
 /* Per generator i: the excess of its cell, in the sense of `sign`, as a site to split (sign > 0) or to delete. Cells of few
-   sides go, those of many are split, if their excess is alike. Above 4 all are alike. */
+   faces go, those of many are split, if their excess is alike. Above 4 all are alike. */
 kernel void score_excess(const int size, global const int *starts, global const REAL *excess, const REAL sign,
                          global ulong *keys)
 {
     WORK_ITEM(i);
-    const REAL sides = starts[i + 1] - starts[i];
-    const REAL magnitude = 2 + sign * (excess[i] + R(0.2) * (sides - 6));
+    const REAL faces = starts[i + 1] - starts[i];
+    const REAL magnitude = 2 + sign * (excess[i] + FACE_WEIGHT * (faces - REGULAR_FACES));
     keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), i) : 0;
 }
+
+/* The direction in which a cell is longest, of length 1, from its second moments. */
+#if DIM == 2
+inline void longest_axis(global const REAL *moments, REAL *axis)
+{
+    const REAL angle = atan2(2 * moments[1], moments[0] - moments[2]) / 2;
+    axis[0] = cos(angle);
+    axis[1] = sin(angle);
+}
+#else
+inline void longest_axis(global const REAL *moments, REAL *axis)
+{
+    /* Powers of the matrix, from the coordinate axis along which it is longest; a nearly round cell has no axis that
+       matters. */
+    const REAL xx = moments[0], xy = moments[1], xz = moments[2], yy = moments[3], yz = moments[4], zz = moments[5];
+    REAL3 v = (REAL3)(xx >= yy && xx >= zz, yy > xx && yy >= zz, zz > xx && zz > yy);
+    for (int k = 0; k < 12; ++k) {
+        v = (REAL3)(xx * v.s0 + xy * v.s1 + xz * v.s2, xy * v.s0 + yy * v.s1 + yz * v.s2,
+                    xz * v.s0 + yz * v.s1 + zz * v.s2);
+        v /= sqrt(dot(v, v));
+    }
+    axis[0] = v.s0;
+    axis[1] = v.s1;
+    axis[2] = v.s2;
+}
+#endif
 
 /* Per chosen site: split the cell across its longest axis, or delete it. */
 kernel void mark_excess(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
                         global const REAL *covariances, global const REAL *volumes, global int *kept,
-                        global REAL2 *shifts, global int *born, global REAL2 *births)
+                        global REAL *shifts, global int *born, global REAL *births)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -289,41 +329,48 @@ kernel void mark_excess(const int size, global const ulong *chosen, const REAL s
         kept[i] = 0;
         return;
     }
-    const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
-    const REAL angle = atan2(2 * xy, xx - yy) / 2;
-    const REAL2 axis = sqrt(volumes[i]) / 4 * (REAL2)(cos(angle), sin(angle));
-    const REAL2 centre = (REAL2)(offsets[2 * i], offsets[2 * i + 1]);
+    REAL axis[DIM];
+    longest_axis(covariances + DIM * (DIM + 1) / 2 * i, axis);
+    const REAL quarter = (DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i])) / 4;
     born[i] = 1;
-    shifts[i] = centre + axis;
-    births[i] = centre - axis;
+    for (int a = 0; a < DIM; ++a) {
+        shifts[DIM * i + a] = offsets[DIM * i + a] + quarter * axis[a];
+        births[DIM * i + a] = offsets[DIM * i + a] - quarter * axis[a];
+    }
 }
 
 /* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
    generators go behind all kept rows, with new labels. */
 kernel void apply_changes(const int size, global const int *place, global const int *birth_place,
                           const int next_label, const REAL4 box_lower, const REAL4 box_upper,
-                          global const REAL2 *points, global const int *labels, global const REAL2 *velocity,
-                          global const ulong *signatures, global const REAL *ever, global const REAL2 *shifts,
-                          global const REAL2 *births, global REAL2 *new_points, global int *new_labels,
-                          global REAL2 *new_velocity, global ulong *new_signatures, global REAL *new_ever)
+                          global const REAL *points, global const int *labels, global const REAL *velocity,
+                          global const ulong *signatures, global const REAL *ever, global const REAL *shifts,
+                          global const REAL *births, global REAL *new_points, global int *new_labels,
+                          global REAL *new_velocity, global ulong *new_signatures, global REAL *new_ever)
 {
     WORK_ITEM(i);
-    const REAL2 lower = (REAL2)(box_lower.s0, box_lower.s1), upper = (REAL2)(box_upper.s0, box_upper.s1);
+    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
+    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
     if (place[i + 1] > place[i]) {
         const int p = place[i];
-        const REAL2 shift = shifts[i];
-        const bool moved = shift.s0 != 0 || shift.s1 != 0;
-        new_points[p] = clamp(points[i] + shift, lower, upper);
+        bool moved = false;
+        for (int a = 0; a < DIM; ++a)
+            moved |= shifts[DIM * i + a] != 0;
+        for (int a = 0; a < DIM; ++a) {
+            new_points[DIM * p + a] = clamp(points[DIM * i + a] + shifts[DIM * i + a], lower[a], upper[a]);
+            new_velocity[DIM * p + a] = moved ? 0 : velocity[DIM * i + a];
+        }
         new_labels[p] = labels[i];
-        new_velocity[p] = moved ? (REAL2)(0, 0) : velocity[i];
         new_signatures[p] = signatures[i];
         new_ever[p] = ever[i];
     }
     if (birth_place[i + 1] > birth_place[i]) {
         const int q = place[size] + birth_place[i];
-        new_points[q] = clamp(points[i] + births[i], lower, upper);
+        for (int a = 0; a < DIM; ++a) {
+            new_points[DIM * q + a] = clamp(points[DIM * i + a] + births[DIM * i + a], lower[a], upper[a]);
+            new_velocity[DIM * q + a] = 0;
+        }
         new_labels[q] = next_label + birth_place[i];
-        new_velocity[q] = 0;
         new_signatures[q] = 0;
         new_ever[q] = 1;
     }

@@ -33,7 +33,7 @@ LARGEST_CHANGE = 0.05
 
 @dataclass(frozen=True)
 class Population:
-    """Generators, on the device: points and velocity (n, 2), labels, signatures and ever (n,)."""
+    """Generators, on the device: points and velocity (n, d), labels, signatures and ever (n,)."""
 
     points: cla.Array
     labels: cla.Array
@@ -45,7 +45,7 @@ class Population:
 
 
 class PopulationControl:
-    """Decide where generators are inserted and deleted, and do it. 2D."""
+    """Decide where generators are inserted and deleted, and do it: for the lattice (in 2D) and for the count."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -91,7 +91,7 @@ class PopulationControl:
             First label for the new ones.
         nuclei : int
         climb : bool
-            Without it only the count is corrected, to the last generator.
+            2D only. Without it only the count is corrected, to the last generator.
         theta : float
             Strain from which on a pair climbs; above `THETA`, pairs at walls are left alone.
 
@@ -247,7 +247,7 @@ class PopulationControl:
         if m == 0 or (deleted == 0 and inserted == 0):
             return None
         new = Population(
-            engine.empty((m, 2)), engine.empty(m, np.int32), engine.empty((m, 2)),
+            engine.empty((m, engine.dim)), engine.empty(m, np.int32), engine.empty((m, engine.dim)),
             engine.empty(m, np.uint64), engine.empty(m), inserted, deleted,
         )  # fmt: skip
         engine.run_each(
@@ -274,7 +274,7 @@ class _Marks:
         kept = engine.zeros(n + 1, np.int32)
         kept.fill(1)
         return cls(
-            kept, engine.zeros((n, 2)), engine.zeros(n + 1, np.int32), engine.zeros((n, 2)),
+            kept, engine.zeros((n, engine.dim)), engine.zeros(n + 1, np.int32), engine.zeros((n, engine.dim)),
             engine.zeros(n, np.uint64),
         )  # fmt: skip
 

@@ -31,14 +31,23 @@ class Refinement:
             Size on the new level, at the generators of `t`.
         """
         engine, k, n = self.engine, self._kernels, t.n
-        firsts = engine.empty(n + 1, np.int32)
-        engine.run_each(
-            k.count_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, firsts
-        )
-        self._scan.exclusive(firsts, firsts, n)
+        firsts = self._children(t)
         finer = engine.empty((n + int(firsts[n].get()), engine.dim))
         engine.run_each(
             k.place_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points, h,
             np.int32(n), *box.device_corners(engine.real), firsts, finer,
         )  # fmt: skip
         return finer
+
+    def count(self, t: Tessellation) -> int:
+        """Return how many generators `refine` would make of `t`."""
+        return t.n + int(self._children(t)[t.n].get())
+
+    def _children(self, t: Tessellation) -> cla.Array:
+        """Return the prefix sums (n + 1,) int32 of how many new generators each one brings."""
+        firsts = self.engine.empty(t.n + 1, np.int32)
+        self.engine.run_each(
+            self._kernels.count_children, t.n, t.starts, t.neighbours, t.face_measures, t.volumes, firsts
+        )  # fmt: skip
+        self._scan.exclusive(firsts, firsts, t.n)
+        return firsts
