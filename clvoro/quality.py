@@ -99,8 +99,9 @@ def measure_mesh(diagram: Diagram) -> Measures:
     line[walls, normal_axis] = 2 * side * gap
     distance = np.linalg.norm(line, axis=1)
     meeting = points[owner] + 0.5 * line
-    with np.errstate(divide="ignore"):
-        skewness = np.linalg.norm(middles - meeting, axis=1) / distance
+    offset = np.linalg.norm(middles - meeting, axis=1)
+    skewness = np.where(offset > 0, np.inf, 0.0)  # stays where the distance is none
+    np.divide(offset, distance, out=skewness, where=distance > 0)
 
     angle = np.zeros(len(line))
     angle[inner] = _angles(line[inner], centroids[neighbour[inner]] - centroids[owner[inner]])

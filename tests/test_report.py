@@ -121,7 +121,7 @@ def test_side_shares_are_complete(result):
 
 
 def test_unknown_colour_is_named(result):
-    with pytest.raises(InputError, match=r"'hue'.*error, quality, size, sides"):
+    with pytest.raises(InputError, match=r"'hue'.*error, quality, size, sides, skewness"):
         plot_cells(result, "hue")
 
 

@@ -22,6 +22,8 @@ Picture = tuple[str, str, Callable[[], Any]]
 
 FINE_MESH = 10_000
 """From so many cells on the mesh itself shows the size field."""
+MANY_SOLID_CELLS = 20_000
+"""From so many cells on a 3D mesh is shown closer, too."""
 
 
 def pictures_of(
@@ -112,7 +114,7 @@ def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
         ),
         ("sides", f"Cells by number of faces ({name}).", slices("sides")),
     ]
-    if len(main.points) > 20_000:
+    if len(main.points) > MANY_SOLID_CELLS:
         pictures.append(
             ("closer", f"Where the cells are smallest ({name}).", lambda: _closer_slice(main))
         )
