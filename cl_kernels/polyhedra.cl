@@ -87,108 +87,133 @@ inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
     return (int2)(axis_bin(x - w, origin, inverse, side), axis_bin(x + w, origin, inverse, side));
 }
 
+/* Add those of the items begin .. end - 1 to the batch that may cut the cell; when it is full, clip by it.
+   Returns FLAG_* or 0. */
+inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
+                      const search_t *in)
+{
+    while (begin < end) {
+        const int stop = min(end, begin + BATCH - batch->n);
+        const REAL limit = 4 * cell->reach2;
+        int n = batch->n;
+        SHORT_LOOP
+        for (int q = begin; q < stop; ++q) {
+            const REAL dx = in->binned[3 * q] - x.s0;
+            const REAL dy = in->binned[3 * q + 1] - x.s1;
+            const REAL dz = in->binned[3 * q + 2] - x.s2;
+            const REAL d2 = dx * dx + dy * dy + dz * dz;
+            batch->places[n] = q;
+            batch->d2[n] = d2;
+            n += d2 < limit && q != own;
+        }
+        batch->n = n;
+        begin = stop;
+        if (n == BATCH) {
+            const int flag = clip_by_batch(cell, x, batch, per_shell, warm, in);
+            if (flag != 0)
+                return flag;
+        }
+    }
+    return 0;
+}
+
+/* A grid that is open: which, where it was left (layer, row, part of the row, bin), and whether its own bin was opened
+   for the inner cube. */
+typedef struct {
+    int grid, iz, iy, part, bin;
+    bool inside;
+} open_grid_t;
+
 /* Clip the cell of the generator at place `own` by every generator in the bins that the cube of half-width w covers
    and the cube of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
    the farthest vertex. Returns FLAG_* or 0. */
 inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
 {
-    /* The grids that are open, from the root down, and where each was left: row, part of the row, bin. */
-    int grids[MAX_DEPTH], rows[MAX_DEPTH], parts[MAX_DEPTH], bins_at[MAX_DEPTH];
-    bool inside[MAX_DEPTH]; /* was the grid's own bin opened for the inner cube? */
+    open_grid_t open[MAX_DEPTH]; /* from the root down */
     const REAL per_shell = SHELLS / (6 * w * w);
     batch_t batch;
     batch.n = 0;
     int depth = 0;
-    grids[0] = rows[0] = parts[0] = 0;
-    bins_at[0] = -1;
-    inside[0] = inner >= 0;
+    open[0].grid = open[0].part = 0;
+    open[0].iz = open[0].iy = open[0].bin = -1;
+    open[0].inside = inner >= 0;
     while (depth >= 0) {
-        const FRAME frame = in->grid_frames[grids[depth]];
-        const int4 shape = in->grid_shapes[grids[depth]];
+        const open_grid_t here = open[depth];
+        const FRAME frame = in->grid_frames[here.grid];
+        const int4 shape = in->grid_shapes[here.grid];
         const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
         const int2 ys = bin_range(x.s1, w, frame.s1, inverse, shape.s2);
         const int2 zs = bin_range(x.s2, w, frame.s2, inverse, shape.s3);
-        const int height = ys.s1 - ys.s0 + 1, row_count = height * (zs.s1 - zs.s0 + 1);
         /* What the inner cube has taken. */
         int2 done_x = (int2)(0, -1), done_y = done_x, done_z = done_x;
-        if (inside[depth]) {
+        if (here.inside) {
             done_x = bin_range(x.s0, inner, frame.s0, inverse, shape.s1);
             done_y = bin_range(x.s1, inner, frame.s1, inverse, shape.s2);
             done_z = bin_range(x.s2, inner, frame.s2, inverse, shape.s3);
         }
-        int row = rows[depth], part = parts[depth], at = bins_at[depth];
         int child = -1;
-        for (; row < row_count; ++row, part = 0, at = -1) {
-            const int iz = zs.s0 + row / height, iy = ys.s0 + row % height;
-            const REAL away_y = row_distance(x.s1, frame.s1, edge, iy);
+        open_grid_t next = here; /* where to go on */
+        int iy = here.iy, part = here.part, at = here.bin;
+        for (int iz = max(here.iz, zs.s0); iz <= zs.s1 && child < 0; ++iz, iy = -1) {
             const REAL away_z = row_distance(x.s2, frame.s2, edge, iz);
-            const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
-            if (!(left2 > 0))
-                continue;
-            const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;
-            const int2 xs = bin_range(x.s0, span, frame.s0, inverse, shape.s1);
-            /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
-            const bool row_done = iy >= done_y.s0 && iy <= done_y.s1 && iz >= done_z.s0 && iz <= done_z.s1;
-            global const int2 *row_bins = in->bins + shape.s0 + (iz * shape.s2 + iy) * shape.s1;
-            while (part < 3 && child < 0) {
-                const int from = part == 0 ? xs.s0 : (part == 1 ? max(xs.s0, done_x.s0) : max(xs.s0, done_x.s1 + 1));
-                const int to = !row_done || part == 2 ? xs.s1 : min(xs.s1, part == 0 ? done_x.s0 - 1 : done_x.s1);
-                const int bin = max(at, from);
-                if (bin > to) {
-                    part = row_done ? part + 1 : 3;
-                    at = -1;
+            const bool layer_done = iz >= done_z.s0 && iz <= done_z.s1;
+            for (iy = max(iy, ys.s0); iy <= ys.s1; ++iy, part = 0, at = -1) {
+                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy);
+                const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
+                if (!(left2 > 0))
                     continue;
-                }
-                /* A run of leaves beside each other is a run of items. */
-                const int2 first = row_bins[bin];
-                int2 end = row_bins[to + 1];
-                at = to + 1;
-                if (first.s1 != end.s1) {
-                    /* There are divided bins ahead: one bin at a time. */
-                    end = row_bins[bin + 1];
-                    at = bin + 1;
+                const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;
+                const int2 xs = bin_range(x.s0, span, frame.s0, inverse, shape.s1);
+                global const int2 *row_bins = in->bins + shape.s0 + (iz * shape.s2 + iy) * shape.s1;
+                /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
+                const bool row_done = layer_done && iy >= done_y.s0 && iy <= done_y.s1;
+                while (part < 3) {
+                    int from = xs.s0, to = xs.s1;
+                    if (row_done) {
+                        from = part == 0 ? from : max(from, part == 1 ? done_x.s0 : done_x.s1 + 1);
+                        to = part == 2 ? to : min(to, part == 0 ? done_x.s0 - 1 : done_x.s1);
+                    }
+                    from = max(at, from);
+                    if (from > to) {
+                        part = row_done ? part + 1 : 3;
+                        at = -1;
+                        continue;
+                    }
+                    /* A run of leaves beside each other is a run of items. */
+                    const int2 first = row_bins[from];
+                    int2 end = row_bins[to + 1];
+                    at = to + 1;
                     if (first.s1 != end.s1) {
-                        child = first.s1;
-                        inside[depth + 1] = part == 1 && row_done;
-                        end.s0 = first.s0;
+                        /* There are divided bins ahead: one bin at a time. */
+                        end = row_bins[from + 1];
+                        at = from + 1;
+                        if (first.s1 != end.s1) {
+                            child = first.s1;
+                            break;
+                        }
                     }
+                    if (part == 1 && row_done)
+                        continue;
+                    const int flag = take_items(cell, x, own, first.s0, end.s0, &batch, per_shell, warm, in);
+                    if (flag != 0)
+                        return flag;
                 }
-                if (part == 1 && row_done)
-                    end.s0 = first.s0;
-                int begin = first.s0;
-                while (begin < end.s0) {
-                    const int stop = min(end.s0, begin + BATCH - batch.n);
-                    const REAL limit = 4 * cell->reach2;
-                    int n = batch.n;
-                    for (int q = begin; q < stop; ++q) {
-                        const REAL dx = in->binned[3 * q] - x.s0;
-                        const REAL dy = in->binned[3 * q + 1] - x.s1;
-                        const REAL dz = in->binned[3 * q + 2] - x.s2;
-                        const REAL d2 = dx * dx + dy * dy + dz * dz;
-                        batch.places[n] = q;
-                        batch.d2[n] = d2;
-                        n += d2 < limit && q != own;
-                    }
-                    batch.n = n;
-                    begin = stop;
-                    if (n == BATCH) {
-                        const int flag = clip_by_batch(cell, x, &batch, per_shell, warm, in);
-                        if (flag != 0)
-                            return flag;
-                    }
+                if (child >= 0) {
+                    next.iz = iz;
+                    next.iy = iy;
+                    next.part = part;
+                    next.bin = at;
+                    open[depth] = next;
+                    open[depth + 1].inside = part == 1 && row_done;
+                    break;
                 }
             }
-            if (child >= 0)
-                break;
         }
         if (child >= 0) {
-            rows[depth] = row;
-            parts[depth] = part;
-            bins_at[depth] = at;
             ++depth;
-            grids[depth] = child;
-            rows[depth] = parts[depth] = 0;
-            bins_at[depth] = -1;
+            open[depth].grid = child;
+            open[depth].part = 0;
+            open[depth].iz = open[depth].iy = open[depth].bin = -1;
         } else {
             --depth;
         }
