@@ -153,6 +153,53 @@ shapes = [
     )
 
 
+def test_kinds_in_space(tmp_path):
+    pytest.importorskip("trimesh")
+    (tmp_path / "roof.off").write_text("OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 1\n0 1 1\n3 0 1 2\n3 0 2 3\n")
+    read = Case.from_toml(
+        "[domain]\nlower = [0, 0, 0]\nupper = [1, 1, 1]\n[size]\nkind = 'distance'\nh_min = 0.1\n"
+        "slope = 0.5\nshapes = [{ kind = 'surface', file = 'roof.off' }, { kind = 'box' },\n"
+        "{ kind = 'sphere', centre = [0.5, 0.2, 0.7], radius = 0.1 }]",
+        "my.toml",
+        tmp_path,
+    )
+    x = np.random.default_rng(404).random((300, 3))
+    roof = np.abs(x[:, 1] - x[:, 2]) / math.sqrt(2)
+    walls = np.minimum(x, 1 - x).min(axis=1)
+    ball = np.abs(np.linalg.norm(x - (0.5, 0.2, 0.7), axis=1) - 0.1)
+    wanted = 0.1 + 0.5 * np.minimum(np.minimum(roof, walls), ball)
+    assert read.size_field()(x) == pytest.approx(wanted)
+    out = tmp_path / "out"
+    out.mkdir()
+    again = load_case(read.write(out))
+    assert (out / "roof.off").is_file()
+    assert again.size_field()(x) == pytest.approx(wanted)
+
+
+def test_graded_and_products():
+    x = points()
+    text = (
+        "[size]\nkind = 'graded'\nslope = 0.2\nresolution = 201\n[size.field]\n"
+        "kind = 'expression'\nexpression = 'x < 1 ? 0.05 : 1'"
+    )
+    ramp = 0.05 + 0.2 * np.maximum(x[:, 0] - 1, 0)
+    assert field(text)(x) == pytest.approx(ramp, abs=0.2 * 0.0101)  # one spacing
+    pair = "[size]\nkind = 'product'\nfields = [0.2, {kind = 'expression', expression = '1 + x'}]"
+    assert field(pair)(x) == pytest.approx(0.2 * (1 + x[:, 0]))
+    assert field(pair.replace("product", "quotient"))(x) == pytest.approx(0.2 / (1 + x[:, 0]))
+
+
+def test_sizes_from_a_solution(tmp_path):
+    u = np.tanh(5 * np.linspace(-1, 1, 81)) + np.zeros((41, 1))
+    np.save(tmp_path / "u.npy", u)
+    text = "[size]\nkind = 'hessian'\nfile = 'u.npy'\nn_cells = 500\nh_max = 0.2"
+    wanted = sizing.hessian_size(u, (0, 0), (2, 1), n_cells=500, h_max=0.2)
+    assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
+    text = "[size]\nkind = 'gradient'\nfile = 'u.npy'\neps = 0.1\nh_max = 0.2"
+    wanted = sizing.gradient_size(u, (0, 0), (2, 1), eps=0.1, h_max=0.2)
+    assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
@@ -184,6 +231,15 @@ shapes = [
             "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='segment',a=[0],b=[1,1]}]",
             ["size.shapes[0].a", "2 or 3 numbers"],
         ),
+        ("[size]\nkind='graded'\nfield=1", ["size", "none of growth, slope"]),
+        ("[size]\nkind='graded'\nslope=1\nfield=-1", ["size.field", "above 0"]),
+        ("[size]\nkind='hessian'\nfile='u.npy'\neps=1\nn_cells=5", ["n_cells, eps"]),
+        ("[size]\nkind='quotient'\nfields=[1]", ["size.fields", "2 or more"]),
+        (
+            "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='sphere',centre=[0,0],radius=1}]",
+            ["size.shapes[0].centre", "3 numbers"],
+        ),
+        ("[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='surface'}]", ["lacks file"]),
         ("a b", ["not a TOML file", "line"]),
     ],
 )

@@ -40,26 +40,48 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
     if kind == "raster":
         values = load_array(folder / node["file"], "size.file")
         corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
-        return sizing.Raster(values, *corners, at=node.get("at", "nodes"))
+        return sizing.Raster(values, *corners, **_given(node, "at", "missing"))
+    if kind in ("hessian", "gradient"):
+        values = load_array(folder / node["file"], "size.file")
+        corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
+        options = _given(node, "n_cells", "eps", "p", "h_min", "h_max", "at", "missing")
+        make = sizing.hessian_size if kind == "hessian" else sizing.gradient_size
+        return make(values, *corners, **options)
     if kind == "distance":
-        options = {key: node[key] for key in ("growth", "slope", "h_max") if key in node}
-        return sizing.Distance([_shape(s) for s in node["shapes"]], node["h_min"], **options)
+        options = _given(node, "growth", "slope", "h_max")
+        shapes = [_shape(s, folder, domain) for s in node["shapes"]]
+        return sizing.Distance(shapes, node["h_min"], **options)
+    if kind == "graded":
+        options = _given(node, "growth", "slope", "resolution")
+        return sizing.Graded(inner(node["field"]), box=domain, **options)
     if kind == "min":
         return sizing.minimum(*map(inner, node["fields"]))
     if kind == "max":
         return sizing.maximum(*map(inner, node["fields"]))
     if kind == "sum":
         return functools.reduce(operator.add, map(inner, node["fields"]))
+    if kind == "product":
+        return functools.reduce(operator.mul, map(inner, node["fields"]))
+    if kind == "quotient":
+        return functools.reduce(operator.truediv, map(inner, node["fields"]))
     if kind == "scale":
         return node["factor"] * inner(node["field"])
     raise AssertionError(f"the schema passed a size field of kind {kind!r}")
 
 
-def _shape(node: Mapping[str, Any]) -> Any:
+def _given(node: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: node[key] for key in keys if key in node}
+
+
+def _shape(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
     from .. import sizing
 
     kind = node["kind"]
-    if kind == "circle":
+    if kind == "surface":
+        return sizing.Surface.read(folder / node["file"])
+    if kind == "box":
+        return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
+    if kind in ("circle", "sphere"):
         return sizing.Circle(node["centre"], node["radius"])
     if kind == "segment":
         return sizing.Segment(node["a"], node["b"])
@@ -91,5 +113,5 @@ def load_array(path: Path, place: str) -> np.ndarray:
 def named_files(node: dict[str, Any]) -> list[dict[str, Any]]:
     """Return every table of the tree that names a file, so that the files can be copied along."""
     children = [*node.get("fields", []), *([node["field"]] if "field" in node else [])]
-    own = [node] if node["kind"] == "raster" else []
+    own = [part for part in (node, *node.get("shapes", [])) if "file" in part]
     return own + [found for child in children for found in named_files(child)]

@@ -174,6 +174,9 @@ def _nearest(name: object, known: Iterable[str]) -> str:
 SHAPE = Kinds(
     {
         "circle": Table({"centre": vector(2, 3), "radius": not_negative}, {}),
+        "sphere": Table({"centre": vector(3), "radius": not_negative}, {}),
+        "box": Table({}, {"lower": vector(2, 3), "upper": vector(2, 3)}),
+        "surface": Table({"file": text}, {}),
         "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
         "polyline": Table({"points": vectors(2)}, {}),
         "polygon": Table({"points": vectors(3)}, {}),
@@ -193,6 +196,14 @@ def size(value: object, place: str) -> dict[str, Any]:
     return _SIZE(value, place)
 
 
+# What an array in a file covers, and how.
+_COVERED: dict[str, Check] = {
+    "lower": vector(2, 3),
+    "upper": vector(2, 3),
+    "at": one_of("nodes", "centres"),
+    "missing": one_of("error", "nearest"),
+}
+
 _SIZE = Kinds(
     {
         "constant": Table({"value": positive}, {}),
@@ -204,11 +215,41 @@ _SIZE = Kinds(
         "expression": Table({"expression": text}, {}),
         "raster": Table(
             {"file": text},
-            {"lower": vector(2, 3), "upper": vector(2, 3), "at": one_of("nodes", "centres")},
+            _COVERED,
+        ),
+        "hessian": Table(
+            {"file": text},
+            {
+                **_COVERED,
+                "n_cells": positive,
+                "eps": positive,
+                "p": positive,
+                "h_min": not_negative,
+                "h_max": positive,
+            },
+            choice=("n_cells", "eps"),
+        ),
+        "gradient": Table(
+            {"file": text},
+            {
+                **_COVERED,
+                "n_cells": positive,
+                "eps": positive,
+                "h_min": not_negative,
+                "h_max": positive,
+            },
+            choice=("n_cells", "eps"),
+        ),
+        "graded": Table(
+            {"field": size},
+            {"growth": positive, "slope": positive, "resolution": whole(2)},
+            choice=("growth", "slope"),
         ),
         "min": Table({"fields": list_of(size)}, {}),
         "max": Table({"fields": list_of(size)}, {}),
         "sum": Table({"fields": list_of(size)}, {}),
+        "product": Table({"fields": list_of(size)}, {}),
+        "quotient": Table({"fields": list_of(size, 2)}, {}),
         "scale": Table({"factor": positive, "field": size}, {}),
     }
 )

@@ -5,8 +5,9 @@ from .distance import Distance
 from .expression import Expression
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
-from .raster import Raster
+from .raster import Raster, Scattered
 from .shapes import Circle, Polygon, Polyline, Segment, Sphere
+from .solution import gradient_size, hessian_size
 from .stage import Sizing
 from .surface import Surface
 
@@ -21,12 +22,15 @@ __all__ = [
     "Polygon",
     "Polyline",
     "Raster",
+    "Scattered",
     "Segment",
     "Sizing",
     "Sphere",
     "Surface",
     "as_field",
     "bind",
+    "gradient_size",
+    "hessian_size",
     "maximum",
     "minimum",
 ]

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError, InputTypeError
+from ..errors import InputError
 from .field import Field
+from .filling import filled, scattered_values
 
 if TYPE_CHECKING:
     from ..domain import Box
@@ -32,13 +33,17 @@ class Raster(Field):
         ``linspace(lower, upper, nx)``; with "centres" each value is the centre of one of nx equal
         pixels.
 
+    missing : "error" or "nearest"
+        Whether values that are missing (NaN, or under a NumPy mask) are refused, or filled with the
+        nearest one that is there.
+
     Outside the box, and with "centres" within half a pixel of its sides, the value of the nearest
     edge holds on.
 
     Raises
     ------
     InputError
-        If shape and corners do not fit, or a value is not finite. (Values that are not positive are
+        If shape and corners do not fit, or a value is missing or infinite. (Values that are not positive are
         refused only where the finished field is: a `maximum` may cover them.)
     """
 
@@ -48,38 +53,14 @@ class Raster(Field):
         lower: Sequence[float],
         upper: Sequence[float],
         at: str = "nodes",
+        missing: str = "error",
     ):
-        array = np.asarray(values)
-        if array.dtype.kind not in "fiu":
-            raise InputTypeError(f"Raster values are of type {array.dtype}, expected real numbers")
-        if array.ndim not in (2, 3) or array.size == 0:
-            raise InputError(
-                f"Raster values have shape {array.shape}, expected (ny, nx) or (nz, ny, nx), "
-                "not empty"
-            )
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            index = tuple(bad[0].tolist())
-            raise InputError(
-                f"Raster values{list(index)} is {array[index]}, expected finite numbers; "
-                "fill the gaps first"
-            )
-        low, high = (np.asarray(c, dtype=float) for c in (lower, upper))
-        if low.shape != (array.ndim,) or high.shape != (array.ndim,):
-            raise InputError(
-                f"Raster got corners of shape {low.shape} and {high.shape} for values of "
-                f"{array.ndim} dimensions, expected {array.ndim} coordinates each"
-            )
-        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
-            raise InputError(
-                f"Raster got lower {lower} and upper {upper}, expected finite numbers with "
-                "lower < upper"
-            )
-        if at not in ("nodes", "centres"):
-            raise InputError(f"Raster got at={at!r}, expected 'nodes' or 'centres'")
-        self.values = array.astype(float)
+        low, high = check_corners("Raster", np.shape(values), lower, upper, at)
+        counts = np.array(np.shape(values)[::-1])
+        spacing = (high - low) / np.maximum(counts - (at == "nodes"), 1)
+        self.values = filled("Raster values", values, missing, spacing)
         self.lower, self.upper, self.at = low, high, at
-        self.dim = array.ndim
+        self.dim = self.values.ndim
 
     @property
     def _counts(self) -> np.ndarray:
@@ -135,3 +116,71 @@ class Raster(Field):
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.values.shape))
         return f"Raster({shape}, {self.lower.tolist()}, {self.upper.tolist()})"
+
+
+class Scattered(Raster):
+    """Values at scattered points, laid onto a raster once: measurements, or another mesh's cells.
+
+    Parameters
+    ----------
+    points : (n, d) float
+        d = 2 or 3; for the data of a mesh's cells their centroids.
+    values : (n,) float
+    lower, upper : sequences of d floats, optional
+        The box that the raster covers; by default that of the points.
+    resolution : int or sequence of d ints, optional
+        Number of nodes along the longest side, or along each. By default two per mean distance of
+        the points, (volume / n)^(1/d), and at most 2^22 in all; where the points are dense in one
+        part, ask for more.
+    method : "linear" or "nearest"
+        Linear interpolation in the Delaunay triangulation of the points, beyond their hull the value
+        of the nearest; or the nearest everywhere.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If shapes do not fit, a number is not finite, or (linear) the points cannot be triangulated
+        or two of them at the same place disagree.
+
+    Examples
+    --------
+    The sizes of one mesh, halved, for the next::
+
+        size = 0.5 * Scattered(result.diagram.centroids, result.size, box.lower, box.upper)
+    """
+
+    def __init__(
+        self,
+        points: object,
+        values: object,
+        lower: Sequence[float] | None = None,
+        upper: Sequence[float] | None = None,
+        resolution: int | Sequence[int] | None = None,
+        method: str = "linear",
+    ):
+        found, low, high = scattered_values(points, values, lower, upper, resolution, method)
+        super().__init__(found, low.tolist(), high.tolist())
+
+
+def check_corners(
+    what: str, shape: tuple[int, ...], lower: object, upper: object, at: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a raster of `shape` as arrays (d,), or raise what is wrong with them."""
+    if len(shape) not in (2, 3) or 0 in shape:
+        raise InputError(
+            f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty"
+        )
+    low, high = (np.asarray(c, dtype=float) for c in (lower, upper))
+    d = len(shape)
+    if low.shape != (d,) or high.shape != (d,):
+        raise InputError(
+            f"{what} got corners of shape {low.shape} and {high.shape} for values of {d} "
+            f"dimensions, expected {d} coordinates each"
+        )
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        raise InputError(
+            f"{what} got lower {lower} and upper {upper}, expected finite numbers with lower < upper"
+        )
+    if at not in ("nodes", "centres"):
+        raise InputError(f"{what} got at={at!r}, expected 'nodes' or 'centres'")
+    return low, high
