@@ -16,7 +16,9 @@ from clvoro.faces import face_corners, face_owners, following
 from clvoro.report import (
     plot_cells,
     plot_cutaway,
+    plot_displacements,
     plot_distributions,
+    plot_size,
     plot_slice,
     plot_slices,
     write_report,
@@ -205,6 +207,10 @@ def test_result_plots_itself(result):
         result.plot(view="front")
     with pytest.raises(InputError, match=r"plot_slice.*ParaView"):
         plot_cells(result)
+    with pytest.raises(InputError, match="this mesh is in 3D"):
+        plot_displacements(result)
+    with pytest.raises(InputError, match="is in 3D"):
+        plot_size(lambda x: x[:, 0], result.diagram.domain)
 
 
 @pytest.mark.parametrize(("upper", "panels"), [((6, 1, 1.5), 2), ((1, 1, 5), 2), ((1, 4, 1), 2)])

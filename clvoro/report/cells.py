@@ -212,7 +212,16 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     Returns
     -------
     matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        For a 3D domain.
     """
+    if domain.dim != 2:
+        raise InputError(
+            f"the size field is drawn on 2D domains, and {domain} is in 3D; draw a slice of a mesh"
+        )
     scheme = COLOURINGS["size"]
     extent = domain.extent
     counts = np.maximum((extent * np.sqrt(60_000 / domain.measure)).astype(int), 2)

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.spatial import KDTree
 
+from ..errors import InputError
 from ..results import Displacements, Result
 from .style import (
     METHOD_COLOURS,
@@ -103,7 +104,14 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
     -------
     matplotlib.figure.Figure or None
         None if the run recorded no displacements.
+
+    Raises
+    ------
+    InputError
+        For a 3D mesh.
     """
+    if result.diagram.domain.dim != 2:
+        raise InputError("displacements are drawn in 2D, and this mesh is in 3D; plot its history")
     rows = [(n, d) for n, d in (("first", result.initial), ("last", result.final)) if d is not None]
     if not rows:
         return None

@@ -43,7 +43,7 @@ def kept_cells(diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndar
     if cut is None:
         return np.ones(len(diagram), bool)
     if isinstance(cut, str):  # the corner between the point and the viewer goes
-        return ~((diagram.points - through) * np.where(towards >= 0, 1, -1) > 0).all(axis=1)
+        return ~np.all((diagram.points - through) * np.where(towards >= 0, 1, -1) > 0, axis=1)
     cut = np.asarray(cut)
     return cut if cut.dtype == bool else (diagram.points - through) @ cut <= 0
 
