@@ -43,7 +43,7 @@ from clvoro.profile import Profile
 
 SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
 """Programs that solve linear systems."""
-TESSELLATION = ("bins", "cells", "primitives")
+TESSELLATION = ("bins", "cells", "repair", "primitives")
 """Programs of the diagram; the scans and the reductions of the figures are in "primitives"."""
 
 CELLS_OF_F2 = 22972

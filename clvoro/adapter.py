@@ -117,11 +117,6 @@ class Adapter:
     def _stages_for(self, domain: Box) -> Stages:
         if not isinstance(domain, Box):
             raise InputTypeError(f"domain is a {type(domain).__name__}, expected a clvoro.Box")
-        if domain.dim != 2:
-            raise InputError(
-                f"domain is {domain}, in {domain.dim} dimensions; this version meshes boxes in 2: "
-                "give two coordinates for each corner"
-            )
         if domain.dim not in self._stages:
             engine = Engine(self.ctx, self.queue, domain.dim, self.dtype)
             self._stages[domain.dim] = Stages(engine)
@@ -294,8 +289,10 @@ class Adapter:
                 host = sample_density(sizing, domain, n, options["seed"], self.dtype)
         plan: list[Action]
         if planned:
-            effort, aim = EFFORTS[options["effort"]], options["error_target"]
-            plan = plan_adaptive(effort, levels, method == "exact", aim, warm=points is not None)
+            plan = plan_adaptive(
+                domain.dim, options["effort"], levels, method == "exact", options["error_target"],
+                warm=points is not None,
+            )  # fmt: skip
         else:
             relaxation = Relaxation(options["alpha"], options["k"])
             steps = STEPS if options["max_steps"] is None else options["max_steps"]
@@ -309,7 +306,7 @@ class Adapter:
         settings = {**options, "levels": levels, "dtype": self.dtype.name}
         if points is not None:
             settings["start"] = "points"
-        return loop.run(n_cells if planned else None, settings)
+        return loop.run(n_cells if planned else None, float(target), settings)
 
     @staticmethod
     def _levels(levels: int | str, engine: Engine, target: int, host: np.ndarray | None) -> int:

@@ -312,6 +312,10 @@ class Mesh:
         s.collect("ever", self.ever, n)
         return s.read()
 
+    def refined_count(self) -> int:
+        """Return how many generators `refine` would make."""
+        return self.stages.refinement.count(self.t)
+
     def refine(self) -> Mesh:
         """Return the mesh of the next finer level; the present generators keep their labels."""
         finer = self.coarsening / 2

@@ -9,6 +9,13 @@
 *settle*      where a count was asked for: exactly that many
 *polish*      descent of cell quality, projected; the penalty is steered to the error that is aimed at
 *project*     the same with next to no penalty: every cell the size that was asked for
+
+In 3D there is no lattice whose defects could climb, and a mesh that has been coupled long enough loses next to no
+quality in the projection:
+
+    density start ─► [ couple ─► settle ahead ] x 2 ─► refine ─► ... ─► couple ─► settle ─► couple ─► glide (─► project)
+
+*settle ahead*  the count at which refinement makes the one that the next level wants
 """
 
 from __future__ import annotations
@@ -20,8 +27,8 @@ from dataclasses import dataclass, replace
 from .methods import Method, ProjectedMethod, WeightedMethod
 from .population import THETA
 
-COARSEST = 700
-"""Cells of the coarsest level of a 2D run, roughly: enough to feel the field, few enough to be free."""
+COARSEST = {2: 700, 3: 1500}
+"""Cells of the coarsest level, roughly, by dimension: enough to feel the field, few enough to be free."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,13 @@ EFFORTS = {
     ),
 }  # fmt: skip
 
+EFFORTS_3D = {
+    "fast": Effort(30, 4, 2, (), glide=4, polish=0, aim=0.004, relaxation=1.5, momentum=0.7),
+    "default": Effort(40, 8, 2, (), glide=8, polish=0, aim=0.0025, relaxation=1.5, momentum=0.8),
+    "best": Effort(80, 30, 3, (), glide=60, polish=0, aim=0.003, relaxation=1.5, momentum=0.8),
+}
+"""The same in 3D. `couple` steps follow each of three counts on a coarser level, `couple_finest` each of two."""
+
 SINGLE_AIM = 0.0017
 """Mean |log(L / h)| that polishing aims at most at, where there is one level only."""
 COUNT_SHARE = 0.03
@@ -85,6 +99,7 @@ COUNT_LEAST = 1e-3
 COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
+EXACT_STEPS_3D = 3
 
 
 @dataclass(frozen=True)
@@ -121,10 +136,11 @@ class Rest:
 class Settle:
     """Bring the count to the one that is held.
 
-    With `share`, to within that share of what the size field asks for.
+    With `share`, to within that share of what the size field asks for; `ahead`: to what makes the next level's count.
     """
 
     share: float = 0.0
+    ahead: bool = False
 
 
 Action = Step | Reorganise | Refine | Rest | Settle
@@ -132,7 +148,7 @@ Action = Step | Reorganise | Refine | Rest | Settle
 
 def auto_levels(n: float, dim: int) -> int:
     """Return the number of coarser levels for a mesh of `n` cells."""
-    return max(0, round(math.log(max(n, 1) / COARSEST, 2**dim)))
+    return max(0, round(math.log(max(n, 1) / COARSEST[dim], 2**dim)))
 
 
 def plan_steps(method: Method, steps: int) -> list[Action]:
@@ -141,12 +157,14 @@ def plan_steps(method: Method, steps: int) -> list[Action]:
 
 
 def plan_adaptive(
-    effort: Effort, levels: int, exact: bool, aim: float | None = None, warm: bool = False
+    dim: int, effort: str, levels: int, exact: bool, aim: float | None = None, warm: bool = False
 ) -> list[Action]:
     """Return the plan that reaches the size field and good cells, over `levels` coarser levels.
 
     Parameters
     ----------
+    effort : str
+        Of `EFFORTS`.
     exact : bool
         End with the exact projection.
     aim : float, optional
@@ -154,13 +172,17 @@ def plan_adaptive(
     warm : bool
         The start is a mesh already, not a random sample.
     """
+    if dim == 3:
+        solid = EFFORTS_3D[effort]
+        return list(_adaptive_3d(solid, levels, exact, solid.aim if aim is None else aim, warm))
+    flat = EFFORTS[effort]
     if aim is None:
         # A mesh that is small enough for one level can be had nearer to its size.
-        aim = effort.aim if levels else min(effort.aim, SINGLE_AIM)
-    return list(_adaptive(effort, levels, exact, aim, warm))
+        aim = flat.aim if levels else min(flat.aim, SINGLE_AIM)
+    return list(_adaptive_2d(flat, levels, exact, aim, warm))
 
 
-def _adaptive(effort: Effort, levels: int, exact: bool, aim: float, warm: bool) -> Iterator[Action]:
+def _adaptive_2d(effort: Effort, levels: int, exact: bool, aim: float, warm: bool) -> Iterator[Action]:
     glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
     if warm:
         yield Settle(COUNT_SHARE)
@@ -203,6 +225,38 @@ def _adaptive(effort: Effort, levels: int, exact: bool, aim: float, warm: bool) 
         # The last two only project: Newton's steps on the sizes.
         newton = replace(project, relaxation=0.0, momentum=0.0)
         yield from [Step(project)] * (EXACT_STEPS - 2)
+        yield from [Step(newton)] * 2
+
+
+def _adaptive_3d(
+    effort: Effort, levels: int, exact: bool, aim: float, warm: bool
+) -> Iterator[Action]:
+    couple = [Step(WeightedMethod(cautious=True))]
+    if warm:
+        yield Settle(COUNT_SHARE)
+    for level in range(levels, -1, -1):
+        if level < levels:
+            yield Refine()
+        elif not warm:
+            yield from couple * effort.start
+        if level:
+            for _ in range(2):
+                yield from couple * effort.couple
+                yield Settle(COUNT_LEAST, ahead=True)
+            yield from couple * effort.couple
+    yield from couple * effort.couple_finest
+    yield Settle(COUNT_LEAST)
+    yield from couple * effort.couple_finest
+    yield Settle()
+    glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=effort.eps, aim=aim)
+    yield from [Step(glide)] * effort.glide
+    if exact:
+        project = ProjectedMethod(
+            "lloyd", 0.5, 0.0, eps=1e-3, iterations=EXACT_ITERATIONS, sampled_gradient=True,
+            keep_mean=True,
+        )  # fmt: skip
+        newton = replace(project, relaxation=0.0)
+        yield from [Step(project)] * (EXACT_STEPS_3D - 2)
         yield from [Step(newton)] * 2
 
 
