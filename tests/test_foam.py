@@ -10,6 +10,7 @@ from test_io import make_result
 
 from clvoro import io
 from clvoro.errors import InputError
+from clvoro.io import foam
 
 LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
 
@@ -143,6 +144,14 @@ def test_patches_are_the_walls(result, mesh):
     assert after == len(faces)
     assert len(patches) == 6
     assert sorted({v for f in faces for v in f}) == list(range(len(points)))
+
+
+def test_texts_are_the_same_in_parts(solid, tmp_path, monkeypatch):
+    io.save(solid, tmp_path / "one" / "polyMesh")
+    monkeypatch.setattr(foam, "_CHUNK", 37)
+    io.save(solid, tmp_path / "two" / "polyMesh")
+    for path in (tmp_path / "one" / "polyMesh").iterdir():
+        assert (tmp_path / "two" / "polyMesh" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_marker_puts_the_mesh_into_its_case(solid, tmp_path):

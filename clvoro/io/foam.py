@@ -5,6 +5,7 @@ In 2D the cells become prisms, one layer of them, between two patches of type `e
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,9 @@ _FILES = {
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
+
+
+_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -120,18 +124,22 @@ def write_foam(result: Result, path: Path) -> None:
         f"nPoints:{len(mesh.points)} nCells:{len(result.diagram)} nFaces:{len(mesh.owner)} "
         f"nInternalFaces:{len(mesh.neighbour)}"
     )
-    texts = {
-        "points": _vectors(mesh.points),
-        "faces": _faces(mesh.starts, mesh.corners),
-        "owner": _labels(mesh.owner),
-        "neighbour": _labels(mesh.neighbour),
-        "boundary": _boundary(mesh),
+    bodies = {
+        "points": (len(mesh.points), _vectors(mesh.points)),
+        "faces": (len(mesh.owner), _faces(mesh.starts, mesh.corners)),
+        "owner": (len(mesh.owner), _labels(mesh.owner)),
+        "neighbour": (len(mesh.neighbour), _labels(mesh.neighbour)),
+        "boundary": (len(mesh.patches), [_boundary(mesh)]),
     }
     # `faces` is put in place last: a case without it is plainly incomplete.
     with atomic_folder(folder / "faces") as target:
         for name, kind in _FILES.items():
+            count, body = bodies[name]
             head = _header(name, kind, note if name in ("owner", "neighbour") else "")
-            target.with_name(name).write_text(head + texts[name], encoding="ascii", newline="\n")
+            with open(target.with_name(name), "w", encoding="ascii", newline="\n") as file:
+                file.write(f"{head}{count}\n(\n")
+                file.writelines(body)
+                file.write(")\n")
 
 
 def _make(folder: Path) -> None:
@@ -153,26 +161,30 @@ def _header(name: str, kind: str, note: str) -> str:
     )
 
 
-def _list(count: int, body: str) -> str:
-    return f"{count}\n(\n{body})\n"
+def _chunks(count: int) -> Iterator[slice]:
+    """Cut `count` rows into parts, as text in Python takes ten times the room of the numbers."""
+    return (slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK))
 
 
-def _labels(values: np.ndarray) -> str:
-    return _list(len(values), "%d\n" * len(values) % tuple(values.tolist()))
+def _labels(values: np.ndarray) -> Iterator[str]:
+    for part in _chunks(len(values)):
+        rows = values[part].tolist()
+        yield "%d\n" * len(rows) % tuple(rows)
 
 
-def _vectors(values: np.ndarray) -> str:
-    # The shortest text that reads back as the same number.
-    return _list(len(values), "(%r %r %r)\n" * len(values) % tuple(values.ravel().tolist()))
+def _vectors(values: np.ndarray) -> Iterator[str]:
+    for part in _chunks(len(values)):
+        rows = values[part]
+        # The shortest text that reads back as the same number.
+        yield "(%r %r %r)\n" * len(rows) % tuple(rows.ravel().tolist())
 
 
-def _faces(starts: np.ndarray, corners: np.ndarray) -> str:
+def _faces(starts: np.ndarray, corners: np.ndarray) -> Iterator[str]:
     sides = np.diff(starts)
-    forms = [
-        f"{k}({' '.join(['%d'] * k)})\n" for k in range(int(sides.max(initial=0)) + 1)
-    ]  # by number of corners
-    form = "".join([forms[k] for k in sides.tolist()])
-    return _list(len(sides), form % tuple(corners.tolist()))
+    forms = [f"{k}({' '.join(['%d'] * k)})\n" for k in range(int(sides.max(initial=0)) + 1)]
+    for part in _chunks(len(sides)):
+        form = "".join([forms[k] for k in sides[part].tolist()])
+        yield form % tuple(corners[starts[part.start] : starts[part.stop]].tolist())
 
 
 def _boundary(mesh: PolyMesh) -> str:
@@ -183,4 +195,4 @@ def _boundary(mesh: PolyMesh) -> str:
             f"        nFaces          {count};\n        startFace       {start};\n    }}\n"
         )
         start += count
-    return _list(len(mesh.patches), body)
+    return body
