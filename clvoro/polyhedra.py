@@ -128,6 +128,8 @@ class Polyhedra:
                 np.int32(warm), *old, np.int32(again), np.int32(self._room), self._row_places,
                 self._row_counts, self._labels, self._measures, self._centroids,
                 arrays["volumes"], arrays["offsets"], arrays["covariances"], self._report,
+                # Private arrays of a whole group lie on the stack of a CPU's thread.
+                group=1 if again else None,
             )  # fmt: skip
             flags, generator, m = (int(v) for v in self._report.get())
             if flags & ~FULL:

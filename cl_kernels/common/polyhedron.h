@@ -174,7 +174,7 @@ inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const
 }
 
 /* Make what lies beyond one disc: grown from the farthest vertex by a triangle at a time, the farthest first, and where
-   that does not reach all that lies farther beyond than `doubt`, through vertices that lie in doubt. The distances of
+   that does not reach all that lies farther beyond than `doubt`, through the nearest that do not. The distances of
    vertices that do not belong where rounding has put them are changed. False if something stays out of reach. */
 inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 {
@@ -192,7 +192,7 @@ inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
         const INDEX4 f = cell->faces[added];
         inside[added] = on[f.s0] = on[f.s1] = on[f.s2] = true;
         left -= s[added] > doubt;
-        const REAL least = left > 0 ? -doubt : depth;
+        const REAL least = left > 0 ? -64 * doubt : depth;
         added = -1;
         for (int v = 0; v < cell->n; ++v) {
             if (inside[v] || !(s[v] > least) || (added >= 0 && !(s[v] > s[added])))
