@@ -2,6 +2,8 @@
 
 import os
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -182,6 +184,29 @@ def test_as_vtk_reads_it(result, tmp_path):
     volumes = prism_volumes(result, read(tmp_path / "constant" / "polyMesh")[0])
     # VTK keeps such points in single precision, and disagrees with itself on which way round a wedge is.
     np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
+
+
+@pytest.mark.skipif(shutil.which("checkMesh") is None, reason="OpenFOAM is not installed")
+def test_as_openfoam_checks_it(result, tmp_path):
+    io.save(result, tmp_path / "case.foam")
+    system = tmp_path / "system"
+    system.mkdir()
+    times = "startTime 0; endTime 1; deltaT 1; writeInterval 1;"
+    parts = ("ddt", "grad", "div", "laplacian", "interpolation", "snGrad")
+    schemes = " ".join(f"{part}Schemes {{ default none; }}" for part in parts)
+    for name, text in {"controlDict": times, "fvSchemes": schemes, "fvSolution": ""}.items():
+        head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {name}; }}\n"
+        (system / name).write_text(head + text)
+    # Where Debian's package has its settings; others set it themselves.
+    env = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
+    done = subprocess.run(
+        ["checkMesh", "-case", str(tmp_path)], env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    topology = done.stdout.split("Checking topology...")[1].split("Checking geometry...")
+    assert "***" not in topology[0]
+    for line in ("Boundary openness", "Max cell openness", "Cell volumes", "Face pyramids"):
+        assert re.search(f"{line}.*OK", topology[1]), line
 
 
 def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """Measures for finite volumes: known shapes, and one face after the other."""
 
+import re
+
 import numpy as np
 import pytest
 import solids
@@ -9,6 +11,7 @@ from clvoro.domain import Box
 from clvoro.faces import face_corners, face_owners
 from clvoro.quality import measure_mesh
 from clvoro.results import Diagram
+from clvoro.summary import measures_line
 
 LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
 
@@ -144,3 +147,14 @@ def test_result_measures_itself_once(solid):
     s = result.measures.summary()
     assert s["max_volume_ratio"] >= s["mean_volume_ratio"] > 1
     assert 0 <= s["min_face_ratio"] <= s["mean_face_ratio"] <= 1
+
+
+def test_line_for_people(solid):
+    result = solids.solid_result(solid)
+    s = result.measures.summary()
+    numbers = [float(x) for x in re.findall(r"[\d.]+", measures_line(result))]
+    names = (
+        "mean_faces", "mean_skewness", "max_skewness", "mean_centroid_angle", "max_centroid_angle",
+    )  # fmt: skip
+    assert numbers == pytest.approx([s[name] for name in names], abs=0.05)
+    assert numbers[0] == pytest.approx(len(solid.neighbours) / len(solid), abs=0.005)
