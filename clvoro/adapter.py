@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pyopencl as cl
 from . import device
 from ._arrays import check_integer, check_number, check_points, coincident_pair
 from ._program import Engine
+from .checkpoint import Checkpointer, Saved, describe
 from .domain import Box
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
@@ -177,6 +179,9 @@ class Adapter:
         effort: str = "default",
         levels: int | str = "auto",
         error_target: float | None = None,
+        checkpoint: str | PathLike[str] | None = None,
+        checkpoint_every: float = 60.0,
+        resume: str | PathLike[str] | None = None,
     ) -> Result:
         """Adapt generators until their cells have the target size and a good shape.
 
@@ -219,6 +224,14 @@ class Adapter:
         error_target : float, optional
             Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0025 (.0035 for "fast", .0039 for
             "best"). The larger, the better the cells' shape.
+        checkpoint : path, optional
+            File to which the run's state is written every so often, and where the callback stops it. It is replaced
+            at one stroke: whenever the process dies, the file is a whole one.
+        checkpoint_every : float
+            Seconds from one checkpoint to the next; 0: after every step.
+        resume : path, optional
+            Checkpoint to go on from, given the same other arguments as that run. On the same device the run ends as
+            it would have, bit for bit (seconds apart).
 
         Returns
         -------
@@ -227,7 +240,7 @@ class Adapter:
         Raises
         ------
         InputError, InputTypeError
-            If an argument is not as expected.
+            If an argument is not as expected, or the checkpoint is damaged or of another run.
         SizeFieldError
             If h is not positive and finite somewhere; names the place.
         MemoryLimitError
@@ -254,8 +267,10 @@ class Adapter:
                 f"callback is {callback!r} of type {type(callback).__name__}, expected a function "
                 "of a row of the history"
             )
+        every = check_number("checkpoint_every", checkpoint_every, least=0)
+        files = checkpoint, every, resume
         with self._alone():
-            return self._run(domain, size, points, options, self._shown(callback))
+            return self._run(domain, size, points, options, self._shown(callback), *files)
 
     def _run(
         self,
@@ -264,12 +279,19 @@ class Adapter:
         points: np.ndarray | None,
         options: dict[str, Any],
         callback: Callable[[np.void], object] | None,
+        checkpoint: str | PathLike[str] | None,
+        every: float,
+        resume: str | PathLike[str] | None,
     ) -> Result:
         """Build mesh and plan, and carry the plan out; the options are checked."""
         stages = self._stages_for(domain)
         engine, method, n_cells = stages.engine, options["method"], options["n_cells"]
         planned = method not in PUBLISHED
         host = None if points is None else check_points(points, domain)
+        made_by = describe(domain, options, self.dtype, host)
+        saved = None if resume is None else Saved(resume)
+        if saved is not None:
+            saved.fit(made_by)
         if host is not None and not planned and n_cells not in (None, len(host)):
             raise InputError(
                 f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} "
@@ -281,7 +303,7 @@ class Adapter:
         check_memory(engine, max(target, 0 if host is None else len(host)))
         factor = (asked / target) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
         levels = self._levels(options["levels"], engine, target, host) if planned else 0
-        if host is None:
+        if host is None and saved is None:
             n = max(1, round(target / 2 ** (domain.dim * levels)))
             if options["start"] == "uniform":
                 host = sample_uniform(domain, n, options["seed"], self.dtype)
@@ -297,12 +319,19 @@ class Adapter:
             relaxation = Relaxation(options["alpha"], options["k"])
             steps = STEPS if options["max_steps"] is None else options["max_steps"]
             plan = plan_steps(make_method(method, relaxation), steps)
-        origin, scale = domain.frame
-        with _Naming(host, domain, self.dtype):
-            unsorted = engine.upload((host - origin) / scale)
-            mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
         tol = None if planned else options["tol"]
+        writer = None if checkpoint is None else Checkpointer(checkpoint, every, made_by, plan)
+        if saved is None:
+            origin, scale = domain.frame
+            with _Naming(host, domain, self.dtype):
+                unsorted = engine.upload((host - origin) / scale)
+                mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
+        else:
+            mesh = saved.restore(stages, domain, sizing, plan)
         loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
+        loop.checkpoint = writer
+        if saved is not None:
+            saved.set(loop)
         settings = {**options, "levels": levels, "dtype": self.dtype.name}
         if points is not None:
             settings["start"] = "points"

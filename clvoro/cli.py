@@ -21,6 +21,8 @@ examples:
   clvoro run airfoil --device gpu       a wing section on a GPU
   clvoro cases paper > my.toml          a case file to start from
   clvoro run my.toml --effort fast --out result
+  clvoro run my.toml --checkpoint my.state                   and, should it be killed,
+  clvoro run my.toml --checkpoint my.state --resume my.state
   clvoro check result/mesh.vtu          is the mesh what it claims to be?
 """
 
@@ -68,6 +70,15 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--effort", choices=("fast", "default", "best"), help="work against quality")
     run.add_argument(
         "--levels", metavar="N", help="coarser levels to begin with, or auto (the default)"
+    )
+    run.add_argument(
+        "--checkpoint", metavar="FILE", type=Path, help="write the run's state there every so often"
+    )
+    run.add_argument(
+        "--checkpoint-every", metavar="SECONDS", type=float, help="time between (default: 60)"
+    )
+    run.add_argument(
+        "--resume", metavar="FILE", type=Path, help="go on from a checkpoint of the same case"
     )
     run.add_argument("--no-report", action="store_true", help="no pictures and no page")
     run.add_argument(
@@ -156,6 +167,9 @@ def _run(arguments: argparse.Namespace) -> int:
         quiet=arguments.quiet,
         as_json=arguments.json,
         profile=arguments.profile,
+        checkpoint=arguments.checkpoint,
+        checkpoint_every=arguments.checkpoint_every,
+        resume=arguments.resume,
     )
     return INTERRUPTED if job.run() else OK
 

@@ -47,6 +47,9 @@ class Job:
         No progress and no summary; one JSON object per finished run on the standard output.
     profile : bool
         Whether to time every kernel, and print where the time went.
+    checkpoint, resume : Path or None
+    checkpoint_every : float or None
+        As `Adapter.run` takes them; for one method only.
     """
 
     case: Case
@@ -57,6 +60,9 @@ class Job:
     quiet: bool = False
     as_json: bool = False
     profile: bool = False
+    checkpoint: Path | None = None
+    checkpoint_every: float | None = None
+    resume: Path | None = None
     interrupted: bool = field(default=False, init=False)
 
     def run(self) -> bool:
@@ -73,6 +79,7 @@ class Job:
 
         arguments, size = self.case.run_arguments(), self.case.size_field()
         self._refuse_unknown(arguments, Adapter.run)
+        arguments |= self._checkpoints()
         check_folder(self.out)
         if self.report:
             _require_plots()
@@ -133,6 +140,21 @@ class Job:
                     f"{self.case.name}: run.{name} is not a setting of this version of clvoro; "
                     "leave it out"
                 )
+
+    def _checkpoints(self) -> dict[str, Any]:
+        """Return the arguments of `Adapter.run` that have to do with checkpoints."""
+        given = {
+            "checkpoint": self.checkpoint,
+            "checkpoint_every": self.checkpoint_every,
+            "resume": self.resume,
+        }
+        given = {name: value for name, value in given.items() if value is not None}
+        if given and len(self.case.methods) > 1:
+            raise InputError(
+                f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
+                f"{len(self.case.methods)}; choose one with --method"
+            )
+        return given
 
     @contextmanager
     def _stopping_cleanly(self) -> Iterator[None]:

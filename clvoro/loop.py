@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .checkpoint import Checkpointer
 from .krylov import Solution
 from .mesh import Mesh
 from .plans import Action, Refine, Reorganise, Rest, Settle, Step, work_of
@@ -35,6 +36,12 @@ class Loop:
         converged where the plan ends.
     callback : callable or None
         Takes the new row of the history; the run stops if it returns True.
+
+    Attributes
+    ----------
+    position : int
+        Actions of the plan that are done; a checkpoint sets it.
+    checkpoint : Checkpointer or None
     """
 
     def __init__(
@@ -55,6 +62,8 @@ class Loop:
         self.solution: Solution | None = None
         self.initial: Displacements | None = None
         self.began = time.perf_counter()
+        self.position = 0
+        self.checkpoint: Checkpointer | None = None
 
     def run(self, n_cells: int | None, asked: float, settings: dict[str, Any]) -> Result:
         """Carry out the plan.
@@ -65,8 +74,9 @@ class Loop:
         self.n_cells, self.asked = n_cells, asked
         converged, reason = False, "plan completed"
         try:
-            stop = self.record(0.0)
-            for action, progress in zip(self.plan, [*self.done[1:], 1.0], strict=False):
+            stop = not self.rows and self.record(0.0)
+            ahead = list(zip(self.plan, [*self.done[1:], 1.0], strict=False))
+            for action, progress in ahead[self.position :]:
                 if stop or (self.max_steps is not None and self.steps >= self.max_steps):
                     reason = "stopped by the callback" if stop else "max_steps reached"
                     break
@@ -84,6 +94,9 @@ class Loop:
                 if not stop and self.stalled():
                     converged, reason = True, "error and quality no longer improve"
                     break
+                self.position += 1
+                if self.checkpoint is not None:
+                    self.checkpoint.offer(self, stop)
             else:
                 if stop:
                     reason = "stopped by the callback"

@@ -10,20 +10,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import struct
 import zipfile
-import zlib
 from collections.abc import Mapping
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from ..domain import Box
-from ..errors import InputError
 from ..results import HISTORY_DTYPE, Diagram, Displacements, Result
-from .atomic import atomic_file
+from .arrays import FileError, explained, list_members, read_member, write_arrays
 
 FORMAT, VERSION = "clvoro-result", 1
 
@@ -68,18 +65,8 @@ def write_npz(result: Result, path: Path) -> None:
             arrays[name] = value
         elif name != "settings":
             about["values"][name] = value
-    arrays |= {"format": FORMAT, "version": VERSION, "about": json.dumps(about, default=_plain)}
-    with (
-        atomic_file(path) as file,
-        # Coordinates hardly compress; the graphs do, at any level.
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-    ):
-        for name, array in arrays.items():
-            # ZipInfo's own date is fixed, unlike the clock's.
-            member = zipfile.ZipInfo(f"{name}.npy")
-            member.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(member, "w", force_zip64=True) as stream:
-                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+    arrays["about"] = json.dumps(about, default=_plain)
+    write_arrays(path, FORMAT, VERSION, arrays)
 
 
 def load(path: str | PathLike[str]) -> Result:
@@ -94,89 +81,19 @@ def load(path: str | PathLike[str]) -> Result:
         If the file is missing, damaged, cut off, of another format or of a newer version; names the
         file and what is wrong.
     """
-    name = fspath(path)
-    try:
+    with explained(path, "a file written by Result.save"):
         with zipfile.ZipFile(path) as archive:
-            arrays = _read_all(archive)
+            members = list_members(archive, FORMAT, VERSION)
+            missing = [name for name in _NEEDED if name not in members]
+            if missing:
+                raise FileError(f"it lacks {', '.join(missing)}")
+            parts = (f"{part}.{name}" for part, names in _PARTS.items() for name in names)
+            known = ("about", *_FIELDS, *parts)
+            arrays = {
+                name: read_member(archive, members[name]) for name in known if name in members
+            }
         _check(arrays)
         return _assemble(arrays)
-    except _FileError as problem:
-        raise InputError(f"cannot load {name}: {problem}") from problem
-    except zipfile.BadZipFile as error:
-        raise InputError(
-            f"cannot load {name}: it is no .npz file, or damaged or cut off ({error}); expected a "
-            "file written by Result.save"
-        ) from error
-    except (zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError) as error:
-        raise InputError(f"cannot load {name}: it is damaged or foreign ({error})") from error
-    except OSError as error:
-        raise InputError(f"cannot load {name}: {error.strerror or error}") from error
-
-
-class _FileError(Exception):
-    """What is wrong with a file; `load` adds which one."""
-
-
-def _read_all(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
-    """Return the arrays of the file, after a look at what kind of file it is."""
-    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    if "format" not in members or "version" not in members:
-        raise _FileError(
-            f"it holds no {FORMAT} (members: {', '.join(sorted(members)[:6])}); expected a file "
-            "written by Result.save"
-        )
-    found = _read(archive, members["format"])
-    if found.dtype.kind != "U" or found.shape != () or found.item() != FORMAT:
-        raise _FileError(f"its format is {found!r:.60}, expected {FORMAT!r}")
-    version = _read(archive, members["version"])
-    if version.dtype.kind not in "iu" or version.shape != ():
-        raise _FileError(f"its version is {version!r:.60}, expected an integer")
-    if not 1 <= version.item() <= VERSION:
-        raise _FileError(
-            f"its version is {version.item()}, expected at most {VERSION}; install a newer clvoro"
-        )
-    missing = [name for name in _NEEDED if name not in members]
-    if missing:
-        raise _FileError(f"it lacks {', '.join(missing)}")
-    parts = (f"{part}.{name}" for part, names in _PARTS.items() for name in names)
-    known = ("about", *_FIELDS, *parts)
-    return {name: _read(archive, members[name]) for name in known if name in members}
-
-
-def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Read one array; the sizes are checked against the member's before memory is asked for."""
-    with archive.open(info) as stream:
-        try:
-            shape, fortran, dtype = _read_header(stream)
-        except (ValueError, SyntaxError, TypeError, KeyError) as error:
-            raise _FileError(f"{info.filename} is no array ({error})") from error
-        if dtype.hasobject:
-            raise _FileError(
-                f"{info.filename} holds pickled Python objects, which could run any program; they "
-                "are never loaded"
-            )
-        count = 1
-        for extent in shape:  # Python's integers do not overflow
-            count *= extent
-        length = count * dtype.itemsize
-        if (
-            min(shape, default=1) < 0
-            or length != info.file_size - stream.tell()
-            or not dtype.itemsize
-        ):
-            raise _FileError(f"{info.filename} has not the length that its shape {shape} asks for")
-        data = stream.read()  # checks the checksum
-    array = np.frombuffer(data, dtype, count) if count else np.empty(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C").copy()
-
-
-def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(stream)
-    if version == (2, 0):
-        return np.lib.format.read_array_header_2_0(stream)
-    raise ValueError(f"its header's version is {version}")
 
 
 def _check(arrays: Mapping[str, np.ndarray]) -> None:
@@ -188,30 +105,30 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
         array = arrays[name]
         if name == "history":
             if array.ndim != 1 or array.dtype.names is None:
-                raise _FileError(f"history has shape {array.shape} and dtype {array.dtype}")
+                raise FileError(f"history has shape {array.shape} and dtype {array.dtype}")
             continue
         integer = axes in ("N", "m", "c", "M", "f") and name != "diagram.face_measures"
         if array.dtype.kind not in ("iu" if integer else "f"):
-            raise _FileError(f"{name} has dtype {array.dtype}")
+            raise FileError(f"{name} has dtype {array.dtype}")
         expected = tuple(sizes.setdefault(a, s) for a, s in zip(axes, array.shape, strict=False))
         if array.ndim != len(axes) or array.shape != expected:
-            raise _FileError(f"{name} has shape {array.shape}, which does not fit the other arrays")
+            raise FileError(f"{name} has shape {array.shape}, which does not fit the other arrays")
     for starts, items, rows, bound in (
         ("diagram.neighbour_starts", "diagram.neighbours", ("cell", "n"), sizes["n"]),
         ("diagram.cell_vertex_starts", "diagram.cell_vertices", ("cell", "n"), sizes.get("v", 0)),
         ("diagram.face_vertex_starts", "diagram.face_vertices", ("face", "m"), sizes.get("v", 0)),
     ):
         if (starts in arrays) != (items in arrays):
-            raise _FileError(f"it lacks {starts if items in arrays else items}")
+            raise FileError(f"it lacks {starts if items in arrays else items}")
         if starts not in arrays:
             continue
         s, j = arrays[starts], arrays[items]
         piece, count = rows[0], sizes.get(rows[1], 0)
         if len(s) != count + 1 or s[0] != 0 or s[-1] != len(j) or (np.diff(s) < 0).any():
-            raise _FileError(f"{starts} does not cut {items} into one piece per {piece}")
+            raise FileError(f"{starts} does not cut {items} into one piece per {piece}")
         lowest = 0 if items.endswith("vertices") else np.iinfo(j.dtype).min
         if j.size and not (lowest <= j.min() and j.max() < bound):
-            raise _FileError(f"{items} points to what does not exist")
+            raise FileError(f"{items} points to what does not exist")
 
 
 def _assemble(arrays: dict[str, np.ndarray]) -> Result:
@@ -223,16 +140,16 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         description = dict(facts["domain"])
         kind = description.pop("kind")
         if kind not in _DOMAINS:
-            raise _FileError(f"its domain is a {kind!r:.40}, which this version of clvoro lacks")
+            raise FileError(f"its domain is a {kind!r:.40}, which this version of clvoro lacks")
         domain = _DOMAINS[kind](**description)
         settings = dict(facts["settings"])
         values = {name: value for name, value in facts["values"].items() if name in _FIELDS}
         if {"converged", "stop_reason"} - set(values) or set(values) & (set(arrays) | set(_PARTS)):
             raise KeyError("values")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise _FileError(f"its description is damaged ({error})") from error
+        raise FileError(f"its description is damaged ({error})") from error
     if arrays["points"].shape[1] != domain.dim:
-        raise _FileError(f"its points have {arrays['points'].shape[1]} coordinates in {domain}")
+        raise FileError(f"its points have {arrays['points'].shape[1]} coordinates in {domain}")
     stored = arrays["history"]
     history = np.zeros(len(stored), HISTORY_DTYPE)
     for column in set(stored.dtype.names or ()) & set(HISTORY_DTYPE.names or ()):

@@ -1,0 +1,168 @@
+"""NumPy arrays in a zip file, and single ones, read without trust: what `npz.py` and checkpoints are made of."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from os import PathLike, fspath, fstat
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from ..errors import InputError
+from .atomic import atomic_file
+
+EXPANSION, SMALL = 256, 1 << 24
+"""A file may hold this many times its own size, or this many bytes: meshes compress two- or threefold."""
+
+
+class FileError(Exception):
+    """What is wrong with a file; `explained` adds which one."""
+
+
+@contextmanager
+def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
+    """Turn whatever goes wrong in reading `path` into an InputError that names it and what was expected."""
+    name = fspath(path)
+    try:
+        yield
+    except FileError as problem:
+        raise InputError(f"cannot load {name}: {problem}") from problem
+    except zipfile.BadZipFile as error:
+        raise InputError(
+            f"cannot load {name}: it is no such file, or damaged or cut off ({error}); expected {expected}"
+        ) from error
+    except (zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError) as error:
+        raise InputError(f"cannot load {name}: it is damaged or foreign ({error})") from error
+    except (KeyError, IndexError, TypeError, MemoryError) as error:
+        raise InputError(
+            f"cannot load {name}: it is damaged or foreign ({error!r:.200})"
+        ) from error
+    except OSError as error:
+        raise InputError(f"cannot load {name}: {error.strerror or error}") from error
+
+
+def write_arrays(
+    path: str | PathLike[str],
+    kind: str,
+    version: int,
+    arrays: Mapping[str, object],
+    compress: bool = True,
+) -> None:
+    """Write `arrays` by name, atomically; the same arrays give the same bytes.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+    with (
+        atomic_file(path) as file,
+        # Coordinates hardly compress; the graphs do, at any level.
+        zipfile.ZipFile(file, "w", method, compresslevel=1) as archive,
+    ):
+        for name, array in {"format": kind, "version": version, **arrays}.items():
+            # ZipInfo's own date is fixed, unlike the clock's.
+            member = zipfile.ZipInfo(f"{name}.npy")
+            member.compress_type = method
+            with archive.open(member, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+
+
+def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
+    """Read all that `write_arrays` wrote; every byte is under a checksum.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, cut off, of another kind or of a newer version.
+    """
+    with explained(path, f"a {kind}"), zipfile.ZipFile(path) as archive:
+        members = list_members(archive, kind, version)
+        return {name: read_member(archive, info) for name, info in members.items()}
+
+
+def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str, zipfile.ZipInfo]:
+    """Return the members by name, after a look at what kind of file it is and how much it holds."""
+    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    check_expansion(archive)
+    if "format" not in members or "version" not in members:
+        raise FileError(f"it holds no {kind} (members: {', '.join(sorted(members)[:6]):.200})")
+    found = read_member(archive, members["format"])
+    if found.dtype.kind != "U" or found.shape != () or found.item() != kind:
+        raise FileError(f"its format is {found!r:.60}, expected {kind!r}")
+    number = read_member(archive, members["version"])
+    if number.dtype.kind not in "iu" or number.shape != ():
+        raise FileError(f"its version is {number!r:.60}, expected an integer")
+    if not 1 <= number.item() <= version:
+        raise FileError(
+            f"its version is {number.item()}, expected at most {version}; install a newer clvoro"
+        )
+    return members
+
+
+def check_expansion(archive: zipfile.ZipFile) -> None:
+    """Refuse a file that would fill the memory from next to nothing."""
+    held = sum(info.file_size for info in archive.infolist())
+    packed = sum(info.compress_size for info in archive.infolist())
+    if held > max(SMALL, EXPANSION * packed):
+        raise FileError(f"its {packed} bytes expand to {held}, more than {EXPANSION} times as many")
+
+
+def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """Read one array; the sizes are checked against the member's before memory is asked for."""
+    with archive.open(info) as stream:
+        return _read(stream, info.filename, info.file_size)
+
+
+def read_array(path: Path, member: str = "points") -> np.ndarray:
+    """Read an array from a `.npy` file, or the array `member` from a `.npz` file.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it holds no such array, or one of Python objects.
+    """
+    with explained(path, "a .npy file"), open(path, "rb") as file:
+        if file.read(4) == b"PK\x03\x04":
+            with zipfile.ZipFile(file) as archive:
+                check_expansion(archive)
+                if f"{member}.npy" not in archive.namelist():
+                    raise FileError(f"it holds no array called {member!r}")
+                return read_member(archive, archive.getinfo(f"{member}.npy"))
+        file.seek(0)
+        return _read(file, Path(path).name, fstat(file.fileno()).st_size)
+
+
+def _read(stream: IO[bytes], name: str, size: int) -> np.ndarray:
+    try:
+        shape, fortran, dtype = _read_header(stream)
+    except (ValueError, SyntaxError, TypeError, KeyError, RecursionError, MemoryError) as error:
+        raise FileError(f"{name} is no array ({error!s:.200})") from error
+    if dtype.hasobject:
+        raise FileError(
+            f"{name} holds pickled Python objects, which could run any program; they are never loaded"
+        )
+    count = 1
+    for extent in shape:  # Python's integers do not overflow
+        count *= extent
+    length = count * dtype.itemsize
+    if min(shape, default=1) < 0 or length != size - stream.tell() or not dtype.itemsize:
+        raise FileError(f"{name} has not the length that its shape {shape!s:.60} asks for")
+    data = stream.read()  # checks the checksum
+    array = np.frombuffer(data, dtype, count) if count else np.empty(0, dtype)
+    return array.reshape(shape, order="F" if fortran else "C").copy()
+
+
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(stream)
+    if version == (2, 0):
+        return np.lib.format.read_array_header_2_0(stream)
+    raise ValueError(f"its header's version is {version}")
