@@ -7,7 +7,6 @@ import pytest
 
 from clvoro import sizing
 from clvoro._program import Engine
-from clvoro.device import create_context
 from clvoro.domain import Box
 from clvoro.errors import InputError, InputTypeError, SizeFieldError
 
@@ -96,10 +95,10 @@ CASES = [
 
 
 @pytest.fixture(scope="module")
-def queue():
+def queue(ctx):
     import pyopencl as cl
 
-    return cl.CommandQueue(create_context())
+    return cl.CommandQueue(ctx)
 
 
 @pytest.fixture(params=["float64", "float32"])

@@ -8,7 +8,6 @@ import pytest
 from clvoro import sizing
 from clvoro._program import Engine
 from clvoro.boxes import Boxes, hilbert_tables
-from clvoro.device import create_context
 from clvoro.domain import Box
 from clvoro.errors import InputError, InputTypeError, SizeFieldError
 from clvoro.quadrature import DensityTree
@@ -308,10 +307,10 @@ def test_more_points_than_the_precision_can_tell_apart():
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_device_and_host_agree(dtype):
+def test_device_and_host_agree(ctx, dtype):
     import pyopencl as cl
 
-    queue = cl.CommandQueue(create_context())
+    queue = cl.CommandQueue(ctx)
     engine = Engine(queue.context, queue, 2, np.dtype(dtype))
     stage = sizing.Sizing(engine, BOX, F1)
     assert count_cells(stage, BOX) == pytest.approx(587.8113, rel=1.5e-4)
