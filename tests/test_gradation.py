@@ -239,6 +239,16 @@ def test_in_space_and_within_other_fields(make_engine):
     assert 2 * hosted(x) == pytest.approx(stage(x), rel=1e-5)
 
 
+def test_computed_once_for_all_who_ask(make_engine, monkeypatch):
+    engine = make_engine(2)
+    field = sizing.Graded(JUMP, slope=0.25)
+    sizing.Sizing(engine, PLANE, field)
+    monkeypatch.setattr(sizing.Graded, "_compute", None)
+    sizing.Sizing(engine, PLANE, 2 * field)
+    assert len(field.landmarks(PLANE)) > 0
+    assert field([(0.0, 3.5)])[0] == pytest.approx(0.02)
+
+
 def test_callables_are_graded_too(make_engine):
     engine = make_engine(2)
     graded = sizing.Graded(lambda p: np.where(p[:, 0] < 0.1, 0.02, 0.5), slope=0.25)

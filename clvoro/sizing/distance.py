@@ -92,7 +92,7 @@ class Distance(Field):
         dims = {begin.shape[1] for begin, _, _ in parts} | ({3} if self.surfaces else set())
         if len(dims) > 1:
             raise InputError("Distance got shapes of 2 and of 3 coordinates, expected one kind")
-        self.dim: int = dims.pop()
+        self.dim = dims.pop()
         parts = parts or [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))]
         self._begin, self._end, self._radius = (np.concatenate(p) for p in zip(*parts, strict=True))
 
@@ -199,7 +199,7 @@ def _plain(shape: Shape) -> Curve | Surface:
     if shape.dim == 3:
         return box_surface(np.array(shape.lower), np.array(shape.upper))
     (x0, y0), (x1, y1) = shape.lower, shape.upper
-    return Polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+    return Polygon(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
 
 
 def _item_boxes(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from .shapes import coordinates
 _MOST = 1 << 22  # nodes of a raster whose size nobody has asked for
 
 
-def filled(what: str, values: object, missing: str, spacing: np.ndarray) -> np.ndarray:
+def filled(what: str, values: Any, missing: str, spacing: np.ndarray) -> np.ndarray:
     """Return `values` as floats without gaps.
 
     Parameters
@@ -59,7 +60,7 @@ def filled(what: str, values: object, missing: str, spacing: np.ndarray) -> np.n
         raise InputError(f"{what} are all missing, {gaps.size} of them; expected some numbers")
     from scipy.ndimage import distance_transform_edt
 
-    found = distance_transform_edt(
+    found: Any = distance_transform_edt(
         gaps, sampling=spacing[::-1], return_distances=False, return_indices=True
     )
     return array[tuple(found)]
@@ -125,7 +126,7 @@ def scattered_values(
 
 def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: str) -> np.ndarray:
     from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import QhullError, cKDTree
+    from scipy.spatial import KDTree, QhullError
 
     found = np.full(len(nodes), np.nan)
     if method == "linear":
@@ -139,7 +140,7 @@ def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: s
             ) from error
     outside = np.isnan(found)
     if outside.any():
-        found[outside] = values[cKDTree(x).query(nodes[outside])[1]]
+        found[outside] = values[KDTree(x).query(nodes[outside])[1]]
     return found
 
 

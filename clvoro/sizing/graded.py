@@ -102,12 +102,13 @@ class Graded(Field):
                 f"{self!r} has no domain yet, on which it could be computed; pass box=, such as "
                 "Graded(field, 1.2, box=domain)"
             )
-        real = np.dtype(np.float64) if engine is None else engine.real
         self._latest = box
-        key = (box, real)
+        known = [raster for (b, _), raster in self._rasters.items() if b == box]
+        if engine is None and known:
+            return known[0]
+        engine = engine or _default_engine(box.dim)
+        key = (box, engine.real)
         if key not in self._rasters:
-            if engine is None:
-                engine = _default_engine(box.dim, real)
             self._rasters[key] = self._compute(box, engine)
         return self._rasters[key]
 
@@ -133,9 +134,7 @@ class Graded(Field):
         marks = marks[box.contains(marks)]
         at_marks = evaluate(marks) if len(marks) else np.zeros(0)
         counts = self._counts(box, evaluate, at_marks)
-        axes = [
-            np.linspace(*ends, n) for *ends, n in zip(box.lower, box.upper, counts, strict=True)
-        ]
+        axes = _axes(box, counts)
         values = np.empty(np.prod(counts))
         for first in range(0, len(values), _BATCH):
             flat = np.arange(first, min(first + _BATCH, len(values)))
@@ -161,9 +160,7 @@ class Graded(Field):
             return _along(box, longest / (self.resolution - 1))
         coarse = longest / (_PROBES[box.dim] - 1)
         counts = _along(box, coarse)
-        grid = [
-            np.linspace(*ends, n) for *ends, n in zip(box.lower, box.upper, counts, strict=True)
-        ]
+        grid = _axes(box, counts)
         probes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, box.dim)
         least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))  # type: ignore[operator]
         finest = (box.measure / _MOST) ** (1 / box.dim)
@@ -195,6 +192,14 @@ class Graded(Field):
         return f"Graded({self.field!r}, slope={self.slope:g})"
 
 
+def _axes(box: Box, counts: np.ndarray) -> list[np.ndarray]:
+    """Return the coordinates of the nodes along each axis."""
+    return [
+        np.linspace(low, high, n)
+        for low, high, n in zip(box.lower, box.upper, counts.tolist(), strict=True)
+    ]
+
+
 def _along(box: Box, spacing: float) -> np.ndarray:
     """Return how many nodes put them at most `spacing` apart on each axis, at least two."""
     return np.maximum(np.ceil(box.extent / spacing * (1 - 1e-12)).astype(np.int64), 1) + 1
@@ -217,11 +222,11 @@ def _checked(resolution: int | Sequence[int], dim: int | None) -> int | tuple[in
     return tuple(given.tolist()) if given.ndim else int(given)
 
 
-def _default_engine(dim: int, real: np.dtype) -> Engine:
+def _default_engine(dim: int) -> Engine:
     import pyopencl as cl
 
     from .._program import Engine
     from ..device import create_context
 
     ctx = create_context()
-    return Engine(ctx, cl.CommandQueue(ctx), dim, real)
+    return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))

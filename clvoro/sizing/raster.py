@@ -13,6 +13,8 @@ from .field import Field
 from .filling import filled, scattered_values
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from ..domain import Box
     from .bind import Binder
 
@@ -49,9 +51,9 @@ class Raster(Field):
 
     def __init__(
         self,
-        values: object,
-        lower: Sequence[float],
-        upper: Sequence[float],
+        values: ArrayLike,
+        lower: ArrayLike,
+        upper: ArrayLike,
         at: str = "nodes",
         missing: str = "error",
     ):
@@ -100,7 +102,7 @@ class Raster(Field):
         first = np.minimum(t.astype(int), np.maximum(self._counts - 2, 0))
         weight = t - first
         total = np.zeros(len(points))
-        for corner in product((0, 1), repeat=self.dim):
+        for corner in product((0, 1), repeat=self.values.ndim):
             index = np.minimum(first + corner, self._counts - 1)
             w = np.prod(np.where(corner, weight, 1 - weight), axis=1)
             total += w * self.values[tuple(index.T[::-1])]
@@ -159,11 +161,11 @@ class Scattered(Raster):
         method: str = "linear",
     ):
         found, low, high = scattered_values(points, values, lower, upper, resolution, method)
-        super().__init__(found, low.tolist(), high.tolist())
+        super().__init__(found, low, high)
 
 
 def check_corners(
-    what: str, shape: tuple[int, ...], lower: object, upper: object, at: str
+    what: str, shape: tuple[int, ...], lower: ArrayLike, upper: ArrayLike, at: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of a raster of `shape` as arrays (d,), or raise what is wrong with them."""
     if len(shape) not in (2, 3) or 0 in shape:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,11 +14,14 @@ from .field import positive
 from .filling import filled
 from .raster import Raster, check_corners
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 _FLAT = 1e-12  # curvature below this part of the largest is none
 
 
 def hessian_size(
-    values: object,
+    values: ArrayLike,
     lower: Sequence[float],
     upper: Sequence[float],
     *,
@@ -31,7 +35,7 @@ def hessian_size(
 ) -> Raster:
     r"""Return the size that interpolates a solution best in the L^p norm.
 
-    Loseille and Alauzet (Continuous mesh framework, part I, SIAM J. Numer. Anal. 49, 2011) minimise
+    Loseille and Alauzet (Continuous mesh framework, I and II, SIAM J. Numer. Anal. 49, 2011) minimise
     the L^p norm of the interpolation error of u over all metrics of complexity N,
 
         M = D (det |H|)^(-1 / (2 p + d)) |H|,   D = N^(2/d) (integral (det |H|)^(p / (2 p + d)))^(-2/d),
@@ -113,7 +117,7 @@ def hessian_size(
 
 
 def gradient_size(
-    values: object,
+    values: ArrayLike,
     lower: Sequence[float],
     upper: Sequence[float],
     *,
@@ -168,7 +172,13 @@ def gradient_size(
 
 
 def _solution(
-    what: str, values: object, lower: object, upper: object, at: str, missing: str, least: int
+    what: str,
+    values: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    at: str,
+    missing: str,
+    least: int,
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Return the checked values, the corners and the distances of the values along x, y (, z)."""
     shape = np.shape(values)

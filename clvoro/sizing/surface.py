@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
+from numbers import Real
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +31,9 @@ class Surface:
         counter-clockwise for `contains`.
     name : str
         What errors call it.
+    join : float
+        Vertices so near to each other count as one for `closed` and its like, in the unit of the
+        coordinates; 0 joins those at the same place.
 
     Corners at the same place count as one vertex, so a file of separate triangles (STL) is as good
     as one with shared vertices. Open, branching and self-intersecting surfaces are accepted: the
@@ -48,8 +54,12 @@ class Surface:
         size = clvoro.sizing.Distance(part, h_min=0.01, growth=1.1, h_max=0.2)
     """
 
-    def __init__(self, vertices: object, triangles: object, name: str = "Surface"):
-        self.name = name
+    def __init__(
+        self, vertices: object, triangles: object, name: str = "Surface", join: float = 0.0
+    ):
+        if not (isinstance(join, Real) and 0 <= join < math.inf):
+            raise InputError(f"{name} join is {join!r}, expected a finite distance, 0 or more")
+        self.name, self.join = name, float(join)
         self.vertices = coordinates(f"{name} vertices", vertices, 2)
         if self.vertices.shape[1] != 3:
             raise InputError(
@@ -79,12 +89,12 @@ class Surface:
         if not (self.areas > 0).any():
             raise InputError(
                 f"{name} has {len(given)} triangles, none of which has an area; expected a "
-                "surface. Is a column of the coordinates missing, or the unit far too large?"
+                "surface. Is a column of the coordinates missing?"
             )
 
     @classmethod
-    def read(cls, path: str | PathLike[str]) -> Surface:
-        """Read a surface from an STL, OBJ, PLY or OFF file (needs trimesh).
+    def read(cls, path: str | PathLike[str], join: float = 0.0) -> Surface:
+        """Read a surface from an STL, OBJ, PLY or OFF file (needs trimesh); `join` as above.
 
         Raises
         ------
@@ -108,10 +118,10 @@ class Surface:
                 "(or pip install trimesh), or pass the arrays: Surface(vertices, triangles)"
             ) from error
         # Pictures and materials beside the surface are none of our business.
-        extra = {"skip_materials": True} if kind == "obj" else {}
+        extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
         try:
             with path.open("rb") as file:
-                mesh = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
+                mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
             vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         except MemoryError:
             raise
@@ -122,7 +132,7 @@ class Surface:
             ) from error
         if not triangles.size:
             raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
-        return cls(vertices, triangles, name=f"surface {str(path)!r}")
+        return cls(vertices, triangles, f"surface {str(path)!r}", join)
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -130,9 +140,16 @@ class Surface:
         return self.vertices[self.triangles]
 
     @cached_property
+    def _unit_corners(self) -> np.ndarray:
+        """The corners about the middle of the vertices, in units of their largest extent."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        extent = (high - low).max()
+        return (self.corners - (low + 0.5 * (high - low))) / (extent if extent > 0 else 1.0)
+
+    @cached_property
     def areas(self) -> np.ndarray:
-        """Areas of the triangles, (t,) float; in float64 0 below 1e-154 of the unit squared."""
-        a, b, c = np.moveaxis(self.corners, 1, 0)
+        """Areas of the triangles, (t,) float, in units of the largest extent squared."""
+        a, b, c = np.moveaxis(self._unit_corners, 1, 0)
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     @cached_property
@@ -143,7 +160,16 @@ class Surface:
     @cached_property
     def _merged(self) -> np.ndarray:
         """Triangles (t, 3) as indices of places: vertices at the same place are one."""
-        _, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
+        unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
+        if self.join > 0:
+            from scipy.sparse import coo_array
+            from scipy.sparse.csgraph import connected_components
+            from scipy.spatial import KDTree
+
+            near = KDTree(unique).query_pairs(self.join, output_type="ndarray")
+            shape = (len(unique), len(unique))
+            graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
+            places = connected_components(graph, directed=False)[1][places.reshape(-1)]
         return places.reshape(-1)[self.triangles]
 
     @cached_property
@@ -189,8 +215,8 @@ class Surface:
             a, b = (self._place(self.vertices[i]) for i in edges[0])
             raise InputError(
                 f"{self.name} is open: {len(edges)} edges bound one triangle only, the first from "
-                f"{a} to {b}; expected a closed surface, so fill the holes or join vertices that "
-                "should coincide"
+                f"{a} to {b}; expected a closed surface: fill the holes, or pass join= if "
+                "vertices that should coincide are a little apart"
             )
         edges, count, where = self._edges
         odd = np.flatnonzero(count % 2)
@@ -208,8 +234,7 @@ class Surface:
         than 1e-7 of their length are not looked at.
         """
         i, j = self.tree.overlaps()
-        middle = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
-        corners = (self.corners - middle) / np.abs(self.vertices - middle).max()
+        corners = self._unit_corners
         low, high = corners.min(axis=1), corners.max(axis=1)
         found = []
         for first in range(0, len(i), _BLOCK):
@@ -272,10 +297,10 @@ class Surface:
 
     def distance2(self, points: np.ndarray) -> np.ndarray:
         """Return the squared distances of `points` (n, 3) to the surface, (n,) float64."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         used = self.vertices[np.unique(self.triangles)]
-        bound = cKDTree(used).query(points)[0] * (1 + 1e-12)
+        bound = KDTree(used).query(points)[0] * (1 + 1e-12)
         return self.tree.nearest2(
             points, bound**2, lambda x, item: triangle_distance2(x, self.corners[item])
         )
@@ -283,7 +308,8 @@ class Surface:
     def landmarks(self, spacing: float, most: int) -> np.ndarray:
         """Return at most `most` points on the surface, `spacing` apart or so."""
         total = np.cumsum(self.areas)
-        count = int(min(max(total[-1] / spacing**2, 1), most))
+        unit = np.ptp(self.vertices, axis=0).max()
+        count = int(min(max(total[-1] * (unit / spacing) ** 2, 1), most))
         # Evenly along the sum of areas, and in each triangle by the golden section.
         item = np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1])
         item = np.minimum(item, len(total) - 1)
