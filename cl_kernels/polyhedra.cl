@@ -21,6 +21,12 @@ inline void raise_flag(global int *report, int flag, int generator)
     atomic_min(report + 1, generator);
 }
 
+/* The flag that tells of an outcome of clip_cell or clip_by_row, or 0. */
+inline int flag_of(int what)
+{
+    return what < CLIP_FULL ? 0 : (what == CLIP_FULL ? FLAG_FULL : (what == CLIP_COINCIDE ? FLAG_COINCIDE : FLAG_COLLAPSED));
+}
+
 /* Where to look for neighbours. */
 typedef struct {
     global const REAL *points, *binned;
@@ -67,7 +73,7 @@ inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, 
         const REAL4 d = (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
         const int what = clip_cell(cell, d, d2, in->items[q], warm, in->points);
         if (what >= CLIP_FULL)
-            return what == CLIP_FULL ? FLAG_FULL : FLAG_COLLAPSED;
+            return flag_of(what);
     }
     batch->n = 0;
     return 0;
@@ -221,26 +227,6 @@ inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool
     return clip_by_batch(cell, x, &batch, per_shell, warm, in);
 }
 
-/* Clip by the neighbours in an earlier diagram. Returns FLAG_* or 0. */
-inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbours,
-                       global const REAL *points)
-{
-    const int end = starts[i + 1];
-    for (int k = starts[i]; k < end; ++k) {
-        const int j = neighbours[k];
-        if (j < 0)
-            continue;
-        const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
-        const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
-        if (d2 == 0)
-            return FLAG_COINCIDE;
-        const int what = clip_cell(cell, d, d2, j, false, points);
-        if (what >= CLIP_FULL)
-            return what == CLIP_FULL ? FLAG_FULL : FLAG_COLLAPSED;
-    }
-    return 0;
-}
-
 inline REAL4 vertex_at(const cell_t *cell, int v)
 {
     return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
@@ -289,7 +275,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     int flag = 0;
     REAL w = reach[p], inner = -1;
     if (warm) {
-        flag = clip_by_row(&cell, i, x, old_starts, old_neighbours, points);
+        flag = flag_of(clip_by_row(&cell, i, x, old_starts, old_neighbours, points));
         w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
     }
     while (flag == 0) {
@@ -350,21 +336,19 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         square += normal.s3 * face_square;
         mixed += normal.s3 * face_mixed;
         const int label = cell.labels[f];
-        if (label >= 0) {
-            /* Faces below rounding are none; smaller ones than a neighbour is sure to see, too, are doubtful. */
-            if (!(area > sqrt(REAL_EPS) * d2)) {
-                REAL width2 = 0;
-                for (v = vertex_after(&cell, first_vertex, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
-                    const REAL4 e = vertex_at(&cell, v) - a;
-                    width2 = fmax(width2, dot3(e, e));
-                }
-                const REAL least = 8 * noise_length(1 / inverse);
-                if (!(area > 2 * least * sqrt(width2)))
-                    continue;
-                doubtful = true;
+        /* Faces below rounding are none; smaller ones than a neighbour is sure to see, too, are doubtful. */
+        const REAL across2 = label >= 0 ? d2 : cell.reach2;
+        if (!(area > sqrt(REAL_EPS) * across2)) {
+            REAL width2 = 0;
+            for (v = vertex_after(&cell, first_vertex, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
+                const REAL4 e = vertex_at(&cell, v) - a;
+                width2 = fmax(width2, dot3(e, e));
             }
-            doubtful |= d2 < near2;
+            if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2)))
+                continue;
+            doubtful |= label >= 0;
         }
+        doubtful |= across2 < near2;
         if (fits) {
             const REAL third = area > 0 ? 1 / (3 * area) : 0;
             labels[place + count] = label;

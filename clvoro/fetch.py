@@ -10,6 +10,7 @@ import pyopencl.array as cla
 from ._program import Engine
 from .cells import Tessellation
 from .domain import Box
+from .loops import FaceLoops, Loops
 from .results import Diagram
 from .vertices import VertexNumbering, Vertices
 
@@ -17,7 +18,8 @@ from .vertices import VertexNumbering, Vertices
 def fetch_diagram(engine: Engine, domain: Box, t: Tessellation, labels: cla.Array) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for."""
     fetched = _Fetched(engine, domain, t, labels)
-    names = (name for name in Diagram._NAMES if hasattr(_Fetched, name))
+    others = "face_vert" if engine.dim == 2 else "cell_vert"
+    names = (name for name in Diagram._NAMES if not name.startswith(others))
     return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
 
 
@@ -75,8 +77,18 @@ class _Fetched:
 
     @cached_property
     def shared(self) -> Vertices:
-        """Vertices, each once."""
+        """Vertices, each once, in 2D."""
         return VertexNumbering(self.engine).number(self.domain, self.t)
+
+    @cached_property
+    def loops(self) -> Loops:
+        """Vertices, each once, in 3D, and the loops of faces in the device's order."""
+        return FaceLoops(self.engine).walk(self.domain, self.t)
+
+    @cached_property
+    def loop_starts(self) -> np.ndarray:
+        """Device `starts` of the loops, (m + 1,)."""
+        return self.loops.starts.get()
 
     def _read(self, array: cla.Array, rows: np.ndarray, power: int) -> np.ndarray:
         return array.get().astype(np.float64)[rows] * self.scale**power
@@ -107,7 +119,8 @@ class _Fetched:
         return self._read(self.t.face_centroids, self.slots, 1) + own
 
     def vertices(self) -> np.ndarray:
-        positions = self.shared.positions.get().astype(np.float64) * self.scale + self.origin
+        shared = self.shared if self.engine.dim == 2 else self.loops
+        positions = shared.positions.get().astype(np.float64) * self.scale + self.origin
         # A rounding may not carry a corner out of the domain.
         return np.clip(positions, self.domain.lower, self.domain.upper)
 
@@ -116,3 +129,13 @@ class _Fetched:
 
     def cell_vertices(self) -> np.ndarray:
         return self.shared.cell_vertices.get()[self.slots]
+
+    def face_vertex_starts(self) -> np.ndarray:
+        lengths = np.diff(self.loop_starts)[self.slots]
+        return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+
+    def face_vertices(self) -> np.ndarray:
+        starts = self.face_vertex_starts()
+        shift = self.loop_starts[self.slots] - starts[:-1]
+        places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))
+        return self.loops.vertices.get()[places]

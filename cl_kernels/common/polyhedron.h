@@ -69,6 +69,7 @@ inline int next_face(const ulong *set, int f)
 #define CLIP_CUT 1       /* it does */
 #define CLIP_FULL 2      /* it does, and there are too many faces */
 #define CLIP_COLLAPSED 3 /* rounding leaves nothing, or much on the wrong side */
+#define CLIP_COINCIDE 4  /* another generator is at the place of the cell's own */
 
 /* Arrays of vertices are filled up to whole vectors by zeros: the generator itself, which no bisector cuts off. */
 typedef struct {
@@ -310,6 +311,11 @@ inline REAL noise_length(REAL distance)
     return 4 * REAL_EPS * distance + fmin(4 * REAL_EPS, FINEST * distance);
 }
 
+/* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbours that are seen are known to have a face. */
+#ifndef CLIP_SHARPLY
+#define CLIP_SHARPLY 0
+#endif
+
 /* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before` the
    neighbour may be a face of the cell already. */
 inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
@@ -325,10 +331,10 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
     const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
     const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
-    if (!(farthest > 4 * REAL_EPS * d2))
+    if (!(farthest > (CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
         return CLIP_MISSED;
     const REAL distance = sqrt(d2);
-    const REAL depth = distance * noise_length(distance);
+    const REAL depth = CLIP_SHARPLY ? 0 : distance * noise_length(distance);
     if (!(farthest > depth))
         return CLIP_MISSED;
     if (seen_before)
@@ -340,7 +346,7 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
     if (!find_rim(cell, depth, &rim)) {
         if (rim.gone == cell->n)
             return CLIP_COLLAPSED;
-        const REAL doubt = 64 * (depth + distance * REAL_EPS * sqrt(cell->reach2));
+        const REAL doubt = 64 * distance * (noise_length(distance) + REAL_EPS * sqrt(cell->reach2));
         if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
             return CLIP_COLLAPSED;
     }
@@ -406,6 +412,24 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
         x[last] = y[last] = z[last] = 0;
     }
     find_reach(cell);
+    return CLIP_CUT;
+}
+
+/* Clip by the generators in row i of a graph; one of CLIP_*, or CLIP_COINCIDE. */
+inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbours,
+                       global const REAL *points)
+{
+    const int end = starts[i + 1];
+    for (int k = starts[i]; k < end; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
+        const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
+        const int what = d2 == 0 ? CLIP_COINCIDE : clip_cell(cell, d, d2, j, false, points);
+        if (what >= CLIP_FULL)
+            return what;
+    }
     return CLIP_CUT;
 }
 

@@ -1,0 +1,252 @@
+#define CLIP_SHARPLY 1
+#include "common/polyhedron.h"
+
+/* Vertices and face loops of a diagram in 3D, from its graph. Each cell is clipped once more, by its neighbours alone. Its
+   vertices, the corners, are numbered cell by cell: corner u. The same point is a corner of every cell that meets
+   there: corners are one vertex where an edge between them has no length, and where they lie at the same place of the
+   face that two cells share. The least corner of a vertex gives it its label and its position. That needs no tolerance
+   but in edges, and so holds where many cells meet in a point.
+
+   starts, neighbours          the graph: faces k, in rows i
+   corner_starts (n + 1,)      first corner of each cell
+   turn_starts (m + 1,)        first turn of each face: its loop as its own cell sees it, counter-clockwise from outside
+   turns (t,)                  corners */
+
+/* The cell of generator i; false if there is not enough room. */
+inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
+                      global const int *starts, global const int *neighbours)
+{
+    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    start_cell(cell, x, lower, upper);
+    return clip_by_row(cell, i, x, starts, neighbours, points) != CLIP_FULL;
+}
+
+/* The face of the cell with a label, or FACE_CAPACITY. */
+inline int find_face(const cell_t *cell, int label)
+{
+    int f = next_face(cell->alive, 0);
+    while (f < FACE_CAPACITY && cell->labels[f] != label)
+        f = next_face(cell->alive, f + 1);
+    return f;
+}
+
+inline int vertex_of(const cell_t *cell, int f)
+{
+    int v = 0;
+    while (cell->faces[v].s0 != f && cell->faces[v].s1 != f && cell->faces[v].s2 != f)
+        ++v;
+    return v;
+}
+
+/* Per generator i: how many corners its cell has, and how many turns each of its faces. full[0] is set if a cell has more
+   than FACE_CAPACITY faces. */
+kernel void count_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                          global const int *starts, global const int *neighbours, global int *corner_counts,
+                          global int *turn_counts, global int *full)
+{
+    WORK_ITEM(i);
+    cell_t cell;
+    if (!make_cell(&cell, i, points, box_lower, box_upper, starts, neighbours)) {
+        full[0] = 1;
+        return;
+    }
+    corner_counts[i] = cell.n;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int f = find_face(&cell, neighbours[k]);
+        int count = 0;
+        if (f < FACE_CAPACITY) {
+            const int first = vertex_of(&cell, f);
+            int v = first;
+            do {
+                v = vertex_after(&cell, v, f);
+                ++count;
+            } while (v != first);
+        }
+        turn_counts[k] = count;
+    }
+}
+
+/* Per generator i: its corners (c, 3), relative to x_i, and turns. same[u] is the least corner of the cell that lies where
+   corner u does, joined to it by edges of no length. */
+kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                         global const int *starts, global const int *neighbours, global const int *corner_starts,
+                         global const int *turn_starts, global REAL *corners, global int *same, global int *turns)
+{
+    WORK_ITEM(i);
+    cell_t cell;
+    make_cell(&cell, i, points, box_lower, box_upper, starts, neighbours);
+    const int base = corner_starts[i];
+    const REAL least = 4 * noise_length(sqrt(cell.reach2));
+    INDEX joined[VERTEX_CAPACITY];
+    for (int v = 0; v < cell.n; ++v) {
+        corners[3 * (base + v)] = X(&cell)[v];
+        corners[3 * (base + v) + 1] = Y(&cell)[v];
+        corners[3 * (base + v) + 2] = Z(&cell)[v];
+        joined[v] = v;
+    }
+    bool changed = true;
+    while (changed) {
+        changed = false;
+        for (int v = 0; v < cell.n; ++v) {
+            const INDEX4 f = cell.faces[v];
+            const int a[4] = {f.s0, f.s1, f.s2, f.s0};
+            for (int e = 0; e < 3; ++e) {
+                const int w = cell.at[a[e + 1] * FACE_CAPACITY + a[e]];
+                if (joined[w] >= joined[v])
+                    continue;
+                const REAL dx = X(&cell)[w] - X(&cell)[v], dy = Y(&cell)[w] - Y(&cell)[v], dz = Z(&cell)[w] - Z(&cell)[v];
+                if (dx * dx + dy * dy + dz * dz < least * least) {
+                    joined[v] = joined[w];
+                    changed = true;
+                }
+            }
+        }
+    }
+    for (int v = 0; v < cell.n; ++v)
+        same[base + v] = base + joined[v];
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int f = find_face(&cell, neighbours[k]);
+        if (f == FACE_CAPACITY)
+            continue;
+        int v = vertex_of(&cell, f);
+        for (int t = turn_starts[k]; t < turn_starts[k + 1]; ++t) {
+            turns[t] = base + v;
+            v = vertex_after(&cell, v, f);
+        }
+    }
+}
+
+/* Per generator i: twins[k], the same face in the neighbour's row (k for a wall), and partners[t] of its turns: the corner
+   of the twin that lies nearest. */
+kernel void match_corners(const int size, global const REAL *points, global const int *starts,
+                          global const int *neighbours, global const REAL *corners, global const int *turn_starts,
+                          global const int *turns, global int *twins, global int *partners)
+{
+    WORK_ITEM(i);
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        int twin = k;
+        REAL d[3] = {0, 0, 0};
+        if (j >= 0) {
+            twin = starts[j];
+            while (neighbours[twin] != i)
+                ++twin;
+            for (int a = 0; a < 3; ++a)
+                d[a] = points[3 * j + a] - points[3 * i + a];
+        }
+        twins[k] = twin;
+        for (int t = turn_starts[k]; t < turn_starts[k + 1]; ++t) {
+            const int u = turns[t];
+            int nearest = u;
+            REAL least = REAL_MAX;
+            for (int s = turn_starts[twin]; s < turn_starts[twin + 1] && twin != k; ++s) {
+                const int w = turns[s];
+                REAL r2 = 0;
+                for (int a = 0; a < 3; ++a) {
+                    const REAL r = corners[3 * w + a] + d[a] - corners[3 * u + a];
+                    r2 += r * r;
+                }
+                if (r2 < least) {
+                    least = r2;
+                    nearest = w;
+                }
+            }
+            partners[t] = nearest;
+        }
+    }
+}
+
+inline bool join(global int *labels, int u, int w)
+{
+    const int a = labels[u], b = labels[w];
+    if (a == b)
+        return false;
+    atomic_min(labels + (a > b ? u : w), min(a, b));
+    atomic_min(labels + max(a, b), min(a, b));
+    return true;
+}
+
+/* Per corner u: pass on the least label to where it lies. */
+kernel void spread_in_cells(const int size, global const int *same, global int *labels, global int *changed)
+{
+    WORK_ITEM(u);
+    if (join(labels, u, same[u]))
+        changed[0] = 1;
+    const int label = labels[labels[u]];
+    if (label < labels[u]) {
+        atomic_min(labels + u, label);
+        changed[0] = 1;
+    }
+}
+
+/* Per turn t: the same across the face. The least label of all is where this ends, in whatever order. */
+kernel void spread_over_faces(const int size, global const int *turns, global const int *partners, global int *labels,
+                              global int *changed)
+{
+    WORK_ITEM(t);
+    if (join(labels, turns[t], partners[t]))
+        changed[0] = 1;
+}
+
+/* Vertices of a loop, each once where corners are the same; written to `out` in its order, or against it. */
+inline int walk_loop(int k, bool reverse, global const int *turn_starts, global const int *turns, global const int *labels,
+                     global const int *ids, global int *out)
+{
+    const int begin = turn_starts[k], n = turn_starts[k + 1] - begin;
+    int count = 0;
+    for (int s = 0; s < n; ++s) {
+        const int at = reverse ? n - 1 - s : s;
+        const int label = labels[turns[begin + at]];
+        const int last = labels[turns[begin + (reverse ? (at == n - 1 ? 0 : at + 1) : (at == 0 ? n - 1 : at - 1))]];
+        if (label == last)
+            continue;
+        if (out)
+            out[count] = ids[label];
+        ++count;
+    }
+    return count;
+}
+
+/* Which of a face and its twin gives both their loop: that of the lesser cell, unless it is no polygon there. */
+inline int giver_of(int k, int twin, global const int *turn_starts, global const int *turns, global const int *labels)
+{
+    const int first = min(k, twin), second = max(k, twin);
+    if (first == second || walk_loop(first, false, turn_starts, turns, labels, labels, 0) >= 3)
+        return first;
+    return walk_loop(second, false, turn_starts, turns, labels, labels, 0) >= 3 ? second : first;
+}
+
+/* Per face k: the length of its loop; marks the labels that are in use. */
+kernel void measure_loops(const int size, global const int *twins, global const int *turn_starts, global const int *turns,
+                          global const int *labels, global int *loop_counts, global int *used)
+{
+    WORK_ITEM(k);
+    const int giver = giver_of(k, twins[k], turn_starts, turns, labels);
+    loop_counts[k] = walk_loop(giver, false, turn_starts, turns, labels, labels, 0);
+    for (int t = turn_starts[giver]; t < turn_starts[giver + 1]; ++t)
+        used[labels[turns[t]]] = 1;
+}
+
+/* Per face k: its loop, in the numbers of vertices; ids are the prefix sums of `used`. */
+kernel void write_loops(const int size, global const int *twins, global const int *turn_starts, global const int *turns,
+                        global const int *labels, global const int *ids, global const int *loop_starts,
+                        global int *loops)
+{
+    WORK_ITEM(k);
+    const int giver = giver_of(k, twins[k], turn_starts, turns, labels);
+    walk_loop(giver, giver != k, turn_starts, turns, labels, ids, loops + loop_starts[k]);
+}
+
+/* Per generator i: the positions of the vertices (v, 3) whose least corner is one of its cell's. */
+kernel void place_vertices(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                           global const int *corner_starts, global const REAL *corners, global const int *ids,
+                           global REAL *vertices)
+{
+    WORK_ITEM(i);
+    const REAL lower[3] = {box_lower.s0, box_lower.s1, box_lower.s2};
+    const REAL upper[3] = {box_upper.s0, box_upper.s1, box_upper.s2};
+    for (int u = corner_starts[i]; u < corner_starts[i + 1]; ++u)
+        if (ids[u] != ids[u + 1])
+            for (int a = 0; a < 3; ++a)
+                vertices[3 * ids[u] + a] = clamp(points[3 * i + a] + corners[3 * u + a], lower[a], upper[a]);
+}
