@@ -226,14 +226,16 @@ kernel void compose_groups(int n, global const int *inner, global const int *out
        u_i = own_i r_i + both_i (r_i + r_partner_i)
 
    in these terms, all >= 0 (but for a pair without neighbours), because the entries of the block's inverse differ by less than rounding when the pair is
-   tight: rounded on their own they can make the inverse indefinite. both is the same to the last bit for the two. */
+   tight: rounded on their own they can make the inverse indefinite. both is the same to the last bit for the two.
+
+   mate may be `partner` itself, of an earlier call: who is its own mate has none. */
 kernel void pair_inverse(
     int n, global const int *starts, global const int *columns, global const REAL *weights, global const int *mate,
     global int *partner, global REAL *own, global REAL *both)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
-    const int j = mate[i];
+    const int j = mate[i] == i ? NONE : mate[i];
     REAL mine = 0, theirs = 0, between = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         if (columns[k] == i) continue;

@@ -113,24 +113,28 @@ class Coarsening:
         self._kernels = engine.kernels("coarsening", {"SOURCE": source})
         self._scan = Scan(engine)
         self._room = Room(engine)
+        self._exponent = 0
 
     def _run(self, kernel: cl.Kernel, size: int, *args: object) -> None:
         self.engine.run(kernel, whole_groups(size), *args)
 
-    def convert(self, graph: Graph, level: int) -> Graph:
+    def convert(self, graph: Graph, level: int, *, anew: bool = True) -> Graph:
         """Return `graph` with its weights in this engine's precision, times a power of two.
 
         The largest becomes 1 at most, so that weights of any unit and their inverses are in range.
+        Without `anew` the power is the last call's.
         """
         m = len(graph.weights)
         size, weights = np.int32(m), self._room(level, "weights", size=m)
-        items = self.engine.groups * self.engine.group_size
-        partial = self._room("largest", size=items, dtype=graph.weights.dtype)
-        rows = (np.int32(len(graph)), graph.starts)
-        self.engine.run_blocks(self._kernels.largest, *rows, graph.weights, partial)
-        most = float(partial.get().max())
-        exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
-        self._run(self._kernels.convert, m, size, np.int32(exponent), graph.weights, weights)
+        if anew:
+            items = self.engine.groups * self.engine.group_size
+            partial = self._room("largest", size=items, dtype=graph.weights.dtype)
+            rows = (np.int32(len(graph)), graph.starts)
+            self.engine.run_blocks(self._kernels.largest, *rows, graph.weights, partial)
+            most = float(partial.get().max())
+            self._exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
+        exponent = np.int32(self._exponent)
+        self._run(self._kernels.convert, m, size, exponent, graph.weights, weights)
         return Graph(graph.starts, graph.columns, weights)
 
     def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Groups, Graph]:
@@ -152,6 +156,14 @@ class Coarsening:
         mate = room("mate", size=n, dtype=np.int32).fill(-1)
         self._round(graph, self._sums(graph), mate, room("choice", size=n, dtype=np.int32))
         return self._pair_inverse(graph, mate, level)
+
+    def renew_pairs(self, graph: Graph, pairs: PairInverse) -> None:
+        """Set the blocks of `pairs` for other weights of the same cells; the pairs stay."""
+        n = len(graph)
+        self._run(
+            self._kernels.pair_inverse, n, np.int32(n), graph.starts, graph.columns, graph.weights,
+            pairs.partner, pairs.partner, pairs.own, pairs.both,
+        )  # fmt: skip
 
     def _sums(self, graph: Graph) -> cla.Array:
         """Inverse sums of the rows' weights."""

@@ -65,7 +65,9 @@ class PublishedMethod:
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         laplacian = poisson.assemble(t.starts, t.neighbours, t.face_measures, mesh.points)
         poisson.compatible(mesh.error, t.volumes, mesh.source)
-        solution = poisson.solve(laplacian, mesh.source, mesh.potential, tolerance=r.tolerance)
+        solution = poisson.solve(
+            laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
+        )
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
         alpha = mesh.engine.dim if r.alpha is None else r.alpha
@@ -107,8 +109,11 @@ class WeightedMethod:
             t.starts, t.neighbours, t.face_measures, mesh.points, w.density
         )
         poisson.compatible(w.excess, w.weight, mesh.source)
-        mesh.potential.fill(0)
-        solution = poisson.solve(laplacian, mesh.source, mesh.potential, tolerance=self.tolerance)
+        # Generators get new labels, in an array of their own, whenever their order changes.
+        solution = poisson.solve(
+            laplacian, mesh.source, mesh.potential, tolerance=self.tolerance, numbering=mesh.labels,
+            from_zero=True,
+        )  # fmt: skip
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         return solution
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -107,6 +107,24 @@ class Multigrid:
                 break
             self._levels.append(_Level(graph, pairs, groups, *vectors))
             graph = coarse
+        self._programme = None
+
+    def renew(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
+        """Take a similar operator on the same cells: only the smoother of the finest level follows.
+
+        Any coarse correction will do for a positive definite cycle, and that of a graph that has
+        changed a little does nearly as well: groups hold together, and flows between them change
+        less than those between cells.
+
+        Parameters
+        ----------
+        starts, columns, weights
+            As for `set_up`, which has been called for as many cells.
+        """
+        graph = self._coarsening.convert(Graph(starts, columns, weights), 0, anew=False)
+        finest = self._levels[0]
+        self._coarsening.renew_pairs(graph, finest.pairs)
+        self._levels[0] = replace(finest, graph=graph)
         self._programme = None
 
     def _eliminate(self, graph: Graph) -> None:

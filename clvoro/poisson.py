@@ -16,6 +16,10 @@ from .krylov import CURVATURE, BreakdownError, ConjugateGradient, Launch, Soluti
 from .multigrid import Multigrid
 
 _MOST_CYCLES = 200
+_ROUGH = 1e-3
+"""Tolerance from which on the recurrence is trusted with the residual: it loses digits only far down."""
+_MOST_LOST = 5
+"""Iterations that a solve may take more than the first with the same multigrid; a set-up costs about nine."""
 _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
 
 
@@ -74,6 +78,8 @@ class Poisson:
         self._krylov = ConjugateGradient(engine)
         self._multigrid: Multigrid | None = None
         self._prepared: Laplacian | None = None
+        self._numbering: object = None
+        self._at_best = self._latest = 0
         self._room = Room(engine)
 
     def assemble(
@@ -136,13 +142,24 @@ class Poisson:
         """Enqueue y = A x."""
         self.engine.run_blocks(self._kernels.apply, *self._arguments(laplacian, x, y))
 
-    def set_up_multigrid(self, laplacian: Laplacian) -> Multigrid:
-        """Make the preconditioner for `laplacian` unless it was made last; `solve` does so."""
+    def set_up_multigrid(self, laplacian: Laplacian, numbering: object = None) -> Multigrid:
+        """Make the preconditioner for `laplacian` unless it was made last; `solve` does so.
+
+        With the `numbering` of the last call only its finest level is made anew, as long as that
+        costs the solves no more than `_MOST_LOST` iterations.
+        """
         if self._multigrid is None:
             self._multigrid = Multigrid(self.engine)
-        if self._prepared is not laplacian:
-            self._multigrid.set_up(laplacian.starts, laplacian.neighbours, laplacian.weights)
-            self._prepared = laplacian
+        if self._prepared is laplacian:
+            return self._multigrid
+        operator = laplacian.starts, laplacian.neighbours, laplacian.weights
+        similar = numbering is not None and numbering is self._numbering
+        if similar and 0 < self._latest <= self._at_best + _MOST_LOST:
+            self._multigrid.renew(*operator)
+        else:
+            self._multigrid.set_up(*operator)
+            self._at_best = self._latest = 0
+        self._prepared, self._numbering = laplacian, numbering
         return self._multigrid
 
     def solve(
@@ -154,6 +171,8 @@ class Poisson:
         tolerance: float = 1e-8,
         max_iterations: int | None = None,
         preconditioner: str = "auto",
+        numbering: object = None,
+        from_zero: bool = False,
     ) -> Solution:
         """Solve A phi = b, the paper's (3.2) integrated over the cells; phi has mean zero.
 
@@ -175,6 +194,11 @@ class Poisson:
             multigrid break down, stagnate early, or not converge in 200 iterations where
             `max_iterations` is not given, Jacobi's method takes over from there;
             `Solution.reason` says so.
+        numbering : object, optional
+            One that is the same as in an earlier call tells that the cells are the same, in the same
+            order, and have only moved a little: most of the multigrid is then used again.
+        from_zero : bool
+            Start from zero, whatever `potential` holds.
 
         Returns
         -------
@@ -209,6 +233,8 @@ class Poisson:
                 fused=True,
                 centre=True,
                 lookahead=lookahead,
+                from_zero=from_zero,
+                verify=tolerance < _ROUGH,
             )
 
         default = 500 + 30 * math.isqrt(n)
@@ -220,7 +246,10 @@ class Poisson:
             return run(laplacian.inverse_diagonal, most, 64)
         try:
             most = _MOST_CYCLES if max_iterations is None else max_iterations
-            first = run(self.set_up_multigrid(laplacian).apply, most, 4)
+            multigrid = self.set_up_multigrid(laplacian, numbering)
+            first = run(multigrid.apply, most, 4)
+            self._latest = first.iterations
+            self._at_best = self._at_best or first.iterations
             # Far above what the precision allows it is the preconditioner, in float32, that is stuck.
             stuck = self.engine.real == np.float64 and first.residual > 1e-8
             if first.reason == "stagnated" and stuck:
@@ -236,6 +265,7 @@ class Poisson:
             potential.fill(0)
         done = len(residuals) - 1
         most = default if max_iterations is None else max(max_iterations - done, 0)
+        from_zero = False
         second = run(laplacian.inverse_diagonal, most, 64)
         return Solution(
             done + second.iterations,

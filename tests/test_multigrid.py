@@ -461,3 +461,88 @@ def test_set_up_again_for_another_graph(make):
         multigrid.apply(engine.upload(r), u)
         results.append(u.get())
     assert np.array_equal(*results)
+
+
+def neighbouring_weights(n, amount, seed=404):
+    """Weights of the same random cells before and after each has moved by `amount` of their spacing."""
+    points = graphs.random_graph(n, seed=seed)[0]
+    noise = np.random.default_rng(seed + 1).normal(0, amount / np.sqrt(n), (n, 2))
+    moved = np.clip(points + noise, 1e-3, 1 - 1e-3)
+    after = (moved, *graphs.voronoi_graph(moved))
+    return weights_of((points, *graphs.voronoi_graph(points))), weights_of(after)
+
+
+def test_renewed_cycle(make):
+    """The finest level is the new graph's, in the old pairs; groups and coarse graphs are the old ones."""
+    engine, n = make(), 900
+    before, after = neighbouring_weights(n, 0.3)
+    assert (before != after).nnz > 0.5 * before.nnz
+    multigrid = Multigrid(engine)
+    multigrid.set_up(*upload(engine, before))
+    coarse = dense_graph(multigrid._levels[1].graph)
+    partner = multigrid._levels[0].pairs.partner.get()
+    multigrid.renew(*upload(engine, after))
+    assert np.array_equal(multigrid._levels[0].pairs.partner.get(), partner)
+    assert np.array_equal(dense_graph(multigrid._levels[1].graph), coarse)
+    A = sp.diags(np.asarray(after.sum(axis=1)).ravel()) - after
+    fine = dense_graph(multigrid._levels[0].graph)
+    # Weights in single precision, times a power of two.
+    scale = fine.max() / A.max()
+    assert np.log2(scale) == pytest.approx(round(np.log2(scale)), abs=1e-5)
+    assert np.abs(fine - scale * A.toarray()).max() <= 1e-6 * fine.max()
+    r = np.random.default_rng(9).standard_normal(n)
+    r -= r.mean()
+    u = engine.zeros(n)
+    multigrid.apply(engine.upload(r), u)
+    expected = reference_cycle(multigrid, 0, r)
+    assert np.abs(u.get() - expected).max() <= 2e-4 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("amount", [0.05, 0.5, 3.0])
+def test_renewed_cycle_is_positive_definite(make, amount):
+    """However little the coarse levels have to do with the new graph."""
+    engine, n = make(), 400
+    before, after = neighbouring_weights(n, amount)
+    multigrid = Multigrid(engine)
+    multigrid.set_up(*upload(engine, before))
+    multigrid.renew(*upload(engine, after))
+    M = reference_cycle(multigrid, 0, np.eye(n))
+    assert np.abs(M - M.T).max() <= 1e-6 * np.abs(M).max()
+    assert np.linalg.eigvalsh((M + M.T) / 2).min() > 0
+
+
+def test_multigrid_is_used_again_while_it_serves(make):
+    """Cells that move a little: a few more iterations. If they move a lot it is made anew at the next solve."""
+    engine, n = make(), 6000
+    first, second = neighbouring_weights(n, 0.05)
+    scattered = neighbouring_weights(n, 1.5)[1]
+    poisson, cells = Poisson(engine), object()
+    b = np.random.default_rng(10).standard_normal(n)
+
+    def solve(W, numbering):
+        diagonal = np.asarray(W.sum(axis=1)).ravel()
+        laplacian = Laplacian(
+            *upload(engine, W), engine.upload(diagonal), engine.upload(1 / diagonal), engine.zeros((n, 2))
+        )  # fmt: skip
+        phi = engine.zeros(n)
+        solution = poisson.solve(
+            laplacian, engine.upload(b), phi, preconditioner="multigrid", numbering=numbering
+        )
+        assert solution.reason == "converged"
+        A = sp.diags(diagonal) - W
+        left = np.linalg.norm(b - b.mean() - A @ phi.get()) / np.linalg.norm(b - b.mean())
+        assert left == pytest.approx(solution.residual, rel=0.1)
+        return solution.iterations, poisson._multigrid._levels[1].graph
+
+    anew, coarse = solve(first, cells)
+    again, kept = solve(second, cells)
+    assert again <= anew + 5
+    assert kept is coarse
+    worse, kept = solve(scattered, cells)
+    assert kept is coarse
+    assert worse > anew + 5
+    better, kept = solve(scattered, cells)
+    assert kept is not coarse
+    assert abs(better - anew) <= 2
+    assert solve(second, None)[1] is not kept
+    assert solve(second, object())[1] is not kept

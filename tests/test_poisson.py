@@ -348,3 +348,22 @@ def test_bad_input(make):
         poisson.solve(laplacian, b, phi, preconditioner="ilu")
     with pytest.raises(InputError, match="tolerance got"):
         poisson.solve(laplacian, b, phi, tolerance=0)
+
+
+def test_from_zero_and_unverified(make):
+    """The start's content does not matter; a rough solve tells the recurrence's residual, which is the true one."""
+    engine = make()
+    graph = graphs.random_graph(900, seed=363)
+    poisson, laplacian = assembled(engine, graph)
+    b = np.random.default_rng(7).standard_normal(900)
+    b -= b.mean()
+    results = []
+    for start in (np.zeros(900), np.full(900, np.nan)):
+        phi = engine.upload(start)
+        solution = poisson.solve(laplacian, engine.upload(b), phi, tolerance=1e-2, from_zero=True)
+        left = np.linalg.norm(b - as_matrix(laplacian) @ phi.get()) / np.linalg.norm(b)
+        assert solution.residual <= 1e-2
+        assert solution.reason == "converged"
+        assert left == pytest.approx(solution.residual, rel=1e-9)
+        results.append(phi.get())
+    assert np.array_equal(*results)
