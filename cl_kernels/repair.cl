@@ -9,7 +9,7 @@
    that every cell is still convex and fits its neighbours (`check_rows`), clip those that do not by all the neighbours
    of their neighbours (`clip_marked`), check these (`check_clipped`), and so on until all fit. */
 
-/* Directions to as many neighbours are kept while a cell is checked; one with more is clipped anew each time. */
+/* A cell with more is clipped anew each time: it is rare, and would hold up its work-group. */
 #define CHECKED_FACES 16
 
 /* Do a corner of cell i and what cell `other` takes for the same corner, between its faces p and q, coincide but for
@@ -25,10 +25,11 @@ inline bool same_corner(REAL2 mine, int i, int other, int p, int q, REAL d2, glo
 }
 
 /* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
-   `after`, at corners u and v; so in j's row i must stand between `after` and `before`. */
+   `after`, at corners u and v; so in j's row i must stand between `after` and `before`; it is `exact` if it does. */
 inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
-                           global const REAL *points, const REAL *lower, const REAL *upper)
+                           global const REAL *points, const REAL *lower, const REAL *upper, bool *exact)
 {
+    *exact = false;
     int q = 0;
     while (q < n && row[q] != i)
         ++q;
@@ -38,17 +39,31 @@ inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v
         return is_short(dot(e, e), d2);
     }
     const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
-    if (p == after && s == before)
+    *exact = p == after && s == before;
+    if (*exact)
         return true;
     return (p == after || same_corner(v, i, j, p, i, d2, points, lower, upper)) &&
            (s == before || same_corner(u, i, j, i, s, d2, points, lower, upper));
 }
 
+/* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from the
+   directions, which are at hand, where both are generators. */
+inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points, const REAL *lower,
+                       const REAL *upper)
+{
+    if (a < 0 || b < 0)
+        return corner(i, x, a, b, points, lower, upper);
+    const REAL2 w = v - u;
+    const REAL u2 = dot(u, u), w2 = dot(w, w);
+    return w2 > R(1e-3) * u2 ? circumcentre(u, v, u2, dot(v, v)) : corner(i, x, a, b, points, lower, upper);
+}
+
 /* Per generator i: marks[i] = 1, and its neighbours' at the face in question, where the neighbours from before no longer
    enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; all who write one
-   write the same. */
+   write the same. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up. */
 kernel void check_rows(const int size, global const int *starts, global const int *neighbours,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *marks)
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *fits,
+                       global int *marks)
 {
     WORK_ITEM(i);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
@@ -60,47 +75,53 @@ kernel void check_rows(const int size, global const int *starts, global const in
         marks[i] = 1;
         return;
     }
-    REAL2 d[CHECKED_FACES];
-    for (int k = 0; k < n; ++k)
-        d[k] = face_direction(row[k], x, points);
-    /* Corner v lies before face k, w behind it. */
-    int a = row[n - 1];
-    REAL2 da = d[n - 1];
-    REAL2 v = corner(i, x, a, row[0], points, lower, upper);
+    /* Face k, its direction, and the corners u before it and v behind it; face `before` lies before it. */
+    int before = row[n - 1], face = row[0];
+    REAL2 d = face_direction(face, x, points);
+    REAL2 u = corner_of(i, x, before, face, face_direction(before, x, points), d, points, lower, upper);
     REAL reach2 = 0, least2 = REAL_MAX;
     int turns = 0;
-    bool bad = false;
+    bool bad = false, fit = true;
+    const bool known = fits[i];
     for (int k = 0; k < n; ++k) {
-        const int face = row[k], b = row[k == n - 1 ? 0 : k + 1];
-        const REAL2 df = d[k], db = d[k == n - 1 ? 0 : k + 1];
-        const REAL2 w = corner(i, x, face, b, points, lower, upper);
-        const REAL2 e = w - v;
-        const REAL r2 = dot(w, w);
+        const int after = row[k == n - 1 ? 0 : k + 1];
+        const REAL2 d_after = face_direction(after, x, points);
+        const REAL2 v = corner_of(i, x, face, after, d, d_after, points, lower, upper);
+        const REAL2 e = v - u;
+        const REAL r2 = dot(v, v);
         reach2 = fmax(reach2, r2);
-        const bool convex = difference_of_products(df.s0, db.s1, df.s1, db.s0) > 0;
-        turns += df.s1 < 0 && db.s1 >= 0;
-        const REAL d2 = face >= 0 ? dot(df, df) : r2;
-        bool good = convex && df.s0 * e.s1 - df.s1 * e.s0 > 0 && dot(e, e) >= REAL_EPS * d2;
+        turns += d.s1 < 0 && d_after.s1 >= 0;
+        const REAL d2 = face >= 0 ? dot(d, d) : r2;
+        bool good = d.s0 * d_after.s1 - d.s1 * d_after.s0 > 0 && d.s0 * e.s1 - d.s1 * e.s0 > 0 &&
+                    dot(e, e) >= REAL_EPS * d2;
         if (face >= 0) {
             least2 = fmin(least2, d2);
-            const int other = starts[face];
-            good = good && fits_neighbour(i, face, a, b, v, w, d2, neighbours + other, starts[face + 1] - other, points,
-                                          lower, upper);
+            if (!known) {
+                const int other = starts[face], m = starts[face + 1] - other;
+                bool exact;
+                good = good && fits_neighbour(i, face, before, after, u, v, d2, neighbours + other, m, points, lower,
+                                              upper, &exact);
+                fit = fit && good && exact;
+            }
         }
         if (!good) {
             bad = true;
-            if (a >= 0)
-                marks[a] = 1;
+            if (before >= 0)
+                marks[before] = 1;
             if (face >= 0)
                 marks[face] = 1;
-            if (b >= 0)
-                marks[b] = 1;
+            if (after >= 0)
+                marks[after] = 1;
         }
-        a = face;
-        v = w;
+        before = face;
+        face = after;
+        d = d_after;
+        u = v;
     }
     if (bad || turns != 1 || least2 < sqrt(REAL_EPS) * reach2)
         marks[i] = 1;
+    if (!known)
+        fits[i] = fit;
 }
 
 /* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */
@@ -157,11 +178,11 @@ kernel void clip_marked(const int size, global const int *listed, const int base
 
 /* Per listed generator: put its new row in the place of the old one. */
 kernel void place_clipped(const int size, global const int *listed, const int base, global int *places,
-                          global int *marks)
+                          global int *marks, global int *fits)
 {
     WORK_ITEM(w);
     places[listed[w]] = base + w;
-    marks[listed[w]] = 0;
+    marks[listed[w]] = fits[listed[w]] = 0;
 }
 
 /* Per listed generator: mark it and its neighbours where they do not fit together. Those who were not clipped have been
@@ -169,7 +190,7 @@ kernel void place_clipped(const int size, global const int *listed, const int ba
 kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
                           global const int *slot_counts, global const int *old_starts,
                           global const int *old_neighbours, global const REAL *points, const REAL4 box_lower,
-                          const REAL4 box_upper, global int *marks)
+                          const REAL4 box_upper, global int *marks, global int *fits)
 {
     WORK_ITEM(w);
     const int i = listed[w];
@@ -190,7 +211,9 @@ kernel void check_clipped(const int size, global const int *listed, global const
             continue;
         const REAL2 d = face_direction(j, x, points);
         global const int *other = face_row(&rows, j, &m);
-        if (!fits_neighbour(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
+        bool exact;
+        fits[j] = 0;
+        if (!fits_neighbour(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper, &exact))
             marks[i] = marks[j] = 1;
     }
     /* Whom the row from before names is told as well: he may still name i. */

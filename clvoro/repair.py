@@ -29,6 +29,7 @@ class Repair:
         self._scan = Scan(engine)
         self._kernels: dict[tuple[int, ...], SimpleNamespace] = {}
         self._n = -1
+        self._last: Tessellation | None = None
 
     def follow(
         self, cells: Cells, box: Box, points: cla.Array, previous: Tessellation
@@ -45,19 +46,23 @@ class Repair:
         if n != self._n:
             self._n = n
             self._marks, self._listed = engine.empty(n, np.int32), engine.empty(n, np.int32)
-            self._sums = engine.empty(n + 1, np.int32)
+            self._sums, self._fits = engine.empty(n + 1, np.int32), engine.empty(n, np.int32)
+            self._last = None
+        if previous is not self._last:
+            self._fits.fill(0)
         corners = box.device_corners(engine.real)
         old = (previous.starts, previous.neighbours)
         cells.clear_flags()
         self._marks.fill(0)
         rows.places.fill(-1)
-        engine.run_each(k.check_rows, n, *old, points, *corners, self._marks)
+        engine.run_each(k.check_rows, n, *old, points, *corners, self._fits, self._marks)
         base = 0
         for _ in range(MAX_ROUNDS):
             self._scan.exclusive(self._marks, self._sums, n)
             count = int(self._sums[n].get())
             if count == 0:
-                return cells.complete(box, points, previous)
+                self._last = cells.complete(box, points, previous)
+                return self._last
             if base + count > MAX_SHARE * n:
                 return None
             engine.run_each(k.list_marked, n, self._marks, self._sums, self._listed)
@@ -66,11 +71,12 @@ class Repair:
                 rows.counts, *old, points, *corners, rows.flags,
             )  # fmt: skip
             engine.run_each(
-                k.place_clipped, count, self._listed, np.int32(base), rows.places, self._marks
-            )
+                k.place_clipped, count, self._listed, np.int32(base), rows.places, self._marks,
+                self._fits,
+            )  # fmt: skip
             engine.run_each(
                 k.check_clipped, count, self._listed, rows.places, rows.slots, rows.counts, *old,
-                points, *corners, self._marks,
+                points, *corners, self._marks, self._fits,
             )  # fmt: skip
             base += count
         return None
