@@ -183,7 +183,7 @@ def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
     assert counts[0] == pytest.approx(counts[1], rel=5e-3)
 
 
-@pytest.mark.parametrize("unit", [1e-250, 1e-30, 1e30, 1e150])
+@pytest.mark.parametrize("unit", [1e-45, 1e-20, 1e20, 1e45])
 def test_units_do_not_matter(engine, unit):
     vertices, triangles = MESHES["torus"]
     points = np.random.default_rng(10).uniform(DOMAIN.lower, DOMAIN.upper, (200, 3))

@@ -75,8 +75,8 @@ REAL size_segment_distance2(const REAL *x, __global const REAL *item)
 
 /* A triangle with a corner at a: a (3), its sides b - a and c - a (3 each), the vectors that give the coordinates
    s and t of a point a + s (b - a) + t (c - a) in its plane (3 each), the unit normal (3; 0 if it is so thin that it is
-   its sides). */
-#define SIZE_TRIANGLE 18
+   its sides), 1 / length^2 of b - a, c - a and c - b (0 for a point). */
+#define SIZE_TRIANGLE 21
 
 #if DIM == 3
 REAL size_dot(const REAL *a, __global const REAL *b)
@@ -84,12 +84,11 @@ REAL size_dot(const REAL *a, __global const REAL *b)
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-/* Squared distance to a side of which v = x - begin and its vector d are known. */
-REAL size_side_distance2(const REAL *v, const REAL *d)
+/* Squared distance to a side of which v = x - begin, its vector d and 1 / |d|^2 are known. */
+REAL size_side_distance2(const REAL *v, const REAL *d, REAL inverse)
 {
-    const REAL length2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
     REAL t = v[0] * d[0] + v[1] * d[1] + v[2] * d[2], sum = 0;
-    t = length2 > 0 ? fmin(fmax(t / length2, (REAL)0), (REAL)1) : 0;
+    t = fmin(fmax(t * inverse, (REAL)0), (REAL)1);
     for (int a = 0; a < 3; ++a) {
         const REAL w = v[a] - t * d[a];
         sum += w * w;
@@ -117,17 +116,17 @@ REAL size_triangle_distance2(const REAL *x, __global const REAL *item)
             side[a] = item[6 + a] - item[3 + a];
             w[a] = v[a] - item[3 + a];
         }
-        best2 = size_side_distance2(w, side);
+        best2 = size_side_distance2(w, side, item[20]);
     }
     if (thin || t < 0) {
         for (int a = 0; a < 3; ++a)
             side[a] = item[3 + a];
-        best2 = fmin(best2, size_side_distance2(v, side));
+        best2 = fmin(best2, size_side_distance2(v, side, item[18]));
     }
     if (thin || s < 0) {
         for (int a = 0; a < 3; ++a)
             side[a] = item[6 + a];
-        best2 = fmin(best2, size_side_distance2(v, side));
+        best2 = fmin(best2, size_side_distance2(v, side, item[19]));
     }
     return best2;
 }

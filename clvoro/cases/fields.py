@@ -12,6 +12,7 @@ import numpy as np
 
 from ..domain import Box
 from ..errors import InputError
+from ..io.arrays import read_array
 from .naca import naca4
 
 
@@ -101,9 +102,8 @@ def load_array(path: Path, place: str) -> np.ndarray:
         If there is no such file or it holds no such array.
     """
     try:
-        content = np.load(path, allow_pickle=False)
-        return content if isinstance(content, np.ndarray) else content["points"]
-    except (OSError, ValueError, KeyError) as error:
+        return read_array(path, "points")
+    except InputError as error:
         raise InputError(
             f"{place} names {str(path)!r}, which cannot be read as an array ({error}); "
             "give a .npy file beside the case file"

@@ -83,12 +83,14 @@ def hessian_size(
 
     Examples
     --------
-    About 5000 cells, small across the front of a tanh and large elsewhere::
+    About 5000 cells, small where a tanh bends and large elsewhere. Between its two bends, and
+    wherever else a second derivative passes through 0, the formula asks for large cells; `Graded`
+    fills such gaps, and `n_cells` of the run brings the count back::
 
         x, y = np.meshgrid(np.linspace(0, 1, 401), np.linspace(0, 1, 401))
         u = np.tanh(50 * (x + y - 1))
-        size = hessian_size(u, (0, 0), (1, 1), n_cells=5000, h_max=0.1)
-        clvoro.Adapter().run(clvoro.Box((0, 0), (1, 1)), size).plot("size")
+        size = Graded(hessian_size(u, (0, 0), (1, 1), n_cells=5000, h_max=0.1), growth=1.2)
+        clvoro.Adapter().run(clvoro.Box((0, 0), (1, 1)), size, n_cells=5000).plot("size")
     """
     u, corners, spacing = _solution("hessian_size", values, lower, upper, at, missing, least=3)
     if not (isinstance(p, Real) and p >= 1):

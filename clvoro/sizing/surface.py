@@ -319,12 +319,12 @@ class Surface:
         return np.einsum("nk,nkd->nd", weights, self.corners[item])
 
     def packed(self, origin: np.ndarray, scale: float, real: np.dtype) -> tuple[np.ndarray, Tree]:
-        """Return the triangles as the device takes them, (t, 18) in the tree's order, and the tree.
+        """Return the triangles as the device takes them, (t, 21) in the tree's order, and the tree.
 
         A corner a, the sides b - a and c - a, the two vectors that tell a point's coordinates s and
-        t in them, and the unit normal; coordinates x' = (x - origin) / scale, rounded to `real`
-        first, so that the rest fits what the device sees. A triangle thinner than 1e-7 of its
-        length has no normal: it is its sides.
+        t in them, the unit normal, and 1 / length^2 of b - a, c - a, c - b; in coordinates
+        x' = (x - origin) / scale, rounded to `real` first, so that the rest fits what the device
+        sees. A triangle thinner than 1e-7 of its length has no normal: it is its sides.
         """
         corners = ((self.corners - origin) / scale).astype(real)
         tree = Tree(corners.min(axis=1), corners.max(axis=1))
@@ -336,14 +336,15 @@ class Surface:
         )
         normal = np.cross(side1, side2)
         double_area = np.linalg.norm(normal, axis=1)
-        longest = np.maximum.reduce(
-            [(s**2).sum(axis=1) for s in (side1, side2, side2 - side1)], initial=0.0
-        )
+        length2 = np.column_stack([(v**2).sum(axis=1) for v in (side1, side2, side2 - side1)])
+        longest = length2.max(axis=1)
         sound = double_area > 1e-7 * longest
         normal = np.where(sound[:, None], normal / np.where(sound, double_area, 1)[:, None], 0)
         over = np.divide(1, double_area, out=np.zeros_like(double_area), where=sound)[:, None]
         s, t = np.cross(side2, normal) * over, np.cross(normal, side1) * over
-        return np.hstack([a, side1, side2, s, t, normal]), tree
+        tiny = 4 * float(np.finfo(real).tiny)
+        inverse = np.divide(1, length2, out=np.zeros_like(length2), where=length2 > tiny)
+        return np.hstack([a, side1, side2, s, t, normal, inverse]), tree
 
     def __len__(self) -> int:
         return len(self.triangles)
