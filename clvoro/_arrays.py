@@ -22,7 +22,10 @@ def check_points(points: object, domain: Box) -> np.ndarray:
     InputError
         If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
     """
-    array = np.asarray(points)
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise InputError(f"points is no array ({error}), expected shape (n, {domain.dim})") from error
     if array.dtype.kind not in "fiu":
         raise InputTypeError(
             f"points has dtype {array.dtype}, expected real numbers; convert with points.astype(float)"

@@ -370,7 +370,7 @@ def _check_result(check: _Check, result: Result) -> None:
         lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
     )  # fmt: skip
     check.note("size", ~(h > 0), lambda i: f"size[{i}] is {h[i]}, expected > 0", stop=True)
-    eps = np.finfo(Rebuilt(d).real).eps
+    eps = float(np.finfo(Rebuilt(d).real).eps)
     length = np.maximum(d.volumes, 0) ** (1 / dim)
     with np.errstate(all="ignore"):
         error = (length - h) / np.minimum(length, h)

@@ -9,6 +9,9 @@ import numpy as np
 
 from .errors import InputError
 
+LARGEST_EDGE = 1e50
+"""Longest edge, and one over the shortest: fifth powers of lengths must not leave the range of float64."""
+
 
 @dataclass(frozen=True)
 class Box:
@@ -22,7 +25,7 @@ class Box:
     Raises
     ------
     InputError
-        If the corners are not 2 or 3 finite numbers each with lower < upper.
+        If the corners are not 2 or 3 finite numbers each with lower < upper, or too near or far for float64.
     """
 
     lower: tuple[float, ...]
@@ -40,6 +43,13 @@ class Box:
             raise InputError(
                 f"Box got lower {self.lower} and upper {self.upper}, expected finite numbers with "
                 "lower < upper in every direction; exchange or correct the corners"
+            )
+        with np.errstate(over="ignore"):
+            extent = upper - lower
+        if not (extent.min() >= 1 / LARGEST_EDGE and extent.max() <= LARGEST_EDGE):
+            raise InputError(
+                f"Box got edges of {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to {LARGEST_EDGE:g}: "
+                "volumes and moments of cells must be numbers, too; choose another unit of length"
             )
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))

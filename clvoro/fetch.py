@@ -96,7 +96,9 @@ class _Fetched:
     # One method for each of Diagram's arrays.
 
     def points(self) -> np.ndarray:
-        return self._read(self.t.points, self.order, 1) + self.origin
+        positions = self._read(self.t.points, self.order, 1) + self.origin
+        # A rounding may not carry a generator on a wall out of the domain.
+        return np.clip(positions, self.domain.lower, self.domain.upper)
 
     def volumes(self) -> np.ndarray:
         return self._read(self.t.volumes, self.order, self.engine.dim)

@@ -36,7 +36,7 @@ class Rebuilt:
         far = max(map(abs, (*d.domain.lower, *d.domain.upper)))
         size = float(np.linalg.norm(d.domain.extent))
         # What is on the host is in float64 again: the way from the origin rounds in that.
-        self.unit = np.finfo(self.real).eps * size + np.finfo(float).eps * far
+        self.unit = float(np.finfo(self.real).eps) * size + np.finfo(float).eps * far
         self.owner = np.repeat(np.arange(n), np.diff(d.neighbour_starts))
         x = d.vertices
         # All lengths relative to the cell's generator: small cells far from the origin keep their digits.

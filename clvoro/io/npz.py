@@ -40,7 +40,7 @@ _SHAPES = {
     "diagram.neighbour_starts": "N", "diagram.neighbours": "m", "diagram.face_measures": "m",
     "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
     "diagram.cell_vertices": "c", "diagram.face_vertex_starts": "M", "diagram.face_vertices": "f",
-    "initial.points": "nd", "initial.lloyd": "nd", "initial.poisson": "nd",
+    "initial.points": "ad", "initial.lloyd": "ad", "initial.poisson": "ad",  # before any were inserted
     "final.points": "nd", "final.lloyd": "nd", "final.poisson": "nd",
 }  # fmt: skip
 

@@ -1,0 +1,170 @@
+"""Small work for every kernel, to be run on the simulator Oclgrind: `python -m tests.oclgrind_work NAME [OPTION ...]`.
+
+Prints one JSON object: which kernels have run, and how often. `tests/test_oclgrind.py` starts it and
+reads the simulator's log. Options: `float32`; `groups`, the work-groups of a GPU (of 16 here, with
+local memory and barriers) in the place of a CPU's groups of one.
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+import clvoro
+from clvoro import _program
+from clvoro.sizing import Circle, Distance, Expression, Polygon, Raster, minimum
+
+BOX = clvoro.Box((0, 0), (2.5, 1.5))
+GRADED = "0.12 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)"
+
+
+def points(n: int, dim: int = 2, seed: int = 733) -> np.ndarray:
+    return np.random.default_rng(seed).random((n, dim))
+
+
+def diagrams(adapter: clvoro.Adapter) -> None:
+    """Sets that need every branch: few, lattice, cluster (bins in bins), cocircular (rows enlarged)."""
+    square = clvoro.Box((0, 0), (1, 1))
+    lattice = np.stack(np.meshgrid(*[np.arange(5) / 4] * 2), axis=-1).reshape(-1, 2)
+    cluster = np.concatenate([points(15), 0.3 + 1e-4 * points(60)])
+    angle = np.linspace(0, 2 * np.pi, 29)[:-1]
+    ring = 0.5 + 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for each in (points(1), points(2), lattice, cluster, np.vstack([ring, [[0.5, 0.5]]])):
+        diagram = adapter.diagram(square, each)
+        assert abs(diagram.volumes.sum() - 1) < 1e-4
+        assert len(diagram.vertices) > 3
+
+
+def solid(adapter: clvoro.Adapter) -> None:
+    """A diagram in three dimensions."""
+    diagram = adapter.diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), points(20, 3))
+    assert abs(diagram.volumes.sum() - 1) < 1e-4
+    assert len(diagram.vertices) > 3
+
+
+def method(name: str, **options: object) -> Callable[[clvoro.Adapter], None]:
+    def work(adapter: clvoro.Adapter) -> None:
+        size = Expression(GRADED)
+        result = adapter.run(BOX, size, method=name, seed=911, **options)
+        assert np.isfinite(result.error).all()
+
+    return work
+
+
+def fields(adapter: clvoro.Adapter) -> None:
+    """Every kind of size field, and a callable."""
+    many = Polygon(0.75 + 0.4 * np.stack([np.cos(t := np.linspace(0, 6.2, 150)), np.sin(t)], 1))
+    raster = Raster(0.2 + 0.1 * points(12).reshape(4, 6), BOX.lower, BOX.upper)
+    few = Distance([Circle((0.5, 0.5), 0.2)], 0.1, growth=1.3, h_max=0.4)
+    for size in (
+        minimum(few, raster),
+        Distance([many], 0.2, slope=0.3),
+        lambda x: 0.3 + 0 * x[:, 0],
+    ):
+        adapter.run(BOX, size, method="weighted", max_steps=1, seed=911)
+    adapter.run(BOX, few, method="exact", n_cells=60, effort="fast", seed=911, max_steps=3)
+
+
+def multigrid(adapter: clvoro.Adapter) -> None:
+    """The preconditioner, which runs would only take for larger meshes."""
+    from clvoro.poisson import Poisson
+
+    n = 400
+    adapter.diagram(BOX, points(n))
+    engine = adapter._stages[2].engine
+    t = _tessellate(adapter, n)
+    stage = Poisson(engine)
+    laplacian = stage.assemble(t.starts, t.neighbours, t.face_measures, t.points)
+    rhs = engine.upload(points(n)[:, 0])
+    for preconditioner in ("multigrid", "jacobi"):
+        potential = engine.zeros(n)
+        solution = stage.solve(
+            laplacian, rhs, potential, tolerance=1e-3, preconditioner=preconditioner
+        )
+        assert solution.converged
+        stage.apply(laplacian, potential, rhs)
+
+
+def _tessellate(adapter: clvoro.Adapter, n: int):
+    stages, (origin, scale) = adapter._stages[2], BOX.frame
+    on_device = stages.engine.upload((points(n) - origin) / scale)
+    return stages.cells.tessellate(BOX, on_device, n, stages.bins.build(BOX, on_device, n))
+
+
+def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
+    """A kernel that is wrong on purpose: what finds nothing here finds nothing anywhere."""
+
+    def work(adapter: clvoro.Adapter) -> None:
+        text = {
+            "bounds": "kernel void bounds(global int *a) { a[get_global_id(0) + 1] = 1; }",
+            "race": "kernel void race(global int *a) { a[0] = get_global_id(0); }",
+            "local_race": "kernel void local_race(global int *a) { local int s[16]; int i = get_local_id(0);"
+            " s[i] = i; a[i] = s[15 - i]; }",
+            "barrier_": "kernel void barrier_(global int *a)"
+            " { if (get_local_id(0) < 3) barrier(CLK_LOCAL_MEM_FENCE); a[get_global_id(0)] = 1; }",
+            "private": "kernel void private_(global int *a) { int s[4]; int i = get_global_id(0);"
+            " s[i % 3] = i; a[i] = s[a[i] + 3]; }",
+        }[kernel]
+        ones = np.zeros(16, np.int32)
+        buffer = cl.Buffer(adapter.ctx, cl.mem_flags.COPY_HOST_PTR, hostbuf=ones)
+        program = cl.Program(adapter.ctx, text).build()
+        cl.enqueue_nd_range_kernel(
+            adapter.queue, _bound(program.all_kernels()[0], buffer), (16,), (16,)
+        )
+        adapter.queue.finish()
+
+    return work
+
+
+def _bound(kernel: cl.Kernel, buffer: cl.Buffer) -> cl.Kernel:
+    kernel.set_args(buffer)
+    return kernel
+
+
+WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
+    "diagrams": diagrams,
+    "solid": solid,
+    "fields": fields,
+    "multigrid": multigrid,
+    "coupled": method("coupled", max_steps=2),
+    "lloyd": method("lloyd", max_steps=1),
+    "weighted": method("weighted", max_steps=2),
+    "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
+    "best": method("adaptive", levels=0, n_cells=60, effort="best", max_steps=40),
+    "exact": method("exact", levels=0, effort="fast", max_steps=75),
+    **{f"broken-{k}": broken(k) for k in ("bounds", "race", "local_race", "barrier_", "private")},
+}
+
+
+def main(name: str, *options: str) -> None:
+    context = clvoro.create_context("oclgrind")
+    counts: collections.Counter[str] = collections.Counter()
+    original = cl.enqueue_nd_range_kernel
+
+    def counted(queue, kernel, *rest, **more):
+        counts[kernel.function_name] += 1
+        return original(queue, kernel, *rest, **more)
+
+    cl.enqueue_nd_range_kernel = counted
+    if "groups" in options:
+        made = _program.Engine.__post_init__
+
+        def like_a_gpu(self) -> None:
+            made(self)
+            object.__setattr__(self, "groups", 3)
+            object.__setattr__(self, "group_size", 16)
+
+        _program.Engine.__post_init__ = like_a_gpu
+    adapter = clvoro.Adapter(context, "float32" if "float32" in options else "float64")
+    WORK[name](adapter)
+    adapter.queue.finish()
+    print(json.dumps(counts))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,256 @@
+"""A run goes on from a checkpoint to the same end, bit for bit; what is not its checkpoint is refused by name."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro import cli
+from clvoro.checkpoint import Saved
+from clvoro.errors import InputError
+
+BOX = clvoro.Box((0, 0), (2.5, 1.5))
+SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")
+RUNS = {
+    "coupled": {"method": "coupled", "max_steps": 9},
+    "adaptive": {"method": "adaptive", "effort": "fast", "levels": 1},
+    "count held": {"method": "exact", "effort": "fast", "n_cells": 250},
+}
+
+
+def stop_after(rows):
+    seen = []
+
+    def callback(row):
+        seen.append(row)
+        return len(seen) > rows
+
+    return callback
+
+
+def assert_same(a, b):
+    for name in ("points", "size", "error", "quality", "origin"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    for name in ("volumes", "neighbours", "vertices", "face_measures", "centroids"):
+        assert np.array_equal(getattr(a.diagram, name), getattr(b.diagram, name)), name
+    for name in set(a.history.dtype.names) - {"seconds"}:
+        assert np.array_equal(a.history[name], b.history[name]), name
+    for part in ("initial", "final"):
+        for name in ("points", "lloyd", "poisson"):
+            one, other = (getattr(getattr(r, part), name) for r in (a, b))
+            assert np.array_equal(one, other), (part, name)
+    assert (a.converged, a.stop_reason, a.size_factor) == (
+        b.converged,
+        b.stop_reason,
+        b.size_factor,
+    )
+    assert a.settings == b.settings
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("kind", list(RUNS))
+def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
+    whole = clvoro.Adapter(ctx, dtype).run(BOX, SIZE, seed=5, **RUNS[kind])
+    rows = len(whole.history)
+    for stop in (1, rows // 2, rows - 3):
+        path = tmp_path / "state"
+        stopped = clvoro.Adapter(ctx, dtype).run(
+            BOX, SIZE, seed=5, callback=stop_after(stop), checkpoint=path, checkpoint_every=1e9,
+            **RUNS[kind],
+        )  # fmt: skip
+        assert stopped.stop_reason == "stopped by the callback"
+        resumed = clvoro.Adapter(ctx, dtype).run(BOX, SIZE, seed=5, resume=path, **RUNS[kind])
+        assert_same(resumed, whole)
+        assert (np.diff(resumed.history["seconds"]) >= 0).all()
+
+
+def test_writing_checkpoints_changes_nothing(ctx, tmp_path):
+    options = {"method": "adaptive", "effort": "fast", "seed": 8}
+    path = tmp_path / "state"
+    plain = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
+    written = clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=0, **options)
+    assert_same(plain, written)
+    # The last one is the end of the plan: nothing is left to do but to fetch.
+    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **options), plain)
+    assert os.listdir(tmp_path) == ["state"]
+
+
+def test_own_points_and_callables(ctx, tmp_path):
+    points = np.random.default_rng(12).random((200, 2)) * BOX.extent
+    path = tmp_path / "state"
+    options = {"points": points, "method": "weighted", "max_steps": 8, "tol": 0.0}
+
+    def size(x):
+        return 0.1 + 0.02 * x[:, 0]
+
+    whole = clvoro.Adapter(ctx).run(BOX, size, **options)
+    stop = {"callback": stop_after(4), "checkpoint": path}
+    clvoro.Adapter(ctx).run(BOX, size, **stop, **options)
+    assert_same(clvoro.Adapter(ctx).run(BOX, size, resume=path, **options), whole)
+
+
+@pytest.fixture(scope="module")
+def saved(ctx, tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "state"
+    options = {"method": "coupled", "max_steps": 6, "seed": 5}
+    clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(2), checkpoint=path, **options)
+    return path, options
+
+
+OTHERS = {
+    "seed": {"seed": 6},
+    "method": {"method": "lloyd"},
+    "max_steps": {"max_steps": 7},
+    "k": {"k": 0.25},
+    "n_cells": {"n_cells": 300},
+    "points": {"points": np.random.default_rng(4).random((50, 2))},
+}
+
+
+@pytest.mark.parametrize("name", list(OTHERS))
+def test_other_settings_are_refused_by_name(ctx, saved, name):
+    path, options = saved
+    with pytest.raises(InputError, match=rf"cannot resume.*{name} = "):
+        clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **{**options, **OTHERS[name]})
+
+
+def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
+    path, options = saved
+    with pytest.raises(InputError, match="domain = "):
+        clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (2.5, 1.6)), SIZE, resume=path, **options)
+    with pytest.raises(InputError, match="dtype = float64"):
+        clvoro.Adapter(ctx, "float32").run(BOX, SIZE, resume=path, **options)
+    with pytest.raises(InputError, match=r"size field is another.*this field's is [0-9]"):
+        clvoro.Adapter(ctx).run(BOX, 1.0001 * SIZE, resume=path, **options)
+    with pytest.raises(InputError, match="checkpoint_every is -1"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=-1, **options)
+    with pytest.raises(InputError, match="no folder"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path / "none" / "state", **options)
+
+
+def rewrite(path, target, change):
+    """Copy a checkpoint with some of its arrays changed, all checksums right."""
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(target, "w") as new:
+        for info in old.infolist():
+            with old.open(info) as stream:
+                array = np.lib.format.read_array(stream)
+            name = info.filename.removesuffix(".npy")
+            with new.open(info.filename, "w") as stream:
+                np.lib.format.write_array(stream, np.asanyarray(change(name, array)))
+
+
+def with_state(**values):
+    def change(name, array):
+        if name != "about":
+            return array
+        about = json.loads(array.item())
+        about["state"] |= values
+        return np.array(json.dumps(about))
+
+    return change
+
+
+def spoil(which, index, value):
+    def change(name, array):
+        if name == which:
+            array[index] = value
+        return array
+
+    return change
+
+
+DAMAGED = {
+    "neighbour too high": spoil("diagram.neighbours", 7, 10**6),
+    "neighbour too low": spoil("diagram.neighbours", 7, -9),
+    "starts": spoil("diagram.starts", 4, 10**6),
+    "labels": spoil("mesh.labels", 0, 10**6),
+    "labels twice": lambda name, a: np.where(a == 3, 4, a) if name == "mesh.labels" else a,
+    "points": spoil("mesh.points", (0, 0), np.nan),
+    "outside": spoil("mesh.points", (0, 0), 1.5),
+    "sizes": spoil("mesh.h", 3, 0.0),
+    "position": with_state(position=-1),
+    "far position": with_state(position=10**9),
+    "spare": with_state(spare=10**12),
+    "text": with_state(steps="3"),
+    "coarsening": with_state(coarsening="nan"),
+    "shape": lambda name, array: array[:-1] if name == "mesh.velocity" else array,
+    "type": lambda name, array: array.astype(np.float32) if name == "mesh.h" else array,
+}
+
+
+@pytest.mark.parametrize("name", list(DAMAGED))
+def test_damaged_checkpoints_are_refused(ctx, saved, tmp_path, name):
+    path, options = saved
+    rewrite(path, tmp_path / "state", DAMAGED[name])
+    with pytest.raises(InputError, match="cannot resume"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, resume=tmp_path / "state", **options)
+
+
+def flipped(data):
+    """One bit of the middle, where an array is."""
+    place = len(data) // 2
+    return data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :]
+
+
+def test_cut_off_and_foreign_files_are_refused(saved, tmp_path):
+    data = saved[0].read_bytes()
+    for content in (
+        data[:-100],
+        data[: len(data) // 2],
+        b"",
+        b"PK\x03\x04",
+        flipped(data),
+    ):
+        (tmp_path / "state").write_bytes(content)
+        with pytest.raises(InputError, match="cannot load"):
+            Saved(tmp_path / "state")
+    with pytest.raises(InputError, match="cannot load"):
+        Saved(tmp_path / "none")
+    clvoro.Adapter().run(BOX, 0.3, method="lloyd", max_steps=0).save(tmp_path / "m.npz")
+    with pytest.raises(InputError, match="its format is"):
+        Saved(tmp_path / "m.npz")
+
+
+CASE = """[domain]
+lower = [0, 0]
+upper = [2.5, 1.5]
+[size]
+kind = "expression"
+expression = "0.02 + 0.1*fabs(hypot(x-0.9, y-0.75)-0.3)"
+[run]
+method = "coupled"
+max_steps = 400
+tol = 0
+"""
+
+
+def test_command_line_stops_at_sigterm_and_resumes(tmp_path, capsys):
+    case, state, out = tmp_path / "c.toml", tmp_path / "state", tmp_path / "out"
+    case.write_text(CASE)
+    command = ["run", str(case), "--out", str(out), "--no-report", "--quiet", "--checkpoint"]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "clvoro", *command, str(state), "--checkpoint-every", "0.2"],
+        cwd=Path(__file__).parent.parent,
+    )
+    until = time.monotonic() + 120
+    while not state.exists() and time.monotonic() < until and child.poll() is None:
+        time.sleep(0.05)
+    child.send_signal(signal.SIGTERM)
+    assert child.wait(60) == 130
+    stopped = clvoro.load(out / "mesh.npz")
+    assert stopped.stop_reason == "interrupted"
+    # The checkpoint is where it stopped.
+    assert Saved(state).state["steps"] == stopped.history["step"][-1]
+    again = [*command, str(state), "--resume", str(state)]
+    assert cli.main([*again, "--seed", "9"]) == 2
+    assert "seed = 0" in capsys.readouterr().err
+    assert cli.main([*again, "--method", "coupled,lloyd"]) == 2
+    assert "--method" in capsys.readouterr().err
