@@ -5,17 +5,32 @@
 /* Per generator i:
    density  rho = h^-d
    weight   V rho, the number of generators that the cell should hold
-   excess   r = log(V / h^d) = d log(L / h): the cell is too large by this share of its volume */
+   excess   r = log(V / h^d) = d log(L / h): the cell is too large by this share of its volume
+
+   Four generators per work-item, as their logarithms come at the price of one on a CPU. */
 kernel void evaluate_density(const int size, global const REAL *volumes, global const REAL *h, global REAL *density,
                              global REAL *weight, global REAL *excess, global REAL *log_h)
 {
-    WORK_ITEM(i);
-    const REAL target = h[i];
-    const REAL rho = 1 / (DIM == 2 ? target * target : target * target * target);
-    density[i] = rho;
-    weight[i] = volumes[i] * rho;
-    excess[i] = log(volumes[i] * rho);
-    log_h[i] = log(target);
+    const int begin = 4 * get_global_id(0);
+    if (begin >= size)
+        return;
+    if (begin + 4 <= size) {
+        const REAL4 target = vload4(0, h + begin), volume = vload4(0, volumes + begin);
+        const REAL4 rho = 1 / (DIM == 2 ? target * target : target * target * target), v = volume * rho;
+        vstore4(rho, 0, density + begin);
+        vstore4(v, 0, weight + begin);
+        vstore4(log(v), 0, excess + begin);
+        vstore4(log(target), 0, log_h + begin);
+        return;
+    }
+    for (int i = begin; i < size; ++i) {
+        const REAL target = h[i];
+        const REAL rho = 1 / (DIM == 2 ? target * target : target * target * target);
+        density[i] = rho;
+        weight[i] = volumes[i] * rho;
+        excess[i] = log(volumes[i] * rho);
+        log_h[i] = log(target);
+    }
 }
 
 /* Per generator i: grad log h by least squares over the neighbours, weighted by 1 / distance^2. One evaluation of h per

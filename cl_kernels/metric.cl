@@ -1,5 +1,18 @@
 #include "common/real.h"
 
+#if DIM == 2
+/* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Nearly all cells have so few sides that it need not be evaluated. */
+constant REAL ROUNDNESS[12] = {
+    0, 0, 0, R(20.784609690826521), R(15.999999999999998), R(14.530850560107218), R(13.856406460551018),
+    R(13.484089326610802), R(13.254833995939041), R(13.102928433583283), R(12.996787849316252),
+    R(12.919565689288136)};
+
+inline REAL regular_roundness(int n)
+{
+    return n < 12 ? ROUNDNESS[n] : 4 * n * tan(R(3.14159265358979324) / n);
+}
+#endif
+
 /* Per generator i: metric error and quality of its cell.
 
    error    e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
@@ -19,8 +32,7 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
         surface += face_measures[k];
 #if DIM == 2
     const REAL length = sqrt(volume);
-    const REAL n = end - begin;
-    quality[i] = 4 * volume * n * tan(R(3.14159265358979324) / n) / (surface * surface);
+    quality[i] = regular_roundness(end - begin) * volume / (surface * surface);
 #else
     const REAL length = cbrt(volume);
     quality[i] = R(113.09733552923255) * volume * volume / (surface * surface * surface);

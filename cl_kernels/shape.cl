@@ -7,29 +7,53 @@
    omega >= 1 weighs bad cells more. A cell pulls at its corners along its faces with the tension 2 omega / P and pushes
    its faces outwards with the pressure omega / A. */
 
-/* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. */
+/* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. Four generators per work-item, as their
+   logarithms come at the price of one on a CPU. */
 kernel void load_cells(const int size, global const int *starts, global const REAL *face_measures, global const REAL *volumes,
                        global const REAL *quality, const REAL emphasis, global REAL *tension, global REAL *pressure)
 {
-    WORK_ITEM(i);
-    REAL perimeter = 0;
-    for (int k = starts[i]; k < starts[i + 1]; ++k)
-        perimeter += face_measures[k];
-    const REAL omega = 1 - emphasis * log(fmax(quality[i], R(1e-6)));
-    tension[i] = 2 * omega / perimeter;
-    pressure[i] = omega / volumes[i];
+    const int begin = 4 * get_global_id(0), count = min(4, size - begin);
+    REAL q[4] = {1, 1, 1, 1};
+    for (int c = 0; c < count; ++c)
+        q[c] = fmax(quality[begin + c], R(1e-6));
+    const REAL4 omegas = 1 - emphasis * log((REAL4)(q[0], q[1], q[2], q[3]));
+    const REAL omega[4] = {omegas.s0, omegas.s1, omegas.s2, omegas.s3};
+    for (int c = 0; c < count; ++c) {
+        const int i = begin + c;
+        REAL perimeter = 0;
+        for (int k = starts[i]; k < starts[i + 1]; ++k)
+            perimeter += face_measures[k];
+        tension[i] = 2 * omega[c] / perimeter;
+        pressure[i] = omega[c] / volumes[i];
+    }
 }
 
-/* Unit vector along the face of `label`, counter-clockwise around the cell of generator i. */
-inline REAL2 face_tangent(int i, int label, global const REAL *points)
+/* A face of a cell, as seen from its generator at x. */
+typedef struct {
+    int label;
+    REAL2 away;    /* to the neighbour; 0 for a wall */
+    REAL2 tangent; /* unit vector along the face, counter-clockwise */
+    REAL inverse;  /* 1 / distance of the neighbour */
+    REAL tension;  /* the neighbour's */
+} Face;
+
+inline Face look_at_face(int label, REAL2 x, global const REAL *points, global const REAL *tension)
 {
+    Face f;
+    f.label = label;
+    f.away = 0;
+    f.inverse = f.tension = 0;
     if (label >= 0) {
-        const REAL2 d = (REAL2)(points[2 * label] - points[2 * i], points[2 * label + 1] - points[2 * i + 1]);
-        return (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
+        f.away = (REAL2)(points[2 * label], points[2 * label + 1]) - x;
+        f.inverse = 1 / sqrt(dot(f.away, f.away));
+        f.tangent = f.inverse * (REAL2)(-f.away.s1, f.away.s0);
+        f.tension = tension[label];
+    } else {
+        const int wall = -1 - label;
+        const REAL sign = wall % 2 ? 1 : -1;
+        f.tangent = wall < 2 ? (REAL2)(0, sign) : (REAL2)(-sign, 0);
     }
-    const int wall = -1 - label;
-    const REAL sign = wall % 2 ? 1 : -1;
-    return wall < 2 ? (REAL2)(0, sign) : (REAL2)(-sign, 0);
+    return f;
 }
 
 /* Per generator i: lloyd = -rate h^2 dE/dx_i, at most `longest` h.
@@ -46,38 +70,34 @@ kernel void descend_shape(const int size, global const int *starts, global const
     const int begin = starts[i], end = starts[i + 1];
     const REAL wi = tension[i];
     REAL2 g = 0;
+    Face before = look_at_face(neighbours[end - 1], x, points, tension);
     for (int k = begin; k < end; ++k) {
-        const int before = k == begin ? end - 1 : k - 1;
-        const int j = neighbours[before], q = neighbours[k];
-        const REAL2 tj = face_tangent(i, j, points), tq = face_tangent(i, q, points);
+        const Face face = look_at_face(neighbours[k], x, points, tension);
         const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
-        const REAL2 r = m - face_measures[k] / 2 * tq; /* corner k */
+        const REAL2 r = m - face_measures[k] / 2 * face.tangent; /* corner k */
         REAL s = 0;
-        if (j >= 0 && q >= 0) {
-            const REAL2 a = (REAL2)(points[2 * j], points[2 * j + 1]) - x;
-            const REAL2 b = (REAL2)(points[2 * q], points[2 * q + 1]) - x;
+        if (before.label >= 0 && face.label >= 0) {
+            const REAL2 a = before.away, b = face.away, c = b - a;
             const REAL det = a.s0 * b.s1 - a.s1 * b.s0;
-            const REAL2 c = b - a;
-            const REAL2 away = (REAL2)(-c.s1, c.s0) / sqrt(dot(c, c)); /* against the face between j and q */
-            const REAL wj = tension[j], wq = tension[q];
-            const REAL2 pull = (wi + wj) * tj - (wi + wq) * tq + (wj + wq) * away;
+            const REAL2 between = (REAL2)(-c.s1, c.s0) / sqrt(dot(c, c)); /* against the face between the two */
+            const REAL2 pull = (wi + before.tension) * before.tangent - (wi + face.tension) * face.tangent +
+                               (before.tension + face.tension) * between;
             if (det > 0)
-                s = ((b.s1 - a.s1) * pull.s0 + (a.s0 - b.s0) * pull.s1) / det;
-        } else if (j >= 0 || q >= 0) {
-            const int other = j >= 0 ? j : q;
-            const REAL wo = tension[other];
-            const REAL2 d = (REAL2)(points[2 * other], points[2 * other + 1]) - x;
-            const REAL2 wall = j >= 0 ? tq : tj;
-            const REAL2 pull = j >= 0 ? (wi + wo) * tj - (wi - wo) * tq : (wi - wo) * tj - (wi + wo) * tq;
+                s = (c.s1 * pull.s0 - c.s0 * pull.s1) / det;
+        } else if (before.label >= 0 || face.label >= 0) {
+            const bool first = before.label >= 0;
+            const REAL wo = first ? before.tension : face.tension;
+            const REAL2 d = first ? before.away : face.away, wall = first ? face.tangent : before.tangent;
+            const REAL wj = first ? wo : -wo;
+            const REAL2 pull = (wi + wj) * before.tangent - (wi - wj) * face.tangent;
             const REAL slope = dot(d, wall);
             if (slope * slope > R(1e-12) * dot(d, d))
                 s = dot(wall, pull) / slope;
         }
         g += s * r;
-        if (q >= 0) {
-            const REAL2 d = (REAL2)(points[2 * q], points[2 * q + 1]) - x;
-            g += face_measures[k] / sqrt(dot(d, d)) * (pressure[q] - pressure[i]) * m;
-        }
+        if (face.label >= 0)
+            g += face_measures[k] * face.inverse * (pressure[face.label] - pressure[i]) * m;
+        before = face;
     }
     REAL2 u = -rate * h[i] * h[i] * g;
     const REAL length = sqrt(dot(u, u));

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pyopencl.array as cla
 
 from ._primitives import Summaries
@@ -55,9 +56,10 @@ class Density:
                 *(engine.empty(n) for _ in range(3)), *(engine.empty((n, d)) for _ in range(2))
             )
         w = self._weighting
-        engine.run_each(
-            k.evaluate_density, n, t.volumes, h, w.density, w.weight, w.excess, self._log_h
-        )
+        engine.run(
+            k.evaluate_density, -(-n // 4), np.int32(n), t.volumes, h, w.density, w.weight,
+            w.excess, self._log_h,
+        )  # fmt: skip
         engine.run_each(
             k.fit_gradient, n, t.starts, t.neighbours, t.points, self._log_h, w.gradient
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
@@ -41,9 +42,9 @@ class Shape:
         if t.n != self._n:
             self._n = t.n
             self._tension, self._pressure = engine.empty(t.n), engine.empty(t.n)
-        engine.run_each(
-            k.load_cells, t.n, t.starts, t.face_measures, t.volumes, quality, real(emphasis),
-            self._tension, self._pressure,
+        engine.run(
+            k.load_cells, -(-t.n // 4), np.int32(t.n), t.starts, t.face_measures, t.volumes,
+            quality, real(emphasis), self._tension, self._pressure,
         )  # fmt: skip
         engine.run_each(
             k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
