@@ -51,8 +51,9 @@ class Gradation:
         engine, kernels = self.engine, self._kernels
         tiles = tuple(-(-n // self._tile) for n in counts)
         n = math.prod(tiles)
-        awake, wake = engine.zeros(n, np.int32), engine.zeros(n, np.int32)
+        awake, wake = engine.empty(n, np.int32), engine.empty(n, np.int32)
         awake.fill(np.int32(1))
+        wake.fill(np.int32(0))
         lowest = engine.empty(n)
         nodes = [np.int32(c) for c in [*counts, 1][:3]]
         steps = [engine.real.type(s) for s in [*spacing, 1.0][:3]]
