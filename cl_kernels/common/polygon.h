@@ -182,10 +182,10 @@ inline bool is_short(REAL e2, REAL d2)
 }
 
 /* Might rounding let a neighbour see this cell's faces otherwise? Only where a face is short, or a generator is near beside
-   the cell (then far corners are ill-conditioned) or beside the rounding of positions. */
+   the cell (then far corners are ill-conditioned) or beside the rounding of positions. In single precision anything may. */
 inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *points)
 {
-    bool doubtful = false;
+    bool doubtful = !IS_DOUBLE;
     const REAL near2 = fmax(sqrt(REAL_EPS) * cell->reach2, R(1e8) * POSITION_NOISE * POSITION_NOISE);
     for (int k = 0; k < cell->n; ++k) {
         const int next = k == cell->n - 1 ? 0 : k + 1;
