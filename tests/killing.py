@@ -34,6 +34,8 @@ def work(folder: Path) -> None:
     adapter = clvoro.Adapter()
     mesh = adapter.run(BOX, 0.1, method="coupled", max_steps=1)
 
+    (folder / "begun").touch()
+
     def callback(row: np.void) -> None:
         mesh.save(folder / "mesh.npz")
         mesh.save(folder / "mesh.vtu")
@@ -54,8 +56,11 @@ def main(times: int, seed: int) -> int:
             command = [sys.executable, "-m", "tests.killing", "--work", name]
             child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
             # Once all kills are done, the last run is let through.
-            patience = rng.uniform(0.5, 2.5) if kills < times else 600.0
+            patience = rng.uniform(0, 2) if kills < times else 600.0
             try:
+                while child.poll() is None and not (folder / "begun").exists():
+                    time.sleep(0.02)
+                (folder / "begun").unlink(missing_ok=True)
                 if child.wait(patience):
                     print("the child failed by itself")
                     return 1

@@ -64,7 +64,14 @@ class Case:
             content = toml.read(text)
         except ValueError as error:
             raise InputError(f"{place} not a TOML file: {error}") from error
-        checked = schema.CASE(content, place)
+        except RecursionError as error:
+            raise InputError(f"{place} not a case: it is nested too deep") from error
+        try:
+            checked = schema.CASE(content, place)
+        except (OverflowError, RecursionError) as error:
+            raise InputError(
+                f"{place} not a case: a number is too large or the nesting too deep ({error})"
+            ) from error
         run = checked.get("run", {})
         if "method" in run and "methods" in run:
             raise InputError(f"{place} run has both method and methods; keep one of them")

@@ -24,6 +24,7 @@ from ..results import HISTORY_DTYPE, Diagram, Result
 
 _LONGEST_HEAD = 1 << 22
 _MARK = b'<AppendedData encoding="raw">\n_'
+_END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
 _BLOCK = 1 << 20
 EXPANSION = 256
@@ -54,6 +55,9 @@ def load_vtu(path: str | PathLike[str]) -> Result:
                 raise _FileError("it has no appended raw data, as clvoro's have")
             start = end + len(_MARK)
             size = os.fstat(file.fileno()).st_size
+            file.seek(max(0, size - len(_END)))
+            if file.read() != _END:
+                raise _FileError("its end is missing: it is cut off, or something follows")
             arrays = _Reader(head[:end], start, size).read_all(file)
         return _assemble(arrays)
     except _FileError as problem:

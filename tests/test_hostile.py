@@ -1,0 +1,219 @@
+"""Files that mean harm - cut off, huge, with code in them - are refused with a clear error, and nothing else happens."""
+
+import io
+import pickle
+import re
+import struct
+import time
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.cases import load_case
+from clvoro.cases.fields import load_array
+from clvoro.errors import InputError
+from clvoro.io.vtu_read import load_vtu
+from clvoro.sizing import Expression
+
+BOX = clvoro.Box((0, 0), (1, 1))
+
+
+class Bomb:
+    """Unpickling it makes a folder: so would any program."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        import os
+
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.fixture(scope="module")
+def result(ctx):
+    points = np.random.default_rng(91).random((40, 2))
+    return clvoro.Adapter(ctx).run(BOX, 0.15, points=points, method="lloyd", max_steps=1)
+
+
+def member(array, pickled=False):
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=pickled)
+    return stream.getvalue()
+
+
+def header(description):
+    """A `.npy` file's head that says what it likes."""
+    text = description.encode() + b" " * (64 - len(description) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+
+
+HUGE = header("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 2), }")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "vtu"])
+def test_every_cut_is_refused(result, tmp_path, suffix):
+    path = tmp_path / f"m.{suffix}"
+    result.save(path)
+    data = path.read_bytes()
+    reader = clvoro.load if suffix == "npz" else load_vtu
+    for length in {*range(0, len(data), max(1, len(data) // 40)), len(data) - 60}:
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=re.escape(str(path))):
+            reader(path)
+
+
+def test_pickles_are_not_opened(result, tmp_path):
+    trap = np.array([Bomb(tmp_path / "exploded")], dtype=object)
+    result.save(tmp_path / "m.npz")
+    with (
+        zipfile.ZipFile(tmp_path / "m.npz") as old,
+        zipfile.ZipFile(tmp_path / "t.npz", "w") as new,
+    ):
+        for info in old.infolist():
+            trapped = info.filename == "quality.npy"
+            new.writestr(info.filename, member(trap, True) if trapped else old.read(info))
+    with pytest.raises(InputError, match="pickled"):
+        clvoro.load(tmp_path / "t.npz")
+    (tmp_path / "a.npy").write_bytes(member(trap, True))
+    (tmp_path / "b.npy").write_bytes(pickle.dumps(Bomb(tmp_path / "exploded")))
+    for name in ("a.npy", "b.npy"):
+        with pytest.raises(InputError):
+            load_array(tmp_path / name, "run.points")
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_headers_that_ask_for_terabytes_are_refused(tmp_path):
+    (tmp_path / "a.npy").write_bytes(HUGE + b"\0" * 64)
+    with pytest.raises(InputError, match="has not the length"):
+        load_array(tmp_path / "a.npy", "size.file")
+    with zipfile.ZipFile(tmp_path / "m.npz", "w") as archive:
+        archive.writestr("format.npy", HUGE)
+        archive.writestr("version.npy", member(1))
+    with pytest.raises(InputError, match="has not the length"):
+        clvoro.load(tmp_path / "m.npz")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{'descr': '<f8', 'shape': ", "[" * 500, "__import__('os').mkdir('x')", "{'descr': '|V0', "
+     "'fortran_order': False, 'shape': (9,), }", "{'descr': '<f8', 'fortran_order': 0, 'shape': (-1,), }"],
+)  # fmt: skip
+def test_headers_that_are_none_are_refused(tmp_path, text):
+    (tmp_path / "a.npy").write_bytes(header(text) + b"\0" * 64)
+    with pytest.raises(InputError, match=r"size\.file"):
+        load_array(tmp_path / "a.npy", "size.file")
+
+
+def test_zip_bombs_are_refused(tmp_path):
+    zeros = HUGE.replace(b"1000000000000, 2", b"       6250000,") + bytes(50_000_000)
+    with zipfile.ZipFile(tmp_path / "m.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", zeros)
+        archive.writestr("format.npy", member("clvoro-result"))
+        archive.writestr("version.npy", member(1))
+    assert (tmp_path / "m.npz").stat().st_size < 1e6
+    for read in (clvoro.load, lambda path: load_array(path, "run.points")):
+        with pytest.raises(InputError, match="expand to"):
+            read(tmp_path / "m.npz")
+
+
+VTU = """<?xml version="1.0"?>
+%s<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64" \
+compressor="vtkZLibDataCompressor">
+<UnstructuredGrid><Piece NumberOfPoints="%s" NumberOfCells="1">
+<Points><DataArray type="Float64" NumberOfComponents="3" format="appended" offset="0"/></Points>
+</Piece></UnstructuredGrid>
+<AppendedData encoding="raw">
+_"""
+LAUGHS = (
+    '<!DOCTYPE lolz [<!ENTITY lol "lol">'
+    + "".join(
+        f'<!ENTITY lol{k} "{f"&lol{k - 1 if k > 1 else str()};" * 10}">' for k in range(1, 10)
+    )
+    + "]>"
+)
+SPY = '<!DOCTYPE x [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
+
+
+@pytest.mark.parametrize("doctype", [LAUGHS, SPY, "<!DOCTYPE html>"], ids=["laughs", "file", "any"])
+def test_entities_are_refused(tmp_path, doctype):
+    path = tmp_path / "m.vtu"
+    path.write_bytes((VTU % (doctype, "&lol9;")).encode() + b"\0" * 100)
+    began = time.monotonic()
+    with pytest.raises(InputError, match="document type"):
+        load_vtu(path)
+    assert time.monotonic() - began < 5
+
+
+def test_vtu_bombs_and_lies_are_refused(tmp_path):
+    path = tmp_path / "m.vtu"
+    block = zlib.compress(bytes(1 << 20), 9)
+
+    def write(count, block_size, partial, sizes, blocks, points=1):
+        table = struct.pack(f"<{3 + len(sizes)}Q", count, block_size, partial, *sizes)
+        path.write_bytes(
+            (VTU % ("", points)).encode() + table + blocks + b"\n</AppendedData>\n</VTKFile>\n"
+        )
+
+    lies = {
+        "expands to more": (300, 1 << 20, 0, [len(block)] * 300, block * 300),
+        "cut off": (1 << 60, 1 << 20, 0, [], b""),
+        "in blocks of": (1, 1 << 40, 0, [len(block)], block),
+        "has not the length|expands to more": (1, 1 << 19, 0, [len(block)], block),
+        "is cut off": (1, 1 << 20, 0, [1 << 50], block),
+    }
+    for message, content in lies.items():
+        write(*content)
+        with pytest.raises(InputError, match=message):
+            load_vtu(path)
+    write(1, 1 << 20, 0, [len(block)], block, points=10**18)
+    with pytest.raises(InputError):
+        load_vtu(path)
+
+
+INJECTIONS = [
+    "__import__('os').system('true')", "x.__class__", "(lambda: 1)()", "exec('1')", "x; y", "x\ny; }",
+    "1 /* */ + x", "x // y", "#include <x>", "get_global_id(0)", "data[0]", "x[0]", "*data", "&x", "printf(x)",
+    "as_double(x)", "x = 1", "x++", "1e999", "0x10", "1f", "'a'", '"a"', "x ? y", "s1", "size_at(x, data)",
+    "asm(1)", "x\\\n", "\0", "x\u2028y", "\uff58 + 1", "x" * 5000, "(" * 3000 + "x" + ")" * 3000, "-" * 4000, "",
+    "1 ? " * 60 + "x", "M_E", "true", "x if y else z", "x**2", "{x}", "x@y", "`x`", "$x",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", INJECTIONS, ids=range(len(INJECTIONS)))
+def test_expressions_are_formulas_and_nothing_else(text):
+    with pytest.raises(InputError):
+        Expression(text)
+
+
+def test_what_the_device_compiles_is_written_from_the_list_of_operations():
+    from clvoro.sizing.bind import bind
+
+    text, _ = bind(Expression("  0.1+\tfabs( x )*\n2e-1 < y ? min(x,y) : 3 "), BOX)
+    body = text.split('#line 1 "size_at"')[1]
+    known = {"REAL", "size_at", "const", "x", "__global", "data", "return", "fabs", "size_min"}
+    names = set(re.findall(r"[A-Za-z_]\w*", body)) - known
+    assert all(re.fullmatch(r"s\d+|e|e\d+", name) for name in names), names
+
+
+CASES = {
+    "not text": b"\xff\xfe\x00case",
+    "cut off": b"[domain]\nlower = [0, ",
+    "deep": b"x = " + b"[" * 100_000,
+    "nested sizes": b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='scale'\nfactor=2.0\nfield="
+    + b"{kind='scale',factor=2.0,field=" * 3000 + b"1.0" + b"}" * 3000,
+    "path": b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='raster'\nfile='/dev/zero'\n",
+    "huge number": b"[domain]\nlower=[0,0]\nupper=[1e400,1]\n[size]\nkind='constant'\nvalue=1\n",
+    "huge integer": b"[domain]\nlower=[0,0]\nupper=[" + b"9" * 400 + b",1]\n[size]\nkind='constant'\nvalue=1\n",
+    "null": b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='raster'\nfile='a\\u0000b'\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_cases_that_are_none_are_refused(tmp_path, name):
+    (tmp_path / "c.toml").write_bytes(CASES[name])
+    with pytest.raises(InputError):
+        load_case(tmp_path / "c.toml").size_field()
