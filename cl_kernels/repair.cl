@@ -12,6 +12,13 @@
 /* A cell with more is clipped anew each time: it is rare, and would hold up its work-group. */
 #define CHECKED_FACES 16
 
+/* Is a gap between corners, given by its square, no more than their rounding? d2 is the squared distance of the generators
+   across the face. In single precision a spacing may be a thousand roundings of a position, and a corner is worse. */
+inline bool is_rounding(REAL gap2, REAL d2)
+{
+    return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
+}
+
 /* Do a corner of cell i and what cell `other` takes for the same corner, between its faces p and q, coincide but for
    rounding? Where four or more cells meet in a point, cells may leave out different faces of no length. */
 inline bool same_corner(REAL2 mine, int i, int other, int p, int q, REAL d2, global const REAL *points,
@@ -20,8 +27,7 @@ inline bool same_corner(REAL2 mine, int i, int other, int p, int q, REAL d2, glo
     const REAL x[2] = {points[2 * other], points[2 * other + 1]};
     const REAL2 from = (REAL2)(points[2 * i] - x[0], points[2 * i + 1] - x[1]);
     const REAL2 gap = mine + from - corner(other, x, p, q, points, lower, upper);
-    const REAL gap2 = dot(gap, gap);
-    return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= R(1e-6) * d2;
+    return is_rounding(dot(gap, gap), d2);
 }
 
 /* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
@@ -36,7 +42,7 @@ inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v
     if (q == n) {
         /* A face of no length, which i is then doubtful of, will be dropped. */
         const REAL2 e = v - u;
-        return is_short(dot(e, e), d2);
+        return is_rounding(dot(e, e), d2);
     }
     const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
     *exact = p == after && s == before;
