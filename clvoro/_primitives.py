@@ -98,3 +98,22 @@ class Gather:
         words = int(np.prod(array.shape[1:], dtype=int)) * array.dtype.itemsize // 4
         self.engine.run_each(self._kernel, shape[0], items, array, np.int32(words), out)
         return out
+
+
+class Room:
+    """Device arrays by name that grow when needed and else are handed out again."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._arrays: dict[tuple, cla.Array] = {}
+
+    def __call__(self, *name: object, size: int, dtype: object = None) -> cla.Array:
+        """Return the first `size` items of the array called `name`; their content is arbitrary."""
+        array = self._arrays.get(name)
+        if array is None or len(array) < size:
+            array = self._arrays[name] = self._engine.empty(max(size, 1), dtype)
+        return array[:size]
+
+    def zeros(self, *name: object, size: int, dtype: object = None) -> cla.Array:
+        """Return the same, filled with zeros."""
+        return self(*name, size=size, dtype=dtype).fill(0)

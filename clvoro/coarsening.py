@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ._primitives import Scan
+from ._primitives import Room, Scan
 from ._program import Engine
 
 ROUNDS = 3
@@ -77,21 +77,6 @@ class PairInverse:
     partner: cla.Array
     own: cla.Array
     both: cla.Array
-
-
-class Room:
-    """Device arrays by name that grow when needed and else are handed out again."""
-
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
-        self._arrays: dict[tuple, cla.Array] = {}
-
-    def __call__(self, *name: object, size: int, dtype: object = None) -> cla.Array:
-        """Return the first `size` items of the array called `name`; its content is arbitrary."""
-        array = self._arrays.get(name)
-        if array is None or len(array) < size:
-            array = self._arrays[name] = self._engine.empty(max(size, 1), dtype)
-        return array[:size]
 
 
 class Coarsening:

@@ -10,8 +10,9 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._primitives import Room
 from ._program import Engine
-from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, Room, whole_groups
+from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, whole_groups
 
 _COARSEST = 64
 _MOST_LEVELS = 30

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
+from ._primitives import Room
 from ._program import Engine
-from .coarsening import Room
 from .errors import InputError
 from .krylov import CURVATURE, BreakdownError, ConjugateGradient, Launch, Solution
 from .multigrid import Multigrid

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ._primitives import Scan
+from ._primitives import Room, Scan
 from ._program import Engine
 from .cells import Tessellation
 from .domain import Box
@@ -50,6 +50,7 @@ class PopulationControl:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
+        self._room = Room(engine)
         self._kernels = engine.kernels(
             "population",
             {
@@ -105,7 +106,7 @@ class PopulationControl:
         need = math.trunc(missing + math.copysign(0.3, missing))
         most = max(4, int(LARGEST_CHANGE * n))
         need = max(-most, min(most, need))
-        marks = _Marks.clean(self.engine, n)
+        marks = _Marks.clean(self._room, n, self.engine.dim)
         if climb:
             kinds, strain_1, strain_2 = self._measure(t, h)
             if nuclei:
@@ -121,8 +122,8 @@ class PopulationControl:
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and walls (n, 2), and the strain averaged over one ring and over two (n, 4)."""
         engine, k, n = self.engine, self._kernels, t.n
-        kinds = engine.empty((n, 2), np.int32)
-        raw, once, twice = (engine.empty((n, 4)) for _ in range(3))
+        kinds = self._room("kinds", size=2 * n, dtype=np.int32)
+        raw, once, twice = (self._room("strain", rings, size=4 * n) for rings in range(3))
         engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, twice)
@@ -133,14 +134,14 @@ class PopulationControl:
     ) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the clean lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
-        keys = engine.empty(n, np.uint64)
+        keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
             k.score_strain, n, t.starts, t.neighbours, kinds, strain,
             engine.real.type(NUCLEATION_STRAIN), keys,
         )  # fmt: skip
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
         self._limit(chosen, n, 2 * nuclei)
-        ranks = engine.empty(n + 1, np.int32)
+        ranks = self._room("ranks", size=n + 1, dtype=np.int32)
         engine.run_each(k.flag_sites, n, chosen, ranks)
         self._scan.exclusive(ranks, ranks, n)
         engine.run_each(
@@ -161,15 +162,16 @@ class PopulationControl:
         """Mark the pairs that climb, with thresholds shifted to bring the count nearest to `need`; return the gain."""
         engine, k, n = self.engine, self._kernels, t.n
         real = engine.real.type
-        partners, pull = engine.empty(n, np.int32), engine.empty(n)
-        keys = engine.empty(n, np.uint64)
+        partners = self._room("partners", size=n, dtype=np.int32)
+        pull = self._room("pull", size=n)
+        keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
             k.score_pairs, n, t.starts, t.neighbours, t.points, kinds, strain,
             np.int32(theta <= THETA), partners, pull, keys,
         )  # fmt: skip
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
-        tally = engine.zeros(SHIFTS, np.int32)
+        tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
         engine.run_each(k.tally_pairs, n, chosen, pull, kinds, partners, real(theta), tally)
         changes = tally.get()
         # The shift of the threshold whose change is nearest to the need, the least among equals.
@@ -188,7 +190,7 @@ class PopulationControl:
         """Mark about `rest` cells to be split, or -rest to be deleted: those that are most too large or too small."""
         engine, k, n = self.engine, self._kernels, t.n
         sign = engine.real.type(math.copysign(1, rest))
-        keys = engine.empty(n, np.uint64)
+        keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(k.score_excess, n, t.starts, excess, sign, keys)
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, EXCESS_RINGS), keys)
         chosen = self._choose(t, keys, EXCESS_RINGS)
@@ -200,7 +202,7 @@ class PopulationControl:
     def _spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
         """Return the largest key within `rings` rings of each generator."""
         engine, n = self.engine, t.n
-        into, other = engine.empty(n, np.uint64), engine.empty(n, np.uint64)
+        into, other = (self._room("spread", turn, size=n, dtype=np.uint64) for turn in range(2))
         for _ in range(rings):
             engine.run_each(self._kernels.spread_keys, n, t.starts, t.neighbours, source, into)
             source, into, other = into, other, into
@@ -209,7 +211,8 @@ class PopulationControl:
     def _choose(self, t: Tessellation, keys: cla.Array, rings: int) -> cla.Array:
         """Return the keys of sites that are `rings` rings apart, the strongest first; `keys` is used up."""
         engine, k, n = self.engine, self._kernels, t.n
-        chosen, latest = engine.zeros(n, np.uint64), engine.empty(n, np.uint64)
+        chosen = self._room.zeros("chosen", size=n, dtype=np.uint64)
+        latest = self._room("latest", size=n, dtype=np.uint64)
         for _ in range(ROUNDS):
             spread = self._spread(t, keys, rings)
             engine.run_each(k.choose_sites, n, keys, spread, chosen, latest)
@@ -223,7 +226,7 @@ class PopulationControl:
         while True:
             bins = min(HISTOGRAM, span)
             width = span // bins
-            histogram = engine.zeros(HISTOGRAM, np.int32)
+            histogram = self._room.zeros("histogram", size=HISTOGRAM, dtype=np.int32)
             engine.run_each(k.count_sites, n, chosen, np.uint64(low), np.uint64(width), histogram)
             from_top = np.cumsum(histogram.get()[:bins][::-1])
             whole = int(np.searchsorted(from_top, most, side="right"))
@@ -270,13 +273,14 @@ class _Marks:
     busy: cla.Array
 
     @classmethod
-    def clean(cls, engine: Engine, n: int) -> _Marks:
-        kept = engine.zeros(n + 1, np.int32)
-        kept.fill(1)
+    def clean(cls, room: Room, n: int, dim: int) -> _Marks:
         return cls(
-            kept, engine.zeros((n, engine.dim)), engine.zeros(n + 1, np.int32), engine.zeros((n, engine.dim)),
-            engine.zeros(n, np.uint64),
-        )  # fmt: skip
+            room("kept", size=n + 1, dtype=np.int32).fill(1),
+            room.zeros("shifts", size=dim * n),
+            room.zeros("born", size=n + 1, dtype=np.int32),
+            room.zeros("births", size=dim * n),
+            room.zeros("busy", size=n, dtype=np.uint64),
+        )
 
     @property
     def arrays(self) -> tuple[cla.Array, ...]:
