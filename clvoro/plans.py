@@ -219,7 +219,7 @@ def _adaptive_2d(effort: Effort, levels: int, exact: bool, aim: float, warm: boo
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
-            "shape", eps=1e-3, iterations=EXACT_ITERATIONS, k=0.3, sampled_gradient=True,
+            "shape", eps=1e-3, iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3, sampled_gradient=True,
             keep_mean=True,
         )  # fmt: skip
         # The last two only project: Newton's steps on the sizes.
