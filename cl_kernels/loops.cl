@@ -129,8 +129,9 @@ kernel void match_corners(const int size, global const REAL *points, global cons
         REAL d[3] = {0, 0, 0};
         if (j >= 0) {
             twin = starts[j];
-            while (neighbours[twin] != i)
+            while (twin < starts[j + 1] && neighbours[twin] != i)
                 ++twin;
+            twin = twin < starts[j + 1] ? twin : k;
             for (int a = 0; a < 3; ++a)
                 d[a] = points[3 * j + a] - points[3 * i + a];
         }
@@ -138,7 +139,7 @@ kernel void match_corners(const int size, global const REAL *points, global cons
         for (int t = turn_starts[k]; t < turn_starts[k + 1]; ++t) {
             const int u = turns[t];
             int nearest = u;
-            REAL least = REAL_MAX;
+            REAL least = REAL_MAX, widest = 0;
             for (int s = turn_starts[twin]; s < turn_starts[twin + 1] && twin != k; ++s) {
                 const int w = turns[s];
                 REAL r2 = 0;
@@ -146,12 +147,15 @@ kernel void match_corners(const int size, global const REAL *points, global cons
                     const REAL r = corners[3 * w + a] + d[a] - corners[3 * u + a];
                     r2 += r * r;
                 }
+                widest = fmax(widest, r2);
                 if (r2 < least) {
                     least = r2;
                     nearest = w;
                 }
             }
-            partners[t] = nearest;
+            /* A corner that only one of the cells sees, where others meet in the middle of an edge, has no partner. */
+            const REAL noise = 512 * noise_length(sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]));
+            partners[t] = least < fmax(R(1e-6) * widest, noise * noise) ? nearest : u;
         }
     }
 }
@@ -188,7 +192,8 @@ kernel void spread_over_faces(const int size, global const int *turns, global co
         changed[0] = 1;
 }
 
-/* Vertices of a loop, each once where corners are the same; written to `out` in its order, or against it. */
+/* Vertices of a loop, each once where corners are the same; written to `out` in its order, or against it. Their number is
+   less than 3 if the face is no wider than its vertices round. */
 inline int walk_loop(int k, bool reverse, global const int *turn_starts, global const int *turns, global const int *labels,
                      global const int *ids, global int *out)
 {
@@ -216,13 +221,16 @@ inline int giver_of(int k, int twin, global const int *turn_starts, global const
     return walk_loop(second, false, turn_starts, turns, labels, labels, 0) >= 3 ? second : first;
 }
 
-/* Per face k: the length of its loop; marks the labels that are in use. */
+/* Per face k: the length of its loop, 0 if it is no polygon; marks the labels that are in use. */
 kernel void measure_loops(const int size, global const int *twins, global const int *turn_starts, global const int *turns,
                           global const int *labels, global int *loop_counts, global int *used)
 {
     WORK_ITEM(k);
     const int giver = giver_of(k, twins[k], turn_starts, turns, labels);
-    loop_counts[k] = walk_loop(giver, false, turn_starts, turns, labels, labels, 0);
+    const int count = walk_loop(giver, false, turn_starts, turns, labels, labels, 0);
+    loop_counts[k] = count >= 3 ? count : 0;
+    if (count < 3)
+        return;
     for (int t = turn_starts[giver]; t < turn_starts[giver + 1]; ++t)
         used[labels[turns[t]]] = 1;
 }
@@ -233,6 +241,8 @@ kernel void write_loops(const int size, global const int *twins, global const in
                         global int *loops)
 {
     WORK_ITEM(k);
+    if (loop_starts[k + 1] == loop_starts[k])
+        return;
     const int giver = giver_of(k, twins[k], turn_starts, turns, labels);
     walk_loop(giver, giver != k, turn_starts, turns, labels, ids, loops + loop_starts[k]);
 }

@@ -378,11 +378,11 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
         for (int k = 0; k < rim.n; ++k) {
             const int in = rim.in[k], out = rim.out[k];
             const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
-            /* But for planes that are nearly parallel to the edge: what they say is not within the rounding of both. */
+            /* But for planes that are nearly parallel to the edge: there only interpolation stays on it. */
             const REAL slack = 1 + reach / (s[out] - s[in]);
             const REAL off = fabs(v.s0 - nx[k]) + fabs(v.s1 - ny[k]) + fabs(v.s2 - nz[k]);
             const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
-            if (off < R(1024) * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
+            if (slack < 1024 && off < 1024 * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
                 nx[k] = v.s0;
                 ny[k] = v.s1;
                 nz[k] = v.s2;
