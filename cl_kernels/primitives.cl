@@ -49,42 +49,80 @@ kernel void scan_chunks(const int size, global const int *values, const int firs
         out[n] = total;
 }
 
-/* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier), so that float32 totals of
-   millions of terms stay exact to a few ulp. */
+/* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier, with Knuth's exact difference, which
+   has no branch), so that float32 totals of millions of terms stay exact to a few ulp. */
 typedef struct {
     REAL sum, sum_low, magnitude, magnitude_low, least, largest;
 } summary_t;
 
-inline void add_compensated(REAL *sum, REAL *low, REAL value)
-{
-    const REAL total = *sum + value;
-    *low += fabs(*sum) >= fabs(value) ? (*sum - total) + value : (value - total) + *sum;
-    *sum = total;
-}
+#define ADD_COMPENSATED(T, sum, low, value) \
+    do { \
+        const T total_ = (sum) + (value), part_ = total_ - (sum); \
+        (low) += ((sum) - (total_ - part_)) + ((value) - part_); \
+        (sum) = total_; \
+    } while (0)
 
 inline void merge_summary(summary_t *a, summary_t b)
 {
-    add_compensated(&a->sum, &a->sum_low, b.sum);
+    ADD_COMPENSATED(REAL, a->sum, a->sum_low, b.sum);
     a->sum_low += b.sum_low;
-    add_compensated(&a->magnitude, &a->magnitude_low, b.magnitude);
+    ADD_COMPENSATED(REAL, a->magnitude, a->magnitude_low, b.magnitude);
     a->magnitude_low += b.magnitude_low;
     a->least = fmin(a->least, b.least);
     a->largest = fmax(a->largest, b.largest);
 }
 
+inline void add_value(summary_t *a, REAL value)
+{
+    ADD_COMPENSATED(REAL, a->sum, a->sum_low, value);
+    ADD_COMPENSATED(REAL, a->magnitude, a->magnitude_low, fabs(value));
+    a->least = fmin(a->least, value);
+    a->largest = fmax(a->largest, value);
+}
+
+#if GROUP_SIZE == 1
+#define REAL8 CLVORO_JOIN(REAL, 8)
+
+/* Items [begin, end) eight at a time: one after the other they would wait for each other's sums. */
+inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
+{
+    REAL8 sum = 0, sum_low = 0, magnitude = 0, magnitude_low = 0, least = REAL_MAX, largest = -REAL_MAX;
+    int i = begin;
+    for (; i + 8 <= end; i += 8) {
+        const REAL8 value = vload8(0, values + i);
+        ADD_COMPENSATED(REAL8, sum, sum_low, value);
+        ADD_COMPENSATED(REAL8, magnitude, magnitude_low, fabs(value));
+        least = fmin(least, value);
+        largest = fmax(largest, value);
+    }
+    REAL s[8], l[8], m[8], n[8], lo[8], hi[8];
+    vstore8(sum, 0, s);
+    vstore8(sum_low, 0, l);
+    vstore8(magnitude, 0, m);
+    vstore8(magnitude_low, 0, n);
+    vstore8(least, 0, lo);
+    vstore8(largest, 0, hi);
+    for (int k = 0; k < 8; ++k) {
+        const summary_t lane = {s[k], l[k], m[k], n[k], lo[k], hi[k]};
+        merge_summary(a, lane);
+    }
+    for (; i < end; ++i)
+        add_value(a, values[i]);
+}
+#endif
+
 /* Block-wise: partials[group] = summary of the group's items. */
 kernel void summarise_blocks(global const REAL *values, const int n, global summary_t *partials)
 {
+    summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
+#if GROUP_SIZE == 1
+    add_run(&mine, values, block_begin(n), block_end(n));
+    partials[get_group_id(0)] = mine;
+#else
     local summary_t shares[GROUP_SIZE];
     const int t = get_local_id(0);
-    summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
-    for (BLOCK_LOOP(i, n)) {
-        const REAL value = values[i];
-        add_compensated(&mine.sum, &mine.sum_low, value);
-        add_compensated(&mine.magnitude, &mine.magnitude_low, fabs(value));
-        mine.least = fmin(mine.least, value);
-        mine.largest = fmax(mine.largest, value);
-    }
+    for (BLOCK_LOOP(i, n))
+        add_value(&mine, values[i]);
     shares[t] = mine;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (t == 0) {
@@ -92,6 +130,7 @@ kernel void summarise_blocks(global const REAL *values, const int n, global summ
             merge_summary(&mine, shares[s]);
         partials[get_group_id(0)] = mine;
     }
+#endif
 }
 
 /* One work-item: out[4 slot ...] = sum, sum of magnitudes, least, largest. */
