@@ -78,7 +78,10 @@ class FaceRows:
 
 
 class Cells:
-    """Tessellate a box. Buffers are reused: a `Tessellation` lives until the second call after it."""
+    """Tessellate a box.
+
+    Buffers are reused: of a `Tessellation` the next call leaves only the graph as it is, and the one after that nothing.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -110,27 +113,29 @@ class Cells:
                 engine.empty(n, np.int32),
                 engine.empty(n, np.int32),
             )
-            # Two sets in turn: the previous diagram stays valid, to be repaired and to compare neighbours.
-            self._sets = [
-                {
-                    "starts": engine.empty(n + 1, np.int32),
-                    "neighbours": engine.empty(m, np.int32),
-                    "face_measures": engine.empty(m),
-                    "face_centroids": engine.empty((m, d)),
-                    "volumes": engine.empty(n),
-                    "offsets": engine.empty((n, d)),
-                    "covariances": engine.empty((n, d * (d + 1) // 2)),
-                }
+            # Two graphs in turn: the previous one stays valid, to be repaired. Measures are those of the present.
+            self._graphs = [
+                {"starts": engine.empty(n + 1, np.int32), "neighbours": engine.empty(m, np.int32)}
                 for _ in range(2)
             ]
+            self._measures = {
+                "face_measures": engine.empty(m),
+                "face_centroids": engine.empty((m, d)),
+                "volumes": engine.empty(n),
+                "offsets": engine.empty((n, d)),
+                "covariances": engine.empty((n, d * (d + 1) // 2)),
+            }
             self._capacity = n
             self._n = -1
         if n != self._n:
             # Cut the buffers to n cells (the faces' keep their spare room: their number is only known on the device).
             lengths = {"starts": n + 1, "volumes": n, "offsets": n, "covariances": n}
             self._views = [
-                {name: a[: lengths[name]] if name in lengths else a for name, a in arrays.items()}
-                for arrays in self._sets
+                {
+                    name: a[: lengths[name]] if name in lengths else a
+                    for name, a in {**graph, **self._measures}.items()
+                }
+                for graph in self._graphs
             ]
             self._n = n
 

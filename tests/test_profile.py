@@ -66,14 +66,14 @@ def test_steps_are_those_of_the_history(run):
     assert taken.spans[-1].step is None
     assert [s.step for s in taken.steps] == [1, 2, 3, 4, 5]
     for span in taken.steps:  # each step solves, moves, and tessellates
-        assert min(span.stages[name] for name in ("bins", "cells", "krylov", "motion")) > 0
+        assert min(span.stages[name] for name in ("repair", "cells", "krylov", "motion")) > 0
 
 
 def test_launches_of_every_kind_are_seen(run):
     taken, result = run
     calls = {key: cost.calls for key, cost in taken.costs.items()}
     tessellations = len(result.history)
-    assert calls["cells", "clip_cells"] >= tessellations
+    assert calls["cells", "measure_cells"] >= tessellations
     assert calls["motion", "move_generators"] == 5
     # The solver enqueues its kernels itself; so do PyOpenCL's arrays.
     assert calls["krylov", "direction"] >= result.history["iterations"].sum() - 5
