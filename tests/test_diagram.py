@@ -161,7 +161,7 @@ def test_lattice_has_square_cells_of_four_faces(adapter):
     assert np.abs(diagram.volumes - 1).max() < 64 * float(np.finfo(adapter.dtype).eps)
 
 
-@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e-3, 1e6, 1e30, 1e140])
+@pytest.mark.parametrize("scale", [1e-49, 1e-30, 1e-3, 1e6, 1e30, 1e49])
 def test_any_scale_and_place(adapter64, scale):
     rng = np.random.default_rng(5150)
     unit = rng.random((200, 2)) * [2.5, 1.5]
