@@ -135,7 +135,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
     "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
-    "best": method("adaptive", levels=0, n_cells=60, effort="best", max_steps=40),
+    "best": method("adaptive", levels=0, n_cells=320, effort="best", max_steps=31),
     "exact": method("exact", levels=0, effort="fast", max_steps=75),
     **{f"broken-{k}": broken(k) for k in ("bounds", "race", "local_race", "barrier_", "private")},
 }
