@@ -154,7 +154,8 @@ kernel void match_corners(const int size, global const REAL *points, global cons
                 }
             }
             /* A corner that only one of the cells sees, where others meet in the middle of an edge, has no partner. */
-            const REAL noise = 512 * noise_length(sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]));
+            const REAL d2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+            const REAL noise = 64 * REAL_EPS + sqrt(REAL_EPS * d2);
             partners[t] = least < fmax(R(1e-6) * widest, noise * noise) ? nearest : u;
         }
     }
@@ -259,4 +260,103 @@ kernel void place_vertices(const int size, global const REAL *points, const REAL
         if (ids[u] != ids[u + 1])
             for (int a = 0; a < 3; ++a)
                 vertices[3 * ids[u] + a] = clamp(points[3 * i + a] + corners[3 * u + a], lower[a], upper[a]);
+}
+
+/* Where many cells meet, a vertex may lie in the middle of an edge of a cell that does not see it as a corner: its loops
+   of the two faces at the edge, which come from different cells, then differ. Such a vertex is put into the loops that
+   lack it, one per edge at a time, until every cell closes. */
+
+inline int turn_after(int t, int begin, int end)
+{
+    return t + 1 == end ? begin : t + 1;
+}
+
+/* Is there an edge from vertex a to b in the loops of the faces [from, to)? */
+inline bool has_edge(int a, int b, int from, int to, global const int *loop_starts, global const int *loops)
+{
+    for (int k = from; k < to; ++k) {
+        const int begin = loop_starts[k], end = loop_starts[k + 1];
+        for (int t = begin; t < end; ++t)
+            if (loops[t] == a && loops[turn_after(t, begin, end)] == b)
+                return true;
+    }
+    return false;
+}
+
+/* Per generator i: missing[t], the vertex that should follow place t of one of its loops, or -1. */
+kernel void find_missing(const int size, global const int *starts, global const int *loop_starts,
+                         global const int *loops, global int *missing, global int *changed)
+{
+    WORK_ITEM(i);
+    const int from = starts[i], to = starts[i + 1];
+    for (int k = from; k < to; ++k) {
+        const int begin = loop_starts[k], end = loop_starts[k + 1];
+        for (int t = begin; t < end; ++t) {
+            const int a = loops[t], b = loops[turn_after(t, begin, end)];
+            missing[t] = -1;
+            if (has_edge(b, a, from, to, loop_starts, loops))
+                continue;
+            /* Another loop goes from b to a by way of it. */
+            for (int q = from; q < to && missing[t] < 0; ++q) {
+                const int first = loop_starts[q], last = loop_starts[q + 1];
+                int place = -1;
+                bool passes = false;
+                for (int s = first; s < last; ++s) {
+                    passes |= loops[s] == b;
+                    place = loops[turn_after(s, first, last)] == a ? s : place;
+                }
+                if (q == k || !passes || place < 0)
+                    continue;
+                const int p = loops[place];
+                bool here = false;
+                for (int s = begin; s < end; ++s)
+                    here |= loops[s] == p;
+                if (!here && !has_edge(a, p, from, to, loop_starts, loops)) {
+                    missing[t] = p;
+                    changed[0] = 1;
+                }
+            }
+        }
+    }
+}
+
+/* What follows place t of face k: as its own cell or the other says, the lesser first. */
+inline int missing_at(int k, int twin, int t, global const int *loop_starts, global const int *loops,
+                      global const int *missing)
+{
+    const int begin = loop_starts[k], end = loop_starts[k + 1];
+    if (twin == k)
+        return missing[t];
+    const int b = loops[turn_after(t, begin, end)];
+    int s = loop_starts[twin];
+    while (s < loop_starts[twin + 1] && loops[s] != b)
+        ++s;
+    const int own = missing[t], other = s < loop_starts[twin + 1] ? missing[s] : -1;
+    const int one = k < twin ? own : other, two = k < twin ? other : own;
+    return one >= 0 ? one : two;
+}
+
+/* Per face k: the length of its loop with what was missing. */
+kernel void measure_mended(const int size, global const int *twins, global const int *loop_starts,
+                           global const int *loops, global const int *missing, global int *counts)
+{
+    WORK_ITEM(k);
+    int count = 0;
+    for (int t = loop_starts[k]; t < loop_starts[k + 1]; ++t)
+        count += 1 + (missing_at(k, twins[k], t, loop_starts, loops, missing) >= 0);
+    counts[k] = count;
+}
+
+kernel void write_mended(const int size, global const int *twins, global const int *loop_starts,
+                         global const int *loops, global const int *missing, global const int *new_starts,
+                         global int *mended)
+{
+    WORK_ITEM(k);
+    int to = new_starts[k];
+    for (int t = loop_starts[k]; t < loop_starts[k + 1]; ++t) {
+        mended[to++] = loops[t];
+        const int p = missing_at(k, twins[k], t, loop_starts, loops, missing);
+        if (p >= 0)
+            mended[to++] = p;
+    }
 }

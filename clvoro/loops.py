@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl.array as cla
@@ -15,6 +16,8 @@ from .errors import MemoryLimitError
 
 FACE_CAPACITY = 64
 MOST_TURNS = 2**31 - 1
+MOST_ROUNDS = 16
+"""Vertices that may be put into one edge."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +93,7 @@ class FaceLoops:
             if not int(flag[0].get()):
                 break
         loop_starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
-        engine.run_each(
-            k.measure_loops, m, twins, turn_starts, turns, labels, loop_starts, ids
-        )
+        engine.run_each(k.measure_loops, m, twins, turn_starts, turns, labels, loop_starts, ids)
         self._scan.exclusive(loop_starts, loop_starts, m)
         self._scan.exclusive(ids, ids, c)
         loops = engine.empty(int(loop_starts[m].get()), np.int32)
@@ -101,4 +102,30 @@ class FaceLoops:
             k.write_loops, m, twins, turn_starts, turns, labels, ids, loop_starts, loops
         )
         engine.run_each(k.place_vertices, n, *cell[:3], corner_starts, corners, ids, positions)
-        return Loops(positions, loop_starts, loops)
+        starts, loops = self._mended(k, t, twins, loop_starts, loops)
+        return Loops(positions, starts, loops)
+
+    def _mended(
+        self,
+        k: SimpleNamespace,
+        t: Tessellation,
+        twins: cla.Array,
+        starts: cla.Array,
+        loops: cla.Array,
+    ) -> tuple[cla.Array, cla.Array]:
+        """Put vertices into edges that they lie on where a cell would not close without."""
+        engine, m = self.engine, len(twins)
+        changed = engine.empty(1, np.int32)
+        for _ in range(MOST_ROUNDS):
+            missing = engine.empty(max(len(loops), 1), np.int32)
+            changed.fill(0)
+            engine.run_each(k.find_missing, t.n, t.starts, starts, loops, missing, changed)
+            if not int(changed[0].get()):
+                break
+            longer = engine.empty(m + 1, np.int32)
+            engine.run_each(k.measure_mended, m, twins, starts, loops, missing, longer)
+            self._scan.exclusive(longer, longer, m)
+            mended = engine.empty(int(longer[m].get()), np.int32)
+            engine.run_each(k.write_mended, m, twins, starts, loops, missing, longer, mended)
+            starts, loops = longer, mended
+        return starts, loops

@@ -22,9 +22,7 @@ class Cell:
 def polygon(corners: np.ndarray, centre: np.ndarray) -> tuple[float, np.ndarray, list]:
     """Return area, centroid and triangles of a convex polygon whose corners (k, 3) go around."""
     middle = corners.mean(axis=0)
-    triangles = [
-        (middle, a, b) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
-    ]
+    triangles = [(middle, a, b) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     areas = np.array([np.linalg.norm(np.cross(b - a, c - a)) / 2 for a, b, c in triangles])
     centroids = np.array([(a + b + c) / 3 for a, b, c in triangles])
     area = areas.sum()
@@ -33,7 +31,6 @@ def polygon(corners: np.ndarray, centre: np.ndarray) -> tuple[float, np.ndarray,
 
 def moments(tetrahedra: list[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume, centroid and second moments of tetrahedra (4, 3), by a quadrature of degree 2."""
-    inner, outer = 0.58541020, 0.13819660
     inner = (5 + 3 * np.sqrt(5)) / 20
     outer = (1 - inner) / 3
     weights = np.full((4, 4), outer) + (inner - outer) * np.eye(4)
@@ -64,16 +61,14 @@ def box_voronoi(lower, upper, points) -> list[Cell]:
     tetrahedra: list[list] = [[] for _ in range(n)]
     for (p, q), ridge in zip(diagram.ridge_points, diagram.ridge_vertices, strict=True):
         for i, j in ((p, q), (q, p)):
-            if i < n:
+            # A cell's own images lie behind the walls; faces to images of others have no area.
+            if i < n and (j < n or j % n == i):
                 area, centroid, triangles = polygon(diagram.vertices[ridge], points[i])
                 label = int(j if j < n else -(j // n))
-                # With coplanar generators another one's image may share a wall.
-                faces[i][label] = faces[i].get(label, 0) + area
+                faces[i][label] = area
                 centroids[i][label] = centroid
                 tetrahedra[i] += [np.array([points[i], *t]) for t in triangles]
-    return [
-        Cell(f, c, *moments(t)) for f, c, t in zip(faces, centroids, tetrahedra, strict=True)
-    ]
+    return [Cell(f, c, *moments(t)) for f, c, t in zip(faces, centroids, tetrahedra, strict=True)]
 
 
 def half_space_volume(lower, upper, points, i) -> float:
