@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from .adapter import Adapter
     from .check import Report
     from .domain import Box
     from .quality import Measures
@@ -67,7 +70,8 @@ class Diagram:
     face_vertex_starts : (m + 1,) int32, 3D only
     face_vertices : (k,) int32, 3D only
         Corners of face f of the graph, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``,
-        counter-clockwise as seen from outside of the cell to whose row the face belongs.
+        counter-clockwise as seen from outside of the cell to whose row the face belongs; the other cell has
+        them in the opposite order. Empty where the face is as narrow as its vertices round.
 
     Raises
     ------
@@ -106,6 +110,55 @@ class Diagram:
         from .check import check_diagram
 
         return check_diagram(self)
+
+    def transfer(
+        self,
+        values: ArrayLike,
+        onto: Result | Diagram,
+        order: int = 1,
+        *,
+        limited: bool = True,
+        adapter: Adapter | None = None,
+    ) -> np.ndarray:
+        """Carry cell data over to another mesh of the same domain, conservatively.
+
+        A new cell gets the mean over its parts, each of which it has in common with one old cell. With `order` 1 an
+        old cell has its value everywhere; with 2 it has a linear function about its centroid, whose slope fits the
+        neighbours' values by least squares, limited as by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the
+        cell beyond the values of cell and neighbours.
+
+        Parameters
+        ----------
+        values : (n,) or (n, k) array of real numbers
+            Means over the cells of this mesh, in the order of its points.
+        onto : Result or Diagram
+            The new mesh.
+        order : 1 or 2
+        limited : bool
+            With False slopes are as they are: linear functions stay exact (to rounding) at walls and extrema too, and
+            values may leave the bounds of the old ones.
+        adapter : Adapter, optional
+            Whose device does the work; by default that of `create_context()`. In float64 where the device has it.
+
+        Returns
+        -------
+        (n_new,) or (n_new, k) float64
+            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values, and every new value lies
+            between the least and the largest old one nearby (unless `limited` is False). Rounding leaves the mass off
+            by little; that is made up for in proportion to the room up to those bounds. Between float32 meshes, whose
+            volumes are rounded, bounds take precedence: the mass of a constant is off as the sums of volumes are.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If the meshes have different domains, `values` has another shape or is not finite (a mean with a NaN is
+            none), or `order` is neither 1 nor 2.
+        ClvoroError
+            If one of the meshes is not the Voronoi diagram of its points.
+        """
+        from .remap import transfer_values
+
+        return transfer_values(self, values, onto, order, limited, adapter)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -179,6 +232,18 @@ class Result:
         from .check import check_result
 
         return check_result(self)
+
+    def transfer(
+        self,
+        values: ArrayLike,
+        onto: Result | Diagram,
+        order: int = 1,
+        *,
+        limited: bool = True,
+        adapter: Adapter | None = None,
+    ) -> np.ndarray:
+        """Carry cell data (n,) or (n, k) over to another mesh of the same domain; see `Diagram.transfer`."""
+        return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the mesh to `path`: `.npz` (reload with `clvoro.load`), `.vtu`, OpenFOAM's `polyMesh`, ...
