@@ -1,7 +1,11 @@
 """The tessellation alone: time of each stage, cold and warm-started, uniform and graded.
 
-    python bench/diagram.py [--sizes 1e4,1e5,1e6,4e6] [--sets uniform,cubed,radial,hexagonal]
+    python bench/diagram.py [--dim 3] [--sizes 1e4,1e5,1e6,4e6] [--sets uniform,cubed,radial,hexagonal]
                             [--scipy] [--repeat 5] [--device NAME] [--dtype float32] [--json]
+
+With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000, and "bcc", the
+body-centred cubic lattice, jittered likewise. Areas and moments are then part of "clip", and a
+warm row bins the moved generators and clips by the neighbours of the diagram before first.
 
 Point sets in the unit square, random with a fixed seed: "uniform"; "cubed", uniform with x -> x^3
 in both coordinates; "radial", spacing in proportion to the distance from the centre, sizes
@@ -40,12 +44,15 @@ from clvoro._primitives import Gather
 from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
+from clvoro.polyhedra import Polyhedra
 from clvoro.profile import Profile, profiled_queue
 from clvoro.repair import Repair
 
 BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
+CUBE = clvoro.Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 SEED = 7919
 RATIO = 1e4
+RATIO_3D = 1e3
 JITTER = 0.1
 WARM_MOVE = 0.1
 
@@ -81,7 +88,36 @@ def hexagonal(n: int, rng: np.random.Generator) -> np.ndarray:
     return rng.permutation(np.clip(p, 0, 1))
 
 
+def uniform_3d(n: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.random((n, 3))
+
+
+def cubed_3d(n: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.random((n, 3)) ** 3
+
+
+def radial_3d(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Points of density 1 / r^3 between r = R / 1000 and the corners, R = sqrt(3/4)."""
+    kept: list[np.ndarray] = []
+    while sum(map(len, kept)) < n:
+        r = math.sqrt(0.75) * RATIO_3D ** -rng.random(n)
+        v = rng.standard_normal((n, 3))
+        p = 0.5 + (r / np.linalg.norm(v, axis=1))[:, None] * v
+        kept.append(p[((p >= 0) & (p <= 1)).all(axis=1)])
+    return np.concatenate(kept)[:n]
+
+
+def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Jittered body-centred cubic lattice in random order, of about n points."""
+    k = max(1, round((n / 2) ** (1 / 3)))
+    p = np.stack(np.meshgrid(*[np.arange(k, dtype=float)] * 3), axis=-1).reshape(-1, 3)
+    p = np.concatenate([p + 0.25, p + 0.75]) / k
+    p += JITTER * math.sqrt(0.75) / k * (rng.random(p.shape) - 0.5) * 2
+    return rng.permutation(np.clip(p, 0, 1))
+
+
 SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
+SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, bcc_3d)}
 
 
 KERNELS = {"clip": ("clip", "check", "list", "place"), "match": ("match",), "measure": ("measure",)}
@@ -106,24 +142,26 @@ class Tessellator:
 
     def __init__(self, engine: Engine, points: np.ndarray) -> None:
         self.engine, self.n = engine, len(points)
-        self.bins, self.cells, self.gather = Bins(engine), Cells(engine), Gather(engine)
-        self.repair = Repair(engine)
+        self.bins, self.gather = Bins(engine), Gather(engine)
+        self.box = BOX if engine.dim == 2 else CUBE
+        self.cells = Cells(engine) if engine.dim == 2 else Polyhedra(engine)
+        self.repair = Repair(engine) if engine.dim == 2 else None
         self.given = engine.upload(points)
         self.points = self.order()
         self.turn = 0
 
     def order(self) -> Any:
         """Bin the generators as given; return them in the order of the bins."""
-        items = self.bins.build(BOX, self.given, self.n).items[: self.n].copy()
+        items = self.bins.build(self.box, self.given, self.n).items[: self.n].copy()
         return self.gather.rows(items, self.given)
 
     def bin(self) -> None:
         """Bin the ordered generators."""
-        self.binned = self.bins.build(BOX, self.points, self.n)
+        self.binned = self.bins.build(self.box, self.points, self.n)
 
     def diagram(self) -> Any:
         """Tessellate from nothing."""
-        self.t = self.cells.tessellate(BOX, self.points, self.n, self.binned)
+        self.t = self.cells.tessellate(self.box, self.points, self.n, self.binned)
         return self.t
 
     def prepare_warm(self, rng: np.random.Generator) -> None:
@@ -133,23 +171,28 @@ class Tessellator:
         starts = t.starts.get()
         neighbours = t.neighbours.get()[: starts[-1]]
         d = host[neighbours] - np.repeat(host, np.diff(starts), axis=0)
-        d = np.where(neighbours >= 0, np.hypot(*d.T), np.inf)
+        d = np.where(neighbours >= 0, np.linalg.norm(d, axis=1), np.inf)
         nearest = np.minimum.reduceat(d, starts[:-1])
         moved = host + WARM_MOVE * nearest[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
         moved = np.clip(moved, 0, 1)
         self.places = [self.points, self.engine.upload(moved)]
         # Capacities grow where a mesh is made anew, not where one is repaired.
         self.cells.tessellate(
-            BOX, self.places[1], self.n, self.bins.build(BOX, self.places[1], self.n)
+            self.box, self.places[1], self.n, self.bins.build(self.box, self.places[1], self.n)
         )
         self.t = self.cells.tessellate(
-            BOX, self.points, self.n, self.bins.build(BOX, self.points, self.n)
+            self.box, self.points, self.n, self.bins.build(self.box, self.points, self.n)
         )
 
     def diagram_warm(self) -> None:
         """Tessellate where the generators moved to, from where they were, to and fro."""
         self.turn = 1 - self.turn
-        t = self.repair.follow(self.cells, BOX, self.places[self.turn], self.t)
+        if isinstance(self.cells, Polyhedra) or self.repair is None:
+            points = self.places[self.turn]
+            binned = self.bins.build(self.box, points, self.n)
+            self.t = self.cells.tessellate(self.box, points, self.n, binned, self.t)
+            return
+        t = self.repair.follow(self.cells, self.box, self.places[self.turn], self.t)
         if t is None:
             raise SystemExit("the generators moved too far for a repair")
         self.t = t
@@ -170,14 +213,18 @@ def kernel_times(queue: Any, repeat: int, function: Callable[[], object]) -> dic
     return {name: statistics.median(seen) for name, seen in times.items()}
 
 
+def sets_of(options: argparse.Namespace) -> dict[str, Callable[..., np.ndarray]]:
+    return SETS if options.dim == 2 else SETS_3D
+
+
 def measure(
     adapter: clvoro.Adapter, name: str, n: int, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
     """Return the records of one set: cold and warm."""
     rng = np.random.default_rng(SEED + n)
-    points = SETS[name](n, rng).astype(adapter.dtype)
+    points = sets_of(options)[name](n, rng).astype(adapter.dtype)
     repeat = options.repeat
-    plain = Tessellator(Engine(adapter.ctx, adapter.queue, 2, adapter.dtype), points)
+    plain = Tessellator(Engine(adapter.ctx, adapter.queue, options.dim, adapter.dtype), points)
     queue = plain.engine.queue
     order = median_time(queue, repeat, plain.order)
     bins = median_time(queue, repeat, plain.bin)
@@ -187,7 +234,7 @@ def measure(
     del plain
 
     queue = profiled_queue(adapter.ctx)
-    timed = Tessellator(Engine(adapter.ctx, queue, 2, adapter.dtype), points)
+    timed = Tessellator(Engine(adapter.ctx, queue, options.dim, adapter.dtype), points)
     timed.bin()
     cold_kernels = kernel_times(queue, repeat, timed.diagram)
     timed.prepare_warm(rng)
@@ -267,13 +314,18 @@ def comparisons(records: list[dict[str, Any]]) -> list[list[str]]:
 def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[10**4, 10**5, 10**6, 4 * 10**6])
-    options_of.add_argument("--sets", type=names, default=list(SETS), help=", ".join(SETS))
+    options_of.add_argument("--dim", type=int, choices=(2, 3), default=2)
+    options_of.add_argument(
+        "--sets", type=names, help=f"{', '.join(SETS)}; in 3D {', '.join(SETS_3D)}"
+    )
     options_of.add_argument("--repeat", type=int, default=5)
     options_of.add_argument("--scipy", action="store_true")
     options_of.add_argument("--scipy-up-to", type=float, default=1e6, metavar="N")
     options = options_of.parse_args()
-    if unknown := set(options.sets) - set(SETS):
-        options_of.error(f"no set {', '.join(unknown)}; there are {', '.join(SETS)}")
+    known = sets_of(options)
+    options.sets = list(known) if options.sets is None else options.sets
+    if unknown := set(options.sets) - set(known):
+        options_of.error(f"no set {', '.join(unknown)}; there are {', '.join(known)}")
 
     adapter = make_adapter(options)
     report = Report(options.json, COLUMNS)
