@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .adapter import Adapter
 
 DEFECT = 1e-3
-"""Share of a cell by which its parts may differ from it, beside what single precision rounds: else a part is missing."""
+"""Share of a cell by which its parts may differ from it, beside single precision: else a part is missing."""
 
 
 def transfer_values(

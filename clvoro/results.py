@@ -143,10 +143,11 @@ class Diagram:
         Returns
         -------
         (n_new,) or (n_new, k) float64
-            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values, and every new value lies
-            between the least and the largest old one nearby (unless `limited` is False). Rounding leaves the mass off
-            by little; that is made up for in proportion to the room up to those bounds. Between float32 meshes, whose
-            volumes are rounded, bounds take precedence: the mass of a constant is off as the sums of volumes are.
+            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values, and every new
+            value lies between the least and the largest old one nearby (unless `limited` is False). Rounding leaves
+            the mass off by little; that is made up for in proportion to the room up to those bounds. Between float32
+            meshes, whose volumes are rounded, bounds take precedence: the mass of a constant is off as the sums of
+            volumes are.
 
         Raises
         ------

@@ -312,7 +312,7 @@ def test_cells_of_many_faces(adapter):
     angle = 2 * np.pi * np.arange(90) / 90
     ring = 0.5 + 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
     old = adapter.diagram(box, np.vstack([[0.5, 0.5], ring]))
-    new = adapter.diagram(box, np.vstack([[0.51, 0.5], ring + [0.01, 0]]))
+    new = adapter.diagram(box, old.points + np.array([0.01, 0]))
     assert np.diff(old.neighbour_starts).max() == 90
     got = old.transfer(old.centroids[:, 1], new, 2, limited=False, adapter=adapter)
     np.testing.assert_allclose(got, new.centroids[:, 1], rtol=0, atol=1e-11)
