@@ -92,8 +92,11 @@ def _enqueue_copy(queue: cl.CommandQueue, dest: Any, src: Any, **options: Any) -
     event = _original["enqueue_copy"](queue, dest, src, **options)
     to_device, from_device = (isinstance(a, cl.MemoryObject) for a in (dest, src))
     name = "copy" if to_device and from_device else "read" if from_device else "write"
-    # Between host and device it is another memory's bandwidth that counts.
-    moved = 2 * (options.get("byte_count") or src.size) if name == "copy" else None
+    if name == "copy":
+        moved = 2 * (options.get("byte_count") or src.size)
+    else:
+        host = dest if name == "read" else src
+        moved = getattr(host, "nbytes", None)
     # A blocking transfer has ended, and its event would keep the host's array alive.
     done = name != "copy" and options.get("is_blocking", True)
     for watch in _of(queue):

@@ -78,6 +78,10 @@ class Summaries:
             np.int32(self.slots[name]), self.values, group=1,
         )  # fmt: skip
 
+    def read_one(self, name: str) -> Summary:
+        """Fetch one slot."""
+        return Summary(*map(float, self.values[self.slots[name]].get()))
+
     def read(self) -> dict[str, Summary]:
         """Fetch every slot, in one transfer."""
         host = self.values.get()

@@ -253,7 +253,7 @@ class Mesh:
     def _excess(self, w: Weighting) -> Summary:
         """Summarise the excess, log(V / h^d)."""
         self.summaries.collect("excess", w.excess, self.n)
-        return self.summaries.read()["excess"]
+        return self.summaries.read_one("excess")
 
     def mean_log_error(self, w: Weighting) -> float:
         """Mean of |log(L / h)|, by a weighting that has just been made."""
@@ -266,7 +266,7 @@ class Mesh:
         """
         w = self.weigh() if w is None else w
         self.summaries.collect("weight", w.weight, self.n)
-        return self.summaries.read()["weight"].sum - self.n
+        return self.summaries.read_one("weight").sum - self.n
 
     def match_size(self) -> None:
         """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""

@@ -5,6 +5,7 @@ Every command is timed, by whichever stage it is enqueued (see `_hooks`). A run 
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -81,6 +82,8 @@ class Span:
         Seconds by the clock.
     stages : Counter
         Device time per stage.
+    read : int
+        Bytes that the host has read from the device.
     """
 
     began: float
@@ -89,6 +92,7 @@ class Span:
     cells: int | None = None
     wall: float = 0.0
     stages: Counter[str] = field(default_factory=Counter)
+    read: int = 0
 
     @property
     def host(self) -> float:
@@ -209,7 +213,11 @@ class Profile:
         cost.seconds += seconds
         if moved is not None:
             cost.bytes += moved
-            cost.seconds_known += seconds
+            # Between host and device it is another memory's bandwidth that counts.
+            if key[1] not in ("read", "write") or key[0] != _hooks.MEMORY:
+                cost.seconds_known += seconds
+            elif key[1] == "read":
+                span.read += moved
         span.stages[key[0]] += seconds
 
     # What came of it.
@@ -333,7 +341,10 @@ class Profile:
         ]
         for name, spans in groups.items():
             cells = max(s.cells or 0 for s in spans)
-            notes.append(f"{name}: {len(spans)} steps, up to {cells} cells")
+            read = statistics.median(s.read for s in spans)
+            notes.append(
+                f"{name}: {len(spans)} steps, up to {cells} cells; the host read {read:.0f} bytes a step"
+            )
         return "\n".join([_aligned(stages), "", _aligned(kernels), "", *notes])
 
     def _require_closed(self) -> None:
