@@ -4,8 +4,8 @@
 /* Vertices and face loops of a diagram in 3D, from its graph. Each cell is clipped once more, by its neighbours alone. Its
    vertices, the corners, are numbered cell by cell: corner u. The same point is a corner of every cell that meets
    there: corners are one vertex where an edge between them has no length, and where they lie at the same place of the
-   face that two cells share. The least corner of a vertex gives it its label and its position. That needs no tolerance
-   but in edges, and so holds where many cells meet in a point.
+   face that two cells share. The least corner of a vertex gives it its label and its position. Nearest corners of a face
+   belong together whatever they round by, and so this holds where many cells meet in a point.
 
    starts, neighbours          the graph: faces k, in rows i
    corner_starts (n + 1,)      first corner of each cell

@@ -13,8 +13,9 @@ from .domain import Box
 
 OCCUPANCY = 2
 """Generators per bin that the grids aim at: fewer bins to open against fewer generators to test."""
-SPLIT_COUNT = 10
-"""A bin that holds more is divided by a grid of its own. Uniform random sets (Poisson, mean 2) stay on one level."""
+SPLIT_COUNT = {2: 10, 3: 18}
+"""A bin that holds more is divided by a grid of its own, in 2D and in 3D, where a division makes more bins. Uniform
+random sets (Poisson, mean 2) stay on one level."""
 MAX_CHILD_SIDE = 64
 MAX_LEVELS = 8
 """Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
@@ -54,7 +55,7 @@ class Bins:
         self._kernels = engine.kernels(
             "bins",
             {
-                "SPLIT_COUNT": SPLIT_COUNT,
+                "SPLIT_COUNT": SPLIT_COUNT[engine.dim],
                 "MAX_CHILD_SIDE": MAX_CHILD_SIDE,
                 "OCCUPANCY": OCCUPANCY,
             },

@@ -53,7 +53,7 @@ def check(binned, points, dim, eps):
         place = slice(start, start + count)
         covered[place] += 1
         assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
-        assert count <= SPLIT_COUNT or level == MAX_LEVELS - 1
+        assert count <= SPLIT_COUNT[dim] or level == MAX_LEVELS - 1
         assert np.allclose(reach[place], edge, rtol=1e-6)
         # A generator lies in its bin but for the rounding of the bin's corner; outermost bins take what rounds out.
         inside = points[items[place]]
