@@ -272,3 +272,47 @@ kernel void measure_cells(const int size, global const int *places, global const
     covariances[3 * i + 1] = xy;
     covariances[3 * i + 2] = yy;
 }
+
+/* Per doubtful cell: is its area positive, and do its neighbours have their common faces where it has them? Where rounding
+   has let two cells see different neighbours, what they disagree about must be as little as rounding makes of the box, and
+   no more than a share of the cell; else generators are too close to tell apart, which is flagged. */
+kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
+                           global const int *starts, global const int *neighbours, global const REAL *volumes,
+                           global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
+                           global int *flags)
+{
+    WORK_ITEM(i);
+    if (places[i] < 0 || slot_counts[places[i]] >= 0)
+        return;
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    global const int *row = neighbours + starts[i];
+    const int n = starts[i + 1] - starts[i];
+    const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
+    bool right = volumes[i] > 0;
+    REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k], before = row[k == 0 ? n - 1 : k - 1], after = row[k == n - 1 ? 0 : k + 1];
+        const REAL2 u = v;
+        v = corner(i, x, j, after, points, lower, upper);
+        if (j < 0)
+            continue;
+        global const int *other = neighbours + starts[j];
+        const int m = starts[j + 1] - starts[j];
+        const int q = place_in_row(other, m, i);
+        if (q == m) {
+            right = false;
+            continue;
+        }
+        const int p = other[q == 0 ? m - 1 : q - 1], s = other[q == m - 1 ? 0 : q + 1];
+        REAL gap2 = 0;
+        if (p != after)
+            gap2 = corner_gap2(v, i, j, p, i, points, lower, upper);
+        if (s != before)
+            gap2 = fmax(gap2, corner_gap2(u, i, j, i, s, points, lower, upper));
+        right = right && gap2 * fmax(dot(u, u), dot(v, v)) <= least * least;
+    }
+    if (!right)
+        raise_flag(flags, FLAG_COLLAPSED, i);
+}

@@ -19,26 +19,13 @@ inline bool is_rounding(REAL gap2, REAL d2)
     return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
 }
 
-/* Do a corner of cell i and what cell `other` takes for the same corner, between its faces p and q, coincide but for
-   rounding? Where four or more cells meet in a point, cells may leave out different faces of no length. */
-inline bool same_corner(REAL2 mine, int i, int other, int p, int q, REAL d2, global const REAL *points,
-                        const REAL *lower, const REAL *upper)
-{
-    const REAL x[2] = {points[2 * other], points[2 * other + 1]};
-    const REAL2 from = (REAL2)(points[2 * i] - x[0], points[2 * i + 1] - x[1]);
-    const REAL2 gap = mine + from - corner(other, x, p, q, points, lower, upper);
-    return is_rounding(dot(gap, gap), d2);
-}
-
 /* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
    `after`, at corners u and v; so in j's row i must stand between `after` and `before`; it is `exact` if it does. */
 inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
                            global const REAL *points, const REAL *lower, const REAL *upper, bool *exact)
 {
     *exact = false;
-    int q = 0;
-    while (q < n && row[q] != i)
-        ++q;
+    const int q = place_in_row(row, n, i);
     if (q == n) {
         /* A face of no length, which i is then doubtful of, will be dropped. */
         const REAL2 e = v - u;
@@ -48,8 +35,9 @@ inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v
     *exact = p == after && s == before;
     if (*exact)
         return true;
-    return (p == after || same_corner(v, i, j, p, i, d2, points, lower, upper)) &&
-           (s == before || same_corner(u, i, j, i, s, d2, points, lower, upper));
+    /* Where four or more cells meet in a point, cells may leave out different faces of no length. */
+    return (p == after || is_rounding(corner_gap2(v, i, j, p, i, points, lower, upper), d2)) &&
+           (s == before || is_rounding(corner_gap2(u, i, j, i, s, points, lower, upper), d2));
 }
 
 /* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from the

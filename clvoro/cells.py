@@ -18,7 +18,13 @@ CELL_CAPACITY = 24
 ROW_CAPACITY = 20
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
 LARGEST_ROW = 512
-FULL, COINCIDE = 1, 2  # of the bits in cells.cl; any other means cells that collapsed
+EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
+"""Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
+FULL, COINCIDE, DOUBT = (
+    1,
+    2,
+    8,
+)  # of the bits in common/face_rows.h; the other means cells that collapsed
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,7 @@ class FaceRows:
 class Cells:
     """Tessellate a box.
 
-    Buffers are reused: of a `Tessellation` the next call leaves only the graph as it is, and the one after that nothing.
+    Buffers are reused: of a `Tessellation` the next call leaves only the graph as it is, the one after that nothing.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -139,8 +145,16 @@ class Cells:
             ]
             self._n = n
 
-    def tessellate(self, box: Box, points: cla.Array, n: int, binned: BinnedPoints) -> Tessellation:
+    def tessellate(
+        self, box: Box, points: cla.Array, n: int, binned: BinnedPoints, exact: bool = True
+    ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
+
+        Parameters
+        ----------
+        exact : bool
+            Refuse generators so close together that rounding makes more than `EXACT_SHARE` of a cell uncertain. Without
+            it only more than `ROUGH_SHARE`.
 
         Raises
         ------
@@ -169,9 +183,13 @@ class Cells:
             if not flags & FULL:
                 break
             self._enlarge(n)
-        if flags:
+        if not flags & ~DOUBT:
+            t = self._measure(box, points, n, rows.places, rows.places)
+            if flags & DOUBT:
+                flags, generator = self._check(box, t, exact)
+        if flags & ~DOUBT:
             self._refuse(flags, generator)
-        return self._measure(box, points, n, rows.places, rows.places)
+        return t
 
     def complete(self, box: Box, points: cla.Array, previous: Tessellation) -> Tessellation | None:
         """Return the diagram of `points` whose `rows` are those of `previous` or, where that has a place, new ones.
@@ -179,9 +197,11 @@ class Cells:
         None if they do not make a diagram.
         """
         n, starts, neighbours = previous.n, previous.starts, previous.neighbours
-        if self._match(box, points, n, starts, neighbours)[0]:
+        flags = self._match(box, points, n, starts, neighbours)[0]
+        if flags & ~DOUBT:
             return None
-        return self._measure(box, points, n, starts, neighbours)
+        t = self._measure(box, points, n, starts, neighbours)
+        return None if flags & DOUBT and self._check(box, t, exact=False)[0] & ~DOUBT else t
 
     def clear_flags(self) -> None:
         """Nothing has gone wrong yet."""
@@ -215,6 +235,17 @@ class Cells:
         # Only now: a call that was broken off leaves the previous diagram as it is.
         self._turn = 1 - self._turn
         return Tessellation(n=n, points=points, **new)
+
+    def _check(self, box: Box, t: Tessellation, exact: bool) -> tuple[int, int]:
+        """Check the doubtful cells of `t`; return the flags, and the first generator concerned."""
+        rows = self.rows
+        self.engine.run_each(
+            self._kernels.check_doubtful, t.n, rows.places, rows.counts, t.starts, t.neighbours,
+            t.volumes, t.points, *box.device_corners(self.engine.real),
+            self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE), rows.flags,
+        )  # fmt: skip
+        flags, generator = rows.flags.get()
+        return int(flags), int(generator)
 
     def _reserve_rows(self, n: int) -> None:
         """Make room for `n` rows of faces of the present capacity."""

@@ -233,13 +233,15 @@ class Mesh:
 
     def _tessellate(self) -> Tessellation:
         """Tessellate: from the diagram before, where there is one and enough of it has stayed, else anew."""
-        stages = self.stages
-        if self.tessellation is not None and self.engine.dim == 2:
-            t = stages.repair.follow(stages.cells, self.domain, self.points, self.tessellation)
+        stages, previous = self.stages, self.tessellation
+        flat = self.engine.dim == 2
+        if previous is not None and flat:
+            t = stages.repair.follow(stages.cells, self.domain, self.points, previous)
             if t is not None:
                 return t
         binned = stages.bins.build(self.domain, self.points, self.n)
-        return stages.cells.tessellate(self.domain, self.points, self.n, binned)
+        how = {"exact": False} if flat else {"previous": previous}
+        return stages.cells.tessellate(self.domain, self.points, self.n, binned, **how)
 
     def _evaluate_metric(self) -> None:
         self.stages.metric.evaluate(

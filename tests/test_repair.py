@@ -32,7 +32,7 @@ def point_sets():
     return {
         "random": random,
         "graded": random**3,
-        "clusters": np.concatenate([random[:300], 0.4 + 1e-4 * random[300:]]),
+        "clusters": np.concatenate([random[:300], 0.4 + 1e-3 * random[300:]]),
         "hexagons": patch.hexagons(0.04),
         "lattice": square(20),
         "cocircular": 0.4 + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)]),
@@ -56,7 +56,9 @@ class Carried:
 
     def anew(self, cells, points):
         x = self.engine.upload(points)
-        return cells.tessellate(patch.BOX, x, self.n, self.bins.build(patch.BOX, x, self.n))
+        return cells.tessellate(
+            patch.BOX, x, self.n, self.bins.build(patch.BOX, x, self.n), exact=False
+        )
 
     def move(self, points):
         """Carry the diagram over to `points`; return it as NumPy arrays, and whether it was."""
@@ -112,12 +114,12 @@ def test_is_the_diagram_itself(engine, name, share):
         times += was
         check(t, eps)
         expected = carried.reference(points)
-        if np.array_equal(t.starts, expected.starts):
-            assert np.array_equal(t.neighbours, expected.neighbours)
+        if np.array_equal(t.neighbours, expected.neighbours):
             assert np.array_equal(t.volumes, expected.volumes)
             assert np.array_equal(t.face_measures, expected.face_measures)
         else:
             # Only faces of no length may be there in one and not in the other.
+            assert eps > 1e-10 or name in ("lattice", "hexagons", "cocircular")
             noise = 256 * eps
             assert np.allclose(t.volumes, expected.volumes, rtol=1e-3 if share else 0, atol=noise)
             for a, b in ((t, expected), (expected, t)):

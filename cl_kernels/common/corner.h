@@ -42,3 +42,23 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along + (points[2 * o + 1 - axis] - x[1 - axis]);
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 }
+
+/* Squared distance between a corner of cell i, relative to x_i, and what cell j takes for the same corner, between its faces
+   p and q. */
+inline REAL corner_gap2(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
+                        const REAL *upper)
+{
+    const REAL x[2] = {points[2 * j], points[2 * j + 1]};
+    const REAL2 from = (REAL2)(points[2 * i] - x[0], points[2 * i + 1] - x[1]);
+    const REAL2 gap = mine + from - corner(j, x, p, q, points, lower, upper);
+    return dot(gap, gap);
+}
+
+/* Where j stands in a row of n; n if it does not. */
+inline int place_in_row(global const int *row, int n, int j)
+{
+    int q = 0;
+    while (q < n && row[q] != j)
+        ++q;
+    return q;
+}

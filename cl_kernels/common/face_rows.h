@@ -10,6 +10,7 @@
 #define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY */
 #define FLAG_COINCIDE 2  /* two generators at the same place; flags[1] is the smallest index of one */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
+#define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be checked in the end */
 
 inline void raise_flag(global int *flags, int flag, int generator)
 {
@@ -69,4 +70,6 @@ inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL 
     for (int k = 0; k < n; ++k)
         slots[place * ROW_CAPACITY + k] = cell->faces[first + k < n ? first + k : first + k - n];
     counts[place] = doubtful ? -n : n;
+    if (doubtful && (*flags & FLAG_DOUBT) == 0)
+        atomic_or(flags, FLAG_DOUBT);
 }
