@@ -21,7 +21,7 @@ from .fetch import fetch_diagram
 from .loop import Loop
 from .mesh import Mesh, Stages, check_memory
 from .methods import PUBLISHED, Relaxation, make_method
-from .plans import EFFORTS, Action, auto_levels, plan_adaptive, plan_steps
+from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
 from .results import Diagram, Result
 from .sizing import Sizing, as_field
 from .start import count_cells, sample_density, sample_uniform
@@ -309,11 +309,19 @@ class Adapter:
                 host = sample_uniform(domain, n, options["seed"], self.dtype)
             else:
                 host = sample_density(sizing, domain, n, options["seed"], self.dtype)
+        mesh, near = None, False
+        if host is not None and (saved is None or (planned and levels == 0)):
+            origin, scale = domain.frame
+            with _Naming(host, domain, self.dtype):
+                unsorted = engine.upload((host - origin) / scale)
+                mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
+            near = points is not None and planned and levels == 0
+            near = near and self._near(mesh, n_cells, options["effort"])
         plan: list[Action]
         if planned:
             plan = plan_adaptive(
                 domain.dim, options["effort"], levels, method == "exact", options["error_target"],
-                warm=points is not None,
+                warm=points is not None, near=near,
             )  # fmt: skip
         else:
             relaxation = Relaxation(options["alpha"], options["k"])
@@ -321,13 +329,9 @@ class Adapter:
             plan = plan_steps(make_method(method, relaxation), steps)
         tol = None if planned else options["tol"]
         writer = None if checkpoint is None else Checkpointer(checkpoint, every, made_by, plan)
-        if saved is None:
-            origin, scale = domain.frame
-            with _Naming(host, domain, self.dtype):
-                unsorted = engine.upload((host - origin) / scale)
-                mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
-        else:
+        if saved is not None:
             mesh = saved.restore(stages, domain, sizing, plan)
+        assert mesh is not None
         loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
         loop.checkpoint = writer
         if saved is not None:
@@ -336,6 +340,15 @@ class Adapter:
         if points is not None:
             settings["start"] = "points"
         return loop.run(n_cells if planned else None, float(target), settings)
+
+    @staticmethod
+    def _near(mesh: Mesh, n_cells: int | None, effort: str) -> bool:
+        """Tell whether a mesh that was given needs no more than correction."""
+        missing = mesh.missing() if n_cells is None else float(n_cells - mesh.n)
+        s, n = mesh.assess(), mesh.n
+        return is_near(
+            mesh.engine.dim, effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
+        )
 
     @staticmethod
     def _levels(levels: int | str, engine: Engine, target: int, host: np.ndarray | None) -> int:

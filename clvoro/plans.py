@@ -16,6 +16,13 @@ quality in the projection:
     density start ─► [ couple ─► settle ahead ] x 2 ─► refine ─► ... ─► couple ─► settle ─► couple ─► glide (─► project)
 
 *settle ahead*  the count at which refinement makes the one that the next level wants
+
+From a mesh that is near its size field already, as after the field has moved by a few cells, in 2D:
+
+    stride ─► settle ─► stride ─► correct ─► settle ─► polish (─► project)
+
+*stride*   weighted Lloyd and Poisson, by as much as two cells at once: the potential's displacement is smooth
+*correct*  one step of the projection alone
 """
 
 from __future__ import annotations
@@ -56,6 +63,8 @@ class Effort:
     emphasis, lenience, bound : float
         Of the polishing: weight of bad cells; -log Q from which on a cell may be off its size for its shape; and
         excess, over the mean that is aimed at, from which on it may not.
+    flaw : float
+        1 - mean Q up to which a mesh is as good as this effort makes it, in 2D, walls apart.
     """
 
     start: int
@@ -72,14 +81,15 @@ class Effort:
     emphasis: float = 20.0
     lenience: float = 0.03
     bound: float = 12.0
+    flaw: float = 0.012
 
 
 EFFORTS = {
-    "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0),
+    "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
     "default": Effort(60, 5, 3, (4, 18, 20, 20), glide=7, polish=18, aim=0.0025, bound=11.0),
     "best": Effort(
         60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, aim=0.0039, relaxation=1.5, momentum=0.8,
-        eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0,
+        eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0, flaw=0.006,
     ),
 }  # fmt: skip
 
@@ -100,6 +110,16 @@ COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
 EXACT_STEPS_3D = 3
+
+NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
+"""Mean |e|, and share by which the count is off, up to which a given mesh is only corrected. Measured on F2 (see
+bench/restart.py): beyond them its cells lose shape that only reorganising brings back."""
+WALL_FLAW = 0.45
+"""Over the square root of the number of cells: 1 - mean Q that walls cost, and strain with no room to be relieved."""
+STRIDE = 2.0
+"""Bound of the displacement over h."""
+NEAR_EPS = 0.03
+"""Penalty with which the polishing of a corrected mesh begins: more would let go of the sizes first."""
 
 
 @dataclass(frozen=True)
@@ -151,13 +171,41 @@ def auto_levels(n: float, dim: int) -> int:
     return max(0, round(math.log(max(n, 1) / COARSEST[dim], 2**dim)))
 
 
+def is_near(
+    dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float
+) -> bool:
+    """Tell whether a given mesh of `n` cells needs no more than correction to be as `effort` makes it.
+
+    Parameters
+    ----------
+    missing : float
+        Cells that are missing; negative: that are too many.
+    mean_error : float
+        Mean of |e|.
+    mean_quality : float
+    """
+    flaw = EFFORTS[effort].flaw + WALL_FLAW / math.sqrt(n)
+    return (
+        dim == 2
+        and mean_error <= NEAR_ERROR
+        and abs(missing) <= NEAR_COUNT * n
+        and 1 - mean_quality <= flaw
+    )
+
+
 def plan_steps(method: Method, steps: int) -> list[Action]:
     """Return the plan of a method that repeats one kind of step."""
     return [Step(method)] * steps
 
 
 def plan_adaptive(
-    dim: int, effort: str, levels: int, exact: bool, aim: float | None = None, warm: bool = False
+    dim: int,
+    effort: str,
+    levels: int,
+    exact: bool,
+    aim: float | None = None,
+    warm: bool = False,
+    near: bool = False,
 ) -> list[Action]:
     """Return the plan that reaches the size field and good cells, over `levels` coarser levels.
 
@@ -171,18 +219,24 @@ def plan_adaptive(
         In the place of the effort's own.
     warm : bool
         The start is a mesh already, not a random sample.
+    near : bool
+        It is near the size field (see `is_near`), and there are no coarser levels.
     """
     if dim == 3:
         solid = EFFORTS_3D[effort]
         return list(_adaptive_3d(solid, levels, exact, solid.aim if aim is None else aim, warm))
     flat = EFFORTS[effort]
+    if near:
+        return list(_correction_2d(flat, exact, flat.aim if aim is None else aim))
     if aim is None:
         # A mesh that is small enough for one level can be had nearer to its size.
         aim = flat.aim if levels else min(flat.aim, SINGLE_AIM)
     return list(_adaptive_2d(flat, levels, exact, aim, warm))
 
 
-def _adaptive_2d(effort: Effort, levels: int, exact: bool, aim: float, warm: bool) -> Iterator[Action]:
+def _adaptive_2d(
+    effort: Effort, levels: int, exact: bool, aim: float, warm: bool
+) -> Iterator[Action]:
     glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
     if warm:
         yield Settle(COUNT_SHARE)
@@ -208,8 +262,27 @@ def _adaptive_2d(effort: Effort, levels: int, exact: bool, aim: float, warm: boo
             yield Reorganise()
     yield Settle()
     yield Rest()
+    yield from _finish_2d(effort, exact, aim, effort.eps)
+
+
+def _correction_2d(effort: Effort, exact: bool, aim: float) -> Iterator[Action]:
+    stride = Step(WeightedMethod(STRIDE, cautious=True))
+    yield from [stride] * 2
+    yield Settle(COUNT_LEAST)
+    yield stride
+    correct = ProjectedMethod(
+        "lloyd", 0.0, 0.0, eps=1e-2, k=1.0, iterations=60, tolerance=1e-3, sampled_gradient=True
+    )
+    yield Step(correct)
+    yield Settle()
+    yield Rest()
+    yield from _finish_2d(effort, exact, aim, NEAR_EPS)
+
+
+def _finish_2d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[Action]:
+    """Polish, and project."""
     polish = ProjectedMethod(
-        "shape", eps=effort.eps, lenience=effort.lenience, bound=effort.bound * aim, k=0.3, aim=aim,
+        "shape", eps=eps, lenience=effort.lenience, bound=effort.bound * aim, k=0.3, aim=aim,
         emphasis=effort.emphasis,
     )  # fmt: skip
     for step in range(effort.polish):
