@@ -17,9 +17,9 @@ quality in the projection:
 
 *settle ahead*  the count at which refinement makes the one that the next level wants
 
-From a mesh that is near its size field already, as after the field has moved by a few cells, in 2D:
+From a mesh that is near its size field already, as after the field has moved by a few cells:
 
-    stride ─► settle ─► stride ─► correct ─► settle ─► polish (─► project)
+    stride ─► settle ─► stride ─► correct ─► settle ─► polish (in 3D: glide) (─► project)
 
 *stride*   weighted Lloyd and Poisson, by as much as two cells at once: the potential's displacement is smooth
 *correct*  one step of the projection alone
@@ -114,6 +114,8 @@ EXACT_STEPS_3D = 3
 NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
 """Mean |e|, and share by which the count is off, up to which a given mesh is only corrected. Measured on F2 (see
 bench/restart.py): beyond them its cells lose shape that only reorganising brings back."""
+FLAW_3D = 0.36
+"""1 - mean Q in 3D up to which a mesh has been smoothed: a random one has 0.47, one of any effort 0.33 or less."""
 WALL_FLAW = 0.45
 """Over the square root of the number of cells: 1 - mean Q that walls cost, and strain with no room to be relieved."""
 STRIDE = 2.0
@@ -184,13 +186,8 @@ def is_near(
         Mean of |e|.
     mean_quality : float
     """
-    flaw = EFFORTS[effort].flaw + WALL_FLAW / math.sqrt(n)
-    return (
-        dim == 2
-        and mean_error <= NEAR_ERROR
-        and abs(missing) <= NEAR_COUNT * n
-        and 1 - mean_quality <= flaw
-    )
+    flaw = EFFORTS[effort].flaw + WALL_FLAW / math.sqrt(n) if dim == 2 else FLAW_3D
+    return mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= flaw
 
 
 def plan_steps(method: Method, steps: int) -> list[Action]:
@@ -222,16 +219,15 @@ def plan_adaptive(
     near : bool
         It is near the size field (see `is_near`), and there are no coarser levels.
     """
-    if dim == 3:
-        solid = EFFORTS_3D[effort]
-        return list(_adaptive_3d(solid, levels, exact, solid.aim if aim is None else aim, warm))
-    flat = EFFORTS[effort]
+    plan = (EFFORTS if dim == 2 else EFFORTS_3D)[effort]
     if near:
-        return list(_correction_2d(flat, exact, flat.aim if aim is None else aim))
+        return list(_correction(dim, plan, exact, plan.aim if aim is None else aim))
+    if dim == 3:
+        return list(_adaptive_3d(plan, levels, exact, plan.aim if aim is None else aim, warm))
     if aim is None:
         # A mesh that is small enough for one level can be had nearer to its size.
-        aim = flat.aim if levels else min(flat.aim, SINGLE_AIM)
-    return list(_adaptive_2d(flat, levels, exact, aim, warm))
+        aim = plan.aim if levels else min(plan.aim, SINGLE_AIM)
+    return list(_adaptive_2d(plan, levels, exact, aim, warm))
 
 
 def _adaptive_2d(
@@ -265,7 +261,7 @@ def _adaptive_2d(
     yield from _finish_2d(effort, exact, aim, effort.eps)
 
 
-def _correction_2d(effort: Effort, exact: bool, aim: float) -> Iterator[Action]:
+def _correction(dim: int, effort: Effort, exact: bool, aim: float) -> Iterator[Action]:
     stride = Step(WeightedMethod(STRIDE, cautious=True))
     yield from [stride] * 2
     yield Settle(COUNT_LEAST)
@@ -276,7 +272,7 @@ def _correction_2d(effort: Effort, exact: bool, aim: float) -> Iterator[Action]:
     yield Step(correct)
     yield Settle()
     yield Rest()
-    yield from _finish_2d(effort, exact, aim, NEAR_EPS)
+    yield from (_finish_2d if dim == 2 else _finish_3d)(effort, exact, aim, NEAR_EPS)
 
 
 def _finish_2d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[Action]:
@@ -321,7 +317,12 @@ def _adaptive_3d(
     yield Settle(COUNT_LEAST)
     yield from couple * effort.couple_finest
     yield Settle()
-    glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=effort.eps, aim=aim)
+    yield from _finish_3d(effort, exact, aim, effort.eps)
+
+
+def _finish_3d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[Action]:
+    """Glide, and project."""
+    glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=eps, aim=aim)
     yield from [Step(glide)] * effort.glide
     if exact:
         project = ProjectedMethod(
