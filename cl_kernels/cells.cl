@@ -166,7 +166,7 @@ kernel void match_faces(const int size, global const int *places, global const i
         counts[i] = n;
         return;
     }
-    const bool doubtful = slot_counts[place] < 0;
+    const bool doubtful = *flags & FLAG_DOUBT;
     uint word = 0;
     int count = 0;
     for (int k = 0; k < n; ++k) {
@@ -273,16 +273,16 @@ kernel void measure_cells(const int size, global const int *places, global const
     covariances[3 * i + 2] = yy;
 }
 
-/* Per doubtful cell: is its area positive, and do its neighbours have their common faces where it has them? Where rounding
-   has let two cells see different neighbours, what they disagree about must be as little as rounding makes of the box, and
+/* Per new cell, where some are doubtful: is its area positive, and do its neighbours have their common faces where it has
+   them? Where rounding has let two cells see different neighbours, what they disagree about must be as little as rounding makes of the box, and
    no more than a share of the cell; else generators are too close to tell apart, which is flagged. */
-kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
-                           global const int *starts, global const int *neighbours, global const REAL *volumes,
+kernel void check_doubtful(const int size, global const int *places, global const int *starts, global const int *neighbours,
+                           global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
                            global int *flags)
 {
     WORK_ITEM(i);
-    if (places[i] < 0 || slot_counts[places[i]] >= 0)
+    if (places[i] < 0)
         return;
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
