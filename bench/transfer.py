@@ -1,0 +1,124 @@
+"""Cell data from mesh to mesh: cells per second, what is left of mass, bounds and a smooth function.
+
+    python bench/transfer.py [--sizes 1e3,1e4,1e5] [--dims 2,3] [--random] [--repeat 3]
+                             [--device NAME] [--dtype float32] [--json]
+
+Two uniform meshes of about as many cells ("fast" effort from two seeds; --random: random generators) in the
+unit box. f = sin(3 x + 1) cos(2 y) (1 + z^2) is given by its values at the centroids of one, which are its
+means but for second order, carried over to the other and compared there; "L1 error" is the mean of |error|,
+"order" its slope in the mesh width, from one row to the one above. "1" is the first order, "2" the second with
+the limiter, "2 free" without. "mass" is the defect of the sum of V f over that of V |f|, "beyond" how far values
+leave the bounds of the old ones. "new cells/s" is the median of whole calls, copies to and from the device included.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser
+
+import clvoro
+
+WAYS: dict[str, dict[str, Any]] = {
+    "1": {"order": 1},
+    "2": {"order": 2},
+    "2 free": {"order": 2, "limited": False},
+}
+
+
+def smooth(x: np.ndarray) -> np.ndarray:
+    """Return the function that is carried."""
+    last = 1 + x[:, 2] ** 2 if x.shape[1] == 3 else 1.0
+    return np.sin(3 * x[:, 0] + 1) * np.cos(2 * x[:, 1]) * last
+
+
+def make_mesh(adapter: clvoro.Adapter, dim: int, n: int, seed: int, random: bool) -> clvoro.Diagram:
+    """Return a mesh of the unit box, its arrays fetched."""
+    box = clvoro.Box((0,) * dim, (1,) * dim)
+    if random:
+        made = adapter.diagram(box, np.random.default_rng(seed).random((n, dim)))
+    else:
+        made = adapter.run(box, n ** (-1 / dim), effort="fast", seed=seed).diagram
+    for name in ("volumes", "centroids", "neighbours"):
+        getattr(made, name)
+    return made
+
+
+def measure(
+    old: clvoro.Diagram,
+    new: clvoro.Diagram,
+    adapter: clvoro.Adapter,
+    repeat: int,
+    way: dict[str, Any],
+) -> dict[str, float]:
+    """Carry the function over `repeat` times."""
+    values = smooth(old.centroids)
+    seconds = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        carried = old.transfer(values, new, adapter=adapter, **way)
+        seconds.append(time.perf_counter() - start)
+    error = np.abs(carried - smooth(new.centroids))
+    mass = float(new.volumes @ carried - old.volumes @ values)
+    return {
+        "cells": len(new), "per_second": len(new) / statistics.median(seconds),
+        "error": float(new.volumes @ error / new.volumes.sum()), "max_error": float(error.max()),
+        "mass": abs(mass) / float(old.volumes @ np.abs(values)),
+        "beyond": max(carried.max() - values.max(), values.min() - carried.min(), 0.0),
+    }  # fmt: skip
+
+
+def shown(figure: str, form: str) -> Callable[[dict[str, Any]], str]:
+    return lambda r: "" if r[figure] is None else format(r[figure], form)
+
+
+COLUMNS = {
+    "dim": shown("dim", "d"),
+    "order asked": lambda r: r["way"],
+    "cells": shown("cells", ",d"),
+    "new cells/s": shown("per_second", ",.0f"),
+    "L1 error": shown("error", ".2e"),
+    "order": shown("rate", ".2f"),
+    "largest error": shown("max_error", ".2e"),
+    "mass": shown("mass", ".0e"),
+    "beyond": shown("beyond", ".0e"),
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    made = parser(__doc__)
+    made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), help="cells")
+    made.add_argument("--dims", type=counts, default=[2, 3])
+    made.add_argument("--random", action="store_true", help="random generators")
+    made.add_argument("--repeat", type=int, default=3)
+    options = made.parse_args(arguments)
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    for dim in options.dims:
+        before: dict[str, tuple[int, float]] = {}
+        for n in options.sizes:
+            old, new = (
+                make_mesh(adapter, dim, n, FIRST_SEED + k, options.random) for k in range(2)
+            )
+            for name, way in WAYS.items():
+                record: dict[str, Any] = {"dim": dim, "way": name, "rate": None}
+                record |= measure(old, new, adapter, options.repeat, way)
+                if name in before:
+                    cells, error = before[name]
+                    width = (len(new) / cells) ** (1 / dim)
+                    record["rate"] = math.log(error / record["error"]) / math.log(width)
+                before[name] = (len(new), record["error"])
+                report.add(record, f"{dim}D, {n} cells, order {name}")
+    kind = "random" if options.random else "uniform"
+    report.finish(heading(adapter, f"Transfer between {kind} meshes"))
+    worst = max(record["mass"] for record in report.records)
+    return 0 if worst <= 1e-12 else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
