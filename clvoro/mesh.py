@@ -30,6 +30,8 @@ from .sizing import Sizing
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
+PEAK = {2: (112, 186), 3: (325, 355)}
+"""Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
 )  # fmt: skip
@@ -77,8 +79,7 @@ def check_memory(engine: Engine, n: float) -> None:
     MemoryLimitError
         Saying how many cells were asked for, how much memory they need and how much there is.
     """
-    # Reals and 32-bit integers per cell at the peak of a run, counted over all stages' buffers.
-    reals, integers = (110, 60) if engine.dim == 2 else (300, 150)
+    reals, integers = PEAK[engine.dim]
     needed = n * (reals * engine.real.itemsize + integers * 4)
     available = engine.queue.device.global_mem_size
     if n > MOST_CELLS:
