@@ -26,16 +26,21 @@ from clvoro import sizing
 
 PICTURES = Path(__file__).resolve().parent / "pictures"
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 FIRST_SEED = 20251
 
 
 def test_field(name: str) -> sizing.Field:
-    """Return the size field F1, F2, F3 or F4; all on `BOX`, all absolute.
+    """Return the size field F1, F2, F3 or F4, on `BOX`, or S1, S2 or S3, on `CUBE`; all absolute.
 
     F1 = 0.02 + 0.3 d, F2 = 0.002 + 0.08 d, F4 = F2 / 6.6, with d the distance to the circle of
     radius 0.3 about (0.9, 0.75); F3 = 0.9306 min(0.15, 0.02 + ln(1.3) d) / 4, radius 0.25 about
-    (0.8, 0.75).
+    (0.8, 0.75). S1 = 0.04 + 0.3 d, with d the distance to the sphere of radius 0.25 about
+    (0.5, 0.5, 0.4); S2 = S1 / 2 and S3 = S1 / 4.
     """
+    if name in ("S1", "S2", "S3"):
+        sphere = sizing.Sphere((0.5, 0.5, 0.4), 0.25)
+        return sizing.Distance(sphere, h_min=0.04, slope=0.3) * 0.5 ** (int(name[1]) - 1)
     circle = sizing.Circle((0.9, 0.75), 0.3)
     if name == "F1":
         return sizing.Distance(circle, h_min=0.02, slope=0.3)
@@ -46,6 +51,11 @@ def test_field(name: str) -> sizing.Field:
         circle = sizing.Circle((0.8, 0.75), 0.25)
         return sizing.Distance(circle, h_min=0.02, growth=1.3, h_max=0.15) * (0.9306 / 4)
     raise ValueError(f"no field {name}")
+
+
+def domain_of(name: str) -> clvoro.Box:
+    """Return the domain of the test field `name`."""
+    return CUBE if name.startswith("S") else BOX
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
@@ -125,6 +135,7 @@ def figures(diagram: clvoro.Diagram, h: np.ndarray, quality: np.ndarray) -> dict
         "mean_quality_all": float(quality.mean()),
         "min_quality_all": float(quality.min()),
         "six_sided": float((sides[inner] == 6).mean()),
+        "faces": float(sides[inner].mean()),
         "mean_deviation": float(deviation.mean()),
         "max_deviation": float(deviation.max()),
     }

@@ -1,4 +1,4 @@
-"""How far a few steps go: size, shape and work of each method on four fields, against targets.
+"""How far a few steps go: size, shape and work of each method on seven fields, against targets.
 
     python bench/convergence.py [--fields F1,F3] [--rows default,exact] [--seeds 3] [--large]
                                 [--device NAME] [--dtype float32] [--json]
@@ -10,6 +10,10 @@ every start. `--large` adds the rows with a million cells. Exits with 1 if a row
 Quality and the share of six-sided cells count the cells off the walls; "all Q" is mean and min of
 every cell. Work is counted in steps of the finest level (a step on a quarter of the cells counts
 a quarter). The size field is absolute: no factor is taken out of the error.
+
+The fields S1, S2 and S3 are in three dimensions and have a table of their own: quality is the
+isoperimetric quotient 36 pi V^2 / S^3 (.753 for the truncated octahedron), and the finest level's
+steps are counted alone.
 """
 
 from __future__ import annotations
@@ -19,10 +23,11 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from _common import (
-    BOX,
     FIRST_SEED,
     Report,
+    domain_of,
     figures,
     heading,
     make_adapter,
@@ -34,10 +39,10 @@ from _common import (
 )
 
 import clvoro
-from clvoro.plans import EXACT_STEPS
+from clvoro.plans import EXACT_STEPS, EXACT_STEPS_3D
 
 LARGE = ("F4",)
-AT_LEAST = ("mean_quality", "min_quality")
+AT_LEAST = ("mean_quality", "min_quality", "mean_quality_all")
 """Figures that are the better the larger; all others the smaller."""
 
 
@@ -69,6 +74,12 @@ EXACT = {
     "mean_deviation": 1e-4, "max_deviation": 2e-3, "mean_quality": 0.986, "min_quality": 0.85,
     "exact_steps": 8, "exact_iterations": 50,
 }  # fmt: skip
+SOLID_DEFAULT = {
+    "mean_error": 0.012, "max_error": 0.08, "mean_quality_all": 0.69, "finest_steps": 12,
+}  # fmt: skip
+SOLID_EXACT = {
+    "mean_deviation": 3e-4, "max_deviation": 5e-3, "mean_quality_all": 0.67, "finest_steps": 15,
+}  # fmt: skip
 WEIGHTED = {"method": "weighted", "tol": 0}
 
 ROWS = (
@@ -93,13 +104,24 @@ ROWS = (
     ),
     Row("exact", ("F1",), {"method": "exact"}, {"max_deviation": 1e-3, "mean_quality": 0.965}),
     Row("exact", ("F2", "F3", "F4"), {"method": "exact"}, EXACT),
+    Row("fast", ("S1", "S2", "S3"), {"effort": "fast"}),
+    Row("default", ("S1",), {}),
+    Row("default", ("S2", "S3"), {}, SOLID_DEFAULT),
+    Row("best", ("S2",), {"effort": "best"}),
+    Row("exact", ("S1",), {"method": "exact"}),
+    Row("exact", ("S2", "S3"), {"method": "exact"}, SOLID_EXACT),
 )  # fmt: skip
+
+
+def is_solid(name: str) -> bool:
+    """Tell whether the field of that name is in three dimensions."""
+    return domain_of(name).dim == 3
 
 
 def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int) -> dict[str, float]:
     """Run `row` on the field of that name and return its figures."""
     start = time.perf_counter()
-    result = adapter.run(BOX, test_field(name), seed=seed, **row.arguments)
+    result = adapter.run(domain_of(name), test_field(name), seed=seed, **row.arguments)
     seconds = time.perf_counter() - start
     history = result.history
     measured = {
@@ -107,10 +129,12 @@ def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int) -> dict[str
         **work(history),
         "seconds": seconds,
         "iterations": int(history["iterations"].sum()),
+        "finest_steps": int((np.diff(history["step"]) * (history["level"][1:] == 0)).sum()),
     }
     if row.arguments.get("method") == "exact":
-        measured["exact_steps"] = EXACT_STEPS
-        extra = history["step"] > history["step"][-1] - EXACT_STEPS
+        steps = EXACT_STEPS_3D if is_solid(name) else EXACT_STEPS
+        measured["exact_steps"] = steps
+        extra = history["step"] > history["step"][-1] - steps
         measured["exact_iterations"] = int(history["iterations"][extra].max())
     return measured
 
@@ -160,6 +184,32 @@ COLUMNS = {
     "holds": lambda r: "yes" if r["holds"] else f"**no**: {', '.join(r['missed'])}",
 }
 
+SOLID_COLUMNS = {
+    **{name: COLUMNS[name] for name in ("row", "field", "cells", "mean |e|", "max |e|")},
+    "mean Q": show("mean_quality_all", ".4f"),
+    "min Q": show("min_quality_all", ".3f"),
+    "mean Q off walls": show("mean_quality", ".4f"),
+    "faces": show("faces", ".2f"),
+    "mean |L/h-1|": COLUMNS["mean |L/h-1|"],
+    "max |L/h-1|": COLUMNS["max |L/h-1|"],
+    "finest steps": show("finest_steps", ".0f"),
+    **{name: COLUMNS[name] for name in ("work", "seconds", "CG its each", "holds")},
+}
+
+
+def no_more_steps(records: list[dict[str, Any]]) -> None:
+    """Let a row on S3 fail that took more of the finest level's steps than the same on S2."""
+    most = {
+        r["row"]: max(run["finest_steps"] for run in r["runs"])
+        for r in records
+        if r["field"] == "S2"
+    }
+    for record in records:
+        steps = max(run["finest_steps"] for run in record["runs"])
+        if record["field"] == "S3" and steps > most.get(record["row"], steps):
+            record["holds"] = False
+            record["missed"].append("more finest steps than on S2")
+
 
 def judge(row: Row, name: str, runs: list[dict[str, float]]) -> dict[str, Any]:
     """Return the record of one row: its runs, its targets, and what missed them how often."""
@@ -177,18 +227,24 @@ def judge(row: Row, name: str, runs: list[dict[str, float]]) -> dict[str, Any]:
 def main() -> int:
     options_of = parser(__doc__)
     known = list(dict.fromkeys(row.name for row in ROWS))
-    options_of.add_argument("--fields", type=names, default=["F1", "F2", "F3", "F4"])
+    fields = list(dict.fromkeys(name for row in ROWS for name in row.fields))
+    options_of.add_argument("--fields", type=names, default=fields, help=", ".join(sorted(fields)))
     options_of.add_argument("--rows", type=names, default=known, help=", ".join(known))
     options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="random starts (1)")
     options_of.add_argument("--large", action="store_true", help="also F4, a million cells")
     options = options_of.parse_args()
-    if unknown := set(options.rows) - set(known):
-        options_of.error(f"no row {', '.join(unknown)}; there are {', '.join(known)}")
+    for what, given, allowed in (
+        ("row", options.rows, known),
+        ("field", options.fields, fields),
+    ):
+        if unknown := sorted(set(given) - set(allowed)):
+            options_of.error(f"no {what} {', '.join(unknown)}; there are {', '.join(allowed)}")
 
     adapter = make_adapter(options)
-    report = Report(options.json, COLUMNS)
+    flat, solid = Report(options.json, COLUMNS), Report(options.json, SOLID_COLUMNS)
     # Kernels are built here, so that no row's time holds it.
-    adapter.run(BOX, test_field("F1"), method="exact", effort="fast")
+    for name in {"S1" if is_solid(name) else "F1" for name in options.fields}:
+        adapter.run(domain_of(name), test_field(name), method="exact", effort="fast")
     for row in ROWS:
         for name in row.fields:
             asked = row.name in options.rows and name in options.fields
@@ -198,9 +254,13 @@ def main() -> int:
                 measure(adapter, row, name, FIRST_SEED + 17 * k) for k in range(options.seeds)
             ]  # fmt: skip
             record = judge(row, name, runs)
+            report = solid if is_solid(name) else flat
             report.add(record, f"{row.name} on {name}: {'yes' if record['holds'] else 'no'}")
-    report.finish(heading(adapter, f"Convergence, {options.seeds} start(s)"))
-    return 0 if all(record["holds"] for record in report.records) else 1
+    no_more_steps(solid.records)
+    for report, where in ((flat, ""), (solid, " in 3D")):
+        if report.records:
+            report.finish(heading(adapter, f"Convergence{where}, {options.seeds} start(s)"))
+    return 0 if all(r["holds"] for r in flat.records + solid.records) else 1
 
 
 if __name__ == "__main__":
