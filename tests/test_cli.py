@@ -176,7 +176,7 @@ def pressing_run(number):
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
         (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "no folder can be made"),
         (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
-        (["cases", "papre"], cli.BAD_INPUT, "airfoil, paper"),
+        (["cases", "papre"], cli.BAD_INPUT, "airfoil, paper, sphere, surface"),
     ],
 )
 def test_errors_are_one_message(here, capsys, arguments, code, named):
@@ -234,6 +234,8 @@ def test_cases_are_listed_and_printed(here, capsys):
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
         "airfoil",
         "paper",
+        "sphere",
+        "surface",
     ]
     assert call("cases", "paper") == cli.OK
     (here / "mine.toml").write_text(capsys.readouterr().out)

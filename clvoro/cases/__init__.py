@@ -14,12 +14,11 @@ from ..domain import Box
 from ..errors import InputError
 from ..io.atomic import atomic_file
 from . import schema, toml
-from .fields import build_size, load_array, named_files
+from .fields import FOLDER, build_size, load_array, locate, named_files
 from .naca import naca4
 
 __all__ = ["Case", "builtin_cases", "load_case", "naca4"]
 
-_FOLDER = Path(__file__).parent
 _RUN_ORDER = (
     "method", "methods", "effort", "levels", "error_target", "start", "points", "n_cells",
     "max_steps", "tol", "alpha", "k",
@@ -40,7 +39,7 @@ class Case:
     run : dict
         The keys of the file's `[run]` table.
     folder : Path
-        Files that the case names are looked for here.
+        Files that the case names are looked for here, then among those of the built-in cases.
     """
 
     name: str
@@ -130,7 +129,7 @@ class Case:
         entries += [(moved.run, "points")] * ("points" in moved.run)
         taken: dict[str, Path] = {}
         for node, key in entries:
-            source = (self.folder / node[key]).resolve()
+            source = locate(self.folder, node[key]).resolve()
             target = source.name
             while taken.setdefault(target, source) != source:
                 target = f"other-{target}"
@@ -145,7 +144,7 @@ class Case:
 
 def builtin_cases() -> Mapping[str, str]:
     """Return the TOML texts of the built-in cases by name."""
-    files = sorted(_FOLDER.glob("*.toml"))
+    files = sorted(FOLDER.glob("*.toml"))
     return {path.stem: path.read_text(encoding="utf-8") for path in files}
 
 

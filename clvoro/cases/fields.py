@@ -15,6 +15,16 @@ from ..errors import InputError
 from ..io.arrays import read_array
 from .naca import naca4
 
+FOLDER = Path(__file__).parent
+"""Where the built-in cases and their files lie."""
+
+
+def locate(folder: Path, name: str) -> Path:
+    """Return the path of a file that a case names: beside the case, else a built-in case's own."""
+    path, own = folder / name, FOLDER / name
+    alone = Path(name).name == name
+    return own if alone and own.is_file() and not path.exists() else path
+
 
 def build_size(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
     """Return the size field that `node` describes.
@@ -79,7 +89,7 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
 
     kind = node["kind"]
     if kind == "surface":
-        return sizing.Surface.read(folder / node["file"])
+        return sizing.Surface.read(locate(folder, node["file"]))
     if kind == "box":
         return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
     if kind in ("circle", "sphere"):

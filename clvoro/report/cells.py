@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
@@ -195,6 +195,10 @@ def add_colour_bar(
         bar.set_ticks([low, *inner, high])
         bar.minorlocator = NullLocator()
         bar.formatter = FuncFormatter(lambda t, _: f"{t:.2g}")
+        bar.update_ticks()
+    elif options.get("location") == "bottom":
+        # Numbers side by side: with a sign and many digits more of them would run into each other.
+        bar.locator = MaxNLocator(5)
         bar.update_ticks()
 
 
