@@ -1,0 +1,246 @@
+"""One step of a run, taken apart: displacing, moving, repairing the diagram, judging it; and the machine's limits.
+
+    python bench/step.py [--sizes 1e5,1e6] [--kinds weighted,glide,polish] [--repeat 7]
+                         [--device NAME] [--dtype float32] [--json]
+
+A mesh of F2 scaled to the count (see `convergence.py`) is made by a fast run, and given a few steps
+of each kind: "weighted" couples weighted centroids and Poisson, "glide" and "polish" project onto
+the cells' sizes. Times are medians over `--repeat` further steps, from an idle queue to an idle
+queue, in milliseconds: "displace" finds the displacement ("solve" is the device's time of its
+linear solver), "diagram" repairs the tessellation, "rest" moves, evaluates h, error, quality and
+their sums. "diagram M/s" is cells per second of the repaired diagram with all its measures,
+"to host" the bytes that the host reads. "cold" makes the same diagram anew, from binning on.
+
+The second table holds kernels against the machine: bytes that must move per cell (each array that
+the kernel needs, once) over what copying moves per second, and operations that must be done per
+cell over what independent multiply-adds reach, each as a share of the time measured; the larger
+says how near the kernel is to its limit. Operations are counted from the source for a cell of six
+faces, a division as four.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from _common import BOX, Report, counts, heading, make_adapter, markdown, names, parser, test_field
+
+import clvoro
+from clvoro._program import Engine
+from clvoro.mesh import Mesh, Stages
+from clvoro.methods import Method, ProjectedMethod, WeightedMethod
+from clvoro.profile import Profile, profiled_queue
+from clvoro.sizing import Sizing
+
+CELLS_OF_F2 = 22972
+SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
+WARM_UP = 4
+
+KINDS: dict[str, Callable[[], Method]] = {
+    "weighted": lambda: WeightedMethod(cautious=True),
+    "glide": lambda: ProjectedMethod("lloyd", 1.3, 0.7, eps=0.1),
+    "polish": lambda: ProjectedMethod(
+        "shape", eps=0.3, lenience=0.03, bound=0.03, k=0.3, aim=0.0025
+    ),
+}
+
+NEEDS = {
+    # kernel: (reals, integers, operations) per cell of six faces
+    "repair.check_rows": (2, 6 + 3, 6 * 40),
+    "cells.match_faces": (0, 4, 0),
+    "cells.measure_cells": (2 + 6 + 12 + 1 + 2 + 3, 6 + 6 + 4, 6 * 75 + 40),
+    "metric.evaluate_metric": (1 + 6 + 2 + 3 + 1 + 4, 1, 60),
+    "metric.compare_neighbours": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
+    "density.fit_gradient": (2 + 1 + 2, 6 + 1, 6 * 20 + 40),
+    "shape.descend_shape": (6 + 12 + 2 + 2 + 1 + 2, 6 + 1, 6 * 60),
+    "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
+    "projection.assemble": (6 + 12 + 2 + 1 + 2 + 1 + 2, 6 + 1 + 12 + 12, 6 * 40),
+    "projection.descend": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
+    "projection.update": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
+}
+"""What each kernel must read or write, and compute. The projection's vectors are single."""
+
+PEAK = """
+kernel void multiply_add(const int size, const REAL a, const REAL b, global REAL *out)
+{
+    const int i = get_global_id(0);
+    VEC x[8];
+    for (int k = 0; k < 8; ++k)
+        x[k] = (VEC)(i + k);
+    for (int n = 0; n < 4096; ++n)
+        for (int k = 0; k < 8; ++k)
+            x[k] = fma(x[k], (VEC)(a), (VEC)(b));
+    VEC sum = 0;
+    for (int k = 0; k < 8; ++k)
+        sum += x[k];
+    if (i < size)
+        out[i] = sum.s0 + sum.s1 + sum.s2 + sum.s3 + sum.s4 + sum.s5 + sum.s6 + sum.s7;
+}
+"""
+
+
+def peak_operations(adapter: clvoro.Adapter) -> float:
+    """Operations per second of independent multiply-adds, in vectors of eight; a multiply-add is two."""
+    real = "double" if adapter.dtype == np.float64 else "float"
+    queue = profiled_queue(adapter.ctx)
+    options = [f"-DREAL={real}", f"-DVEC={real}8"]
+    kernel = cl.Program(adapter.ctx, PEAK).build(options=options).multiply_add
+    items = 64 * 64 * adapter.ctx.devices[0].max_compute_units
+    out = cl.Buffer(adapter.ctx, cl.mem_flags.READ_WRITE, 8 * items)
+    scalar = adapter.dtype.type
+    best = float("inf")
+    for _ in range(5):
+        event = kernel(queue, (items,), (64,), np.int32(items), scalar(0.5), scalar(1), out)
+        event.wait()
+        best = min(best, 1e-9 * (event.profile.end - event.profile.start))
+    return items * 4096 * 8 * 8 * 2 / best
+
+
+def fresh_mesh(adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarray, n: int) -> Mesh:
+    engine = Engine(adapter.ctx, queue, 2, adapter.dtype)
+    field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
+    origin, scale = BOX.frame
+    unsorted = engine.upload((points - origin) / scale)
+    return Mesh(Stages(engine), BOX, Sizing(engine, BOX, field), unsorted)
+
+
+def take_steps(mesh: Mesh, method: Method, repeat: int) -> dict[str, list[float]]:
+    """Seconds of the parts of `repeat` steps."""
+    queue = mesh.engine.queue
+    parts: dict[str, list[float]] = {"displace": [], "diagram": [], "rest": []}
+
+    def timed(name: str, function: Callable[[], object]) -> float:
+        queue.finish()
+        start = time.perf_counter()
+        function()
+        queue.finish()
+        return time.perf_counter() - start
+
+    original = mesh._tessellate
+    spent = 0.0
+
+    def tessellate() -> Any:
+        nonlocal spent
+        kept: list[Any] = []
+        spent = timed("diagram", lambda: kept.append(original()))
+        return kept[0]
+
+    mesh._tessellate = tessellate  # type: ignore[method-assign]
+    try:
+        for _ in range(repeat):
+            parts["displace"].append(timed("displace", lambda: method.displace(mesh)))
+            rest = timed("rest", lambda: (method.move(mesh), mesh.update(), mesh.assess()))
+            parts["diagram"].append(spent)
+            parts["rest"].append(rest - spent)
+    finally:
+        mesh._tessellate = original  # type: ignore[method-assign]
+    return parts
+
+
+def measure(
+    adapter: clvoro.Adapter, kind: str, points: np.ndarray, n: int, repeat: int
+) -> dict[str, Any]:
+    mesh, method = fresh_mesh(adapter, adapter.queue, points, n), KINDS[kind]()
+    take_steps(mesh, method, WARM_UP)
+    parts = {k: statistics.median(v) for k, v in take_steps(mesh, method, repeat).items()}
+    cold = []
+    for _ in range(3):
+        mesh.engine.queue.finish()
+        start = time.perf_counter()
+        mesh.tessellation = None
+        mesh.tessellation = mesh._tessellate()
+        mesh.engine.queue.finish()
+        cold.append(time.perf_counter() - start)
+    del mesh
+
+    queue = profiled_queue(adapter.ctx)
+    mesh, method = fresh_mesh(adapter, queue, points, n), KINDS[kind]()
+    take_steps(mesh, method, WARM_UP)
+    with Profile(queue) as profile:
+        take_steps(mesh, method, repeat)
+    read = sum(span.read for span in profile.spans) / repeat
+    return {
+        "kind": kind, "cells": mesh.n, **parts, "step": sum(parts.values()),
+        "solve": profile.of(*SOLVERS) / repeat, "cold": statistics.median(cold), "read": read,
+        "rate": mesh.n / parts["diagram"],
+        "kernels": {
+            f"{stage}.{kernel}": (cost.seconds / cost.calls, cost.calls / repeat)
+            for (stage, kernel), cost in profile.costs.items()
+        },
+        "bandwidth": profile.bandwidth,
+    }  # fmt: skip
+
+
+def ms(figure: str) -> Callable[[dict[str, Any]], str]:
+    return lambda r: f"{1e3 * r[figure]:.1f}"
+
+
+COLUMNS = {
+    "step": lambda r: r["kind"],
+    "cells": lambda r: f"{r['cells']:,}",
+    "displace": ms("displace"),
+    "solve": ms("solve"),
+    "diagram": ms("diagram"),
+    "rest": ms("rest"),
+    "whole step": ms("step"),
+    "diagram M/s": lambda r: f"{1e-6 * r['rate']:.2f}",
+    "cold": ms("cold"),
+    "to host": lambda r: f"{r['read']:.0f} B",
+}
+
+
+def limits(records: list[dict[str, Any]], peak: float, real: int) -> list[list[str]]:
+    """Each kernel's time per cell, and what of it the least memory traffic and arithmetic would take."""
+    rows = []
+    last = {r["kind"]: r for r in records}
+    for name, (reals, integers, operations) in NEEDS.items():
+        seen = [r for r in last.values() if name in r["kernels"]]
+        if not seen:
+            continue
+        record = max(seen, key=lambda r: r["cells"])
+        seconds, calls = record["kernels"][name]
+        per_cell = seconds / record["cells"]
+        size = reals * real + integers * 4
+        memory = size / record["bandwidth"] / per_cell
+        arithmetic = operations / peak / per_cell
+        rows.append([
+            name, record["kind"], f"{calls:.1f}", f"{1e9 * per_cell:.1f}", str(size),
+            str(operations), f"{memory:.0%}", f"{arithmetic:.0%}",
+        ])  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    options_of = parser(__doc__)
+    options_of.add_argument("--sizes", type=counts, default=[10**5, 10**6])
+    options_of.add_argument("--kinds", type=names, default=list(KINDS), help=", ".join(KINDS))
+    options_of.add_argument("--repeat", type=int, default=7)
+    options = options_of.parse_args()
+    if unknown := set(options.kinds) - set(KINDS):
+        options_of.error(f"no step {', '.join(unknown)}; there are {', '.join(KINDS)}")
+
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    for n in options.sizes:
+        field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
+        points = adapter.run(BOX, field, effort="fast").points
+        for kind in options.kinds:
+            report.add(measure(adapter, kind, points, n, options.repeat), f"{kind} {n:,}")
+    report.finish(heading(adapter, f"One step, medians of {options.repeat}"))
+    if not options.json:
+        peak = peak_operations(adapter)
+        bandwidth = report.records[-1]["bandwidth"]
+        print(
+            f"Copying moves {1e-9 * bandwidth:.1f} GB/s, multiply-adds reach {1e-9 * peak:.0f} Gflop/s.\n"
+        )
+        header = ["kernel", "step", "calls a step", "ns per cell", "bytes needed", "operations",
+                  "memory: share of the time", "arithmetic"]  # fmt: skip
+        print(markdown(header, limits(report.records, peak, adapter.dtype.itemsize)))
+
+
+if __name__ == "__main__":
+    main()
