@@ -91,6 +91,23 @@ kernel void begin(
     }
 }
 
+/* One group: state[4], state[5] = the squared norms of b and r, for the host to read. */
+kernel void sum_norms(global const REAL *partial, global REAL *state, const int groups)
+{
+    local REAL scratch[GROUP_SIZE];
+    REAL norm_b = 0, norm_r = 0;
+    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE) {
+        norm_b += partial[NORM_B * groups + g];
+        norm_r += partial[NORM_R(0) * groups + g];
+    }
+    norm_b = group_sum(norm_b, scratch);
+    norm_r = group_sum(norm_r, scratch);
+    if (get_local_id(0) == 0) {
+        state[4] = norm_b;
+        state[5] = norm_r;
+    }
+}
+
 /* u = D^-1 r and gamma: Jacobi's method, for the first iteration. */
 kernel void jacobi(
     int n, global const REAL *inverse_diagonal, global const REAL *r, global REAL *u, global REAL *partial)

@@ -16,7 +16,7 @@ from .errors import SolverError
 Apply = Callable[[cla.Array, cla.Array], object]
 
 # Rows of the array of partial sums, and columns of the record: as in cl_kernels/krylov.cl.
-_NORM_B, CURVATURE, _NORM_R, _GAMMA, _ROWS = 2, 3, 4, 6, 11
+CURVATURE, _GAMMA, _ROWS = 3, 6, 11
 _NORM, _RUNNING, _CURVATURE = 0, 2, 3
 
 
@@ -79,7 +79,7 @@ class ConjugateGradient:
         self._kernels = engine.kernels("krylov")
         self.partial = engine.zeros(_ROWS * engine.groups)
         """Partial sums; a fused operator leaves those of (x, A x) in row `CURVATURE`."""
-        self._state = engine.zeros(4)
+        self._state = engine.zeros(6)
         self._capacity = 0
         self._record_capacity = 0
 
@@ -172,9 +172,11 @@ class ConjugateGradient:
             launch(
                 kernels.begin, size, mean, rhs, r, p, self.partial, self._state
             )  # fmt: skip
-            rows = self.partial.get().reshape(_ROWS, -1).sum(axis=1, dtype=np.float64)
-            taken = float(self._state.get()[2])
-            norm_b, norm_r = rows[_NORM_B], rows[_NORM_R]
+            self.engine.run(
+                kernels.sum_norms, self.engine.group_size, self.partial, self._state,
+                np.int32(self.engine.groups), group=self.engine.group_size,
+            )  # fmt: skip
+            taken, _, norm_b, norm_r = (float(v) for v in self._state.get()[2:])
             if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
                 raise SolverError(
                     f"the linear solve got a right side, start or operator that is not finite: "
