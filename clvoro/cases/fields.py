@@ -89,7 +89,12 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
 
     kind = node["kind"]
     if kind == "surface":
-        return sizing.Surface.read(locate(folder, node["file"]))
+        surface = sizing.Surface.read(locate(folder, node["file"]), **_given(node, "join"))
+        if node.get("closed", False):
+            surface.require_closed()
+            if "join" not in node:  # corners a hair apart let their triangles cross by a hair
+                surface.check()
+        return surface
     if kind == "box":
         return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
     if kind in ("circle", "sphere"):

@@ -49,6 +49,13 @@ def not_negative(value: object, place: str) -> float:
     return checked
 
 
+def true_or_false(value: object, place: str) -> bool:
+    """Check for a truth value."""
+    if not isinstance(value, bool):
+        raise refuse(place, value, "true or false")
+    return value
+
+
 def whole(least: int) -> Check:
     """Return the check for a whole number of at least `least`."""
 
@@ -176,7 +183,7 @@ SHAPE = Kinds(
         "circle": Table({"centre": vector(2, 3), "radius": not_negative}, {}),
         "sphere": Table({"centre": vector(3), "radius": not_negative}, {}),
         "box": Table({}, {"lower": vector(2, 3), "upper": vector(2, 3)}),
-        "surface": Table({"file": text}, {}),
+        "surface": Table({"file": text}, {"closed": true_or_false, "join": positive}),
         "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
         "polyline": Table({"points": vectors(2)}, {}),
         "polygon": Table({"points": vectors(3)}, {}),
