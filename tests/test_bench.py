@@ -1,0 +1,69 @@
+"""The scripts of bench/ that show what the README says, each on small meshes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCH = Path(__file__).parent.parent / "bench"
+pytestmark = pytest.mark.skipif(not BENCH.is_dir(), reason="the tests lie outside a source tree")
+
+
+def records(script, *options, code=0):
+    """Run a script; return what it prints with --json."""
+    done = subprocess.run(
+        [sys.executable, str(BENCH / script), "--json", *options], capture_output=True, text=True
+    )
+    assert done.returncode == code, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_interpolation():
+    uniform, adapted = records("interpolation.py", "--sizes", "4e3")
+    assert uniform["cells"] == adapted["cells"] == 4000
+    # The script itself fails under 5; on PoCL these are 7.8 and 9.3.
+    assert adapted["l1_factor"] > 6
+    assert adapted["l2_factor"] > 7
+    assert adapted["l2"] < adapted["largest"] < uniform["largest"]
+
+
+def test_interpolation_fails_where_too_little_is_won():
+    # A layer as wide as the square: nothing to adapt to.
+    _, adapted = records("interpolation.py", "--sizes", "4e3", "--steepness", "2", code=1)
+    assert adapted["l1_factor"] < 5
+
+
+def test_restart():
+    cold, *moved = records("restart.py", "--moves", "2")
+    assert cold["steps"] > 100
+    assert len(moved) == 2
+    assert all(r["to_tolerance"] <= 5 for r in moved)
+    assert all(r["mass"] < 1e-12 for r in moved)
+
+
+def test_transfer():
+    rows = records("transfer.py", "--sizes", "500,4000", "--dims", "2", "--repeat", "1")
+    first, second, free = (r for r in rows if r["rate"] is not None)
+    assert first["rate"] > 0.8
+    assert min(second["rate"], free["rate"]) > 1.6
+    assert first["beyond"] == second["beyond"] == 0
+    assert max(r["mass"] for r in rows) < 1e-12
+
+
+def test_fields(tmp_path):
+    rows = records("fields.py", "--effort", "fast", "--out", str(tmp_path))
+    assert len(rows) == 6
+    assert (tmp_path / "fields.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_table_is_markdown():
+    command = [
+        sys.executable, str(BENCH / "transfer.py"), "--sizes", "300", "--dims", "3", "--repeat", "1",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if line.startswith("|")]
+    assert len(lines) == 5
+    assert len({line.count("|") for line in lines}) == 1
