@@ -121,6 +121,16 @@ def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
     return work
 
 
+def transfer(adapter: clvoro.Adapter) -> None:
+    """Cell data from mesh to mesh: few cells to many, the other way, many faces."""
+    for dim in (2, 3):
+        box = clvoro.Box((0,) * dim, (1,) * dim)
+        one, other = (adapter.diagram(box, points(n, dim, n)) for n in (3, 50))
+        for old, new in ((one, other), (other, one)):
+            for order in (1, 2):
+                assert np.ptp(old.transfer(np.ones(len(old)), new, order, adapter=adapter)) == 0
+
+
 def _bound(kernel: cl.Kernel, buffer: cl.Buffer) -> cl.Kernel:
     kernel.set_args(buffer)
     return kernel
@@ -131,6 +141,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "solid": solid,
     "fields": fields,
     "multigrid": multigrid,
+    "transfer": transfer,
     "coupled": method("coupled", max_steps=2),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
