@@ -192,14 +192,13 @@ def test_origin_names_the_callers_generators(adapter):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("dtype", "options"),
     [
-        {"method": "coupled", "max_steps": 6},
-        {"effort": "fast"},
-        {"method": "exact", "effort": "fast", "n_cells": 333, "levels": 1},
+        ("float32", {"method": "coupled", "max_steps": 6}),
+        ("float64", {"effort": "fast"}),
+        ("float32", {"method": "exact", "effort": "fast", "n_cells": 333, "levels": 1}),
     ],
 )
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_repeats_bit_by_bit(adapter, adapter32, dtype, options):
     """By the same adapter, whatever it did before, and by a new one."""
     used = adapter if dtype == "float64" else adapter32
