@@ -182,25 +182,25 @@ kernel void transfer(const int size, const int first, global const int *todo, co
     status[i] = sum > 0 ? DONE : FAILED;
 }
 
-/* Solve the normal equations M g = b, symmetric and not negative, in place of b: by elimination, the largest pivot first. A
-   direction that the neighbours say nothing about (a pivot of rounding) gets no slope. */
-inline void solve_normal(REAL m[DIM][DIM], REAL *b)
+/* Solve M g = b, M symmetric and not negative, in place of M and b: by elimination, the largest pivot first. False, with
+   b as it was, if M is singular but for rounding. */
+inline bool eliminate(REAL m[DIM][DIM], REAL *b)
 {
     int order[DIM];
+    REAL x[DIM], scale = 0;
     bool used[DIM];
-    REAL scale = 0;
     for (int a = 0; a < DIM; ++a) {
         used[a] = false;
+        x[a] = b[a];
         scale = fmax(scale, m[a][a]);
     }
-    int rank = 0;
-    for (; rank < DIM; ++rank) {
+    for (int rank = 0; rank < DIM; ++rank) {
         int p = -1;
         for (int a = 0; a < DIM; ++a)
             if (!used[a] && (p < 0 || m[a][a] > m[p][p]))
                 p = a;
         if (!(m[p][p] > 256 * REAL_EPS * scale))
-            break;
+            return false;
         used[p] = true;
         order[rank] = p;
         for (int a = 0; a < DIM; ++a) {
@@ -209,18 +209,37 @@ inline void solve_normal(REAL m[DIM][DIM], REAL *b)
             const REAL factor = m[a][p] / m[p][p];
             for (int c = 0; c < DIM; ++c)
                 m[a][c] -= factor * m[p][c];
-            b[a] -= factor * b[p];
+            x[a] -= factor * x[p];
         }
     }
-    for (int a = 0; a < DIM; ++a)
-        b[a] = used[a] ? b[a] : 0;
-    for (int r = rank - 1; r >= 0; --r) {
+    for (int r = DIM - 1; r >= 0; --r) {
         const int p = order[r];
-        REAL sum = b[p];
-        for (int later = r + 1; later < rank; ++later)
+        REAL sum = x[p];
+        for (int later = r + 1; later < DIM; ++later)
             sum -= m[p][order[later]] * b[order[later]];
         b[p] = sum / m[p][p];
     }
+    return true;
+}
+
+/* Solve the normal equations M g = b in place of b. A direction that the neighbours say nothing about, as in the corner of
+   a box with one neighbour, gets no slope: the least solution, to the root of rounding. */
+inline void solve_normal(REAL m[DIM][DIM], REAL *b)
+{
+    REAL copy[DIM][DIM], trace = 0;
+    for (int a = 0; a < DIM; ++a) {
+        trace += m[a][a];
+        for (int c = 0; c < DIM; ++c)
+            copy[a][c] = m[a][c];
+    }
+    if (eliminate(copy, b))
+        return;
+    for (int a = 0; a < DIM; ++a)
+        for (int c = 0; c < DIM; ++c)
+            copy[a][c] = m[a][c] + (a == c ? sqrt(REAL_EPS) * trace : 0);
+    if (!(trace > 0) || !eliminate(copy, b))
+        for (int a = 0; a < DIM; ++a)
+            b[a] = 0;
 }
 
 /* Per old cell j and component c: the slope g_j that fits its neighbours k best,

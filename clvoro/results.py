@@ -135,8 +135,8 @@ class Diagram:
             The new mesh.
         order : 1 or 2
         limited : bool
-            With False slopes are as they are: linear functions stay exact (to rounding) at walls and extrema too, and
-            values may leave the bounds of the old ones.
+            With False slopes are as they are: linear functions stay exact (to rounding) at walls and extrema too,
+            wherever a cell has d neighbours in different directions, and values may leave the bounds of the old ones.
         adapter : Adapter, optional
             Whose device does the work; by default that of `create_context()`. In float64 where the device has it.
 

@@ -206,6 +206,35 @@ def test_linear_functions_are_exact_without_limiter(mesh, adapter, dim):
     np.testing.assert_allclose(got, 2 + new.centroids @ slope, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("points", [
+    [(0.1, 0.13), (0.5, 0.8), (0.9, 0.2), (0.7, 0.5), (0.05, 0.04)],
+    [(0.2, 0.3), (0.7, 0.6)],
+    [(0.1, 0.2, 0.3), (0.5, 0.9, 0.4), (0.8, 0.3, 0.9)],
+])  # fmt: skip
+def test_too_few_neighbours_give_the_least_slope(adapter, points):
+    """Corner cells with one neighbour, and cells in a row: no slope across."""
+    dim = len(points[0])
+    box = Box((0,) * dim, (1,) * dim)
+    old = adapter.diagram(box, points)
+    new = adapter.diagram(box, np.random.default_rng(1789).random((300, dim)))
+    q = np.random.default_rng(8).normal(size=len(old))
+    got = old.transfer(q, new, 2, limited=False, adapter=adapter)
+    g, _, _ = slopes(old, q)
+    owner = ((new.points[:, None] - old.points) ** 2).sum(axis=2).argmin(axis=1)
+    # New cells that lie within one old cell, seen from their corners.
+    whole = [
+        i
+        for i in range(len(new))
+        if (
+            ((corners(new, i)[:, None] - old.points) ** 2).sum(axis=2).argmin(axis=1) == owner[i]
+        ).all()
+    ]
+    assert len(whole) > 50
+    expected = q[owner] + ((new.centroids - old.centroids[owner]) * g[owner]).sum(axis=1)
+    # Singular systems are solved to the root of eps.
+    np.testing.assert_allclose(got[whole], expected[whole], rtol=0, atol=1e-6)
+
+
 def test_limiter_leaves_linear_functions_inside_of_good_meshes(adapter):
     box = Box((0, 0), (1, 1))
     old = adapter.run(box, 0.06, seed=93, effort="fast").diagram
