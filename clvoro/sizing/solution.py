@@ -75,8 +75,8 @@ def hessian_size(
     Second derivatives are central differences over neighbouring values (at the sides those one row
     further in). They magnify noise by 1 / spacing^2: smooth noisy data first.
 
-Measured on a layer (bench/interpolation.py): the default p with `Graded`, growth 1.2 to 1.4, and an `h_max` that leaves
-ten cells across the box interpolate best; p = 1 is as good in L^1, a larger p buys the largest error with the mean.
+    Measured on a layer (bench/interpolation.py): the default p within `Graded`, growth 1.2 to 1.4, and an `h_max` of a
+    tenth of the box or more interpolate best; p = 1 is as good in L^1, a larger p buys the largest error with the mean.
 
     Raises
     ------
