@@ -15,31 +15,43 @@ from .results import Diagram
 from .vertices import VertexNumbering, Vertices
 
 
-def fetch_diagram(engine: Engine, domain: Box, t: Tessellation, labels: cla.Array) -> Diagram:
-    """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for."""
-    fetched = _Fetched(engine, domain, t, labels)
+def fetch_diagram(
+    engine: Engine, domain: Box, t: Tessellation, labels: cla.Array, copy: bool = True
+) -> Diagram:
+    """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for.
+
+    Without `copy`, nobody may use the buffers of `t` any more.
+    """
+    fetched = _Fetched(engine, domain, t, labels, copy)
     others = "face_vert" if engine.dim == 2 else "cell_vert"
     names = (name for name in Diagram._NAMES if not name.startswith(others))
     return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
 
 
 class _Fetched:
-    """A copy of a tessellation, since the stages reuse their buffers, and how to read it."""
+    """A tessellation, by default a copy since the stages reuse their buffers, and how to read it."""
 
-    def __init__(self, engine: Engine, domain: Box, t: Tessellation, labels: cla.Array) -> None:
+    def __init__(
+        self, engine: Engine, domain: Box, t: Tessellation, labels: cla.Array, copy: bool
+    ) -> None:
         self.engine, self.domain, self.n = engine, domain, t.n
         self.origin, self.scale = domain.frame
         self.labels = labels.get()[: t.n]
         m = int(t.starts[t.n].get())
+
+        def kept(array: cla.Array) -> cla.Array:
+            return array.copy() if copy else array
+
+        # What lies behind the last face has never been written.
         self.t = Tessellation(
             n=t.n,
-            points=t.points[: t.n].copy(),
-            starts=t.starts.copy(),
-            neighbours=t.neighbours[:m].copy(),
-            face_measures=t.face_measures[:m].copy(),
-            face_centroids=t.face_centroids[:m].copy(),
-            volumes=t.volumes.copy(),
-            offsets=t.offsets.copy(),
+            points=kept(t.points[: t.n]),
+            starts=kept(t.starts),
+            neighbours=kept(t.neighbours[:m]),
+            face_measures=kept(t.face_measures[:m]),
+            face_centroids=kept(t.face_centroids[:m]),
+            volumes=kept(t.volumes),
+            offsets=kept(t.offsets),
             covariances=t.covariances,
         )
 

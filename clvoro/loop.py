@@ -137,6 +137,8 @@ class Loop:
         """Insert and delete generators."""
         if action.least and abs(self.missing()) <= action.least * self.mesh.n:
             return
+        # What the solver holds is of no use for other generators, and the largest of what is not needed here.
+        self.mesh.stages.release("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
         inserted, deleted = self.mesh.reorganise(nuclei, self.held, theta=action.theta)
         self.inserted += inserted
@@ -241,14 +243,16 @@ class Loop:
         if self.steps:
             self.last.displace(mesh)
             final = self.displacements()
-        diagram = mesh.diagram()
         labels = np.sort(mesh.labels.get())
+        size = mesh.values(mesh.h, mesh.domain.frame[1])
+        error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)
+        diagram = mesh.finish()
         return Result(
             points=diagram.points,
             diagram=diagram,
-            size=mesh.values(mesh.h, mesh.domain.frame[1]),
-            error=mesh.values(mesh.error),
-            quality=mesh.values(mesh.quality),
+            size=size,
+            error=error,
+            quality=quality,
             history=np.concatenate(self.rows),
             converged=converged,
             stop_reason=reason,

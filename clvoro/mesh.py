@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from typing import ClassVar
 
@@ -30,7 +31,7 @@ from .sizing import Sizing
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-PEAK = {2: (112, 186), 3: (325, 355)}
+PEAK = {2: (98, 122), 3: (186, 340)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
@@ -69,6 +70,13 @@ class Stages:
         stage = (Polyhedra if three else Stages._CLASSES[name])(self.engine)
         setattr(self, name, stage)
         return stage
+
+    def release(self, *names: str) -> None:
+        """Let go of stages (by default all) and their buffers; those that are used again are made again."""
+        gone = [self.__dict__.pop(name, None) for name in names or Stages._CLASSES]
+        if any(stage is not None for stage in gone):
+            del gone
+            gc.collect()  # stages and the launches that they keep refer to each other
 
 
 def check_memory(engine: Engine, n: float) -> None:
@@ -337,6 +345,8 @@ class Mesh:
         order = np.argsort(self.labels.get(), kind="stable")
         return array.get()[order].astype(np.float64) * factor
 
-    def diagram(self) -> Diagram:
-        """Return the present diagram; its arrays are kept on the device and fetched when asked for."""
-        return fetch_diagram(self.engine, self.domain, self.t, self.labels)
+    def finish(self) -> Diagram:
+        """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""
+        t = self.t
+        self.stages.release()
+        return fetch_diagram(self.engine, self.domain, t, self.labels, copy=False)

@@ -22,7 +22,10 @@ FACES_PER_CELL = 16.5
 
 
 class Polyhedra:
-    """Tessellate a box in 3D. Buffers are reused: a `Tessellation` lives until the second call after it."""
+    """Tessellate a box in 3D.
+
+    Buffers are reused: of a `Tessellation` the next call leaves only the graph as it is, the one after that nothing.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -45,17 +48,16 @@ class Polyhedra:
             return
         engine = self.engine
         self._row_places, self._row_counts = (engine.empty(n, np.int32) for _ in range(2))
-        # Two sets in turn: the previous diagram stays valid, for a warm start and to compare neighbours.
-        self._cells = [
-            {
-                "starts": engine.empty(n + 1, np.int32),
-                "volumes": engine.empty(n),
-                "offsets": engine.empty((n, 3)),
-                "covariances": engine.empty((n, 6)),
-            }
-            for _ in range(2)
+        # Two graphs in turn: the previous one stays valid, for a warm start. Measures are those of the present.
+        self._graphs: list[dict[str, cla.Array]] = [
+            {"starts": engine.empty(n + 1, np.int32)} for _ in range(2)
         ]
-        self._faces: list[dict[str, cla.Array]] = [{}, {}]
+        self._of_cells = {
+            "volumes": engine.empty(n),
+            "offsets": engine.empty((n, 3)),
+            "covariances": engine.empty((n, 6)),
+        }
+        self._of_faces: dict[str, cla.Array] = {}
         self._capacity = n
 
     def _reserve_faces(self, m: int) -> None:
@@ -74,15 +76,15 @@ class Polyhedra:
         self._room = m
 
     def _set(self, n: int, m: int) -> dict[str, cla.Array]:
-        """Return the buffers whose turn it is, cut to `n` cells, with room for `m` faces."""
-        engine, faces = self.engine, self._faces[self._turn]
-        if not faces or len(faces["neighbours"]) < m:
-            faces["neighbours"] = engine.empty(m, np.int32)
+        """Return the graph whose turn it is and the measures, cut to `n` cells, with room for `m` faces."""
+        engine, graph, faces = self.engine, self._graphs[self._turn], self._of_faces
+        if "neighbours" not in graph or len(graph["neighbours"]) < m:
+            graph["neighbours"] = engine.empty(m, np.int32)
+        if not faces or len(faces["face_measures"]) < m:
             faces["face_measures"] = engine.empty(m)
             faces["face_centroids"] = engine.empty((m, 3))
-        lengths = {"starts": n + 1}
-        cells = self._cells[self._turn]
-        return {name: a[: lengths.get(name, n)] for name, a in cells.items()} | faces
+        cells = {name: a[:n] for name, a in self._of_cells.items()}
+        return {**graph, **faces, **cells, "starts": graph["starts"][: n + 1]}
 
     def tessellate(
         self,
