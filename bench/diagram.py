@@ -193,8 +193,9 @@ class Tessellator:
             self.t = self.cells.tessellate(self.box, points, self.n, binned, self.t)
             return
         t = self.repair.follow(self.cells, self.box, self.places[self.turn], self.t)
-        if t is None:
-            raise SystemExit("the generators moved too far for a repair")
+        if t is None:  # as a run does where too much has changed
+            binned = self.bins.build(BOX, self.places[self.turn], self.n)
+            t = self.cells.tessellate(BOX, self.places[self.turn], self.n, binned)
         self.t = t
 
 

@@ -166,17 +166,17 @@ kernel void match_faces(const int size, global const int *places, global const i
         counts[i] = n;
         return;
     }
-    const bool doubtful = *flags & FLAG_DOUBT;
+    const bool some = *flags & FLAG_DOUBT;
     uint word = 0;
     int count = 0;
     for (int k = 0; k < n; ++k) {
-        const int j = doubtful || repaired ? row[k] : -1;
-        bool mutual = j < 0;
+        const int j = row[k];
+        const bool doubtful = some && j >= 0 && (slot_counts[place] < 0 || is_doubtful_row(&rows, j));
+        bool mutual = j < 0 || !(doubtful || repaired);
         if (!mutual) {
             int m;
             global const int *other = face_row(&rows, j, &m);
-            for (int q = 0; q < m && !mutual; ++q)
-                mutual = other[q] == i;
+            mutual = place_in_row(other, m, i) < m;
         }
         if (mutual) {
             word |= 1u << (k % 32);
@@ -273,10 +273,11 @@ kernel void measure_cells(const int size, global const int *places, global const
     covariances[3 * i + 2] = yy;
 }
 
-/* Per new cell, where some are doubtful: is its area positive, and do its neighbours have their common faces where it has
-   them? Where rounding has let two cells see different neighbours, what they disagree about must be as little as rounding makes of the box, and
-   no more than a share of the cell; else generators are too close to tell apart, which is flagged. */
-kernel void check_doubtful(const int size, global const int *places, global const int *starts, global const int *neighbours,
+/* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has them, if
+   one of the two is doubtful? Where rounding has let two cells see different neighbours, what they disagree about must be
+   as little as rounding makes of the box, and no more than a share of the cell; else generators are too close to tell
+   apart, which is flagged. */
+kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts, global const int *starts, global const int *neighbours,
                            global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
                            global int *flags)
@@ -291,6 +292,12 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     const int n = starts[i + 1] - starts[i];
     const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
     bool right = volumes[i] > 0;
+    const bool doubtful = slot_counts[places[i]] < 0;
+    bool any = doubtful;
+    for (int k = 0; k < n && !any; ++k)
+        any = row[k] >= 0 && places[row[k]] >= 0 && slot_counts[places[row[k]]] < 0;
+    if (!any)
+        return;
     REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
     for (int k = 0; k < n; ++k) {
         const int j = row[k], before = row[k == 0 ? n - 1 : k - 1], after = row[k == n - 1 ? 0 : k + 1];

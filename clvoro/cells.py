@@ -240,7 +240,7 @@ class Cells:
         """Check the doubtful cells of `t`; return the flags, and the first generator concerned."""
         rows = self.rows
         self.engine.run_each(
-            self._kernels.check_doubtful, t.n, rows.places, t.starts, t.neighbours,
+            self._kernels.check_doubtful, t.n, rows.places, rows.counts, t.starts, t.neighbours,
             t.volumes, t.points, *box.device_corners(self.engine.real),
             self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE), rows.flags,
         )  # fmt: skip

@@ -46,6 +46,13 @@ inline global const int *face_row(const face_rows_t *rows, int i, int *n)
     return rows->slots + place * ROW_CAPACITY;
 }
 
+/* Is row i new, and has its cell left a doubt? */
+inline bool is_doubtful_row(const face_rows_t *rows, int i)
+{
+    const int place = rows->places[i];
+    return place >= 0 && rows->counts[place] < 0;
+}
+
 /* Write the faces of a clipped cell to its slot, the least label first: a row depends on the cell alone, not on the order
    in which it was clipped. Its count is negative if rounding might let a neighbour see the faces otherwise. */
 inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
