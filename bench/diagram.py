@@ -194,8 +194,8 @@ class Tessellator:
             return
         t = self.repair.follow(self.cells, self.box, self.places[self.turn], self.t)
         if t is None:  # as a run does where too much has changed
-            binned = self.bins.build(BOX, self.places[self.turn], self.n)
-            t = self.cells.tessellate(BOX, self.places[self.turn], self.n, binned)
+            binned = self.bins.build(self.box, self.places[self.turn], self.n)
+            t = self.cells.tessellate(self.box, self.places[self.turn], self.n, binned)
         self.t = t
 
 
