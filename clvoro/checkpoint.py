@@ -1,7 +1,8 @@
 """Checkpoints: a run's whole state in one file, from which it goes on to the same end, bit for bit.
 
 What a step leaves for the next one is saved as it is: generators in the device's order, their diagram (the next one is
-repaired from it), sizes, velocities, the potential, and the few numbers that the host keeps. What is computed anew from
+repaired from it), sizes, velocities, the potential, the multigrid's coarse levels (which last for several steps), and
+the few numbers that the host keeps. What is computed anew from
 these (the size field, the plan) is compared with what the file says, so that a run does not go on from another's state.
 """
 
@@ -105,6 +106,8 @@ class Checkpointer:
         for name in _DIAGRAM:
             array = getattr(t, name)
             arrays[f"diagram.{name}"] = (array[:m] if name in _PER_FACE else array).get()
+        for name, array in mesh.stages.poisson.save(mesh.labels).items():
+            arrays[f"multigrid.{name}"] = array
         if loop.initial is not None:
             for field in dataclasses.fields(Displacements):
                 arrays[f"initial.{field.name}"] = getattr(loop.initial, field.name)
@@ -251,6 +254,15 @@ class Saved:
         mesh.tessellation = Tessellation(n=mesh.n, points=mesh.points, **t)
         mesh.next_label = state["next_label"]
         mesh._evaluate_metric()
+        levels = {
+            k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")
+        }
+        try:
+            stages.poisson.restore(levels, mesh.labels, mesh.n)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"cannot resume from {self.name}: it is damaged ({error!r:.200})"
+            ) from error
         return mesh
 
     def _compare_sizes(self, now: np.ndarray, domain: Box) -> None:

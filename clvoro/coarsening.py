@@ -98,7 +98,7 @@ class Coarsening:
         self._kernels = engine.kernels("coarsening", {"SOURCE": source})
         self._scan = Scan(engine)
         self._room = Room(engine)
-        self._exponent = 0
+        self.exponent = 0
 
     def _run(self, kernel: cl.Kernel, size: int, *args: object) -> None:
         self.engine.run(kernel, whole_groups(size), *args)
@@ -117,8 +117,8 @@ class Coarsening:
             rows = (np.int32(len(graph)), graph.starts)
             self.engine.run_blocks(self._kernels.largest, *rows, graph.weights, partial)
             most = float(partial.get().max())
-            self._exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
-        exponent = np.int32(self._exponent)
+            self.exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
+        exponent = np.int32(self.exponent)
         self._run(self._kernels.convert, m, size, exponent, graph.weights, weights)
         return Graph(graph.starts, graph.columns, weights)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -31,6 +32,54 @@ class _Level:
     b: cla.Array
     x: cla.Array
     t: cla.Array
+
+
+class _SavedLevel:
+    """Level `depth` of what `Multigrid.save` has returned, found sound: nothing in it leads outside of its arrays."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], depth: int, n: int) -> None:
+        self.n, self.coarse = n, 0
+        self.partner = arrays[f"{depth}.partner"]
+        _demand(_within(self.partner, n, n))
+        self.graph: tuple[np.ndarray, ...] = ()
+        self.groups: tuple[np.ndarray, ...] | None = None
+        if depth > 0:
+            starts, columns, weights = self.graph = tuple(
+                arrays[f"{depth}.graph.{name}"] for name in ("starts", "columns", "weights")
+            )
+            _demand(_cuts(starts, n, len(columns)) and _within(columns, len(columns), n))
+            _demand(weights.shape == columns.shape and weights.dtype == np.float32)
+            _demand(bool((weights >= 0).all() and np.isfinite(weights).all()))
+        if f"{depth}.group" in arrays:
+            group, starts, members = self.groups = tuple(
+                arrays[f"{depth}.{name}"] for name in ("group", "starts", "members")
+            )
+            self.coarse = len(starts) - 1
+            _demand(0 < self.coarse < n and depth < _MOST_LEVELS)
+            _demand(_cuts(starts, self.coarse, n) and _within(group, n, self.coarse))
+            _demand(_within(members, n, n))
+
+
+def _factor_size(n: int) -> int:
+    """Entries of the coarsest level's elimination."""
+    return (2 * n + 2) * n
+
+
+def _demand(holds: bool) -> None:
+    if not holds:
+        raise ValueError("multigrid")
+
+
+def _within(array: np.ndarray, length: int, end: int) -> bool:
+    """Tell whether `array` holds `length` integers from 0 to below `end`."""
+    fits = array.shape == (length,) and array.dtype == np.int32
+    return fits and (length == 0 or (array.min() >= 0 and array.max() < end))
+
+
+def _cuts(starts: np.ndarray, rows: int, length: int) -> bool:
+    """Tell whether `starts` cuts `length` entries into `rows` rows."""
+    fits = starts.shape == (rows + 1,) and starts.dtype == np.int32
+    return fits and starts[0] == 0 and starts[-1] == length and bool((np.diff(starts) >= 0).all())
 
 
 class _Bound:
@@ -128,9 +177,62 @@ class Multigrid:
         self._levels[0] = replace(finest, graph=graph)
         self._programme = None
 
+    def save(self) -> dict[str, np.ndarray]:
+        """Return what `renew` builds on: pairs, groups and coarse graphs, fetched from the device."""
+        arrays = {"exponent": np.array(self._coarsening.exponent)}
+        if self._factor is not None:
+            arrays["factor"] = self._factor.get()
+        for depth, level in enumerate(self._levels):
+            arrays[f"{depth}.partner"] = level.pairs.partner.get()
+            if level.groups is not None:
+                for name in ("group", "starts", "members"):
+                    arrays[f"{depth}.{name}"] = getattr(level.groups, name).get()
+            if depth > 0:
+                for name in ("starts", "columns", "weights"):
+                    arrays[f"{depth}.graph.{name}"] = getattr(level.graph, name).get()
+        return arrays
+
+    def restore(self, arrays: Mapping[str, np.ndarray], n: int) -> None:
+        """Set the levels to those that `save` has returned, for `n` cells; `renew` comes next.
+
+        Raises
+        ------
+        KeyError, ValueError
+            If they are no such levels, before anything is changed.
+        """
+        hosts, depth = [], 0
+        while not hosts or hosts[-1].groups is not None:
+            hosts.append(_SavedLevel(arrays, depth, n))
+            n, depth = hosts[-1].coarse, depth + 1
+        n = hosts[-1].n
+        factor = arrays.get("factor")
+        _demand((factor is not None) == (n <= _COARSEST))
+        _demand(factor is None or factor.shape == (_factor_size(n),))
+        single, self._factor = self._single, None
+        self._coarsening.exponent = int(arrays["exponent"])
+        self._levels = []
+        for depth, host in enumerate(hosts):
+            n = host.n
+            # The finest level's graph comes with `renew`, as do the blocks of its pairs.
+            graph = Graph(
+                *(single.upload(a, d) for a, d in zip(host.graph, "iif", strict=True))
+                if host.graph
+                else (single.empty(n + 1, np.int32), single.empty(1, np.int32), single.empty(1))
+            )
+            partner = single.upload(host.partner, np.int32)
+            pairs = PairInverse(partner, single.empty(n), single.empty(n))
+            if depth > 0:
+                self._coarsening.renew_pairs(graph, pairs)
+            groups = host.groups and Groups(*(single.upload(a, np.int32) for a in host.groups))
+            vectors = [self._room(depth, name, size=n) for name in "bxt"]
+            self._levels.append(_Level(graph, pairs, groups, *vectors))
+        if "factor" in arrays:
+            self._factor = single.upload(arrays["factor"], np.float32)
+        self._programme = None
+
     def _eliminate(self, graph: Graph) -> None:
         n = len(graph)
-        self._factor = self._room("factor", size=(2 * n + 2) * n)
+        self._factor = self._room("factor", size=_factor_size(n))
         kernel = self._kernels.eliminate
         kernel.set_args(
             np.int32(n), graph.starts.data, graph.columns.data, graph.weights.data,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,14 +153,42 @@ class Poisson:
         if self._prepared is laplacian:
             return self._multigrid
         operator = laplacian.starts, laplacian.neighbours, laplacian.weights
-        similar = numbering is not None and numbering is self._numbering
-        if similar and 0 < self._latest <= self._at_best + _MOST_LOST:
+        if self._is_similar(numbering):
             self._multigrid.renew(*operator)
         else:
             self._multigrid.set_up(*operator)
             self._at_best = self._latest = 0
         self._prepared, self._numbering = laplacian, numbering
         return self._multigrid
+
+    def save(self, numbering: object) -> dict[str, np.ndarray]:
+        """Return what the next solve with this `numbering` takes over from the last; nothing if it begins anew."""
+        if self._multigrid is None or not self._is_similar(numbering):
+            return {}
+        iterations = np.array([self._at_best, self._latest])
+        return {"iterations": iterations, **self._multigrid.save()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray], numbering: object, n: int) -> None:
+        """Go on from what `save` has returned, with the `numbering` of the `n` cells now.
+
+        Raises
+        ------
+        KeyError, ValueError
+            If it is unsound.
+        """
+        self._prepared = self._numbering = None
+        if not arrays:
+            return
+        if self._multigrid is None:
+            self._multigrid = Multigrid(self.engine)
+        at_best, latest = map(int, arrays["iterations"])
+        self._multigrid.restore(arrays, n)
+        self._at_best, self._latest, self._numbering = at_best, latest, numbering
+
+    def _is_similar(self, numbering: object) -> bool:
+        """Tell whether the last multigrid will do for cells with this numbering."""
+        similar = numbering is not None and numbering is self._numbering
+        return similar and 0 < self._latest <= self._at_best + _MOST_LOST
 
     def solve(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro import cli
+from clvoro import cli, poisson
 from clvoro.checkpoint import Saved
 from clvoro.errors import InputError
 
@@ -70,6 +70,36 @@ def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
         resumed = clvoro.Adapter(ctx, dtype).run(BOX, SIZE, seed=5, resume=path, **RUNS[kind])
         assert_same(resumed, whole)
         assert (np.diff(resumed.history["seconds"]) >= 0).all()
+
+
+BOX_3D = clvoro.Box((0, 0, 0), (1, 1.5, 1))
+SIZE_3D = clvoro.sizing.Expression("0.16 + 0.2*fabs(hypot(x-0.4, y-0.7)-0.3)")
+LONG_LIVED = {
+    "coupled": (BOX, SIZE, {"method": "coupled", "max_steps": 7}),
+    "weighted": (BOX, SIZE, {"method": "weighted", "max_steps": 7, "tol": 0.0}),
+    "adaptive": (BOX, SIZE, {"method": "adaptive", "effort": "fast", "levels": 1}),
+    "coupled in 3D": (BOX_3D, SIZE_3D, {"method": "coupled", "max_steps": 5}),
+    "weighted in 3D": (BOX_3D, SIZE_3D, {"method": "weighted", "max_steps": 5, "tol": 0.0}),
+    "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
+}
+
+
+@pytest.mark.parametrize("solver", ["multigrid", "jacobi"])
+@pytest.mark.parametrize("kind", list(LONG_LIVED))
+def test_resumed_runs_go_on_with_the_same_solver(ctx, tmp_path, monkeypatch, kind, solver):
+    """Multigrid's levels last for several steps: here also on meshes for which Jacobi's method is faster."""
+    monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 1.5 - (solver == "multigrid")))
+    box, size, options = LONG_LIVED[kind]
+    whole = clvoro.Adapter(ctx).run(box, size, seed=5, **options)
+    rows, path = len(whole.history), tmp_path / "state"
+    for stop in sorted({1, 2, rows // 3, rows - 2}):
+        clvoro.Adapter(ctx).run(
+            box, size, seed=5, callback=stop_after(stop), checkpoint=path, checkpoint_every=1e9, **options
+        )  # fmt: skip
+        levels = [name for name in Saved(path).arrays if name.startswith("multigrid.")]
+        assert bool(levels) or solver == "jacobi" or kind.startswith("adaptive")
+        assert not levels or solver == "multigrid"
+        assert_same(clvoro.Adapter(ctx).run(box, size, seed=5, resume=path, **options), whole)
 
 
 def test_writing_checkpoints_changes_nothing(ctx, tmp_path):
@@ -184,6 +214,28 @@ DAMAGED = {
     "shape": lambda name, array: array[:-1] if name == "mesh.velocity" else array,
     "type": lambda name, array: array.astype(np.float32) if name == "mesh.h" else array,
 }
+
+
+DAMAGED_LEVELS = {
+    "groups": spoil("multigrid.0.group", 5, 10**6),
+    "members": spoil("multigrid.0.members", 5, -1),
+    "rows": spoil("multigrid.1.graph.starts", 3, 10**6),
+    "columns": spoil("multigrid.1.graph.columns", 3, -1),
+    "weights": spoil("multigrid.1.graph.weights", 3, np.nan),
+    "pairs": spoil("multigrid.0.partner", 2, 10**6),
+    "elimination": lambda name, a: a[:-1] if name == "multigrid.factor" else a,
+}
+
+
+@pytest.mark.parametrize("name", list(DAMAGED_LEVELS))
+def test_damaged_levels_are_refused(ctx, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 0.0))
+    options = {"method": "coupled", "max_steps": 6, "seed": 5}
+    path, bad = tmp_path / "state", tmp_path / "bad"
+    clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(2), checkpoint=path, **options)
+    rewrite(path, bad, DAMAGED_LEVELS[name])
+    with pytest.raises(InputError, match="cannot resume"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, resume=bad, **options)
 
 
 @pytest.mark.parametrize("name", list(DAMAGED))
