@@ -86,7 +86,10 @@ class Effort:
 
 EFFORTS = {
     "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
-    "default": Effort(60, 5, 3, (4, 18, 20, 20), glide=7, polish=18, aim=0.0025, bound=11.0),
+    "default": Effort(
+        60, 5, 3, (4, 18, 20, 20), glide=7, polish=21, aim=0.0025, lenience=0.02,
+        bound=11.0,
+    ),
     "best": Effort(
         60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, aim=0.0039, relaxation=1.5, momentum=0.8,
         eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0, flaw=0.006,
