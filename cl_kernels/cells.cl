@@ -148,14 +148,33 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     places[i] = i;
 }
 
+/* Twice the area of the cell of generator j by the faces that it lists. */
+inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    const REAL x[2] = {points[2 * j], points[2 * j + 1]};
+    int n;
+    global const int *row = face_row(rows, j, &n);
+    REAL area = 0;
+    if (n < 3)
+        return area;
+    const REAL2 origin = corner(j, x, row[n - 1], row[0], points, lower, upper);
+    REAL2 v = origin;
+    for (int k = 0; k < n; ++k) {
+        const REAL2 w = k == n - 1 ? origin : corner(j, x, row[k], row[k + 1], points, lower, upper);
+        area += difference_of_products(v.s0, w.s1, v.s1, w.s0);
+        v = w;
+    }
+    return area;
+}
+
 /* Per generator i: bit k of keep[KEEP_WORDS * its slot ...] marks a neighbour that also lists i. Rounding may let one of
    two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
-   the graph is symmetric. If what it cuts off is more than rounding, generators are too close to tell apart (from far
-   away, two an ulp apart have the same bisector), and that is flagged. */
+   the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two cells,
+   generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is flagged. */
 kernel void match_faces(const int size, global const int *places, global const int *slots, global const int *slot_counts,
                         global const int *old_starts, global const int *old_neighbours, global const REAL *points,
-                        const REAL4 box_lower, const REAL4 box_upper, const int repaired, global uint *keep,
-                        global int *counts, global int *flags)
+                        const REAL4 box_lower, const REAL4 box_upper, const int repaired, const REAL share,
+                        global uint *keep, global int *counts, global int *flags)
 {
     WORK_ITEM(i);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
@@ -192,7 +211,9 @@ kernel void match_faces(const int size, global const int *places, global const i
             const REAL2 tip = corner(i, x, a, b, points, lower, upper);
             const REAL2 u = corner(i, x, a, j, points, lower, upper) - tip;
             const REAL2 v = corner(i, x, j, b, points, lower, upper) - tip;
-            if (!(fabs(u.s0 * v.s1 - u.s1 * v.s0) < 512 * REAL_EPS))
+            const REAL cut = fabs(u.s0 * v.s1 - u.s1 * v.s0);
+            if (!(cut < 512 * REAL_EPS && cut <= share * listed_area(&rows, i, points, lower, upper) &&
+                  cut <= share * listed_area(&rows, j, points, lower, upper)))
                 raise_flag(flags, FLAG_COLLAPSED, i);
         }
         if (k % 32 == 31 || k == n - 1) {
@@ -303,8 +324,11 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         const int j = row[k], before = row[k == 0 ? n - 1 : k - 1], after = row[k == n - 1 ? 0 : k + 1];
         const REAL2 u = v;
         v = corner(i, x, j, after, points, lower, upper);
-        if (j < 0)
+        if (j < 0) {
+            /* Opposite walls never meet: what was between them is lost. */
+            right = right && !(after < 0 && (-1 - j) / 2 == (-1 - after) / 2);
             continue;
+        }
         global const int *other = neighbours + starts[j];
         const int m = starts[j + 1] - starts[j];
         const int q = place_in_row(other, m, i);

@@ -179,7 +179,7 @@ class Cells:
                 rows.slots, rows.counts, rows.places, rows.flags,
             )  # fmt: skip
             # Every row is new: there are none from before.
-            flags, generator = self._match(box, points, n, rows.places, rows.places)
+            flags, generator = self._match(box, points, n, rows.places, rows.places, exact)
             if not flags & FULL:
                 break
             self._enlarge(n)
@@ -197,7 +197,7 @@ class Cells:
         None if they do not make a diagram.
         """
         n, starts, neighbours = previous.n, previous.starts, previous.neighbours
-        flags = self._match(box, points, n, starts, neighbours)[0]
+        flags = self._match(box, points, n, starts, neighbours, exact=False)[0]
         if flags & ~DOUBT:
             return None
         t = self._measure(box, points, n, starts, neighbours)
@@ -208,14 +208,20 @@ class Cells:
         self.rows.flags.set(np.array([0, 2**31 - 1], np.int32))
 
     def _match(
-        self, box: Box, points: cla.Array, n: int, starts: cla.Array, neighbours: cla.Array
+        self,
+        box: Box,
+        points: cla.Array,
+        n: int,
+        starts: cla.Array,
+        neighbours: cla.Array,
+        exact: bool,
     ) -> tuple[int, int]:
         """Make the rows symmetric, count their faces; return the flags, and the first generator concerned."""
         rows, counts = self.rows, self._views[self._turn]["starts"]
         self.engine.run_each(
             self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, starts, neighbours,
             points, *box.device_corners(self.engine.real), np.int32(starts is not rows.places),
-            rows.keep, counts, rows.flags,
+            self._share(exact), rows.keep, counts, rows.flags,
         )  # fmt: skip
         flags, generator = rows.flags.get()
         return int(flags), int(generator)
@@ -242,10 +248,13 @@ class Cells:
         self.engine.run_each(
             self._kernels.check_doubtful, t.n, rows.places, rows.counts, t.starts, t.neighbours,
             t.volumes, t.points, *box.device_corners(self.engine.real),
-            self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE), rows.flags,
+            self._share(exact), rows.flags,
         )  # fmt: skip
         flags, generator = rows.flags.get()
         return int(flags), int(generator)
+
+    def _share(self, exact: bool) -> np.floating:
+        return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
     def _reserve_rows(self, n: int) -> None:
         """Make room for `n` rows of faces of the present capacity."""

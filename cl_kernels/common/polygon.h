@@ -45,13 +45,14 @@ inline void start_cell(cell_t *cell, int i, const REAL *x, const REAL *lower, co
 
 /* Where face k of the cell meets the bisector that cuts it between corners `in` and `out`, which lie at the signed
    distances s_in <= 0 < s_out of it. Interpolation rounds by eps of the face's length; where that is much beside the
-   distance of the generators (near-duplicates), the corner is computed from the generators instead. */
+   distance of the generators (near-duplicates; in single precision also where it is a ten-thousandth), the corner is
+   computed from the generators instead. */
 inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out, int face, int neighbour, REAL d2,
                       global const REAL *points)
 {
     const REAL2 a = (REAL2)(cell->x[in], cell->y[in]);
     const REAL2 ab = (REAL2)(cell->x[out], cell->y[out]) - a;
-    if (d2 < R(1e-10) * dot(ab, ab))
+    if (d2 < (IS_DOUBLE ? R(1e-10) : R(1e-6)) * dot(ab, ab))
         return corner(cell->generator, cell->position, face, neighbour, points, cell->lower, cell->upper);
     const REAL s = s_in < 0 ? s_in : 0;
     return a + ab * (s / (s - s_out));
