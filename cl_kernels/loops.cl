@@ -4,7 +4,7 @@
 /* Vertices and face loops of a diagram in 3D, from its graph. Each cell is clipped once more, by its neighbours alone. Its
    vertices, the corners, are numbered cell by cell: corner u. The same point is a corner of every cell that meets
    there: corners are one vertex where an edge between them has no length, and where they lie at the same place of the
-   face that two cells share. The least corner of a vertex gives it its label and its position. Nearest corners of a face
+   face that two cells share. The least corner of a vertex gives it its label, the sharpest its position. Nearest corners of a face
    belong together whatever they round by, and so this holds where many cells meet in a point.
 
    starts, neighbours          the graph: faces k, in rows i
@@ -66,11 +66,33 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
     }
 }
 
-/* Per generator i: its corners (c, 3), relative to x_i, and turns. same[u] is the least corner of the cell that lies where
+/* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each, as
+   the bisector of generators d apart rounds by r / d of what they do at the distance r. */
+inline REAL sharpness_of(const cell_t *cell, int v)
+{
+    const INDEX4 f = cell->faces[v];
+    const int faces[3] = {f.s0, f.s1, f.s2};
+    const REAL x = X(cell)[v], y = Y(cell)[v], z = Z(cell)[v];
+    const REAL r = sqrt(x * x + y * y + z * z);
+    REAL4 normals[3];
+    REAL shares = 1;
+    for (int k = 0; k < 3; ++k) {
+        const REAL4 plane = cell->planes[faces[k]];
+        const REAL d = sqrt(plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2);
+        normals[k] = plane / d;
+        shares *= cell->labels[faces[k]] >= 0 ? d / (d + r) : 1;
+    }
+    const REAL4 c = cross_product(normals[1], normals[2]);
+    const REAL span = normals[0].s0 * c.s0 + normals[0].s1 * c.s1 + normals[0].s2 * c.s2;
+    return fabs(span) * shares;
+}
+
+/* Per generator i: its corners (c, 3), relative to x_i, how sharp each is, and turns. same[u] is the least corner of the cell that lies where
    corner u does, joined to it by edges of no length. */
 kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                          global const int *starts, global const int *neighbours, global const int *corner_starts,
-                         global const int *turn_starts, global REAL *corners, global int *same, global int *turns)
+                         global const int *turn_starts, global REAL *corners, global float *sharpness, global int *same,
+                         global int *turns)
 {
     WORK_ITEM(i);
     cell_t cell;
@@ -82,6 +104,7 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
         corners[3 * (base + v)] = X(&cell)[v];
         corners[3 * (base + v) + 1] = Y(&cell)[v];
         corners[3 * (base + v) + 2] = Z(&cell)[v];
+        sharpness[base + v] = (float)sharpness_of(&cell, v);
         joined[v] = v;
     }
     bool changed = true;
@@ -161,36 +184,56 @@ kernel void match_corners(const int size, global const REAL *points, global cons
     }
 }
 
-inline bool join(global int *labels, int u, int w)
+/* Note that the corners u and w are one vertex. What is read is not written meanwhile: labels go from `old` to `new`, which
+   begins as its copy. */
+inline bool join(global const int *old, global int *new, int u, int w)
 {
-    const int a = labels[u], b = labels[w];
+    const int a = old[u], b = old[w];
     if (a == b)
         return false;
-    atomic_min(labels + (a > b ? u : w), min(a, b));
-    atomic_min(labels + max(a, b), min(a, b));
+    atomic_min(new + (a > b ? u : w), min(a, b));
+    atomic_min(new + max(a, b), min(a, b));
     return true;
 }
 
 /* Per corner u: pass on the least label to where it lies. */
-kernel void spread_in_cells(const int size, global const int *same, global int *labels, global int *changed)
+kernel void spread_in_cells(const int size, global const int *same, global const int *old, global int *new,
+                            global int *changed)
 {
     WORK_ITEM(u);
-    if (join(labels, u, same[u]))
+    if (join(old, new, u, same[u]))
         changed[0] = 1;
-    const int label = labels[labels[u]];
-    if (label < labels[u]) {
-        atomic_min(labels + u, label);
+    const int label = old[old[u]];
+    if (label < old[u]) {
+        atomic_min(new + u, label);
         changed[0] = 1;
     }
 }
 
 /* Per turn t: the same across the face. The least label of all is where this ends, in whatever order. */
-kernel void spread_over_faces(const int size, global const int *turns, global const int *partners, global int *labels,
-                              global int *changed)
+kernel void spread_over_faces(const int size, global const int *turns, global const int *partners,
+                              global const int *old, global int *new, global int *changed)
 {
     WORK_ITEM(t);
-    if (join(labels, turns[t], partners[t]))
+    if (join(old, new, turns[t], partners[t]))
         changed[0] = 1;
+}
+
+/* Per corner u: the greatest sharpness at its vertex, in best[label], which begins as 0. Bits of floats >= 0 are in their
+   order. */
+kernel void rate_corners(const int size, global const int *labels, global const float *sharpness, global uint *best)
+{
+    WORK_ITEM(u);
+    atomic_max(best + labels[u], as_uint(sharpness[u]));
+}
+
+/* Per corner u: the first of the sharpest, in chosen[label], which begins as INT_MAX. */
+kernel void choose_corners(const int size, global const int *labels, global const float *sharpness,
+                           global const uint *best, global int *chosen)
+{
+    WORK_ITEM(u);
+    if (as_uint(sharpness[u]) == best[labels[u]])
+        atomic_min(chosen + labels[u], u);
 }
 
 /* Vertices of a loop, each once where corners are the same; written to `out` in its order, or against it. Their number is
@@ -248,18 +291,20 @@ kernel void write_loops(const int size, global const int *twins, global const in
     walk_loop(giver, giver != k, turn_starts, turns, labels, ids, loops + loop_starts[k]);
 }
 
-/* Per generator i: the positions of the vertices (v, 3) whose least corner is one of its cell's. */
+/* Per generator i: the positions of the vertices (v, 3) whose sharpest corner is one of its cell's. */
 kernel void place_vertices(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                           global const int *corner_starts, global const REAL *corners, global const int *ids,
-                           global REAL *vertices)
+                           global const int *corner_starts, global const REAL *corners, global const int *labels,
+                           global const int *chosen, global const int *ids, global REAL *vertices)
 {
     WORK_ITEM(i);
     const REAL lower[3] = {box_lower.s0, box_lower.s1, box_lower.s2};
     const REAL upper[3] = {box_upper.s0, box_upper.s1, box_upper.s2};
-    for (int u = corner_starts[i]; u < corner_starts[i + 1]; ++u)
-        if (ids[u] != ids[u + 1])
+    for (int u = corner_starts[i]; u < corner_starts[i + 1]; ++u) {
+        const int label = labels[u];
+        if (chosen[label] == u && ids[label] != ids[label + 1])
             for (int a = 0; a < 3; ++a)
-                vertices[3 * ids[u] + a] = clamp(points[3 * i + a] + corners[3 * u + a], lower[a], upper[a]);
+                vertices[3 * ids[label] + a] = clamp(points[3 * i + a] + corners[3 * u + a], lower[a], upper[a]);
+    }
 }
 
 /* Where many cells meet, a vertex may lie in the middle of an edge of a cell that does not see it as a corner: its loops

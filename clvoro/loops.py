@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Scan
@@ -76,22 +77,30 @@ class FaceLoops:
                 f"{n} cells have more vertices than 32-bit indices can tell apart; use fewer cells"
             )
         corners, same = engine.empty((c, 3)), engine.empty(c, np.int32)
+        sharpness = engine.empty(c, np.float32)
         turns, partners = engine.empty(turn_count, np.int32), engine.empty(turn_count, np.int32)
         twins = engine.empty(m, np.int32)
         engine.run_each(
-            k.list_corners, n, *cell, corner_starts, turn_starts, corners, same, turns, group=group
-        )
+            k.list_corners, n, *cell, corner_starts, turn_starts, corners, sharpness, same, turns,
+            group=group,
+        )  # fmt: skip
         engine.run_each(
             k.match_corners, n, t.points, t.starts, t.neighbours, corners, turn_starts, turns,
             twins, partners,
         )  # fmt: skip
-        labels = same.copy()
+        labels, new = same.copy(), same.copy()
+        spread = ((k.spread_over_faces, turn_count, turns, partners), (k.spread_in_cells, c, same))
         while True:
             flag.fill(0)
-            engine.run_each(k.spread_over_faces, turn_count, turns, partners, labels, flag)
-            engine.run_each(k.spread_in_cells, c, same, labels, flag)
+            for kernel, size, *links in spread:
+                engine.run_each(kernel, size, *links, labels, new, flag)
+                cl.enqueue_copy(engine.queue, labels.data, new.data)
             if not int(flag[0].get()):
                 break
+        best, chosen = engine.zeros(c, np.uint32), new
+        chosen.fill(2**31 - 1)
+        engine.run_each(k.rate_corners, c, labels, sharpness, best)
+        engine.run_each(k.choose_corners, c, labels, sharpness, best, chosen)
         loop_starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
         engine.run_each(k.measure_loops, m, twins, turn_starts, turns, labels, loop_starts, ids)
         self._scan.exclusive(loop_starts, loop_starts, m)
@@ -101,7 +110,9 @@ class FaceLoops:
         engine.run_each(
             k.write_loops, m, twins, turn_starts, turns, labels, ids, loop_starts, loops
         )
-        engine.run_each(k.place_vertices, n, *cell[:3], corner_starts, corners, ids, positions)
+        engine.run_each(
+            k.place_vertices, n, *cell[:3], corner_starts, corners, labels, chosen, ids, positions
+        )
         starts, loops = self._mended(k, t, twins, loop_starts, loops)
         return Loops(positions, starts, loops)
 

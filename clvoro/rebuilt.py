@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
     from .results import Diagram
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """By how much rounding may have put off what is known of a diagram.
+
+    Attributes
+    ----------
+    measures, middles : (m,) float
+        Of the faces.
+    volumes : (n,) float
+    """
+
+    measures: np.ndarray
+    middles: np.ndarray
+    volumes: np.ndarray
 
 
 class Rebuilt:
@@ -30,6 +47,9 @@ class Rebuilt:
         The rounding of a position.
     """
 
+    directions: np.ndarray
+    """(m, d): from the cell's generator to the neighbour's or the wall, of length 1."""
+
     def __init__(self, d: Diagram) -> None:
         dim, n = d.domain.dim, len(d)
         self.real = _precision(d)
@@ -38,6 +58,7 @@ class Rebuilt:
         # What is on the host is in float64 again: the way from the origin rounds in that.
         self.unit = float(np.finfo(self.real).eps) * size + np.finfo(float).eps * far
         self.owner = np.repeat(np.arange(n), np.diff(d.neighbour_starts))
+        self.directions, self.spacings = _across(d, self.owner)
         x = d.vertices
         # All lengths relative to the cell's generator: small cells far from the origin keep their digits.
         at = d.points[self.owner]
@@ -53,6 +74,7 @@ class Rebuilt:
             self.areas = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
             self.middles = (a + b) / 2
             self.cells, self.corners = self.owner, d.cell_vertices
+            self._following = following
         else:
             face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
             first = d.face_vertex_starts[:-1][face]
@@ -75,6 +97,7 @@ class Rebuilt:
             )
             self.cells, self.corners = self.owner[face], d.face_vertices
             self.edges = (face, d.face_vertices, d.face_vertices[following])
+            self._tails, self._edge, self._before = a, b - a, np.argsort(following)
         self.measures = np.linalg.norm(self.areas, axis=1)
         # The cell as the sum of the cones from its generator to its faces.
         cones = np.einsum("ij,ij->i", self.areas, self.middles) / dim
@@ -86,10 +109,105 @@ class Rebuilt:
         safe = np.where(self.volumes > 0, self.volumes, 1)
         self.centroids = np.stack(moments, axis=1) / safe[:, None]
         self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
+        self._distances = np.linalg.norm(x[self.corners] - d.points[self.cells], axis=1)
         self.reach = np.zeros(n)
-        np.maximum.at(
-            self.reach, self.cells, np.linalg.norm(x[self.corners] - d.points[self.cells], axis=1)
-        )
+        np.maximum.at(self.reach, self.cells, self._distances)
+        self._vertex_count = len(x)
+
+    def are_slits(self, places: np.ndarray, width: float) -> np.ndarray:
+        """Tell which edges of faces' loops (3D), open ones of their cells, border slits no wider than `width`.
+
+        Where faces meet in the middle of an edge, give or take a rounding, one may have a vertex there that the other
+        lacks. Such an edge's middle lies on another open edge of the cell; that of a missing face does not.
+        """
+        result = np.zeros(len(places), bool)
+        ends, cells = self._tails[places] + self._edge[places], self.cells[places]
+        order = np.argsort(cells, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(cells[order])) + 1):
+            a, edge = self._tails[places[rows]], self._edge[places[rows]]
+            square = np.maximum((edge**2).sum(axis=1), 1e-300)
+            for row in rows:
+                middle = (self._tails[places[row]] + ends[row]) / 2
+                t = np.clip(((middle - a) * edge).sum(axis=1) / square, 0, 1)
+                off = np.linalg.norm(a + t[:, None] * edge - middle, axis=1)
+                off[rows == row] = np.sqrt(square[rows == row]) / 2
+                result[row] = off.min() <= width
+        return result
+
+    def doubts(self, slack: float) -> Doubts:
+        """Return what may be off by how much where a position may be off by `slack`.
+
+        The bisector of two generators, d apart, is off by e = ``slack (1 + r / d)`` at the distance r: what two
+        near-duplicates round by is their distance's share of r. A corner lies where its cell's bisectors meet, and
+        is off by more the more nearly parallel they are: with unit normals n, within the ellipsoid of
+        ``C = (sum n n^T / e^2)^-1``, but not beyond the cell. What follows from the corners is off by the sum of
+        what each changes it by, sqrt(g^T C g) for the gradient g.
+        """
+        return (self._doubts_2d if self.directions.shape[1] == 2 else self._doubts_3d)(slack)
+
+    def _doubts_2d(self, slack: float) -> Doubts:
+        here = np.arange(len(self.corners))
+        before = np.argsort(self._following)  # corner k lies between the faces before[k] and k
+        one, two = (1 + self._distances / self.spacings[f] for f in (before, here))
+        a, b = self.directions[before], self.directions[here]
+        sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        with np.errstate(all="ignore"):
+            off = slack * np.hypot(one, two) / sine
+        off = np.where(off < self.reach[self.cells], off, self.reach[self.cells])
+        # A vertex is where several cells have a corner, of which it is one.
+        worst = np.full(self._vertex_count, slack)
+        np.maximum.at(worst, self.corners, off)
+        off = worst[self.corners]
+        ends = np.maximum(off, off[self._following])
+        swept = np.bincount(self.owner, ends * self.measures, len(self.reach))
+        return Doubts(ends, ends, swept + slack**2)
+
+    def _doubts_3d(self, slack: float) -> Doubts:
+        face, key = self.edges[0], self.cells.astype(np.int64) * self._vertex_count + self.corners
+        _, first, group = np.unique(key, return_index=True, return_inverse=True)
+        k, cells, reach = len(first), self.cells[first], self.reach[self.cells[first]]
+        e = 1 + self._distances[first][group] / self.spacings[face]
+        normal = self.directions[face] / e[:, None]
+        m = np.empty((k, 3, 3))
+        for i in range(3):
+            for j in range(i, 3):
+                m[:, i, j] = m[:, j, i] = np.bincount(group, normal[:, i] * normal[:, j], k)
+        values, axes = np.linalg.eigh(m)
+        # Below rounding an eigenvalue is 0: along this axis the corner may be anywhere in the cell.
+        sure = values > 16 * np.finfo(float).eps * values[:, -1:]
+        off = slack / np.sqrt(np.where(sure, values, 1.0))
+        off = np.where(sure & (off < reach[:, None]), off, np.maximum(reach, slack)[:, None])
+        # A vertex has the position of the corner that is sharpest.
+        best = np.full(self._vertex_count, np.inf)
+        np.minimum.at(best, self.corners[first], off.max(axis=1))
+        placed = np.maximum(best, slack)[self.corners[first]]
+
+        def change(gradient: np.ndarray, which: np.ndarray) -> np.ndarray:
+            along = np.einsum("kij,ki->kj", axes[which], gradient) * off[which]
+            return np.linalg.norm(along, axis=1) + placed[which] * np.linalg.norm(gradient, axis=1)
+
+        preceding, ahead = -self._edge[self._before], self._edge
+        rim = np.cross(ahead - preceding, self.directions[face]) / 2
+        faces = np.bincount(face, change(rim, group), len(self.owner))
+        ears = np.cross(ahead, preceding) / 6
+        cone = np.stack([np.bincount(group, ears[:, i], k) for i in range(3)], axis=1)
+        cell = np.bincount(cells, change(cone, np.arange(k)), len(self.reach))
+        widths = self.reach[self.owner]
+        spread = faces * 2 * widths / np.maximum(self.measures, 1e-300)
+        return Doubts(faces + slack * widths, slack + spread, cell + slack * self.perimeters)
+
+
+def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit vector across each face, outward, and the distance of its generators (infinite at a wall)."""
+    inner, walls = np.flatnonzero(d.neighbours >= 0), np.flatnonzero(d.neighbours < 0)
+    across = np.zeros((len(owner), d.domain.dim))
+    across[inner] = d.points[d.neighbours[inner]] - d.points[owner[inner]]
+    axis, upper = (-1 - d.neighbours[walls]) // 2, (-1 - d.neighbours[walls]) % 2
+    across[walls, axis] = 2.0 * upper - 1
+    distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
+    spacing = distance.copy()
+    spacing[walls] = np.inf
+    return across / distance[:, None], spacing
 
 
 def _precision(d: Diagram) -> np.dtype:
