@@ -382,10 +382,12 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
 /* Per generator i: kept[k] of each of its faces, and the number kept. Rounding may let one of two cells, which is then
    doubtful, see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
    If it is wider than rounding explains, generators are too close to tell apart (from far away, two an ulp apart have
-   the same bisector), and that is flagged. */
+   the same bisector), and that is flagged. So it is where both see a face, but of areas that differ by more than a share
+   of the cell. */
 kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
-                        global const int *labels, global const REAL *measures, global const REAL *points,
-                        global uchar *kept, global int *counts, global int *report)
+                        global const int *labels, global const REAL *measures, global const REAL *volumes,
+                        global const REAL *points, const REAL share, global uchar *kept, global int *counts,
+                        global int *report)
 {
     WORK_ITEM(i);
     const int n = abs(row_counts[i]);
@@ -394,27 +396,31 @@ kernel void match_faces(const int size, global const int *row_places, global con
     if (!doubtful)
         return;
     int count = 0;
+    REAL apart = 0; /* the volume of the cones to what faces differ by */
     for (int k = row_places[i]; k < row_places[i] + n; ++k) {
         const int j = labels[k];
         bool mutual = j < 0;
         if (!mutual) {
             const int m = abs(row_counts[j]);
             global const int *row = labels + row_places[j];
-            for (int q = 0; q < m && !mutual; ++q)
-                mutual = row[q] == i;
-            if (!mutual) {
-                const REAL dx = points[3 * j] - points[3 * i];
-                const REAL dy = points[3 * j + 1] - points[3 * i + 1];
-                const REAL dz = points[3 * j + 2] - points[3 * i + 2];
-                if (!(measures[k] < 2048 * REAL_EPS * sqrt(dx * dx + dy * dy + dz * dz)))
-                    raise_flag(report, FLAG_COLLAPSED, i);
-            }
+            int q = 0;
+            while (q < m && row[q] != i)
+                ++q;
+            mutual = q < m;
+            const REAL dx = points[3 * j] - points[3 * i];
+            const REAL dy = points[3 * j + 1] - points[3 * i + 1];
+            const REAL dz = points[3 * j + 2] - points[3 * i + 2];
+            const REAL distance = sqrt(dx * dx + dy * dy + dz * dz);
+            const REAL other = mutual ? measures[row_places[j] + q] : 0;
+            apart += fabs(measures[k] - other) * distance / 6;
+            if (!mutual && !(measures[k] < 2048 * REAL_EPS * distance))
+                raise_flag(report, FLAG_COLLAPSED, i);
         }
         kept[k] = mutual;
         count += mutual;
     }
     counts[i] = count;
-    if (count < 4)
+    if (count < 4 || !(apart <= share * volumes[i]))
         raise_flag(report, FLAG_COLLAPSED, i);
 }
 

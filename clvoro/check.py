@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from .results import Diagram, Result
 
 ROUNDINGS = 256
-"""How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be off
-by more, where the faces that meet there say so: see `Rebuilt.doubts`."""
+"""How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be
+off by more, where the faces that meet there say so: see `Rebuilt.doubts`."""
 
 
 @dataclass(frozen=True)

@@ -249,8 +249,8 @@ class Mesh:
             if t is not None:
                 return t
         binned = stages.bins.build(self.domain, self.points, self.n)
-        how = {"exact": False} if flat else {"previous": previous}
-        return stages.cells.tessellate(self.domain, self.points, self.n, binned, **how)
+        how = {} if flat else {"previous": previous}
+        return stages.cells.tessellate(self.domain, self.points, self.n, binned, exact=False, **how)
 
     def _evaluate_metric(self) -> None:
         self.stages.metric.evaluate(

@@ -10,7 +10,7 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .bins import MAX_LEVELS, BinnedPoints
-from .cells import COINCIDE, FULL, Tessellation
+from .cells import COINCIDE, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import ClvoroError, InputError, MemoryLimitError
 
@@ -93,6 +93,7 @@ class Polyhedra:
         n: int,
         binned: BinnedPoints,
         previous: Tessellation | None = None,
+        exact: bool = True,
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
 
@@ -100,6 +101,9 @@ class Polyhedra:
         ----------
         previous : Tessellation, optional
             A diagram of the same generators at earlier positions: clipping starts from its neighbours.
+        exact : bool
+            Refuse generators so close together that cells differ by more than `EXACT_SHARE` of their volumes about
+            their common faces. Without it only by more than `ROUGH_SHARE`.
 
         Raises
         ------
@@ -156,7 +160,8 @@ class Polyhedra:
         arrays = self._set(n, m)
         engine.run_each(
             k.match_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
-            points, self._kept, arrays["starts"], self._report,
+            arrays["volumes"], points, engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE),
+            self._kept, arrays["starts"], self._report,
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
         if flags:
