@@ -100,8 +100,9 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     Parameters
     ----------
     device : str or pyopencl.Device, optional
-        Part of a platform's or device's name in any case (``"nvidia"``, ``"pocl"``), a kind
-        (``"gpu"``, ``"cpu"``), or indices ``"platform:device"`` as `list_devices` gives them.
+        Part of a platform's name in any case (``"nvidia"``, ``"pocl"``) or, where no platform has it,
+        of a device's or vendor's; a kind (``"gpu"``, ``"cpu"``), or indices ``"platform:device"``
+        as `list_devices` gives them.
     fp64 : bool
         Take only devices that compute in float64.
 
@@ -270,18 +271,21 @@ def _candidates(
 
 
 def _matching(found: Iterable[_Candidate], query: str) -> list[_Candidate]:
-    """Return the devices that `query` means: equal indices, else a part of the name or the kind."""
+    """Return the devices that `query` means: equal indices, else a platform's name or the kind, else a device's."""
     by_index = [c for c in found if c.index == query.replace(" ", "")]
     if by_index:
         return by_index
     text = query.lower()
     aliases = {"Portable Computing Language": "pocl"}
-    return [
-        c
-        for c in found
-        if text in f"{c.platform} / {c.name} / {aliases.get(c.platform, '')}".lower()
-        or text == c.kind
-    ]
+    # The runtime before the device: PoCL calls a device by its processor, which may be an "Intel" one.
+    for parts in (
+        lambda c: f"{c.platform} / {aliases.get(c.platform, '')}",
+        lambda c: f"{c.device.vendor} / {c.platform} / {c.name}",
+    ):
+        meant = [c for c in found if text in parts(c).lower() or text == c.kind]
+        if meant:
+            return meant
+    return []
 
 
 def _from_environment() -> _Candidate:

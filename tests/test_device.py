@@ -19,8 +19,8 @@ ROOT = Path(__file__).parent.parent
 class FakeDevice:
     """As much of a pyopencl.Device as the choice looks at."""
 
-    def __init__(self, key, platform, name, kind, fp64=True):
-        self.int_ptr, self.name, self.type = key, name, kind
+    def __init__(self, key, platform, name, kind, fp64=True, vendor="Maker"):
+        self.int_ptr, self.name, self.type, self.vendor = key, name, kind, vendor
         self.platform = type("FakePlatform", (), {"name": platform})()
         self.double_fp_config, self.extensions = (63 if fp64 else 0), ""
         self.version, self.global_mem_size, self.max_compute_units = "OpenCL 3.0", 2**31, 4
@@ -64,6 +64,26 @@ def test_order_of_choice(machine, devices, broken, expected):
     assert device.create_context() == [expected]
     chosen = [d for d in device.list_devices() if d.default]
     assert [d.name for d in chosen] == [expected.name]
+
+
+ON_INTEL = FakeDevice(
+    -6, "Portable Computing Language", "cpu-Intel(R) Xeon(R)", CPU, vendor="GenuineIntel"
+)
+
+
+@pytest.mark.parametrize("query", ["intel", "Intel(R)", " INTEL "])
+def test_runtime_comes_before_the_name_of_a_processor(machine, query):
+    machine(ON_INTEL, INTEL)
+    assert device.create_context(query) == [INTEL]
+    assert device.create_context("pocl") == device.create_context("xeon") == [ON_INTEL]
+    assert device.create_context("cpu") == [ON_INTEL]
+    # Not another's in the place of a runtime that does not work.
+    machine(ON_INTEL, INTEL, broken=[INTEL])
+    with pytest.raises(DeviceError, match="it cannot build"):
+        device.create_context(query)
+    # Without such a runtime it is the processor that is meant, or its maker.
+    machine(POCL, ON_INTEL, BIG_GPU)
+    assert device.create_context(query) == device.create_context("genuine") == [ON_INTEL]
 
 
 def test_simulator_is_never_taken_unasked(machine):
