@@ -98,14 +98,7 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
     cell_t cell;
     make_cell(&cell, i, points, box_lower, box_upper, starts, neighbours);
     const int base = corner_starts[i];
-    /* A cell may be as thin as its nearest neighbour is near. */
-    REAL near2 = cell.reach2;
-    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
-        const REAL4 plane = cell.planes[f];
-        if (cell.labels[f] >= 0)
-            near2 = fmin(near2, plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2);
-    }
-    const REAL least = 4 * noise_length(sqrt(near2));
+    const REAL least = 4 * noise_length(sqrt(cell.reach2));
     INDEX joined[VERTEX_CAPACITY];
     for (int v = 0; v < cell.n; ++v) {
         corners[3 * (base + v)] = X(&cell)[v];
@@ -146,8 +139,8 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
     }
 }
 
-/* Per generator i: twins[k], the same face in the neighbour's row (k for a wall), and partners[t] of its turns: the turn of
-   the twin whose corner lies nearest. */
+/* Per generator i: twins[k], the same face in the neighbour's row (k for a wall), and partners[t] of its turns: the corner
+   of the twin that lies nearest. */
 kernel void match_corners(const int size, global const REAL *points, global const int *starts,
                           global const int *neighbours, global const REAL *corners, global const int *turn_starts,
                           global const int *turns, global int *twins, global int *partners)
@@ -168,7 +161,7 @@ kernel void match_corners(const int size, global const REAL *points, global cons
         twins[k] = twin;
         for (int t = turn_starts[k]; t < turn_starts[k + 1]; ++t) {
             const int u = turns[t];
-            int nearest = t;
+            int nearest = u;
             REAL least = REAL_MAX, widest = 0;
             for (int s = turn_starts[twin]; s < turn_starts[twin + 1] && twin != k; ++s) {
                 const int w = turns[s];
@@ -180,13 +173,13 @@ kernel void match_corners(const int size, global const REAL *points, global cons
                 widest = fmax(widest, r2);
                 if (r2 < least) {
                     least = r2;
-                    nearest = s;
+                    nearest = w;
                 }
             }
             /* A corner that only one of the cells sees, where others meet in the middle of an edge, has no partner. */
             const REAL d2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
             const REAL noise = 64 * REAL_EPS + sqrt(REAL_EPS * d2);
-            partners[t] = least < fmax(R(1e-6) * widest, noise * noise) ? nearest : t;
+            partners[t] = least < fmax(R(1e-6) * widest, noise * noise) ? nearest : u;
         }
     }
 }
@@ -217,13 +210,12 @@ kernel void spread_in_cells(const int size, global const int *same, global const
     }
 }
 
-/* Per turn t: the same across the face, for corners that are nearest to each other. The least label of all is where this ends, in whatever order. */
+/* Per turn t: the same across the face. The least label of all is where this ends, in whatever order. */
 kernel void spread_over_faces(const int size, global const int *turns, global const int *partners,
                               global const int *old, global int *new, global int *changed)
 {
     WORK_ITEM(t);
-    const int other = partners[t];
-    if (other > t && partners[other] == t && join(old, new, turns[t], turns[other]))
+    if (join(old, new, turns[t], partners[t]))
         changed[0] = 1;
 }
 
