@@ -25,7 +25,9 @@ def check_points(points: object, domain: Box) -> np.ndarray:
     try:
         array = np.asarray(points)
     except ValueError as error:
-        raise InputError(f"points is no array ({error}), expected shape (n, {domain.dim})") from error
+        raise InputError(
+            f"points is no array ({error}), expected shape (n, {domain.dim})"
+        ) from error
     if array.dtype.kind not in "fiu":
         raise InputTypeError(
             f"points has dtype {array.dtype}, expected real numbers; convert with points.astype(float)"

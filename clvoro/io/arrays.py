@@ -142,7 +142,9 @@ def read_array(path: Path, member: str = "points") -> np.ndarray:
 def _read(stream: IO[bytes], name: str, size: int) -> np.ndarray:
     try:
         shape, fortran, dtype = _read_header(stream)
-    except Exception as error:  # NumPy reads it with Python's own parser, which has many ways to complain
+    except (
+        Exception
+    ) as error:  # NumPy reads it with Python's own parser, which has many ways to complain
         raise FileError(f"{name} is no array ({error!s:.200})") from error
     if dtype.hasobject:
         raise FileError(
