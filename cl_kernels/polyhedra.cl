@@ -5,6 +5,7 @@
 #define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
 #define FLAG_COINCIDE 2  /* two generators at the same place; report[1] is the smallest index of one */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision; report[1] likewise */
+#define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be matched with their neighbours */
 
 #define UNFINISHED INT_MIN /* count of a cell that was full: to be clipped again with more room */
 
@@ -252,15 +253,15 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
 
-   row_places, row_counts (n,)   where in the arrays of faces the cell's are, and how many, negative if rounding leaves a
-                                 doubt; cells come in no particular order, the next kernels bring them into it
+   row_places, row_counts (n,)   where in the arrays of faces the cell's are, and how many; cells come in no particular
+                                 order, the next kernels bring them into it
    labels, measures, centroids   of the faces; report[2] counts them
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
 kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
                        global const int *old_starts, global const int *old_neighbours, const int again,
-                       const int room, global int *row_places, global int *row_counts, global int *labels,
+                       const int room, const REAL share, global int *row_places, global int *row_counts, global int *labels,
                        global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
                        global REAL *covariances, global int *report)
 {
@@ -305,7 +306,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     const REAL near2 = sqrt(REAL_EPS) * cell.reach2;
     int count = 0;
     bool doubtful = false;
-    REAL volume = 0;
+    REAL volume = 0, lost = 0;
     REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
     for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
         const REAL4 plane = cell.planes[f];
@@ -344,8 +345,11 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
                 const REAL4 e = vertex_at(&cell, v) - a;
                 width2 = fmax(width2, dot3(e, e));
             }
-            if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2)))
+            if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2))) {
+                lost += fabs(normal.s3 * area);
+                doubtful |= label >= 0;
                 continue;
+            }
             doubtful |= label >= 0;
         }
         doubtful |= across2 < near2;
@@ -360,8 +364,11 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         ++count;
     }
     row_places[i] = place;
-    row_counts[i] = doubtful ? -count : count;
-    if (count < 4 || !(volume > 0))
+    row_counts[i] = count;
+    if (doubtful)
+        atomic_or(report, FLAG_DOUBT);
+    /* In a box as thin as rounding all faces are below it. */
+    if (count < 4 || !(volume > 0 && lost <= share * volume))
         raise_flag(report, FLAG_COLLAPSED, i);
     const REAL inverse = 1 / volume;
     first *= inverse / 4;
@@ -379,8 +386,8 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     covariances[6 * i + 5] = square.s2;
 }
 
-/* Per generator i: kept[k] of each of its faces, and the number kept. Rounding may let one of two cells, which is then
-   doubtful, see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
+/* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, rounding may let one
+   of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
    If it is wider than rounding explains, generators are too close to tell apart (from far away, two an ulp apart have
    the same bisector), and that is flagged. So it is where both see a face, but of areas that differ by more than a share
    of the cell. */
@@ -390,10 +397,9 @@ kernel void match_faces(const int size, global const int *row_places, global con
                         global int *report)
 {
     WORK_ITEM(i);
-    const int n = abs(row_counts[i]);
-    const bool doubtful = row_counts[i] < 0;
+    const int n = row_counts[i];
     counts[i] = n;
-    if (!doubtful)
+    if ((*report & FLAG_DOUBT) == 0)
         return;
     int count = 0;
     REAL apart = 0; /* the volume of the cones to what faces differ by */
@@ -401,7 +407,7 @@ kernel void match_faces(const int size, global const int *row_places, global con
         const int j = labels[k];
         bool mutual = j < 0;
         if (!mutual) {
-            const int m = abs(row_counts[j]);
+            const int m = row_counts[j];
             global const int *row = labels + row_places[j];
             int q = 0;
             while (q < m && row[q] != i)
@@ -424,20 +430,19 @@ kernel void match_faces(const int size, global const int *row_places, global con
         raise_flag(report, FLAG_COLLAPSED, i);
 }
 
-/* Per generator i: its faces, those kept, as row i of the graph.
+/* Per generator i: its faces, those kept, as row i of the graph; all if there is no doubt.
 
    neighbours, face_measures (m,), face_centroids (m, 3)  areas, and centroids relative to x_i */
 kernel void place_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *centroids,
-                        global const uchar *kept, global const int *starts, global int *neighbours,
+                        global const uchar *kept, const int doubt, global const int *starts, global int *neighbours,
                         global REAL *face_measures, global REAL *face_centroids)
 {
     WORK_ITEM(i);
-    const int n = abs(row_counts[i]), from = row_places[i];
-    const bool doubtful = row_counts[i] < 0;
+    const int n = row_counts[i], from = row_places[i];
     int to = starts[i];
     for (int k = from; k < from + n; ++k) {
-        if (doubtful && !kept[k])
+        if (doubt && !kept[k])
             continue;
         neighbours[to] = labels[k];
         face_measures[to] = measures[k];

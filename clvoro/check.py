@@ -329,6 +329,7 @@ def _check_faces(check: _Check, g: Rebuilt, slack: float, doubts: Doubts) -> Non
     )  # fmt: skip
     level = np.array([d.domain.lower, d.domain.upper])[upper, axis]
     height = np.abs(g.middles[walls, axis] + d.points[g.owner[walls], axis] - level)
+    height[g.measures[walls] == 0] = 0  # no polygon, no place
     check.note(
         "walls", np.maximum(height - slack, 0),
         lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",

@@ -10,7 +10,7 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .bins import MAX_LEVELS, BinnedPoints
-from .cells import COINCIDE, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
+from .cells import COINCIDE, DOUBT, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import ClvoroError, InputError, MemoryLimitError
 
@@ -126,19 +126,20 @@ class Polyhedra:
             else (self._row_counts, self._row_counts)
         )
         capacity, again = FACE_CAPACITY, False
+        share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
         while True:
             engine.run_each(
                 self._kernels(capacity).clip_cells, n, binned.points, binned.items, binned.reach,
                 binned.bins, binned.grid_frames, binned.grid_shapes, points, lower, upper,
-                np.int32(warm), *old, np.int32(again), np.int32(self._room), self._row_places,
+                np.int32(warm), *old, np.int32(again), np.int32(self._room), share, self._row_places,
                 self._row_counts, self._labels, self._measures, self._centroids,
                 arrays["volumes"], arrays["offsets"], arrays["covariances"], self._report,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
             flags, generator, m = (int(v) for v in self._report.get())
-            if flags & ~FULL:
+            if flags & ~(FULL | DOUBT):
                 self._refuse(flags, generator)
             if m > self._room:
                 # All anew: what did not fit was not kept.
@@ -154,23 +155,22 @@ class Polyhedra:
                         "many generators on a common sphere are not supported: remove or perturb "
                         "some"
                     )
-                self._report.set(np.array([0, 2**31 - 1, m], np.int32))
+                self._report.set(np.array([flags & DOUBT, 2**31 - 1, m], np.int32))
             else:
                 break
         arrays = self._set(n, m)
         engine.run_each(
             k.match_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
-            arrays["volumes"], points, engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE),
-            self._kept, arrays["starts"], self._report,
+            arrays["volumes"], points, share, self._kept, arrays["starts"], self._report,
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
-        if flags:
+        if flags & ~DOUBT:
             self._refuse(flags, generator)
         self._scan.exclusive(arrays["starts"], arrays["starts"], n)
         engine.run_each(
             k.place_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
-            self._centroids, self._kept, arrays["starts"], arrays["neighbours"],
-            arrays["face_measures"], arrays["face_centroids"],
+            self._centroids, self._kept, np.int32(flags & DOUBT), arrays["starts"],
+            arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
         )  # fmt: skip
         # Only now: a call that was broken off leaves the previous diagram as it is.
         self._turn = 1 - self._turn

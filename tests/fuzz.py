@@ -227,16 +227,42 @@ def try_solid(rng: np.random.Generator) -> str:
     return "mesh"
 
 
-def try_run(rng: np.random.Generator) -> str:
-    box = some_box(rng)
+def some_size_3d(rng: np.random.Generator, box: clvoro.Box):
+    """A size field of up to a hundred cells or so; sometimes an absurd one."""
+    with np.errstate(all="ignore"):
+        h = (box.measure / 10 ** rng.uniform(0, 2)) ** (1 / 3)
+    length, low = box.extent.max(), np.array(box.lower)
+    kind = rng.integers(0, 6)
+    if kind == 0:
+        where = rng.uniform(box.lower, box.upper)
+        sphere = sizing.Circle(where, 0.2 * length)
+        return sizing.Distance([sphere], h / 1.5, slope=rng.uniform(0.05, 2))
+    if kind == 1:
+        values = h * 10 ** rng.uniform(-0.2, 0.3, rng.integers(1, 6, 3))
+        return sizing.Raster(values, low, np.array(box.upper), at=rng.choice(["nodes", "centres"]))
+    if kind == 2:
+        return sizing.Expression(f"{h!r} * (1 + {rng.uniform(0, 0.5)!r}*sin({9 / length!r}*(x+z)))")
+    if kind == 3:
+        return lambda x: h * (1 + rng.uniform(0, 1) * (x[:, 2] > x[:, 2].mean()))
+    if kind == 4 and rng.random() < 0.5:
+        return ABSURD[rng.integers(len(ABSURD))]
+    return h
+
+
+def try_solid_run(rng: np.random.Generator) -> str:
+    return try_run(rng, 3)
+
+
+def try_run(rng: np.random.Generator, dim: int = 2) -> str:
+    box = some_box(rng, dim)
     options = {
         "method": rng.choice(["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted", "nonsense"],
                              p=[0.3, 0.15, 0.15, 0.1, 0.1, 0.18, 0.02]),
-        "max_steps": int(rng.integers(0, 15)), "effort": rng.choice(["fast", "default"]),
+        "max_steps": int(rng.integers(0, 15 if dim == 2 else 6)), "effort": rng.choice(["fast", "default"]),
         "seed": int(rng.integers(0, 2**31)), "start": rng.choice(["density", "uniform"]),
     }  # fmt: skip
     optional = {
-        "n_cells": lambda: int(rng.choice([1, 2, 3, 17, 400, 10**9, -1])),
+        "n_cells": lambda: int(rng.choice([1, 2, 3, 17, 400 if dim == 2 else 40, 10**9, -1])),
         "k": lambda: rng.choice([1e-9, 0.1, 1.0, 100.0, -1.0, np.nan]),
         "alpha": lambda: rng.choice([1e-9, 1.0, 100.0]),
         "tol": lambda: rng.choice([0.0, 0.5, 1e9]),
@@ -245,7 +271,7 @@ def try_run(rng: np.random.Generator) -> str:
         "points": lambda: placed(rng, box),
     }
     options |= {name: make() for name, make in optional.items() if rng.random() < 0.2}
-    size = some_size(rng, box)
+    size = some_size(rng, box) if dim == 2 else some_size_3d(rng, box)
     result = adapter(rng.choice(["float64", "float64", "float32"])).run(box, size, **options)
     demand(result.check())
     if rng.random() < 0.1:
@@ -338,6 +364,7 @@ WORK = {
     "run": (try_run, 0.18),
     "file": (try_file, 0.2),
     "solid": (try_solid, 0.0),
+    "solid-run": (try_solid_run, 0.0),
 }
 
 
@@ -355,7 +382,7 @@ def attempt(seed: int, only: str | None = None) -> tuple[str, str]:
     except clvoro.ClvoroError:
         return kind, "refused"
     except ZeroDivisionError:
-        if kind == "run":  # a callable's own error is the caller's to see
+        if kind.endswith("run"):  # a callable's own error is the caller's to see
             return kind, "refused"
         raise
 
