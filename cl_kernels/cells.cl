@@ -185,7 +185,7 @@ kernel void match_faces(const int size, global const int *places, global const i
         counts[i] = n;
         return;
     }
-    const bool some = *flags & FLAG_DOUBT;
+    const bool some = flags[2]; /* which the kernels before have written: no race with other work-items here */
     uint word = 0;
     int count = 0;
     for (int k = 0; k < n; ++k) {

@@ -393,13 +393,13 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
    of the cell. */
 kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *volumes,
-                        global const REAL *points, const REAL share, global uchar *kept, global int *counts,
-                        global int *report)
+                        global const REAL *points, const REAL share, const int some_doubtful, global uchar *kept,
+                        global int *counts, global int *report)
 {
     WORK_ITEM(i);
     const int n = row_counts[i];
     counts[i] = n;
-    if ((*report & FLAG_DOUBT) == 0)
+    if (!some_doubtful)
         return;
     int count = 0;
     REAL apart = 0; /* the volume of the cones to what faces differ by */

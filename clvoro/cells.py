@@ -20,11 +20,8 @@ ROW_CAPACITY = 20
 LARGEST_ROW = 512
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
-FULL, COINCIDE, DOUBT = (
-    1,
-    2,
-    8,
-)  # of the bits in common/face_rows.h; the other means cells that collapsed
+# FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
+FULL, COINCIDE, DOUBT = 1, 2, 8
 
 
 @dataclass(frozen=True)
@@ -72,8 +69,8 @@ class FaceRows:
         Bits of the faces that both cells see.
     places : (n,) int32
         Slot of each row, or -1 if it is as before.
-    flags : (2,) int32
-        What went wrong, and the first generator concerned.
+    flags : (3,) int32
+        What went wrong, the first generator concerned, and whether any cell is doubtful.
     """
 
     slots: cla.Array
@@ -97,7 +94,7 @@ class Cells:
         self._n = 0
         none = engine.empty(1, np.int32)
         self.rows = FaceRows(
-            none, none, engine.empty(1, np.uint32), none, engine.empty(2, np.int32)
+            none, none, engine.empty(1, np.uint32), none, engine.empty(3, np.int32)
         )
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
@@ -205,7 +202,12 @@ class Cells:
 
     def clear_flags(self) -> None:
         """Nothing has gone wrong yet."""
-        self.rows.flags.set(np.array([0, 2**31 - 1], np.int32))
+        self.rows.flags.set(np.array([0, 2**31 - 1, 0], np.int32))
+
+    def _flags(self) -> tuple[int, int]:
+        """Read what has gone wrong, with `DOUBT` where any cell is doubtful, and the first generator concerned."""
+        wrong, generator, doubtful = (int(v) for v in self.rows.flags.get())
+        return wrong | (DOUBT if doubtful else 0), generator
 
     def _match(
         self,
@@ -223,8 +225,7 @@ class Cells:
             points, *box.device_corners(self.engine.real), np.int32(starts is not rows.places),
             self._share(exact), rows.keep, counts, rows.flags,
         )  # fmt: skip
-        flags, generator = rows.flags.get()
-        return int(flags), int(generator)
+        return self._flags()
 
     def _measure(
         self, box: Box, points: cla.Array, n: int, starts: cla.Array, neighbours: cla.Array
@@ -250,8 +251,7 @@ class Cells:
             t.volumes, t.points, *box.device_corners(self.engine.real),
             self._share(exact), rows.flags,
         )  # fmt: skip
-        flags, generator = rows.flags.get()
-        return int(flags), int(generator)
+        return self._flags()
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)

@@ -161,7 +161,7 @@ class Polyhedra:
         arrays = self._set(n, m)
         engine.run_each(
             k.match_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
-            arrays["volumes"], points, share, self._kept, arrays["starts"], self._report,
+            arrays["volumes"], points, share, np.int32(flags & DOUBT), self._kept, arrays["starts"], self._report,
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
         if flags & ~DOUBT:

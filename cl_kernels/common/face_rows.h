@@ -6,11 +6,10 @@
 #error "build with -DROW_CAPACITY=faces that a cell may have in the end"
 #endif
 
-/* Bits of the word in which kernels report what went wrong. */
+/* Bits of flags[0], in which kernels report what went wrong; flags[2] is not 0 where there are doubtful cells. */
 #define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY */
 #define FLAG_COINCIDE 2  /* two generators at the same place; flags[1] is the smallest index of one */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
-#define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be checked in the end */
 
 inline void raise_flag(global int *flags, int flag, int generator)
 {
@@ -77,6 +76,6 @@ inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL 
     for (int k = 0; k < n; ++k)
         slots[place * ROW_CAPACITY + k] = cell->faces[first + k < n ? first + k : first + k - n];
     counts[place] = doubtful ? -n : n;
-    if (doubtful && (*flags & FLAG_DOUBT) == 0)
-        atomic_or(flags, FLAG_DOUBT);
+    if (doubtful)
+        atomic_or(flags + 2, 1);
 }
