@@ -1,6 +1,6 @@
 """Small work for every kernel, to be run on the simulator Oclgrind: `python -m tests.oclgrind_work NAME [OPTION ...]`.
 
-Prints one JSON object: which kernels have run, and how often. `tests/test_oclgrind.py` starts it and
+Prints one JSON object: which kernels have run ("file.kernel"), and how often. `tests/test_oclgrind.py` starts it and
 reads the simulator's log. Options: `float32`; `groups`, the work-groups of a GPU (of 16 here, with
 local memory and barriers) in the place of a CPU's groups of one.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import collections
 import json
+import re
 import sys
 from collections.abc import Callable
 
@@ -17,10 +18,13 @@ import pyopencl as cl
 
 import clvoro
 from clvoro import _program
-from clvoro.sizing import Circle, Distance, Expression, Polygon, Raster, minimum
+from clvoro.mesh import Stages
+from clvoro.sizing import Circle, Distance, Expression, Graded, Polygon, Raster, minimum
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 GRADED = "0.12 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)"
+SOLID = "0.3 + 0.2*x"
 
 
 def points(n: int, dim: int = 2, seed: int = 733) -> np.ndarray:
@@ -30,30 +34,69 @@ def points(n: int, dim: int = 2, seed: int = 733) -> np.ndarray:
 def diagrams(adapter: clvoro.Adapter) -> None:
     """Sets that need every branch: few, lattice, cluster (bins in bins), cocircular (rows enlarged)."""
     square = clvoro.Box((0, 0), (1, 1))
-    lattice = np.stack(np.meshgrid(*[np.arange(5) / 4] * 2), axis=-1).reshape(-1, 2)
+    to_the_walls = np.stack(np.meshgrid(*[np.arange(5) / 4] * 2), axis=-1).reshape(-1, 2)
     cluster = np.concatenate([points(15), 0.3 + 1e-4 * points(60)])
     angle = np.linspace(0, 2 * np.pi, 29)[:-1]
     ring = 0.5 + 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    for each in (points(1), points(2), lattice, cluster, np.vstack([ring, [[0.5, 0.5]]])):
+    for each in (
+        points(1),
+        points(2),
+        to_the_walls,
+        lattice(4, 2),
+        cluster,
+        np.vstack([ring, [[0.5, 0.5]]]),
+    ):
         diagram = adapter.diagram(square, each)
         assert abs(diagram.volumes.sum() - 1) < 1e-4
         assert len(diagram.vertices) > 3
 
 
+def lattice(side: int, dim: int) -> np.ndarray:
+    line = (np.arange(side) + 0.5) / side
+    return np.stack(np.meshgrid(*[line] * dim), axis=-1).reshape(-1, dim)
+
+
 def solid(adapter: clvoro.Adapter) -> None:
-    """A diagram in three dimensions."""
-    diagram = adapter.diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), points(20, 3))
-    assert abs(diagram.volumes.sum() - 1) < 1e-4
-    assert len(diagram.vertices) > 3
+    """Three dimensions: the same kinds of sets, and a lattice off by so little that loops must be mended."""
+    noise = np.random.default_rng(0).standard_normal((8, 3))
+    near = lattice(2, 3) + (1e-14 if adapter.dtype == np.float64 else 3e-6) * noise
+    cluster = np.concatenate([points(6, 3), 0.3 + 1e-2 * points(12, 3)])
+    ball = points(40, 3) - 0.5
+    ball *= 0.4 / np.linalg.norm(ball, axis=1)[:, None]
+    few = points(1, 3), points(2, 3), points(20, 3)
+    for each in (*few, lattice(3, 3), near, cluster, np.vstack([0.5 + ball, [[0.5] * 3]])):
+        diagram = adapter.diagram(CUBE, each)
+        assert abs(diagram.volumes.sum() - 1) < 1e-4
+        assert len(diagram.vertices) > 3
 
 
-def method(name: str, **options: object) -> Callable[[clvoro.Adapter], None]:
+def method(
+    name: str, box: clvoro.Box = BOX, size: str = GRADED, **options: object
+) -> Callable[[clvoro.Adapter], None]:
     def work(adapter: clvoro.Adapter) -> None:
-        size = Expression(GRADED)
-        result = adapter.run(BOX, size, method=name, seed=911, **options)
+        result = adapter.run(box, Expression(size), method=name, seed=911, **options)
         assert np.isfinite(result.error).all()
+        result.diagram.vertices  # noqa: B018
 
     return work
+
+
+def gradation(adapter: clvoro.Adapter) -> None:
+    """Size fields that are limited in growth, over several tiles."""
+    for dim, counts in ((2, (40, 37)), (3, (12, 11, 13))):
+        values = 0.1 + points(int(np.prod(counts)), 1).reshape(counts[::-1])
+        box = clvoro.Box((0,) * dim, (1,) * dim)
+        raster = Raster(values, box.lower, box.upper)
+        size = Graded(raster, growth=1.2, resolution=counts)
+        adapter.run(box, size, points=points(9, dim), method="weighted", max_steps=1)
+
+
+def copy(adapter: clvoro.Adapter) -> None:
+    """What a profile measures the bandwidth by, on little memory."""
+    source, target = (stages_of(adapter).engine.zeros(256, np.uint8) for _ in range(2))
+    kernel = _program.build_program(adapter.ctx, "copy.cl", {}, "").all_kernels()[0]
+    kernel.set_args(source.data, target.data)
+    cl.enqueue_nd_range_kernel(adapter.queue, kernel, (16,), (16,))
 
 
 def fields(adapter: clvoro.Adapter) -> None:
@@ -75,9 +118,10 @@ def multigrid(adapter: clvoro.Adapter) -> None:
     from clvoro.poisson import Poisson
 
     n = 400
-    adapter.diagram(BOX, points(n))
-    engine = adapter._stages[2].engine
-    t = _tessellate(adapter, n)
+    stages = stages_of(adapter)
+    engine, (origin, scale) = stages.engine, BOX.frame
+    on_device = engine.upload((points(n) - origin) / scale)
+    t = stages.cells.tessellate(BOX, on_device, n, stages.bins.build(BOX, on_device, n))
     stage = Poisson(engine)
     laplacian = stage.assemble(t.starts, t.neighbours, t.face_measures, t.points)
     rhs = engine.upload(points(n)[:, 0])
@@ -90,10 +134,8 @@ def multigrid(adapter: clvoro.Adapter) -> None:
         stage.apply(laplacian, potential, rhs)
 
 
-def _tessellate(adapter: clvoro.Adapter, n: int):
-    stages, (origin, scale) = adapter._stages[2], BOX.frame
-    on_device = stages.engine.upload((points(n) - origin) / scale)
-    return stages.cells.tessellate(BOX, on_device, n, stages.bins.build(BOX, on_device, n))
+def stages_of(adapter: clvoro.Adapter) -> Stages:
+    return Stages(_program.Engine(adapter.ctx, adapter.queue, 2, np.dtype(adapter.dtype)))
 
 
 def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
@@ -142,12 +184,16 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "fields": fields,
     "multigrid": multigrid,
     "transfer": transfer,
+    "gradation": gradation,
+    "copy": copy,
     "coupled": method("coupled", max_steps=2),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
     "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
     "best": method("adaptive", levels=0, n_cells=320, effort="best", max_steps=31),
     "exact": method("exact", levels=0, effort="fast", max_steps=75),
+    "solid-run": method("exact", CUBE, SOLID, effort="fast", max_steps=14),
+    "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **{f"broken-{k}": broken(k) for k in ("bounds", "race", "local_race", "barrier_", "private")},
 }
 
@@ -158,7 +204,11 @@ def main(name: str, *options: str) -> None:
     original = cl.enqueue_nd_range_kernel
 
     def counted(queue, kernel, *rest, **more):
-        counts[kernel.function_name] += 1
+        # Kernels of several files share names.
+        file = re.search(
+            r'^#line 1 "(\w+)\.cl"', kernel.program.get_info(cl.program_info.SOURCE), re.MULTILINE
+        )
+        counts[f"{file[1]}.{kernel.function_name}" if file else kernel.function_name] += 1
         return original(queue, kernel, *rest, **more)
 
     cl.enqueue_nd_range_kernel = counted

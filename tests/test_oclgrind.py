@@ -82,7 +82,7 @@ def test_nothing_is_found(name, variant):
 
 def test_every_kernel_has_run():
     kernels = {
-        name
+        f"{path.stem}.{name}"
         for path in kernel_folder().glob("*.cl")
         for name in re.findall(r"^kernel void (\w+)\(", path.read_text(), re.MULTILINE)
     }
