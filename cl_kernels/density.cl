@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/domain.h"
 
 /* The size field as a density of generators, rho = h^-d, and what follows from it. */
 
@@ -51,7 +51,7 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
             continue;
         REAL d[DIM], d2 = 0;
         EACH_AXIS(a) {
-            d[a] = points[DIM * j + a] - points[DIM * i + a];
+            d[a] = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
             d2 += d[a] * d[a];
         }
         const REAL rise = log_h[j] - log_h[i];

@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/domain.h"
 
 /* Per generator i: u = -grad phi (the paper's 3.3). The solver's potential is psi = -phi, from -div grad psi = e, so that
    u = grad psi, with
@@ -17,7 +17,7 @@ kernel void follow_potential(const int size, global const int *starts, global co
             continue;
         REAL d2 = 0;
         EACH_AXIS(a) {
-            const REAL d = points[DIM * j + a] - points[DIM * i + a];
+            const REAL d = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
             d2 += d * d;
         }
         const REAL flux = face_measures[k] / sqrt(d2) * (psi[j] - psi[i]);
@@ -56,16 +56,14 @@ kernel void measure_displacement(const int size, global const REAL *u, global co
     speed[i] = sqrt(u2) / h[i];
 }
 
-/* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the box: what
-   would leave is reflected, so that no two generators meet on a wall. velocity is the displacement that came of it. */
+/* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the
+   domain. velocity is the displacement that came of it. */
 kernel void move_generators(const int size, global const REAL *lloyd, const REAL a, global const REAL *correction, const REAL b,
-                            global const REAL *h, const REAL clip, const REAL4 box_lower, const REAL4 box_upper,
-                            global REAL *points, global REAL *velocity)
+                            global const REAL *h, const REAL clip, DOMAIN_ARGS, global REAL *points,
+                            global REAL *velocity)
 {
     WORK_ITEM(i);
-    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
-    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
-    REAL d[DIM];
+    REAL d[DIM], x[DIM], y[DIM];
     REAL d2 = 0;
     EACH_AXIS(c) {
         d[c] = a * lloyd[DIM * i + c] + b * correction[DIM * i + c];
@@ -74,15 +72,13 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
     const REAL longest = clip * h[i];
     const REAL scale = clip > 0 && d2 > longest * longest ? longest / sqrt(d2) : 1;
     EACH_AXIS(c) {
-        const REAL x = points[DIM * i + c];
-        REAL y = x + scale * d[c];
-        if (y < lower[c])
-            y = 2 * lower[c] - y;
-        if (y > upper[c])
-            y = 2 * upper[c] - y;
-        y = clamp(y, lower[c], upper[c]);
-        points[DIM * i + c] = y;
-        velocity[DIM * i + c] = y - x;
+        x[c] = points[DIM * i + c];
+        y[c] = x[c] + scale * d[c];
+    }
+    reflect_inside(x, y, DOMAIN);
+    EACH_AXIS(c) {
+        points[DIM * i + c] = y[c];
+        velocity[DIM * i + c] = DIFFERENCE(c, x[c], y[c]);
     }
 }
 

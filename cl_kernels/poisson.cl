@@ -3,7 +3,7 @@
        (A phi)_i = sum_j w_ij (phi_i - phi_j)        w_ij = rho_ij l_ij / |x_i - x_j|
 
    One work-item per cell in `assemble`, a block of cells per group elsewhere. */
-#include "common/real.h"
+#include "common/domain.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
 #include "common/rows.h"
@@ -51,7 +51,7 @@ kernel void assemble(
             const REAL other = measured_by(j, i, last, starts, neighbours, face_measures);
             REAL square = 0;
             EACH_AXIS(a) {
-                const REAL d = points[i * DIM + a] - points[j * DIM + a];
+                const REAL d = DIFFERENCE(a, points[i * DIM + a], points[j * DIM + a]);
                 square += d * d;
             }
             if (other >= 0) {

@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/domain.h"
 
 /* Insertion and deletion of generators: the paper's 2.3.1, where the lattice (in 2D) and the count ask for it.
 
@@ -22,6 +22,11 @@ inline ulong site_key(REAL magnitude, int i)
 }
 
 #if DIM == 2
+inline REAL2 difference(global const REAL *points, int from, int to)
+{
+    return (REAL2)(DIFFERENCE(0, points[2 * from], points[2 * to]), DIFFERENCE(1, points[2 * from + 1], points[2 * to + 1]));
+}
+
 #define LATTICE_2 R(1.1547005383792515) /* (neighbour distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
 
 /* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5 at
@@ -40,8 +45,8 @@ kernel void measure_strain(const int size, global const int *starts, global cons
             ++walls;
             continue;
         }
-        const REAL dx = points[2 * j] - points[2 * i], dy = points[2 * j + 1] - points[2 * i + 1];
-        s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(dx * dx, dx * dy, dy * dy, 0);
+        const REAL2 d = difference(points, i, j);
+        s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(d.s0 * d.s0, d.s0 * d.s1, d.s1 * d.s1, 0);
     }
     kinds[i] = (int2)(n - (6 - min(walls, 2)), walls);
     s /= max(n - walls, 1);
@@ -89,7 +94,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
             const bool one_wall = (kind.s1 > 0) != (kinds[j].s1 > 0);
             if ((kind.s1 > 0 && kinds[j].s1 > 0) || (one_wall && !at_walls))
                 continue;
-            const REAL2 d = (REAL2)(points[2 * j] - points[2 * i], points[2 * j + 1] - points[2 * i + 1]);
+            const REAL2 d = difference(points, i, j);
             const REAL4 s = (strain[i] + strain[j]) / 2;
             const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
@@ -199,11 +204,6 @@ kernel void tally_pairs(const int size, global const ulong *chosen, global const
         if (change)
             atomic_add(tally + m, change);
     }
-}
-
-inline REAL2 difference(global const REAL *points, int from, int to)
-{
-    return (REAL2)(points[2 * to] - points[2 * from], points[2 * to + 1] - points[2 * from + 1]);
 }
 
 /* Per chosen pair: split it at its cell of charge +1, into two generators across the pair, or delete that of charge -1.
@@ -342,22 +342,28 @@ kernel void mark_excess(const int size, global const ulong *chosen, const REAL s
 /* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
    generators go behind all kept rows, with new labels. */
 kernel void apply_changes(const int size, global const int *place, global const int *birth_place,
-                          const int next_label, const REAL4 box_lower, const REAL4 box_upper,
+                          const int next_label, DOMAIN_ARGS,
                           global const REAL *points, global const int *labels, global const REAL *velocity,
                           global const ulong *signatures, global const REAL *ever, global const REAL *shifts,
                           global const REAL *births, global REAL *new_points, global int *new_labels,
                           global REAL *new_velocity, global ulong *new_signatures, global REAL *new_ever)
 {
     WORK_ITEM(i);
-    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
-    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
+    REAL x[DIM], y[DIM];
+    EACH_AXIS(a)
+        x[a] = points[DIM * i + a];
     if (place[i + 1] > place[i]) {
         const int p = place[i];
         bool moved = false;
-        for (int a = 0; a < DIM; ++a)
-            moved |= shifts[DIM * i + a] != 0;
-        for (int a = 0; a < DIM; ++a) {
-            new_points[DIM * p + a] = clamp(points[DIM * i + a] + shifts[DIM * i + a], lower[a], upper[a]);
+        EACH_AXIS(a) {
+            const REAL shift = shifts[DIM * i + a];
+            moved |= shift != 0;
+            y[a] = x[a] + shift;
+        }
+        if (moved)
+            keep_inside(x, y, DOMAIN);
+        EACH_AXIS(a) {
+            new_points[DIM * p + a] = y[a];
             new_velocity[DIM * p + a] = moved ? 0 : velocity[DIM * i + a];
         }
         new_labels[p] = labels[i];
@@ -366,8 +372,11 @@ kernel void apply_changes(const int size, global const int *place, global const 
     }
     if (birth_place[i + 1] > birth_place[i]) {
         const int q = place[size] + birth_place[i];
-        for (int a = 0; a < DIM; ++a) {
-            new_points[DIM * q + a] = clamp(points[DIM * i + a] + births[DIM * i + a], lower[a], upper[a]);
+        EACH_AXIS(a)
+            y[a] = x[a] + births[DIM * i + a];
+        keep_inside(x, y, DOMAIN);
+        EACH_AXIS(a) {
+            new_points[DIM * q + a] = y[a];
             new_velocity[DIM * q + a] = 0;
         }
         new_labels[q] = next_label + birth_place[i];

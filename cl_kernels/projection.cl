@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/domain.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
 
@@ -82,7 +82,7 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
             float d[DIM], d2 = 0, square = 0;
             EACH_AXIS(a)
             {
-                d[a] = (points[DIM * j + a] - x[a]) * unit;
+                d[a] = DIFFERENCE(a, x[a], points[DIM * j + a]) * unit;
                 d2 += d[a] * d[a];
             }
             const float w = (float)(face_measures[k] * (DIM == 2 ? unit : unit * unit)) / sqrt(d2);

@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/domain.h"
 
 /* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular lattice
    over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbour, so that cells
@@ -28,11 +28,10 @@ kernel void count_children(const int size, global const int *starts, global cons
    the counts; h is the size on the new level. */
 kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                            global const REAL *volumes, global const REAL *points, global const REAL *h, const int n,
-                           const REAL4 box_lower, const REAL4 box_upper, global const int *firsts, global REAL *finer)
+                           DOMAIN_ARGS, global const int *firsts, global REAL *finer)
 {
     WORK_ITEM(i);
-    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};
-    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3};
+    BOX_CORNERS(lower, upper);
     for (int a = 0; a < DIM; ++a)
         finer[DIM * i + a] = points[DIM * i + a];
     global REAL *child = finer + DIM * (n + firsts[i]);
@@ -49,7 +48,7 @@ kernel void place_children(const int size, global const int *starts, global cons
             child[axis] = level + (wall % 2 ? -way : way);
         } else if (has_middle(i, j, face_measures[k], volumes[i])) {
             for (int a = 0; a < DIM; ++a)
-                child[a] = (points[DIM * i + a] + points[DIM * j + a]) / 2;
+                child[a] = points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2;
         } else {
             continue;
         }

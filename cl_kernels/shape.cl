@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/domain.h"
 
 /* The gradient of cell quality by the generators, in 2D. By the paper's (4.1), up to a constant for each number of faces,
 
@@ -44,7 +44,7 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points, global c
     f.away = 0;
     f.inverse = f.tension = 0;
     if (label >= 0) {
-        f.away = (REAL2)(points[2 * label], points[2 * label + 1]) - x;
+        f.away = (REAL2)(DIFFERENCE(0, x.s0, points[2 * label]), DIFFERENCE(1, x.s1, points[2 * label + 1]));
         f.inverse = 1 / sqrt(dot(f.away, f.away));
         f.tangent = f.inverse * (REAL2)(-f.away.s1, f.away.s0);
         f.tension = tension[label];

@@ -90,12 +90,15 @@ class Engine:
     ctx, queue : pyopencl.Context, pyopencl.CommandQueue
     dim : 2 or 3
     real : numpy.dtype, float64 or float32
+    domain_defines : tuple of (name, value)
+        What kernels are built with for the kind of domain; see `Domain.defines` and common/domain.h.
     """
 
     ctx: cl.Context
     queue: cl.CommandQueue
     dim: int
     real: np.dtype
+    domain_defines: tuple[tuple[str, object], ...] = ()
     groups: int = field(init=False)
     """Number of work-groups that a block-wise kernel (scan, reduction) is cut into."""
     group_size: int = field(init=False)
@@ -120,7 +123,10 @@ class Engine:
         Each kernel knows its `stage`, for a profile.
         """
         real = "double" if self.real == np.float64 else "float"
-        full = {"DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size, **(defines or {})}
+        full = {
+            "DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size,
+            **dict(self.domain_defines), **(defines or {}),
+        }  # fmt: skip
         program = build_program(self.ctx, f"{stage}.cl", full, prelude)
         kernels = program.all_kernels()
         for kernel in kernels:

@@ -15,7 +15,7 @@ from . import device
 from ._arrays import check_integer, check_number, check_points, coincident_pair
 from ._program import Engine
 from .checkpoint import Checkpointer, Saved, describe
-from .domain import Box
+from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
 from .loop import Loop
@@ -25,6 +25,7 @@ from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_st
 from .results import Diagram, Result
 from .sizing import Sizing, as_field
 from .start import count_cells, sample_density, sample_uniform
+from .tessellator import Tessellator
 
 METHODS = ("adaptive", "exact", *PUBLISHED)
 STARTS = ("density", "uniform")
@@ -62,7 +63,7 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._stages: dict[int, Stages] = {}
+        self._stages: dict[tuple[object, ...], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
@@ -116,20 +117,21 @@ class Adapter:
 
         return both
 
-    def _stages_for(self, domain: Box) -> Stages:
-        if not isinstance(domain, Box):
+    def _stages_for(self, domain: Domain) -> Stages:
+        if not isinstance(domain, Domain):
             raise InputTypeError(f"domain is a {type(domain).__name__}, expected a clvoro.Box")
-        if domain.dim not in self._stages:
-            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype)
-            self._stages[domain.dim] = Stages(engine)
-        return self._stages[domain.dim]
+        kind = domain.dim, domain.defines(self.dtype)
+        if kind not in self._stages:
+            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, kind[1])
+            self._stages[kind] = Stages(engine)
+        return self._stages[kind]
 
-    def diagram(self, domain: Box, points: np.ndarray) -> Diagram:
+    def diagram(self, domain: Domain, points: np.ndarray) -> Diagram:
         """Tessellate `domain` by `points`.
 
         Parameters
         ----------
-        domain : Box
+        domain : Domain
         points : (n, d) array of float
             Distinct generators inside the domain, walls included.
 
@@ -148,7 +150,7 @@ class Adapter:
         with self._alone():
             return self._diagram(domain, points)
 
-    def _diagram(self, domain: Box, points: np.ndarray) -> Diagram:
+    def _diagram(self, domain: Domain, points: np.ndarray) -> Diagram:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
@@ -156,14 +158,13 @@ class Adapter:
         origin, scale = domain.frame
         binned = stages.bins.build(domain, engine.upload((host - origin) / scale), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
-        binned = stages.bins.build(domain, sorted_points, n)
         with _Naming(host, domain, self.dtype):
-            t = stages.cells.tessellate(domain, sorted_points, n, binned)
+            t = Tessellator(stages, domain).tessellate(sorted_points, n, exact=True)
         return fetch_diagram(engine, domain, t, labels)
 
     def run(
         self,
-        domain: Box,
+        domain: Domain,
         size: object,
         points: np.ndarray | None = None,
         method: str = "adaptive",
@@ -187,7 +188,7 @@ class Adapter:
 
         Parameters
         ----------
-        domain : Box
+        domain : Domain
         size : number, callable or clvoro.sizing field
             Target size h(x) > 0: a cell of the right size has volume h^d. A callable takes points (n, d), returns
             (n,), and is evaluated on the host: each step then moves all points there and back.
@@ -276,7 +277,7 @@ class Adapter:
 
     def _run(
         self,
-        domain: Box,
+        domain: Domain,
         size: object,
         points: np.ndarray | None,
         options: dict[str, Any],
@@ -380,7 +381,7 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
 class _Naming:
     """Says which of the caller's points coincide, when the device has found that some do."""
 
-    def __init__(self, points: np.ndarray, domain: Box, real: np.dtype) -> None:
+    def __init__(self, points: np.ndarray, domain: Domain, real: np.dtype) -> None:
         self.points, self.domain, self.real = points, domain, real
 
     def __enter__(self) -> None:

@@ -3,18 +3,86 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .errors import InputError
 
+if TYPE_CHECKING:
+    from ._program import Engine
+
 LARGEST_EDGE = 1e50
 """Longest edge, and one over the shortest: fifth powers of lengths must not leave the range of float64."""
 
 
+class Domain(ABC):
+    """What is meshed.
+
+    Attributes
+    ----------
+    lower, upper : tuples of d floats
+        Opposite corners of the bounding box.
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return len(self.lower)
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Edge lengths of the bounding box, (d,)."""
+        return np.subtract(self.upper, self.lower)
+
+    @property
+    @abstractmethod
+    def measure(self) -> float:
+        """Area or volume."""
+
+    @abstractmethod
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool."""
+
+    # The device's view.
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
+
+        The scale is a power of two, so that scaling itself rounds nothing.
+        """
+        return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
+
+    @property
+    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the box that cells are clipped by, whatever its walls mean."""
+        return np.array(self.lower), np.array(self.upper)
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of `clip_box` in the device's coordinates, padded to four numbers as kernels take them."""
+        origin, scale = self.frame
+        corners = np.zeros((2, 4), real)
+        corners[:, : self.dim] = (np.array(self.clip_box) - origin) / scale
+        return corners[0], corners[1]
+
+    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
+        """Names and values that kernels are built with for this kind of domain; see common/domain.h."""
+        del real
+        return ()
+
+    def device_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return what kernels take as DOMAIN_ARGS; see common/domain.h."""
+        return self.device_corners(engine.real)
+
+
 @dataclass(frozen=True)
-class Box:
+class Box(Domain):
     """Axis-aligned box in 2D or 3D.
 
     Parameters
@@ -55,34 +123,9 @@ class Box:
         object.__setattr__(self, "upper", tuple(upper.tolist()))
 
     @property
-    def dim(self) -> int:
-        """2 or 3."""
-        return len(self.lower)
-
-    @property
-    def extent(self) -> np.ndarray:
-        """Edge lengths, (d,)."""
-        return np.subtract(self.upper, self.lower)
-
-    @property
     def measure(self) -> float:
         """Area or volume."""
         return float(np.prod(self.extent))
-
-    @property
-    def frame(self) -> tuple[np.ndarray, float]:
-        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
-
-        The scale is a power of two, so that scaling itself rounds nothing.
-        """
-        return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
-
-    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner in the device's coordinates, padded to four numbers as kernels take them."""
-        origin, scale = self.frame
-        corners = np.zeros((2, 4), real)
-        corners[:, : self.dim] = (np.array([self.lower, self.upper]) - origin) / scale
-        return corners[0], corners[1]
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool."""

@@ -14,7 +14,7 @@ from ._program import Engine
 from .bins import Bins
 from .cells import Cells, Tessellation
 from .density import Density, Weighting
-from .domain import Box
+from .domain import Domain
 from .errors import MemoryLimitError
 from .fetch import fetch_diagram
 from .metric import Metric
@@ -28,6 +28,7 @@ from .repair import Repair
 from .results import Diagram
 from .shape import Shape
 from .sizing import Sizing
+from .tessellator import Tessellator
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
@@ -160,7 +161,7 @@ class Mesh:
     def __init__(
         self,
         stages: Stages,
-        domain: Box,
+        domain: Domain,
         sizing: Sizing,
         points: cla.Array,
         labels: cla.Array | None = None,
@@ -168,6 +169,7 @@ class Mesh:
     ) -> None:
         self.engine = stages.engine
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
+        self.tessellator = Tessellator(stages, domain)
         self.summaries = Summaries(self.engine, SUMMARIES)
         n = len(points)
         self.next_label = n
@@ -229,7 +231,7 @@ class Mesh:
             If the size of one is not positive and finite.
         """
         stages = self.stages
-        self.tessellation = self._tessellate()
+        self.tessellation = self.tessellator.tessellate(self.points, self.n, self.tessellation)
         self.sizing.evaluate(self.points, self.n, self.h)
         if self.coarsening != 1:
             stages.metric.scale_sizes(self.coarsening, self.h)
@@ -239,18 +241,6 @@ class Mesh:
         )
         # Before anything is done with a bad size: the solver, say, would complain of something else.
         self.sizing.check(self.points, self.h, self.coarsening)
-
-    def _tessellate(self) -> Tessellation:
-        """Tessellate: from the diagram before, where there is one and enough of it has stayed, else anew."""
-        stages, previous = self.stages, self.tessellation
-        flat = self.engine.dim == 2
-        if previous is not None and flat:
-            t = stages.repair.follow(stages.cells, self.domain, self.points, previous)
-            if t is not None:
-                return t
-        binned = stages.bins.build(self.domain, self.points, self.n)
-        how = {} if flat else {"previous": previous}
-        return stages.cells.tessellate(self.domain, self.points, self.n, binned, exact=False, **how)
 
     def _evaluate_metric(self) -> None:
         self.stages.metric.evaluate(

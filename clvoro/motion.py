@@ -8,7 +8,7 @@ import pyopencl.array as cla
 from ._primitives import Summaries
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Box
+from .domain import Domain
 
 
 class Motion:
@@ -53,7 +53,7 @@ class Motion:
 
     def move_generators(
         self,
-        box: Box,
+        domain: Domain,
         points: cla.Array,
         lloyd: cla.Array,
         a: float,
@@ -63,15 +63,14 @@ class Motion:
         velocity: cla.Array,
         clip: float = 0.0,
     ) -> None:
-        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `box`.
+        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `domain`.
 
         `velocity` (n, d) becomes the displacement.
         """
         real = self.engine.real.type
         self.engine.run_each(
             self._kernels.move_generators, h.shape[0], lloyd, real(a), correction, real(b), h,
-            real(clip), *box.device_corners(self.engine.real), points,
-            velocity,
+            real(clip), *domain.device_args(self.engine), points, velocity,
         )  # fmt: skip
 
     def add_momentum(

@@ -11,7 +11,7 @@ import pyopencl.array as cla
 from ._primitives import Room, Scan
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Box
+from .domain import Domain
 
 THETA = 0.06
 """Strain across a pair of a 5-sided and a 7-sided cell at which it climbs."""
@@ -64,7 +64,7 @@ class PopulationControl:
 
     def reorganise(
         self,
-        box: Box,
+        domain: Domain,
         t: Tessellation,
         h: cla.Array,
         reach: cla.Array,
@@ -117,7 +117,7 @@ class PopulationControl:
                 self._split_or_delete(t, excess, marks, rest)
         elif need:
             self._split_or_delete(t, excess, marks, need)
-        return self._apply(box, t, rows, marks, next_label)
+        return self._apply(domain, t, rows, marks, next_label)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and walls (n, 2), and the strain averaged over one ring and over two (n, 4)."""
@@ -239,7 +239,7 @@ class PopulationControl:
         engine.run_each(k.limit_sites, n, np.uint64(min(least, 2**64 - 1)), chosen)
 
     def _apply(
-        self, box: Box, t: Tessellation, rows: Population, marks: _Marks, next_label: int
+        self, domain: Domain, t: Tessellation, rows: Population, marks: _Marks, next_label: int
     ) -> Population | None:
         """Carry out what is marked."""
         engine, n = self.engine, t.n
@@ -255,7 +255,7 @@ class PopulationControl:
         )  # fmt: skip
         engine.run_each(
             self._kernels.apply_changes, n, marks.kept, marks.born, np.int32(next_label),
-            *box.device_corners(engine.real), t.points, rows.labels, rows.velocity,
+            *domain.device_args(engine), t.points, rows.labels, rows.velocity,
             rows.signatures, rows.ever, marks.shifts, marks.births, new.points, new.labels,
             new.velocity, new.signatures, new.ever,
         )  # fmt: skip

@@ -8,7 +8,7 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Box
+from .domain import Domain
 
 SHORT_FACE = 0.02
 """Share of a cell's length (squared in 3D) under which a face is an accident that deserves no new generator."""
@@ -22,7 +22,7 @@ class Refinement:
         self._scan = Scan(engine)
         self._kernels = engine.kernels("refinement", {"SHORT_FACE": SHORT_FACE})
 
-    def refine(self, box: Box, t: Tessellation, h: cla.Array) -> cla.Array:
+    def refine(self, domain: Domain, t: Tessellation, h: cla.Array) -> cla.Array:
         """Return about 2^d times as many generators, (n', d): those of `t` first, then the new ones.
 
         Parameters
@@ -35,7 +35,7 @@ class Refinement:
         finer = engine.empty((n + int(firsts[n].get()), engine.dim))
         engine.run_each(
             k.place_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points, h,
-            np.int32(n), *box.device_corners(engine.real), firsts, finer,
+            np.int32(n), *domain.device_args(engine), firsts, finer,
         )  # fmt: skip
         return finer
 

@@ -68,7 +68,7 @@ def test_multigrid(ctx, filled):
         filled(byte)
         adapter = clvoro.Adapter(ctx)
         adapter.diagram(BOX, points[:1])
-        stages, (origin, scale) = adapter._stages[2], BOX.frame
+        stages, (origin, scale) = adapter._stages_for(BOX), BOX.frame
         engine = stages.engine
         x = engine.upload((points - origin) / scale)
         t = stages.cells.tessellate(BOX, x, 900, stages.bins.build(BOX, x, 900))
