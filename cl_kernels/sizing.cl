@@ -1,12 +1,16 @@
 /* The size field at points: h' = h / scale and, on request, grad log h, in normalised coordinates.
    `size_at` and its data come from the host (see common/size_fields.h). Work-item i serves point i;
-   points are (size, DIM). `bad` keeps the smallest index with an h that is not positive and finite:
+   points are (size, DIM). `bad` keeps the smallest index with an h that is not positive, or above MOST_SIZE (NaN, too):
    a minimum of integers, so the order of the atomics does not matter. */
 #include "common/real.h"
 
+#ifndef MOST_SIZE
+#error "build with -DMOST_SIZE=largest h' whose error and density are numbers"
+#endif
+
 inline void note_bad(REAL h, int i, global int *bad)
 {
-    if (!(h > 0 && h <= REAL_MAX))
+    if (!(h > 0 && h <= R(MOST_SIZE)))
         atomic_min(bad, i);
 }
 

@@ -7,6 +7,7 @@ import pytest
 
 from clvoro import sizing
 from clvoro._program import Engine
+from clvoro.adapter import Adapter
 from clvoro.domain import Box
 from clvoro.errors import InputError, InputTypeError, SizeFieldError
 
@@ -526,7 +527,7 @@ def test_bad_values_are_named(make_engine, case, gradient):
 
 
 def test_sizes_beyond_the_domain_and_the_precision(make_engine):
-    """A size larger than the domain is no error; one that the precision cannot hold is."""
+    """A size larger than the domain is no error; one that the precision cannot hold, or an error by it, is."""
     engine = make_engine(2)
     domain = Box((0, 0), (2, 1))
     points = np.array([(0.5, 0.5), (0.0, 1.0)])
@@ -543,6 +544,18 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
     else:
         with pytest.raises(SizeFieldError):
             tiny(points)
+    # Also where float64 holds it, yet not (L - h) / L or h^-2; numbers beyond float32 are not clipped to it.
+    for huge in (
+        3e9,
+        1e39,
+        1e300,
+        sizing.Expression("x > 0.2 ? 1e100 : 1"),
+        lambda x: 1e200 + x[:, 0],
+    ):
+        with pytest.raises(SizeFieldError, match="at most 2e"):
+            sizing.Sizing(engine, domain, huge)(points)
+        with pytest.raises(SizeFieldError, match="at most 2e"):
+            Adapter(engine.ctx, engine.real).run(domain, huge, n_cells=3, max_steps=0)
 
 
 @pytest.mark.parametrize(

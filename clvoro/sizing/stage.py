@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 _NONE_BAD = np.iinfo(np.int32).max
 
+MOST_SIZE = 1e9
+"""Largest h over the domain's unit of length: beyond, the error (L - h) / L and h^-5 leave float32."""
+
 # Central differences of step s = c h: rounding of h, about eps, shows as eps / (2 c h) in dh/dx,
 # the curvature of h as (c h)^2 h''' / 6. In float32 rounding rules, so the step is wide: 5 % of a
 # cell; dh/dx is then good to 1e-3 for cells down to 1/1000 of the domain. In float64 both are below
@@ -69,8 +72,9 @@ class Sizing:
             self._bad = engine.upload([_NONE_BAD], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
-                "sizing", defines={"GRADIENT_STEP": repr(step)}, prelude=self.prelude
-            )
+                "sizing", defines={"GRADIENT_STEP": repr(step), "MOST_SIZE": repr(MOST_SIZE)},
+                prelude=self.prelude,
+            )  # fmt: skip
         else:
             # The callable itself is exact in float64; its fellows are not, if the device is not.
             self._host_step = self._step(np.float64)
@@ -197,7 +201,7 @@ class Sizing:
     def _refuse(self, points: np.ndarray, sizes: np.ndarray) -> None:
         with np.errstate(over="ignore"):
             working = (sizes / self._scale).astype(self.engine.real)
-        bad = np.flatnonzero(~((working > 0) & np.isfinite(working)))
+        bad = np.flatnonzero(~((working > 0) & (working <= MOST_SIZE)))
         if bad.size:
             raise self._error(points[bad[0]], float(sizes[bad[0]]))
 
@@ -205,7 +209,8 @@ class Sizing:
         where = ", ".join(f"{c:.6g}" for c in place)
         return SizeFieldError(
             f"the size field {self.field!r} is {value:g} at ({where}), expected a positive, finite "
-            "size on the whole domain; bound it, for instance by maximum(field, 1e-3)"
+            f"size on the whole domain, at most {MOST_SIZE * self._scale:.3g} here; bound it, for instance by "
+            "maximum(field, 1e-3)"
         )
 
 
