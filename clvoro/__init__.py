@@ -6,6 +6,7 @@ from .device import create_context, list_devices
 from .domain import Box
 from .errors import ClvoroError
 from .io import load
+from .polygon import Polygon
 from .results import Diagram, Displacements, Result
 
 __version__ = "0.1.0"
@@ -16,6 +17,7 @@ __all__ = [
     "ClvoroError",
     "Diagram",
     "Displacements",
+    "Polygon",
     "Result",
     "create_context",
     "list_devices",

@@ -1,0 +1,293 @@
+"""Domains bounded by straight edges, with holes, of one or several pieces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import shapely
+
+from .domain import Domain
+from .errors import InputError, InputTypeError
+from .rings import make_rings, pieces_of_geojson, pieces_of_shape, project, signed_area
+
+_MARGIN = 1 / 64  # of the clip box around the domain, of the bounding box's longest edge
+_ROUNDINGS = 8  # of a coordinate, by which a point may lie off the boundary and still be on it
+
+
+class Polygon(Domain):
+    """Polygonal domain in 2D.
+
+    Parameters
+    ----------
+    outer : array_like (k, 2)
+        Vertices of the outer ring in either order; the first may be repeated at the end.
+    holes : sequence of array_like (k, 2)
+        Rings that are left out; they may touch each other and the outer ring in single points.
+
+    Attributes
+    ----------
+    vertices : (k, 2) float64
+        Of all rings, one after the other, each once. Outer rings run counter-clockwise, holes clockwise:
+        the interior is on the left of every edge. Vertices on a straight line are kept, as they number
+        edges; repeated ones are dropped.
+    ring_starts : (r + 1,) int32
+        Ring i is ``vertices[ring_starts[i] : ring_starts[i + 1]]``. Each piece's outer ring comes before
+        its holes.
+    next_vertex : (k,) int32
+        Edge e goes from vertex e to vertex ``next_vertex[e]``. Faces of cells on it have the neighbour
+        ``-1 - e``.
+    piece_of_ring : (r,) int32
+        Which piece each ring bounds; pieces may touch in single points.
+    edge_numbers : (k,) int32
+        The number that edge e has in the rings as they were given: ring by ring, in their order, the edge
+        from a ring's vertex i to the next is number i after those of the rings before. It differs from
+        e where a ring was reversed (then from the first edge on) or a repeated vertex dropped (from there
+        on), and ``numpy.flatnonzero(numpy.isin(polygon.edge_numbers, mine))`` finds edges by their numbers.
+    lower, upper : (2,) tuples of float
+        The bounding box.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        Naming the ring and the place: if numbers are not finite, a ring has fewer than 3 distinct vertices,
+        no area, crosses or touches itself (slits of no width, too), holes lie outside or overlap or cut
+        the domain apart, pieces overlap, an edge is shorter than 1e-12 of the domain, or the whole is
+        too large, small or far from the origin for float64.
+    """
+
+    def __init__(self, outer: object, holes: Sequence[object] = ()):
+        try:
+            rings = [outer, *holes]
+        except TypeError:
+            raise InputTypeError(
+                f"holes is a {type(holes).__name__}, expected a list of rings"
+            ) from None
+        self._build([rings])
+
+    @classmethod
+    def from_pieces(cls, pieces: Sequence[Sequence[object]]) -> Polygon:
+        """Make a domain of several pieces, each a list of its outer ring and its holes."""
+        made = cls.__new__(cls)
+        made._build(pieces)
+        return made
+
+    @classmethod
+    def from_shapely(cls, geometry: Any) -> Polygon:
+        """Make a domain of a shapely Polygon or MultiPolygon; heights are left out."""
+        return cls.from_pieces(pieces_of_shape(geometry))
+
+    @classmethod
+    def from_wkt(cls, text: str) -> Polygon:
+        """Make a domain of a POLYGON or MULTIPOLYGON in well-known text."""
+        if not isinstance(text, str):
+            raise InputTypeError(f"text is a {type(text).__name__}, expected well-known text")
+        try:
+            geometry = shapely.from_wkt(text)
+        except shapely.errors.GEOSException as error:
+            raise InputError(f"text {text!r:.60} is no well-known text ({error})") from error
+        return cls.from_shapely(geometry)
+
+    @classmethod
+    def from_geojson(cls, source: str | PathLike[str] | Mapping[str, Any]) -> Polygon:
+        """Make a domain of the polygons in GeoJSON.
+
+        Parameters
+        ----------
+        source : path, str or dict
+            A file, a text that begins with ``{``, or what `json.loads` makes of it: a Polygon, MultiPolygon,
+            Feature or collection of these. Coordinates are taken as they are, in the plane: project
+            longitudes and latitudes before.
+        """
+        return cls.from_pieces(pieces_of_geojson(source))
+
+    def _build(self, pieces: Sequence[Sequence[object]]) -> None:
+        made = make_rings(pieces)
+        rings = [ring for piece in made for ring in piece]
+        counts = [len(ring.vertices) for ring in rings]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        given = np.concatenate([[0], np.cumsum([ring.n_given for ring in rings])])
+        following = np.arange(1, starts[-1] + 1)
+        following[starts[1:] - 1] = starts[:-1]
+        self.vertices = np.concatenate([ring.vertices for ring in rings])
+        self.ring_starts = starts.astype(np.int32)
+        self.next_vertex = following.astype(np.int32)
+        self.piece_of_ring = np.repeat(
+            np.arange(len(made), dtype=np.int32), [len(piece) for piece in made]
+        )
+        self.edge_numbers = np.concatenate(
+            [first + ring.numbers for first, ring in zip(given[:-1], rings, strict=True)]
+        ).astype(np.int32)
+        for array in self._arrays():
+            array.setflags(write=False)
+        self.lower = tuple(self.vertices.min(axis=0).tolist())
+        self.upper = tuple(self.vertices.max(axis=0).tolist())
+        self._measure = math.fsum(signed_area(ring.vertices) for ring in rings)
+
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        return (
+            self.vertices, self.ring_starts, self.next_vertex, self.piece_of_ring, self.edge_numbers
+        )  # fmt: skip
+
+    # What is equal: the same rings in the same order, numbered alike.
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Polygon):
+            return NotImplemented
+        return self is other or self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    @cached_property
+    def _content(self) -> tuple[bytes, ...]:
+        return tuple(array.tobytes() for array in self._arrays())
+
+    def __repr__(self) -> str:
+        pieces, holes = self.n_pieces, len(self.piece_of_ring) - self.n_pieces
+        parts = [f"{len(self.vertices)} edges"]
+        if pieces > 1:
+            parts.append(f"{pieces} pieces")
+        if holes:
+            parts.append(f"{holes} hole{'s' if holes > 1 else ''}")
+        corners = [", ".join(f"{c:.6g}" for c in corner) for corner in (self.lower, self.upper)]
+        return f"Polygon({', '.join(parts)} within ({corners[0]}) and ({corners[1]}))"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _described, (self.describe(),)
+
+    def describe(self) -> dict[str, Any]:
+        """Return plain values (lists, numbers) of which `described` makes an equal domain."""
+        return {
+            "vertices": self.vertices.tolist(),
+            "ring_starts": self.ring_starts.tolist(),
+            "piece_of_ring": self.piece_of_ring.tolist(),
+            "edge_numbers": self.edge_numbers.tolist(),
+        }
+
+    @classmethod
+    def described(cls, **values: Any) -> Polygon:
+        """Make the domain that `describe` described; damaged values are refused."""
+        starts, piece_of_ring = values["ring_starts"], values["piece_of_ring"]
+        pieces: list[list[object]] = [[] for _ in range(max(piece_of_ring) + 1)]
+        ends = zip(starts[:-1], starts[1:], piece_of_ring, strict=True)
+        for first, last, piece in ends:
+            pieces[piece].append(values["vertices"][first:last])
+        made = cls.from_pieces(pieces)
+        numbers = np.array(values["edge_numbers"], np.int32)
+        same = np.array_equal(made.ring_starts, starts) and np.array_equal(
+            made.piece_of_ring, piece_of_ring
+        )
+        if not same or numbers.shape != made.edge_numbers.shape:
+            raise InputError("the description of a Polygon is damaged: its rings do not fit")
+        numbers.setflags(write=False)
+        made.edge_numbers = numbers
+        return made
+
+    # Sizes and places.
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of pieces, each with one outer ring."""
+        return int(self.piece_of_ring[-1]) + 1
+
+    @property
+    def measure(self) -> float:
+        """Area; rounded once per ring, and as a sum."""
+        return self._measure
+
+    @property
+    def rings(self) -> list[np.ndarray]:
+        """Vertices (k, 2) of each ring."""
+        return [
+            self.vertices[a:b]
+            for a, b in zip(self.ring_starts[:-1], self.ring_starts[1:], strict=True)
+        ]
+
+    @cached_property
+    def pieces(self) -> list[Any]:
+        """Each piece as a shapely Polygon."""
+        found = []
+        for p in range(self.n_pieces):
+            mine = [
+                r for r, piece in zip(self.rings, self.piece_of_ring, strict=True) if piece == p
+            ]
+            found.append(shapely.Polygon(mine[0], mine[1:]))
+        return found
+
+    @cached_property
+    def geometry(self) -> Any:
+        """The domain as a shapely Polygon or MultiPolygon, prepared."""
+        whole = self.pieces[0] if self.n_pieces == 1 else shapely.MultiPolygon(self.pieces)
+        shapely.prepare(whole)
+        return whole
+
+    @cached_property
+    def _edges(self) -> Any:
+        """Tree of the edges."""
+        ends = np.stack([self.vertices, self.vertices[self.next_vertex]], axis=1)
+        return shapely.STRtree(np.asarray(shapely.linestrings(ends)))
+
+    @property
+    def _rounding(self) -> float:
+        far = max(map(abs, (*self.lower, *self.upper)))
+        return _ROUNDINGS * float(np.finfo(float).eps) * far
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether it lies in the domain; (n,) bool.
+
+        The boundary is included, and with it what lies off it by less than eight roundings of the largest
+        coordinate: points on slanted edges can be met no better.
+        """
+        points = np.asarray(points, dtype=float)
+        inside = np.asarray(shapely.intersects_xy(self.geometry, points[:, 0], points[:, 1]))
+        near = self.lower - np.full(2, self._rounding), self.upper + np.full(2, self._rounding)
+        rest = np.flatnonzero(~inside & ((points >= near[0]) & (points <= near[1])).all(axis=1))
+        if rest.size:
+            rows, _ = self._edges.query(
+                shapely.points(points[rest]), predicate="dwithin", distance=self._rounding
+            )
+            inside[rest[rows]] = True
+        return inside
+
+    def nearest_edge(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return for each of `points` (n, 2) an edge that is nearest, (n,) int, and the nearest point on it (n, 2)."""
+        points = np.asarray(points, dtype=float)
+        edge = np.empty(len(points), np.int64)
+        rows, edges = self._edges.query_nearest(shapely.points(points), all_matches=False)
+        edge[rows] = edges
+        return edge, project(points, self.vertices[edge], self.vertices[self.next_vertex[edge]])
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest point of the domain to each of `points` (n, 2): itself, or one on the boundary."""
+        found = np.array(points, dtype=float)
+        outside = np.flatnonzero(~self.contains(found))
+        if outside.size:
+            found[outside] = self.nearest_edge(found[outside])[1]
+        return found
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (n, 2) to the boundary, inside and outside; (n,)."""
+        return np.hypot(*(self.nearest_edge(points)[1] - points).T)
+
+    # The device's view: the polygon never touches the box that cells are clipped by.
+
+    @property
+    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the bounding box enlarged by 1/64 of its longest edge on every side."""
+        margin = _MARGIN * self.extent.max()
+        return self.lower - np.full(2, margin), self.upper + np.full(2, margin)
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1]."""
+        lower, upper = self.clip_box
+        return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
+
+
+def _described(values: dict[str, Any]) -> Polygon:
+    return Polygon.described(**values)

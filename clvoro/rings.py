@@ -1,0 +1,317 @@
+"""Rings of a polygonal domain: cleaned, oriented and found sound, or refused with the ring and the place."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from .domain import LARGEST_EDGE
+from .errors import InputError, InputTypeError
+
+SHORTEST_EDGE = 1e-12
+"""Least length of an edge, of the bounding box's longest edge."""
+_RESOLUTION = 2.0**-40  # least extent, of the largest coordinate: what is left of float64's digits
+_SPLIT = 2.0**27 + 1
+
+
+@dataclass(frozen=True)
+class Ring:
+    """One closed chain of edges.
+
+    Attributes
+    ----------
+    vertices : (k, 2) float64
+        Without a closing vertex; the interior of the domain is on the left of every edge.
+    numbers : (k,) int64
+        Of each edge, the user's: in his ring, edge i goes from his vertex i to the next.
+    n_given : int
+        Edges of the ring as it was given.
+    name : str
+        As errors call it: "outer ring", "hole 2 of piece 0".
+    """
+
+    vertices: np.ndarray
+    numbers: np.ndarray
+    n_given: int
+    name: str
+
+
+def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
+    """Return the rings of each piece, its outer ring first, or raise an InputError.
+
+    Repeated vertices are dropped and clockwise rings reversed (holes: the others); all else that is
+    no polygon is refused.
+
+    Parameters
+    ----------
+    pieces : sequence of sequences of array_like (k, 2)
+        For each piece its outer ring and its holes, closed by a repeated first vertex or not.
+    """
+    if not len(pieces):
+        raise InputError("Polygon got no rings, expected an outer ring of at least 3 vertices")
+    several = len(pieces) > 1
+    rings = []
+    for p, piece in enumerate(pieces):
+        if not len(piece):
+            raise InputError(f"Polygon got no rings for piece {p}, expected an outer ring")
+        of = f" of piece {p}" if several else ""
+        names = [f"outer ring{of}", *(f"hole {h}{of}" for h in range(len(piece) - 1))]
+        rings.append([_cleaned(ring, name) for ring, name in zip(piece, names, strict=True)])
+    flat = [ring for piece in rings for ring in piece]
+    for ring in flat:
+        _check_area(ring)
+    _check_lengths(flat)
+    shapes = [_shape(piece) for piece in rings]
+    for piece, shape in zip(rings, shapes, strict=True):
+        _check_valid(shape, piece)
+    if several:
+        _check_valid(shapely.multipolygons(shapes), flat)
+    return [[_oriented(ring, clockwise=i > 0) for i, ring in enumerate(piece)] for piece in rings]
+
+
+def signed_area(vertices: np.ndarray) -> float:
+    """Area that a ring (k, 2) encloses, positive if it runs counter-clockwise; correctly rounded."""
+    x, y = vertices.T
+    x_next, y_next = np.roll(vertices, -1, axis=0).T
+    terms = [*_product(x, y_next), *_product(-x_next, y)]
+    return 0.5 * math.fsum(np.concatenate(terms).tolist())
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a * b as an unevaluated sum of two numbers, without error (Dekker 1971)."""
+    p = a * b
+    (a_high, a_low), (b_high, b_low) = _halves(a), _halves(b)
+    return p, a_low * b_low - (((p - a_high * b_high) - a_low * b_high) - a_high * b_low)
+
+
+def _halves(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    t = _SPLIT * a
+    high = t - (t - a)
+    return high, a - high
+
+
+def _cleaned(given: object, name: str) -> Ring:
+    """Take a ring as it was given; drop vertices that are the same as the next."""
+    try:
+        array = np.asarray(given)
+    except ValueError as error:
+        raise InputError(
+            f"Polygon's {name} is no array ({error}), expected shape (k, 2)"
+        ) from error
+    if array.dtype.kind not in "fiu":
+        raise InputTypeError(f"Polygon's {name} has dtype {array.dtype}, expected real numbers")
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise InputError(
+            f"Polygon's {name} has shape {array.shape}, expected (k, 2): one row per vertex"
+        )
+    array = array.astype(np.float64) + 0.0  # which makes -0.0 0.0: equal polygons have equal bytes
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"Polygon's {name} has vertex {bad[0]} at {_at(array[bad[0]])}, expected finite numbers"
+        )
+    if len(array) > 1 and (array[0] == array[-1]).all():
+        array = array[:-1]
+    long = (array != np.roll(array, -1, axis=0)).any(axis=1)
+    vertices = array[long]
+    if len(vertices) < 3:
+        raise InputError(
+            f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
+        )
+    return Ring(vertices, np.flatnonzero(long), len(array), name)
+
+
+def _check_lengths(rings: Sequence[Ring]) -> None:
+    """Refuse what float64 cannot hold: domains too large, too small or too far off, edges too short."""
+    every = np.concatenate([ring.vertices for ring in rings])
+    with np.errstate(over="ignore"):
+        extent = every.max(axis=0) - every.min(axis=0)
+    if not (extent.min() >= 1 / LARGEST_EDGE and extent.max() <= LARGEST_EDGE):
+        raise InputError(
+            f"Polygon has a bounding box of edges {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to "
+            f"{LARGEST_EDGE:g}: areas and moments of cells must be numbers, too; choose another unit of length"
+        )
+    if extent.max() < _RESOLUTION * np.abs(every).max():
+        raise InputError(
+            f"Polygon has vertices at {_at(every[0])} and extends over {extent.max():g} only: too few "
+            "digits of float64 are left; move it to the origin"
+        )
+    for ring in rings:
+        step = np.roll(ring.vertices, -1, axis=0) - ring.vertices
+        length = np.hypot(*step.T)
+        e = int(np.argmin(length))
+        if length[e] < SHORTEST_EDGE * extent.max():
+            raise InputError(
+                f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}, "
+                f"{_at(ring.vertices[e])}, expected at least {SHORTEST_EDGE:g} of the domain's size; "
+                "merge its ends"
+            )
+
+
+def _check_area(ring: Ring) -> None:
+    # Relative to a vertex, as whatever lies on a line must be found to do so.
+    with np.errstate(over="ignore", invalid="ignore"):
+        offset = ring.vertices - ring.vertices[0]
+        far = offset[np.argmax(np.hypot(*offset.T))]
+        across = np.abs(offset @ np.array([-far[1], far[0]])) / np.hypot(*far)
+    if across.max() < SHORTEST_EDGE * np.hypot(*far):
+        raise InputError(
+            f"Polygon's {ring.name} has all its vertices on the line from {_at(ring.vertices[0])} to "
+            f"{_at(ring.vertices[0] + far)}: its area is zero"
+        )
+
+
+def _shape(piece: Sequence[Ring]) -> Any:
+    return shapely.Polygon(piece[0].vertices, [hole.vertices for hole in piece[1:]])
+
+
+_REMEDIES = {
+    "Hole lies outside shell": "leave the hole out, or make it a piece of its own",
+    "Holes are nested": "unite the holes, or make what lies in a hole a piece of its own",
+    "Nested shells": "unite the pieces (shapely.union_all)",
+    "Interior is disconnected": "give the parts as pieces of their own",
+}
+
+
+def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
+    """Refuse what is no polygon, with what shapely says about it and the rings at the place."""
+    reason = shapely.is_valid_reason(shape)
+    if reason == "Valid Geometry":
+        return
+    found = re.fullmatch(r"(.*)\[(\S+) (\S+)\]", reason)
+    if found is None:
+        raise InputError(f"Polygon is not valid: {reason}")
+    reason, place = found[1], np.array([float(found[2]), float(found[3])])
+    away = []
+    for ring in rings:
+        distance = distance_to_edges(place, ring.vertices)
+        away.append((float(distance.min()), int(ring.numbers[np.argmin(distance)])))
+    close = min(d for d, _ in away) + 1e-9 * float(np.ptp(rings[0].vertices, axis=0).max())
+    where = " and ".join(  # by the numbers in their rings
+        f"edge {e} of the {ring.name}"
+        for ring, (d, e) in zip(rings, away, strict=True)
+        if d <= close
+    )
+    remedy = _REMEDIES.get(reason, "correct it (shapely.make_valid shows what can be made of it)")
+    raise InputError(f"Polygon is not valid: {reason} at {_at(place)}, {where}; {remedy}")
+
+
+def distance_to_edges(point: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Distances (k,) of one point (2,) to the edges of one ring (k, 2)."""
+    nearest = project(point, vertices, np.roll(vertices, -1, axis=0))
+    return np.hypot(*(nearest - point).T)
+
+
+def project(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the nearest points (n, 2) to `points` on the segments from `start` to `end`, row by row."""
+    along = end - start
+    t = ((points - start) * along).sum(axis=-1) / (along * along).sum(axis=-1)
+    t = np.clip(t, 0.0, 1.0)[..., None]
+    # From the nearer end, so that both ends are met exactly.
+    return np.where(t <= 0.5, start + t * along, end - (1.0 - t) * along)
+
+
+def _oriented(ring: Ring, clockwise: bool) -> Ring:
+    if (signed_area(ring.vertices) < 0) == clockwise:
+        return ring
+    # Edge j of the reversed ring is edge k - 2 - j of the other: it begins where that ends.
+    numbers = np.roll(ring.numbers[::-1], -1)
+    return Ring(np.ascontiguousarray(ring.vertices[::-1]), numbers, ring.n_given, ring.name)
+
+
+def _at(place: np.ndarray) -> str:
+    return "(" + ", ".join(f"{c:.6g}" for c in place) + ")"
+
+
+def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
+    """Return the rings of a shapely Polygon or MultiPolygon, piece by piece."""
+    kind = getattr(geometry, "geom_type", type(geometry).__name__)
+    if kind not in ("Polygon", "MultiPolygon"):
+        raise InputTypeError(f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon")
+    parts = geometry.geoms if kind == "MultiPolygon" else [geometry]
+    found = [
+        [np.asarray(ring.coords)[:, :2] for ring in (part.exterior, *part.interiors)]
+        for part in parts
+        if not part.is_empty
+    ]
+    if not found:
+        raise InputError(f"geometry is an empty {kind}, expected at least one ring")
+    return found
+
+
+def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[list[object]]:
+    """Return the rings of the polygons in a GeoJSON file, text or object, piece by piece."""
+    name = "GeoJSON"
+    if isinstance(source, Mapping):
+        found: Any = source
+    else:
+        if not isinstance(source, (str, PathLike)):
+            raise InputTypeError(
+                f"source is a {type(source).__name__}, expected a path, a text or a dict of GeoJSON"
+            )
+        text = source if isinstance(source, str) and source.lstrip().startswith("{") else None
+        if text is None:
+            name = str(source)
+            try:
+                text = Path(source).read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError) as error:
+                raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
+        try:
+            found = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{name} is no JSON ({error}), expected GeoJSON") from error
+    pieces = list(_pieces(found, name))
+    if not pieces:
+        raise InputError(f"{name} holds no Polygon, expected at least one")
+    return pieces
+
+
+_MEMBERS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
+
+
+def _pieces(node: object, name: str) -> Iterator[list[object]]:
+    """Walk through collections and features to the coordinates."""
+    kind = node.get("type") if isinstance(node, Mapping) else None
+    if not isinstance(node, Mapping) or not isinstance(kind, str):
+        raise InputError(f"{name} holds {node!r:.40}, expected an object with a type")
+    if kind in _MEMBERS:
+        for member in _list(node, _MEMBERS[kind], name):
+            yield from _pieces(member, name)
+    elif kind == "Feature":
+        if node.get("geometry") is None:
+            raise InputError(f"{name} holds a Feature without geometry, expected Polygons only")
+        yield from _pieces(node["geometry"], name)
+    elif kind == "Polygon":
+        yield [_flat(ring, name) for ring in _list(node, "coordinates", name)]
+    elif kind == "MultiPolygon":
+        for piece in _list(node, "coordinates", name):
+            if not isinstance(piece, (list, tuple)):
+                raise InputError(f"{name} has a MultiPolygon of {piece!r:.40}, expected lists")
+            yield [_flat(ring, name) for ring in piece]
+    else:
+        raise InputError(f"{name} holds a {kind!r:.40}, expected Polygon or MultiPolygon only")
+
+
+def _flat(ring: object, name: str) -> object:
+    """Leave out heights."""
+    if not isinstance(ring, (list, tuple)):
+        raise InputError(f"{name} has the ring {ring!r:.40}, expected a list of positions")
+    return [p[:2] if isinstance(p, (list, tuple)) else p for p in ring]
+
+
+def _list(node: Mapping[str, Any], member: str, name: str) -> Sequence[Any]:
+    found = node.get(member)
+    if not isinstance(found, (list, tuple)):
+        raise InputError(
+            f"{name} has a {node['type']} with {member} {found!r:.40}, expected a list"
+        )
+    return found
