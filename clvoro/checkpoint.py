@@ -22,10 +22,11 @@ from .cells import Tessellation
 from .errors import InputError
 from .mesh import Mesh, Stages
 from .plans import Action, Step
+from .polygon import Polygon
 from .results import HISTORY_DTYPE, Displacements
 
 if TYPE_CHECKING:
-    from .domain import Box
+    from .domain import Domain
     from .loop import Loop
     from .sizing import Sizing
 
@@ -40,16 +41,24 @@ _COUNTS = ("position", "level", "n_start", "steps", "inserted", "deleted", "next
 
 
 def describe(
-    domain: Box, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None
+    domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None
 ) -> dict:
     """Return what makes a run, as plain values: a checkpoint of other ones is refused."""
     start = None if points is None else hashlib.sha256(np.ascontiguousarray(points).tobytes())
     return {
-        "domain": [list(domain.lower), list(domain.upper)],
+        "domain": _identity(domain),
         "dtype": dtype.name,
         "points": None if start is None else start.hexdigest(),
         **options,
     }
+
+
+def _identity(domain: Domain) -> list:
+    """Return what tells `domain` from others; of polygons the number of edges and a hash."""
+    corners = [list(domain.lower), list(domain.upper)]
+    if isinstance(domain, Polygon):
+        return [*corners, len(domain.vertices), domain.digest]
+    return corners
 
 
 def fingerprint(plan: list[Action]) -> str:
@@ -154,7 +163,9 @@ class Saved:
             self.elapsed = float(state["elapsed"])
             if not (0 < self.coarsening < np.inf and 0 <= self.elapsed < np.inf):
                 raise ValueError("coarsening")
-            self._check(len(self.made_by["domain"][0]), np.dtype(self.made_by["dtype"]))
+            lower, _, *more = self.made_by["domain"]
+            walls = int(more[0]) if more else 2 * len(lower)
+            self._check(len(lower), walls, np.dtype(self.made_by["dtype"]))
         except (
             KeyError,
             ValueError,
@@ -167,7 +178,7 @@ class Saved:
                 f"cannot resume from {self.name}: it is damaged ({error!r:.200})"
             ) from error
 
-    def _check(self, d: int, real: np.dtype) -> None:
+    def _check(self, d: int, walls: int, real: np.dtype) -> None:
         """Check all that the device would otherwise index by, or divide by, unseen."""
         a = self.arrays
         n, m = len(a["mesh.points"]), len(a["diagram.neighbours"])
@@ -187,7 +198,7 @@ class Saved:
         starts, neighbours, labels = a["diagram.starts"], a["diagram.neighbours"], a["mesh.labels"]
         if n == 0 or starts[0] != 0 or starts[-1] != m or (np.diff(starts) < d + 1).any():
             raise ValueError("starts")
-        if not (-2 * d <= neighbours.min() and neighbours.max() < n):
+        if not (-walls <= neighbours.min() and neighbours.max() < n):
             raise ValueError("neighbours")
         known = labels.min() >= 0 and labels.max() < self.state["next_label"]
         if not known or len(np.unique(labels)) < n:
@@ -219,7 +230,7 @@ class Saved:
                 f"{now}; give the settings of that run, or begin anew without resume"
             )
 
-    def restore(self, stages: Stages, domain: Box, sizing: Sizing, plan: list[Action]) -> Mesh:
+    def restore(self, stages: Stages, domain: Domain, sizing: Sizing, plan: list[Action]) -> Mesh:
         """Return the mesh as the run left it, for a loop over `plan`.
 
         Raises
@@ -265,7 +276,7 @@ class Saved:
             ) from error
         return mesh
 
-    def _compare_sizes(self, now: np.ndarray, domain: Box) -> None:
+    def _compare_sizes(self, now: np.ndarray, domain: Domain) -> None:
         saved = self.arrays["mesh.h"].astype(float)
         tolerance = 1e4 * np.finfo(self.arrays["mesh.h"].dtype).eps
         off = np.abs(now / saved - 1)

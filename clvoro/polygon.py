@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import pairwise
 from os import PathLike
 from typing import Any
 
@@ -138,14 +140,15 @@ class Polygon(Domain):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Polygon):
             return NotImplemented
-        return self is other or self._content == other._content
+        return self is other or self.digest == other.digest
 
     def __hash__(self) -> int:
-        return hash(self._content)
+        return hash(self.digest)
 
     @cached_property
-    def _content(self) -> tuple[bytes, ...]:
-        return tuple(array.tobytes() for array in self._arrays())
+    def digest(self) -> str:
+        """SHA-256 of vertices, rings, pieces and numbers: equal domains have the same."""
+        return hashlib.sha256(b"".join(array.tobytes() for array in self._arrays())).hexdigest()
 
     def __repr__(self) -> str:
         pieces, holes = self.n_pieces, len(self.piece_of_ring) - self.n_pieces
@@ -171,19 +174,29 @@ class Polygon(Domain):
 
     @classmethod
     def described(cls, **values: Any) -> Polygon:
-        """Make the domain that `describe` described; damaged values are refused."""
-        starts, piece_of_ring = values["ring_starts"], values["piece_of_ring"]
-        pieces: list[list[object]] = [[] for _ in range(max(piece_of_ring) + 1)]
-        ends = zip(starts[:-1], starts[1:], piece_of_ring, strict=True)
-        for first, last, piece in ends:
-            pieces[piece].append(values["vertices"][first:last])
-        made = cls.from_pieces(pieces)
-        numbers = np.array(values["edge_numbers"], np.int32)
-        same = np.array_equal(made.ring_starts, starts) and np.array_equal(
-            made.piece_of_ring, piece_of_ring
-        )
-        if not same or numbers.shape != made.edge_numbers.shape:
-            raise InputError("the description of a Polygon is damaged: its rings do not fit")
+        """Make the domain that `describe` described; damaged values are refused by an InputError."""
+        try:
+            starts = np.array(values["ring_starts"], np.int32)
+            numbers = np.array(values["edge_numbers"], np.int32)
+            pieces = np.array(values["piece_of_ring"], np.int32)
+            vertices = np.array(values["vertices"], float)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"the description of a Polygon is damaged ({error})") from error
+        steps = np.diff(pieces, prepend=-1)
+        if not (
+            starts.shape == (len(pieces) + 1,)
+            and pieces.size
+            and (np.diff(starts, prepend=0) >= 0).all()
+            and (steps * (steps - 1) == 0).all()
+            and pieces[0] == 0
+            and numbers.shape == vertices.shape[:1] == (starts[-1],)
+        ):
+            raise InputError("the description of a Polygon is damaged: its arrays do not fit")
+        rings = [vertices[a:b] for a, b in pairwise(starts)]
+        firsts = [*np.flatnonzero(steps), len(rings)]
+        made = cls.from_pieces([rings[a:b] for a, b in pairwise(firsts)])
+        if not np.array_equal(made.vertices, vertices):
+            raise InputError("the description of a Polygon is damaged: its rings are not oriented")
         numbers.setflags(write=False)
         made.edge_numbers = numbers
         return made
@@ -203,10 +216,7 @@ class Polygon(Domain):
     @property
     def rings(self) -> list[np.ndarray]:
         """Vertices (k, 2) of each ring."""
-        return [
-            self.vertices[a:b]
-            for a, b in zip(self.ring_starts[:-1], self.ring_starts[1:], strict=True)
-        ]
+        return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
 
     @cached_property
     def pieces(self) -> list[Any]:

@@ -266,8 +266,52 @@ def test_holes_may_touch_in_points() -> None:
     ]
 
 
-def test_damaged_descriptions_are_refused() -> None:
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("edge_numbers", [1, 2]), ("edge_numbers", [10**12] * 8), ("ring_starts", [0, 3, 8]),
+        ("ring_starts", [0, 4, 9]), ("ring_starts", [0, -4, 8]), ("ring_starts", "a"),
+        ("piece_of_ring", [0, 10**9]), ("piece_of_ring", [0, -1]), ("piece_of_ring", []),
+        ("vertices", None), ("vertices", [[0, 0, 0]] * 8), ("vertices", SQUARE.tolist() + HOLE.tolist()),
+    ],
+)  # fmt: skip
+def test_damaged_descriptions_are_refused(name: str, value: object) -> None:
     good = clvoro.Polygon(SQUARE, [HOLE]).describe()
-    for name, value in (("edge_numbers", [1, 2]), ("ring_starts", [0, 3, 8])):
-        with pytest.raises(InputError):
-            clvoro.Polygon.described(**{**good, name: value})
+    assert clvoro.Polygon.described(**good).describe() == good
+    with pytest.raises(InputError):
+        clvoro.Polygon.described(**{**good, name: value})
+
+
+def result_of(domain: clvoro.Polygon) -> clvoro.Result:
+    """A result with a single cell, whatever it holds."""
+    from clvoro.results import HISTORY_DTYPE, Diagram
+
+    ones, starts = np.ones(1), np.array([0, 1], np.int32)
+    arrays = {
+        "points": np.ones((1, 2)), "volumes": ones, "centroids": np.ones((1, 2)), "neighbour_starts": starts,
+        "neighbours": np.array([-8], np.int32), "face_measures": ones, "face_centroids": np.ones((1, 2)),
+        "vertices": np.ones((1, 2)), "cell_vertex_starts": starts, "cell_vertices": np.array([0], np.int32),
+    }  # fmt: skip
+    return clvoro.Result(
+        points=arrays["points"], diagram=Diagram(domain, arrays), size=ones, error=ones, quality=ones,
+        history=np.zeros(1, HISTORY_DTYPE), converged=True, stop_reason="none",
+    )  # fmt: skip
+
+
+def test_files_hold_the_domain(tmp_path) -> None:
+    domain = clvoro.Polygon.from_pieces(
+        [[ragged(40)[::-1], ragged(9, radius=0.1)], [SQUARE + np.pi]]
+    )
+    path = tmp_path / "mesh.npz"
+    result_of(domain).save(path)
+    assert clvoro.load(path).diagram.domain == domain
+
+
+def test_checkpoints_tell_domains_apart() -> None:
+    from clvoro.checkpoint import describe
+
+    domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
+    described = [json.dumps(describe(d, {}, np.dtype(float), None)) for d in domains]
+    assert len(set(described)) == 3
+    again = describe(clvoro.Polygon(SQUARE.copy()), {}, np.dtype(float), None)
+    assert json.dumps(again) == described[0]

@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 
 from ..domain import Box
+from ..polygon import Polygon
 from ..results import HISTORY_DTYPE, Diagram, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
 
 FORMAT, VERSION = "clvoro-result", 1
 
-_DOMAINS = {"Box": Box}
+_DOMAINS = {"Box": Box, "Polygon": Polygon.described}
 _NEEDED = ("about", "points", "size", "error", "quality", "history", "diagram.points")
 _FIELDS = tuple(field.name for field in dataclasses.fields(Result))
 _PARTS = {
@@ -48,9 +49,10 @@ _SHAPES = {
 def write_npz(result: Result, path: Path) -> None:
     """Write all of `result` to `path`; the same result gives the same bytes."""
     diagram = result.diagram
-    kind = type(diagram.domain).__name__
+    domain = diagram.domain
+    plain = domain.describe() if isinstance(domain, Polygon) else dataclasses.asdict(domain)
     about: dict[str, Any] = {
-        "domain": {"kind": kind, **dataclasses.asdict(diagram.domain)},
+        "domain": {"kind": type(domain).__name__, **plain},
         "settings": result.settings,
         "values": {},
     }
