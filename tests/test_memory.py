@@ -1,0 +1,63 @@
+"""What a run is refused by, `mesh.PEAK` and `mesh.OUTPUT`, is what runs hold on the device."""
+
+import importlib
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro import mesh, poisson
+from clvoro._program import Engine
+from clvoro.errors import MemoryLimitError
+
+BENCH = Path(__file__).parent.parent / "bench"
+CASES = [(2, "F2", 8000), (3, "S1", 4000)]
+"""Dimension, field and cells: parts that do not grow with them, and cells at walls, are 5 % of the figures here."""
+
+
+@pytest.mark.skipif(not BENCH.is_dir(), reason="the tests lie outside a source tree")
+@pytest.mark.parametrize(("dim", "field", "n"), CASES)
+def test_figures_are_what_runs_hold(monkeypatch, dim, field, n):
+    """By counting every buffer (bench/memory.py), in both precisions; with multigrid, as larger meshes have it."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 0.5))
+    measure = importlib.import_module("memory").measure
+    found = {
+        real: measure(Namespace(device=None, dtype=real), field, n, "adaptive", "default")
+        for real in ("float64", "float32")
+    }
+    for name, figures in (("run", mesh.PEAK), ("output", mesh.OUTPUT)):
+        double, single = (found[real][name] for real in ("float64", "float32"))
+        # 8 r + 4 i bytes and 4 r + 4 i.
+        fitting = round((double - single) / 4), round((2 * single - double) / 4)
+        reals, integers = figures[dim]
+        for real, bytes_ in (("float64", double), ("float32", single)):
+            expected = reals * np.dtype(real).itemsize + 4 * integers
+            # Loops need mending in one mesh and not in the other: output may take a quarter less.
+            least = 0.75 if name == "output" else 0.9
+            assert least <= bytes_ / expected <= 1.1, (
+                f"{name} in {dim}D, {real}: {bytes_:.0f} bytes per cell, expected {expected} by {reals} reals and "
+                f"{integers} integers; measured: {fitting}"
+            )
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_what_does_not_fit_is_refused(ctx, dim, real):
+    """Of the run and what comes after it, the larger counts."""
+    import pyopencl as cl
+
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
+    room = ctx.devices[0].global_mem_size
+    size = engine.real.itemsize
+    most = max(r * size + 4 * i for r, i in (mesh.PEAK[dim], mesh.OUTPUT[dim]))
+    fits = min(room / most, mesh.MOST_CELLS)
+    mesh.check_memory(engine, 0.99 * fits)
+    with pytest.raises(MemoryLimitError, match="GiB"):
+        mesh.check_memory(engine, 1.01 * fits)
+    with pytest.raises(MemoryLimitError, match="GiB"):
+        clvoro.Adapter(ctx, real).run(
+            clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits)
+        )
