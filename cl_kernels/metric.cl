@@ -1,4 +1,4 @@
-#include "common/real.h"
+#include "common/outline.h"
 
 #if DIM == 2
 /* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Nearly all cells have so few sides that it need not be evaluated. */
@@ -22,7 +22,7 @@ inline REAL regular_roundness(int n)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts, global const REAL *face_measures,
                             global const REAL *offsets, global const REAL *covariances, global const REAL *h,
-                            global REAL *error, global REAL *quality, global REAL *energy, global REAL *reach)
+                            global REAL *error, global REAL *quality, global REAL *energy, global REAL *reach OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
@@ -32,7 +32,12 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
         surface += face_measures[k];
 #if DIM == 2
     const REAL length = sqrt(volume);
-    quality[i] = regular_roundness(end - begin) * volume / (surface * surface);
+#ifdef POLYGON
+    const int sides = outlines[i].s0;
+#else
+    const int sides = end - begin;
+#endif
+    quality[i] = regular_roundness(max(sides, 3)) * volume / (surface * surface);
 #else
     const REAL length = cbrt(volume);
     quality[i] = R(113.09733552923255) * volume * volume / (surface * surface * surface);

@@ -1,4 +1,5 @@
 #include "common/domain.h"
+#include "common/outline.h"
 
 /* Insertion and deletion of generators: the paper's 2.3.1, where the lattice (in 2D) and the count ask for it.
 
@@ -33,7 +34,8 @@ inline REAL2 difference(global const REAL *points, int from, int to)
    a wall, 4 in a corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an
    unstrained lattice. Only six-sided inner cells have weight. */
 kernel void measure_strain(const int size, global const int *starts, global const int *neighbours,
-                           global const REAL *points, global const REAL *h, global int2 *kinds, global REAL4 *strain)
+                           global const REAL *points, global const REAL *h, global int2 *kinds,
+                           global REAL4 *strain OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const int n = starts[i + 1] - starts[i];
@@ -48,7 +50,14 @@ kernel void measure_strain(const int size, global const int *starts, global cons
         const REAL2 d = difference(points, i, j);
         s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(d.s0 * d.s0, d.s0 * d.s1, d.s1 * d.s1, 0);
     }
+#ifdef POLYGON
+    /* Half a neighbour more or less is none. A cell between two boundaries, or at a sharp corner, is as one in a corner. */
+    const REAL charge = n - walls - outlines[i].s1;
+    kinds[i] = (int2)((int)(charge > 0 ? ceil(charge - R(0.5)) : floor(charge + R(0.5))),
+                      walls == 0 ? 0 : (outlines[i].s1 < R(3.2) ? 2 : 1));
+#else
     kinds[i] = (int2)(n - (6 - min(walls, 2)), walls);
+#endif
     s /= max(n - walls, 1);
     s.s3 = walls == 0 && n == 6;
     strain[i] = s;

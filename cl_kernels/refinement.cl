@@ -1,4 +1,5 @@
 #include "common/domain.h"
+#include "common/outline.h"
 
 /* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular lattice
    over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbour, so that cells
@@ -11,6 +12,20 @@ inline bool has_middle(int i, int j, REAL measure, REAL volume)
     return j > i && measure > SHORT_FACE * (DIM == 2 ? length : length * length);
 }
 
+#ifdef POLYGON
+/* A cell at the boundary brings one, before its longest edge there: of two equally long, the first. */
+inline bool is_wall_side(int k, int begin, int end, global const int *neighbours, global const REAL *face_measures, REAL volume)
+{
+    bool longest = neighbours[k] < 0 && face_measures[k] > SHORT_FACE * sqrt(volume);
+    for (int m = begin; m < end && longest; ++m)
+        longest = neighbours[m] >= 0 || m == k || face_measures[m] < face_measures[k] ||
+                  (face_measures[m] == face_measures[k] && m > k);
+    return longest;
+}
+#else
+#define is_wall_side(k, begin, end, neighbours, face_measures, volume) (neighbours[k] < 0)
+#endif
+
 /* Per generator i: how many new generators it brings. */
 kernel void count_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                            global const REAL *volumes, global int *counts)
@@ -19,7 +34,8 @@ kernel void count_children(const int size, global const int *starts, global cons
     int count = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
-        count += j < 0 || has_middle(i, j, face_measures[k], volumes[i]);
+        count += j < 0 ? is_wall_side(k, starts[i], starts[i + 1], neighbours, face_measures, volumes[i])
+                       : has_middle(i, j, face_measures[k], volumes[i]);
     }
     counts[i] = count;
 }
@@ -28,7 +44,7 @@ kernel void count_children(const int size, global const int *starts, global cons
    the counts; h is the size on the new level. */
 kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                            global const REAL *volumes, global const REAL *points, global const REAL *h, const int n,
-                           DOMAIN_ARGS, global const int *firsts, global REAL *finer)
+                           DOMAIN_ARGS, global const int *firsts, global REAL *finer, global const REAL *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);
@@ -38,6 +54,18 @@ kernel void place_children(const int size, global const int *starts, global cons
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
         if (j < 0) {
+            if (!is_wall_side(k, starts[i], starts[i + 1], neighbours, face_measures, volumes[i]))
+                continue;
+#ifdef POLYGON
+            const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]), t = BOUNDARY_TANGENT(j);
+            const REAL gap = m.s0 * t.s1 - m.s1 * t.s0;
+            const REAL way = gap > 0 ? fmin(gap / 2, h[i] / 4) : h[i] / 4;
+            const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+            REAL y[2] = {x[0] + m.s0 - way * t.s1, x[1] + m.s1 + way * t.s0};
+            keep_inside(x, y, DOMAIN);
+            child[0] = y[0];
+            child[1] = y[1];
+#else
             const int wall = -1 - j, axis = wall / 2;
             const REAL level = wall % 2 ? upper[axis] : lower[axis];
             for (int a = 0; a < DIM; ++a)
@@ -46,9 +74,22 @@ kernel void place_children(const int size, global const int *starts, global cons
             const REAL gap = points[DIM * i + axis] - level;
             const REAL way = gap != 0 ? fmin(fabs(gap) / 2, h[i] / 4) : h[i] / 2;
             child[axis] = level + (wall % 2 ? -way : way);
+#endif
         } else if (has_middle(i, j, face_measures[k], volumes[i])) {
             for (int a = 0; a < DIM; ++a)
                 child[a] = points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2;
+#ifdef POLYGON
+            /* Around a corner of the boundary the middle of the common face is in sight of both. */
+            const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+            REAL y[2] = {child[0], child[1]};
+            if (leaves_at(x, y, DOMAIN) <= 1) {
+                y[0] = x[0] + face_centroids[2 * k];
+                y[1] = x[1] + face_centroids[2 * k + 1];
+                keep_inside(x, y, DOMAIN);
+            }
+            child[0] = y[0];
+            child[1] = y[1];
+#endif
         } else {
             continue;
         }

@@ -1,4 +1,5 @@
 #include "common/domain.h"
+#include "common/outline.h"
 
 /* The gradient of cell quality by the generators, in 2D. By the paper's (4.1), up to a constant for each number of faces,
 
@@ -37,7 +38,7 @@ typedef struct {
     REAL tension;  /* the neighbour's */
 } Face;
 
-inline Face look_at_face(int label, REAL2 x, global const REAL *points, global const REAL *tension)
+inline Face look_at_face(int label, REAL2 x, global const REAL *points, global const REAL *tension OUTLINE_ARGS)
 {
     Face f;
     f.label = label;
@@ -49,9 +50,13 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points, global c
         f.tangent = f.inverse * (REAL2)(-f.away.s1, f.away.s0);
         f.tension = tension[label];
     } else {
+#ifdef POLYGON
+        f.tangent = BOUNDARY_TANGENT(label);
+#else
         const int wall = -1 - label;
         const REAL sign = wall % 2 ? 1 : -1;
         f.tangent = wall < 2 ? (REAL2)(0, sign) : (REAL2)(-sign, 0);
+#endif
     }
     return f;
 }
@@ -63,20 +68,30 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points, global c
 kernel void descend_shape(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                           global const REAL *face_centroids, global const REAL *points, global const REAL *tension,
                           global const REAL *pressure, global const REAL *h, const REAL rate, const REAL longest,
-                          global REAL *lloyd)
+                          global REAL *lloyd OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL2 x = (REAL2)(points[2 * i], points[2 * i + 1]);
     const int begin = starts[i], end = starts[i + 1];
     const REAL wi = tension[i];
     REAL2 g = 0;
-    Face before = look_at_face(neighbours[end - 1], x, points, tension);
+    Face before = look_at_face(neighbours[end - 1], x, points, tension OUTLINE);
     for (int k = begin; k < end; ++k) {
-        const Face face = look_at_face(neighbours[k], x, points, tension);
+        const Face face = look_at_face(neighbours[k], x, points, tension OUTLINE);
         const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
         const REAL2 r = m - face_measures[k] / 2 * face.tangent; /* corner k */
         REAL s = 0;
-        if (before.label >= 0 && face.label >= 0) {
+#ifdef POLYGON
+        /* A cell may have several loops: do the two faces meet? */
+        const int last = k == begin ? end - 1 : k - 1;
+        const REAL2 other = (REAL2)(face_centroids[2 * last], face_centroids[2 * last + 1]) +
+                            face_measures[last] / 2 * before.tangent;
+        const bool apart = dot(other - r, other - r) > R(1e-6) * dot(r, r);
+#else
+        const bool apart = false;
+#endif
+        if (apart) {
+        } else if (before.label >= 0 && face.label >= 0) {
             const REAL2 a = before.away, b = face.away, c = b - a;
             const REAL det = a.s0 * b.s1 - a.s1 * b.s0;
             const REAL2 between = (REAL2)(-c.s1, c.s0) / sqrt(dot(c, c)); /* against the face between the two */

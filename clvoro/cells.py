@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl.array as cla
@@ -12,6 +13,9 @@ from ._program import Engine
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import Box
 from .errors import ClvoroError, InputError, MemoryLimitError
+
+if TYPE_CHECKING:
+    from .trim import Trimmed
 
 CELL_CAPACITY = 24
 """Faces that a cell may have while it is clipped."""
@@ -43,6 +47,10 @@ class Tessellation:
         Centroid minus generator: the Lloyd displacement.
     covariances : (n, d (d + 1) / 2) real
         Second moments about the centroid per unit volume: xx, xy, yy in 2D.
+    outlines : tuple of arrays
+        Of a diagram trimmed by a boundary what kernels take as OUTLINE_ARGS (common/outline.h); else empty.
+    trimmed : Trimmed, optional
+        How such a diagram came to be.
     """
 
     n: int
@@ -54,6 +62,8 @@ class Tessellation:
     volumes: cla.Array
     offsets: cla.Array
     covariances: cla.Array
+    outlines: tuple[cla.Array, ...] = ()
+    trimmed: Trimmed | None = None
 
 
 @dataclass

@@ -28,7 +28,7 @@ class Metric:
         """Write the paper's (3.1), signed, its (4.1), each cell's part of its (2.3), and min(L, h); all (n,)."""
         self.engine.run_each(
             self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
-            t.covariances, h, error, quality, energy, reach,
+            t.covariances, h, error, quality, energy, reach, *t.outlines,
         )  # fmt: skip
 
     def compare_neighbours(

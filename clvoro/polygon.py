@@ -8,14 +8,18 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 
 from .domain import Domain
+from .edge_grid import bin_edges
 from .errors import InputError, InputTypeError
 from .rings import make_rings, pieces_of_geojson, pieces_of_shape, project, signed_area
+
+if TYPE_CHECKING:
+    from ._program import Engine
 
 _MARGIN = 1 / 64  # of the clip box around the domain, of the bounding box's longest edge
 _ROUNDINGS = 8  # of a coordinate, by which a point may lie off the boundary and still be on it
@@ -297,6 +301,29 @@ class Polygon(Domain):
         """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1]."""
         lower, upper = self.clip_box
         return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
+
+    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
+        """Kernels for polygons know of edges."""
+        del real
+        return (("POLYGON", 1),)
+
+    def device_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return the corners of the clip box, and the edges in bins; see common/edges.h."""
+        key = engine.queue.int_ptr, engine.real
+        if key not in self._on_device:
+            origin, scale = self.frame
+            begins = (self.vertices - origin) / scale
+            ends = begins[self.next_vertex]
+            frame, shape, starts, listed = bin_edges(begins, ends)
+            self._on_device[key] = (
+                frame.astype(engine.real), shape, engine.upload(starts, np.int32),
+                engine.upload(np.concatenate([begins, ends], axis=1)[listed].ravel()),
+            )  # fmt: skip
+        return *self.device_corners(engine.real), *self._on_device[key]
+
+    @cached_property
+    def _on_device(self) -> dict[tuple[object, ...], tuple[object, ...]]:
+        return {}
 
 
 def _described(values: dict[str, Any]) -> Polygon:

@@ -124,7 +124,7 @@ class PopulationControl:
         engine, k, n = self.engine, self._kernels, t.n
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
         raw, once, twice = (self._room("strain", rings, size=4 * n) for rings in range(3))
-        engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw)
+        engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, twice)
         return kinds, once, twice

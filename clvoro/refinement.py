@@ -36,6 +36,7 @@ class Refinement:
         engine.run_each(
             k.place_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points, h,
             np.int32(n), *domain.device_args(engine), firsts, finer,
+            t.face_centroids, *t.outlines,
         )  # fmt: skip
         return finer
 

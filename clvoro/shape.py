@@ -49,4 +49,5 @@ class Shape:
         engine.run_each(
             k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
             t.points, self._tension, self._pressure, h, real(rate), real(longest), lloyd,
+            *t.outlines,
         )  # fmt: skip

@@ -1,23 +1,51 @@
 /* What a kernel that places generators has to know of the domain: DOMAIN_ARGS in its signature, DOMAIN to hand them on. */
 #include "common/real.h"
 
+#ifdef POLYGON
+#include "common/edges.h"
+#else
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper
 #define DOMAIN box_lower, box_upper
+#endif
 
 /* Corners of the box as arrays. */
 #define BOX_CORNERS(lower, upper) \
     const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3}; \
     const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3}
 
-/* The difference along axis a from one position to another. */
-#define DIFFERENCE(a, from, to) ((to) - (from))
+#ifdef PERIODIC
+/* Length of the period along axis a, in which positions lie in [0, period); 0 where there are walls. Positions and periods
+   are multiples of eps in the unit box, so that differences are exact, whatever the image. */
+#define PERIOD(a) ((a) == 0 ? R(PERIOD_0) : (a) == 1 ? R(PERIOD_1) : R(PERIOD_2))
 
-/* Where a generator that is to go from x to y ends, in the domain: on the way, at a wall of a box. */
+inline REAL nearest_image(REAL d, REAL period)
+{
+    return period > 0 ? d - period * rint(d * (1 / period)) : d;
+}
+
+/* The image in [0, period), on the grid of eps. */
+inline REAL wrapped(REAL y, REAL period)
+{
+    y = (y - period * floor(y / period) + 1) - 1;
+    return y >= period ? y - period : fmax(y, 0);
+}
+#else
+#define PERIOD(a) 0
+#define nearest_image(d, period) (d)
+#define wrapped(y, period) (y)
+#endif
+
+/* The difference along axis a from one position to another: to its nearest image, where the axis is periodic. */
+#define DIFFERENCE(a, from, to) nearest_image((to) - (from), PERIOD(a))
+
+#ifndef POLYGON
+/* Where a generator that is to go from x to y ends, in the domain: on the way, at a wall of a box; on the other side of
+   a periodic one. */
 inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a)
-        y[a] = clamp(y[a], lower[a], upper[a]);
+        y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
 }
 
 /* The same, but a generator that would leave comes back: so no two meet on a wall. */
@@ -25,6 +53,8 @@ inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a) {
+        if (PERIOD(a) > 0)
+            continue;
         if (y[a] < lower[a])
             y[a] = 2 * lower[a] - y[a];
         if (y[a] > upper[a])
@@ -32,3 +62,4 @@ inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
     }
     keep_inside(x, y, DOMAIN);
 }
+#endif

@@ -1,0 +1,195 @@
+#include "common/bins.h"
+#include "common/boundary.h"
+
+/* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex diagram.
+   Each crossing of an edge with a face is computed once, for both cells beside it, so that trimmed cells tile the domain. */
+
+/* Bits of the word in which kernels report what went wrong; see common/face_rows.h. */
+#define FLAG_LOST 1    /* a walk found no way on */
+#define FLAG_OUTSIDE 2 /* the cell of a generator outside the domain, an auxiliary one, reaches into it */
+
+inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
+{
+    const REAL2 d = (REAL2)(points[2 * i], points[2 * i + 1]) - y;
+    return dot(d, d);
+}
+
+/* Per vertex: a generator somewhere near it, the first in the vertex' bin or behind it. */
+kernel void guess_owners(const int size, global const REAL2 *vertices, global const int *items, global const int2 *bins,
+                         global const FRAME *grid_frames, global const int4 *grid_shapes, const int n, global int *owners)
+{
+    WORK_ITEM(v);
+    int grid = 0;
+    while (true) {
+        const int b = bin_in_grid((global const REAL *)(vertices + v), grid_frames[grid], grid_shapes[grid]);
+        const int child = bins[b].s1;
+        if (bins[b + 1].s1 == child) {
+            owners[v] = items[min(bins[b].s0, n - 1)];
+            return;
+        }
+        grid = child;
+    }
+}
+
+/* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is nearer. */
+kernel void find_owners(const int size, global const REAL2 *vertices, global const int *starts, global const int *neighbours,
+                        global const REAL *points, global int *owners)
+{
+    WORK_ITEM(v);
+    const REAL2 y = vertices[v];
+    int cell = owners[v], next = cell;
+    REAL least = squared_distance(y, cell, points);
+    do {
+        cell = next;
+        for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
+            const int j = neighbours[k];
+            const REAL d2 = j >= 0 ? squared_distance(y, j, points) : REAL_MAX;
+            if (d2 < least) {
+                least = d2;
+                next = j;
+            }
+        }
+    } while (next != cell);
+    owners[v] = cell;
+}
+
+/* Where the line a + t e meets the bisector of two generators; the same for both. */
+inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
+{
+    const int o = min(i, j), q = max(i, j);
+    const REAL2 x = (REAL2)(points[2 * o], points[2 * o + 1]);
+    const REAL2 d = (REAL2)(points[2 * q], points[2 * q + 1]) - x;
+    return dot(x - a + d / 2, d) / dot(e, d);
+}
+
+/* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, which ends in cell `target`; -1 if there is none. Of
+   the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends. Where rounding
+   has led past the end of the edge, the neighbour that is nearest to the target's generator: that way leads to it. */
+inline int step_along(int cell, int target, REAL2 a, REAL2 e, global const int *starts, global const int *neighbours,
+                      global const REAL *points, REAL *t)
+{
+    const REAL2 x = (REAL2)(points[2 * cell], points[2 * cell + 1]);
+    const REAL2 goal = (REAL2)(points[2 * target], points[2 * target + 1]);
+    REAL first = REAL_MAX, least = squared_distance(goal, cell, points);
+    int next = -1, towards = -1;
+    for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL2 d = (REAL2)(points[2 * j], points[2 * j + 1]) - x;
+        const REAL d2 = squared_distance(goal, j, points);
+        if (d2 < least) {
+            least = d2;
+            towards = j;
+        }
+        if (dot(e, d) > 0) {
+            const REAL at = crossing(cell, j, a, e, points);
+            if (at < first) {
+                first = at;
+                next = j;
+            }
+        }
+    }
+    const bool past = !(first < 1);
+    *t = past ? 1 : fmax(*t, first);
+    return past ? towards : next;
+}
+
+/* Per edge: walk along it. Without chord_cells only the number of chords is counted. `generators` are those in the domain;
+   the cells of others must not be met: those are marked. */
+kernel void walk_edges(const int size, const int generators, global const REAL2 *vertices, global const int *next_vertex,
+                       global const int *owners, global const int *starts, global const int *neighbours,
+                       global const REAL *points, const int write, global int *firsts, global int *chord_cells,
+                       global int *chord_edges, global REAL *chord_ends, global int *intruders, global int *flags)
+{
+    WORK_ITEM(v);
+    const int w = next_vertex[v], target = owners[w];
+    const REAL2 a = vertices[v], e = vertices[w] - a;
+    int cell = owners[v], chord = write ? firsts[v] : 0;
+    REAL t = 0;
+    /* A walk meets a cell once, whatever rounding does. */
+    for (int steps = 0; cell >= 0; ++steps) {
+        const bool last = cell == target || steps > size + generators;
+        const int next = last ? -1 : step_along(cell, target, a, e, starts, neighbours, points, &t);
+        if (cell >= generators) {
+            intruders[cell - generators] = 1;
+            atomic_or(flags, FLAG_OUTSIDE);
+        }
+        if (cell != target && next < 0)
+            atomic_or(flags, FLAG_LOST);
+        if (write) {
+            chord_cells[chord] = cell;
+            chord_edges[chord] = v;
+            chord_ends[chord] = next < 0 ? 1 : t;
+        }
+        ++chord;
+        cell = next;
+    }
+    if (!write)
+        firsts[v] = chord;
+}
+
+/* Per chord: slots[cell] = the first chord of the cell (INT_MAX before: the boundary does not pass through). */
+kernel void find_firsts(const int size, global const int *chord_cells, global int *slots)
+{
+    WORK_ITEM(c);
+    atomic_min(slots + chord_cells[c], c);
+}
+
+/* Per chord: 1 if it is the first of its cell. */
+kernel void flag_firsts(const int size, global const int *chord_cells, global const int *slots, global int *ranks)
+{
+    WORK_ITEM(c);
+    ranks[c] = slots[chord_cells[c]] == c;
+}
+
+/* Per first chord of a cell: list the cell as number ranks[c] of those that the boundary passes through. */
+kernel void list_touched(const int size, global const int *chord_cells, global const int *ranks, global int *touched)
+{
+    WORK_ITEM(c);
+    if (ranks[c + 1] > ranks[c])
+        touched[ranks[c]] = chord_cells[c];
+}
+
+/* Per touched cell: its number in place of its first chord. */
+kernel void number_touched(const int size, global const int *touched, global int *slots, global int *counts)
+{
+    WORK_ITEM(u);
+    slots[touched[u]] = u;
+    counts[u] = 0;
+}
+
+/* Per chord: count it to its cell. */
+kernel void count_chords(const int size, global const int *chord_cells, global const int *slots, global int *ranks,
+                         global int *counts)
+{
+    WORK_ITEM(c);
+    ranks[c] = atomic_inc(counts + slots[chord_cells[c]]);
+}
+
+/* Per chord: into the list of its cell. The order is put right by sort_chords. */
+kernel void place_chords(const int size, global const int *chord_cells, global const int *slots, global const int *ranks,
+                         global const int *starts, global int *listed)
+{
+    WORK_ITEM(c);
+    listed[starts[slots[chord_cells[c]]] + ranks[c]] = c;
+}
+
+/* Per touched cell: its chords in order. */
+kernel void sort_chords(const int size, global const int *starts, global int *listed)
+{
+    WORK_ITEM(u);
+    global int *list = listed + starts[u];
+    const int count = starts[u + 1] - starts[u];
+    int gap = 1;
+    while (gap < count / 9)
+        gap = 3 * gap + 1;
+    for (; gap > 0; gap /= 3)
+        for (int k = gap; k < count; ++k) {
+            const int item = list[k];
+            int at = k;
+            for (; at >= gap && list[at - gap] > item; at -= gap)
+                list[at] = list[at - gap];
+            list[at] = item;
+        }
+}

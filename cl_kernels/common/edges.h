@@ -1,0 +1,52 @@
+/* The edges of a polygonal domain in uniform bins, for all that moves: which edge does a generator's way cross first?
+
+   edge_frame   origin (2), 1 / edge of a bin
+   edge_shape   bins along x, y
+   edge_starts  (bins + 1) first of the edges that pass through each bin, row by row
+   edge_ends    both ends of each edge, the domain on the left */
+#include "common/real.h"
+
+#define DOMAIN_ARGS                                                                                                  \
+    const REAL4 box_lower, const REAL4 box_upper, const REAL4 edge_frame, const int4 edge_shape,                     \
+        global const int *edge_starts, global const REAL4 *edge_ends
+#define DOMAIN box_lower, box_upper, edge_frame, edge_shape, edge_starts, edge_ends
+
+/* Where the way from x to y, t = 0 to 1, leaves the domain first; 2 if it does not. Corners are seen by both their edges with
+   the same numbers, so that no way slips through between them. */
+inline REAL leaves_at(const REAL *x, const REAL *y, DOMAIN_ARGS)
+{
+    const REAL2 from = (REAL2)(x[0], x[1]), way = (REAL2)(y[0], y[1]) - from;
+    const REAL2 least = fmin(from, from + way), most = fmax(from, from + way);
+    const int left = clamp((int)floor((least.s0 - edge_frame.s0) * edge_frame.s2), 0, edge_shape.s0 - 1);
+    const int right = clamp((int)floor((most.s0 - edge_frame.s0) * edge_frame.s2), 0, edge_shape.s0 - 1);
+    const int bottom = clamp((int)floor((least.s1 - edge_frame.s1) * edge_frame.s2), 0, edge_shape.s1 - 1);
+    const int top = clamp((int)floor((most.s1 - edge_frame.s1) * edge_frame.s2), 0, edge_shape.s1 - 1);
+    REAL first = 2;
+    for (int row = bottom; row <= top; ++row) {
+        /* The bins of a row are one run of edges. */
+        const int begin = edge_starts[row * edge_shape.s0 + left], end = edge_starts[row * edge_shape.s0 + right + 1];
+        for (int k = begin; k < end; ++k) {
+            const REAL2 a = edge_ends[k].s01 - from, b = edge_ends[k].s23 - from, e = b - a;
+            const REAL here = a.s1 * e.s0 - a.s0 * e.s1; /* e x (x - a): positive inside */
+            const REAL there = here + e.s0 * way.s1 - e.s1 * way.s0;
+            const REAL side_a = way.s0 * a.s1 - way.s1 * a.s0, side_b = way.s0 * b.s1 - way.s1 * b.s0;
+            if (here > 0 && there <= 0 && (side_a < 0 ? side_b >= 0 : side_b <= 0))
+                first = fmin(first, here / (here - there));
+        }
+    }
+    return first;
+}
+
+/* Where a generator that is to go from x to y ends: if its way leads out of the domain, half-way to the boundary. */
+inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
+{
+    const REAL t = leaves_at(x, y, DOMAIN);
+    if (t <= 1)
+        EACH_AXIS(a)
+            y[a] = x[a] + t / 2 * (y[a] - x[a]);
+}
+
+inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
+{
+    keep_inside(x, y, DOMAIN);
+}

@@ -1,0 +1,427 @@
+#include "common/trimmed.h"
+
+/* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a cell, what
+   lies in the domain is cut out: its pieces, each an outer loop and the islands in it. The piece with the generator is the
+   cell; the others, which a spit or a slit cuts off from it, go to the cell beside them with which they share the longest
+   face, and stay where they are only if there is none. */
+
+#define FLAG_LOST 1   /* as in chords.cl */
+#define FLAG_ORPHANS 4 /* a cell is in several pieces */
+#define UNTOUCHED 0x7fffffff
+#define ISLAND -2 /* the end of a chord that belongs to an island within its cell */
+
+#define CONVEX_ARGS                                                                                                  \
+    global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,        \
+        const REAL4 box_upper, global const int *touched, global const int *list_starts, global const int *listed
+
+inline convex_t convex_cell(int u, CONVEX_ARGS)
+{
+    convex_t cell;
+    cell.i = touched[u];
+    cell.row = neighbours + starts[cell.i];
+    cell.n = starts[cell.i + 1] - starts[cell.i];
+    cell.chords = listed + list_starts[u];
+    cell.chord_count = list_starts[u + 1] - list_starts[u];
+    cell.points = points;
+    cell.x[0] = points[2 * cell.i];
+    cell.x[1] = points[2 * cell.i + 1];
+    cell.lower[0] = box_lower.s0;
+    cell.lower[1] = box_lower.s1;
+    cell.upper[0] = box_upper.s0;
+    cell.upper[1] = box_upper.s1;
+    return cell;
+}
+#define CONVEX starts, neighbours, points, box_lower, box_upper, touched, list_starts, listed
+
+inline cursor_t loop_begin(int chord)
+{
+    return chord >= 0 ? along_chord(chord) : around_cell();
+}
+
+inline bool winds_around(const convex_t *cell, const chords_t *c, int chord, REAL2 y)
+{
+    cursor_t cursor = loop_begin(chord);
+    int turns = 0;
+    do
+        turns += winding(next_segment(&cursor, cell, c), y);
+    while (!is_complete(&cursor, chord));
+    return turns > 0;
+}
+
+/* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
+
+   loop_chords   a chord with which each loop begins; -1: around the whole cell; -2: no loop
+   loop_pieces   place of the outer loop that the loop belongs to, itself if it is one
+   loop_roots    of outer loops: the generator that the piece goes to, -1 if that is not known yet
+   counts        segments of all loops of the cell */
+kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chord_loops, global int *loop_chords,
+                       global int *loop_pieces, global int *loop_roots, global int *counts, global int *flags)
+{
+    WORK_ITEM(u);
+    const chords_t c = CHORDS;
+    const convex_t cell = convex_cell(u, CONVEX);
+    const int first = list_starts[u] + u;
+    int loops = 0, outer = 0, turns = 0, main = -1, total = 0;
+    bool crossed = false, main_winds = false;
+    REAL nearest = REAL_MAX;
+    for (int k = 0; k < cell.chord_count; ++k)
+        chord_loops[cell.chords[k]] = -1;
+    /* First the loops with chords that come in over a face: they begin with one. */
+    for (int turn = 0; turn < 2 * cell.chord_count; ++turn) {
+        const int begin = cell.chords[turn % cell.chord_count];
+        if (chord_loops[begin] >= 0 || (turn < cell.chord_count && begins_inside(&c, begin)))
+            continue;
+        cursor_t cursor = loop_begin(begin);
+        REAL area = 0, near = REAL_MAX;
+        int around = 0, count = 0;
+        bool open = false;
+        /* A loop that takes more segments than there are has lost its way. */
+        const int most = 2 * (cell.chord_count + 1) * (cell.n + 2);
+        do {
+            if (cursor.chord >= 0)
+                chord_loops[cursor.chord] = loops;
+            const segment_t s = next_segment(&cursor, &cell, &c);
+            area += difference_of_products(s.p.s0, s.q.s1, s.p.s1, s.q.s0);
+            around += winding(s, 0);
+            near = fmin(near, squared_distance_to(s));
+            open |= s.label >= 0;
+        } while (!is_complete(&cursor, begin) && ++count < most);
+        if (count == most)
+            atomic_or(flags, FLAG_LOST);
+        const bool is_outer = open || area > 0;
+        const int place = first + loops;
+        loop_chords[place] = begin;
+        loop_pieces[place] = is_outer ? place : -1;
+        loop_roots[place] = -1;
+        crossed |= open;
+        turns += around;
+        total += count + 1;
+        /* The generator's own piece winds around it; for a generator on the boundary rounding decides, or the distance. */
+        const bool winds = around > 0;
+        if (is_outer && (main < 0 || winds > main_winds || (winds == main_winds && near < nearest))) {
+            main = place;
+            main_winds = winds;
+            nearest = near;
+        }
+        outer += is_outer;
+        ++loops;
+    }
+    if (!crossed && turns == 0) {
+        /* No chord leaves the cell, and loops do not enclose the generator: the cell's own faces do. */
+        main = first + loops++;
+        loop_chords[main] = -1;
+        loop_pieces[main] = main;
+        ++outer;
+        total += cell.n;
+    }
+    if (main < 0) {
+        atomic_or(flags, FLAG_LOST);
+        main = first;
+    }
+    for (int place = first; place < first + loops; ++place)
+        if (loop_pieces[place] < 0) {
+            loop_pieces[place] = main;
+            const REAL2 y = chord_begin(&c, loop_chords[place]) - (REAL2)(cell.x[0], cell.x[1]);
+            for (int other = first; outer > 1 && other < first + loops; ++other)
+                if (loop_pieces[other] == other && winds_around(&cell, &c, loop_chords[other], y))
+                    loop_pieces[place] = other;
+        }
+    loop_roots[main] = cell.i;
+    for (int place = first + loops; place < list_starts[u + 1] + u + 1; ++place) {
+        loop_chords[place] = -2;
+        loop_pieces[place] = -1;
+    }
+    counts[u] = total;
+    if (outer > 1)
+        atomic_or(flags, FLAG_ORPHANS);
+}
+
+/* Segments of all touched cells, cell by cell, piece by piece, loop by loop; see segment_t. */
+typedef struct {
+    global const int *starts, *labels, *from, *to, *places;
+    global const REAL2 *p, *q;
+} segments_t;
+
+#define SEGMENT_ARGS                                                                                                 \
+    global const int *segment_starts, global const int *segment_labels, global const int *segment_from,              \
+        global const int *segment_to, global const int *segment_places, global const REAL2 *segment_p,               \
+        global const REAL2 *segment_q
+#define SEGMENTS {segment_starts, segment_labels, segment_from, segment_to, segment_places, segment_p, segment_q}
+
+/* Per touched cell u: its segments, behind segment_starts[u]; `places` tells the loop's piece. */
+kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const int *loop_chords,
+                           global const int *loop_pieces, global const int *segment_starts, global int *labels,
+                           global int *from, global int *to, global int *places, global REAL2 *p, global REAL2 *q)
+{
+    WORK_ITEM(u);
+    const chords_t c = CHORDS;
+    const convex_t cell = convex_cell(u, CONVEX);
+    const int first = list_starts[u] + u, end = list_starts[u + 1] + u + 1;
+    int at = segment_starts[u];
+    for (int piece = first; piece < end; ++piece) {
+        if (loop_pieces[piece] != piece)
+            continue;
+        /* The outer loop, then the islands. */
+        for (int turn = 0; turn < 2; ++turn)
+            for (int place = turn ? first : piece; place < (turn ? end : piece + 1); ++place) {
+                if (loop_pieces[place] != piece || (turn && place == piece))
+                    continue;
+                const int begin = loop_chords[place];
+                cursor_t cursor = loop_begin(begin);
+                do {
+                    const segment_t s = next_segment(&cursor, &cell, &c);
+                    labels[at] = s.label;
+                    from[at] = s.from;
+                    to[at] = turn ? ISLAND : s.to;
+                    places[at] = piece;
+                    p[at] = s.p;
+                    q[at] = s.q;
+                    ++at;
+                } while (!is_complete(&cursor, begin) && at < segment_starts[u + 1]);
+            }
+    }
+}
+
+/* The generator that the piece on the other side of segment k of cell i goes to, -1 if it is not known yet. */
+inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
+{
+    const int j = s->labels[k], u = slots[j];
+    if (u == UNTOUCHED)
+        return j;
+    for (int m = s->starts[u]; m < s->starts[u + 1]; ++m) {
+        if (s->labels[m] != i)
+            continue;
+        const bool ends_meet = s->from[k] < 0 ? s->to[m] < 0 : s->to[m] == s->from[k];
+        const bool begins_meet = s->to[k] < 0 ? s->from[m] < 0 : s->from[m] == s->to[k];
+        if (ends_meet && begins_meet)
+            return roots[s->places[m]];
+    }
+    return j; /* a face that rounding lets only one of the two see */
+}
+
+/* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is known.
+   Only cells that the boundary passes through take pieces. */
+kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots, global const int *list_starts,
+                         global const int *loop_pieces, global const int *roots, global int *new_roots)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    for (int piece = list_starts[u] + u; piece < list_starts[u + 1] + u + 1; ++piece) {
+        if (loop_pieces[piece] != piece)
+            continue;
+        int root = roots[piece];
+        REAL longest = -1;
+        if (root < 0)
+            for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
+                if (s.places[k] != piece || s.labels[k] < 0)
+                    continue;
+                const int other = other_root(&s, k, i, slots, roots);
+                const REAL2 e = s.q[k] - s.p[k];
+                if (other >= 0 && slots[other] != UNTOUCHED && dot(e, e) > longest) {
+                    longest = dot(e, e);
+                    root = other;
+                }
+            }
+        new_roots[piece] = root;
+    }
+}
+
+/* Per touched cell: a piece that nobody takes stays its own. orphans[place] = 1 for pieces that go to another cell, whose
+   untouched neighbours are to name that one: marked. */
+kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                          global const int *list_starts, global const int *loop_pieces, global int *roots,
+                          global int *orphans, global int *marks)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    for (int piece = list_starts[u] + u; piece < list_starts[u + 1] + u + 1; ++piece) {
+        orphans[piece] = 0;
+        if (loop_pieces[piece] != piece)
+            continue;
+        if (roots[piece] < 0)
+            roots[piece] = i;
+        if (roots[piece] == i)
+            continue;
+        orphans[piece] = 1;
+        for (int k = s.starts[u]; k < s.starts[u + 1]; ++k)
+            if (s.places[k] == piece && s.labels[k] >= 0 && slots[s.labels[k]] == UNTOUCHED)
+                marks[s.labels[k]] = 1;
+    }
+}
+
+/* Per place of a loop: list the orphans, and the touched cell that each lies in. */
+kernel void list_orphans(const int size, global const int *ranks, global int *orphans)
+{
+    WORK_ITEM(place);
+    if (ranks[place + 1] > ranks[place])
+        orphans[ranks[place]] = place;
+}
+
+/* Is segment k of cell i, in a piece that goes to `root`, a face of the cell of `root`? *other is what it names. */
+inline bool is_face(const segments_t *s, int k, int i, int root, global const int *slots, global const int *roots,
+                    int *other)
+{
+    const int label = s->labels[k];
+    *other = label < 0 ? label : other_root(s, k, i, slots, roots);
+    const REAL2 p = s->p[k], q = s->q[k];
+    return *other != root && !(p.s0 == q.s0 && p.s1 == q.s1 && (label < 0 || (s->from[k] >= 0 && s->to[k] >= 0)));
+}
+
+/* Per generator of the domain: faces of its cell, if the boundary does not pass through it. */
+kernel void count_whole(const int size, global const int *starts, global const int *slots, global int *counts)
+{
+    WORK_ITEM(i);
+    counts[i] = slots[i] == UNTOUCHED ? starts[i + 1] - starts[i] : 0;
+}
+
+/* Per touched cell: count the faces of each piece to the generator that the piece goes to. */
+kernel void count_trimmed(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                          global const int *roots, global int *counts)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    int other;
+    for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
+        const int root = roots[s.places[k]];
+        if (is_face(&s, k, touched[u], root, slots, roots, &other))
+            atomic_inc(counts + root);
+    }
+}
+
+/* Per generator of the domain whose cell the boundary does not pass through: its row as it was. Where a neighbour's piece
+   goes to another cell (marks), that one is named. */
+kernel void copy_whole(const int size, global const int *starts, global const int *neighbours,
+                       global const REAL *face_measures, global const REAL2 *face_centroids, SEGMENT_ARGS,
+                       global const int *slots, global const int *roots, global const int *marks,
+                       global const int *new_starts, global int *new_neighbours, global REAL *new_measures,
+                       global REAL2 *new_centroids)
+{
+    WORK_ITEM(i);
+    if (slots[i] != UNTOUCHED)
+        return;
+    const segments_t s = SEGMENTS;
+    const int shift = new_starts[i] - starts[i];
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        int j = neighbours[k];
+        if (marks[i] && j >= 0 && slots[j] != UNTOUCHED) {
+            const int u = slots[j];
+            for (int m = s.starts[u]; m < s.starts[u + 1]; ++m)
+                if (s.labels[m] == i && s.from[m] < 0 && s.to[m] < 0)
+                    j = roots[s.places[m]];
+        }
+        new_neighbours[k + shift] = j;
+        new_measures[k + shift] = face_measures[k];
+        new_centroids[k + shift] = face_centroids[k];
+    }
+}
+
+/* What is summed over the segments of a cell: as in measure_cells. */
+typedef struct {
+    REAL area, cx, cy, xx, xy, yy;
+} moments_t;
+
+inline void add_triangle(moments_t *m, REAL2 v, REAL2 w)
+{
+    const REAL2 sum = v + w;
+    const REAL cross = difference_of_products(v.s0, w.s1, v.s1, w.s0);
+    m->area += cross;
+    m->cx += cross * sum.s0;
+    m->cy += cross * sum.s1;
+    m->xx += cross * (v.s0 * v.s0 + w.s0 * w.s0 + sum.s0 * sum.s0);
+    m->xy += cross * (v.s0 * v.s1 + w.s0 * w.s1 + sum.s0 * sum.s1);
+    m->yy += cross * (v.s1 * v.s1 + w.s1 * w.s1 + sum.s1 * sum.s1);
+}
+
+/* The boundary of a cell, run by run of chords: how many sides it has there, a side turning by less than 30 degrees, and how many
+   neighbours a hexagonal lattice would have there: 6 - sum of 2 + turning / 60 degrees over the runs. */
+typedef struct {
+    REAL2 ahead; /* along the chord before, 0 at the start of a run */
+    REAL turned, sides, missing;
+} outline_t;
+
+#define SIDE_TURN R(0.5235987755982988)
+
+inline void add_side(outline_t *o, REAL2 e, bool chord)
+{
+    if (!chord) {
+        o->ahead = 0;
+        o->sides += 1;
+        return;
+    }
+    const bool goes_on = o->ahead.s0 != 0 || o->ahead.s1 != 0;
+    const REAL turn = goes_on ? atan2(o->ahead.s0 * e.s1 - o->ahead.s1 * e.s0, dot(o->ahead, e)) : 0;
+    o->turned = goes_on ? o->turned + turn : 0;
+    if (!goes_on || fabs(o->turned) > SIDE_TURN) {
+        o->sides += 1;
+        o->turned = 0;
+    }
+    o->missing += (goes_on ? 0 : 2) + turn / R(1.0471975511965976);
+    o->ahead = e;
+}
+
+/* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that have
+   changed cells, in order; segments_of[place] is the touched cell that they lie in.
+
+   outlines[i] = (sides, neighbours that a hexagonal lattice would have here) */
+kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *points, global const int *touched,
+                          global const int *slots, global const int *roots, global const int *orphans, const int orphan_count,
+                          global const int *place_cells, global const int *new_starts, global int *new_neighbours,
+                          global REAL *new_measures, global REAL2 *new_centroids, global int *face_segments,
+                          global REAL *volumes, global REAL2 *offsets, global REAL *covariances, global REAL2 *outlines)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    moments_t m = {0, 0, 0, 0, 0, 0};
+    outline_t o = {0, 0, 0, 0};
+    int at = new_starts[i];
+    for (int turn = -1; turn < orphan_count; ++turn) {
+        /* First the pieces in this cell, then those that have come to it. */
+        const int place = turn < 0 ? -1 : orphans[turn];
+        if (turn >= 0 && roots[place] != i)
+            continue;
+        const int v = turn < 0 ? u : place_cells[place];
+        const int home = touched[v];
+        const REAL2 shift = points[home] - points[i];
+        for (int k = s.starts[v]; k < s.starts[v + 1]; ++k) {
+            if (turn < 0 ? roots[s.places[k]] != i : s.places[k] != place)
+                continue;
+            const REAL2 p = s.p[k] + shift, q = s.q[k] + shift, e = q - p;
+            add_triangle(&m, p, q);
+            int other;
+            if (!is_face(&s, k, home, i, slots, roots, &other))
+                continue;
+            if (other >= 0 || s.to[k] != ISLAND)
+                add_side(&o, e, other < 0);
+            new_neighbours[at] = other;
+            new_measures[at] = sqrt(dot(e, e));
+            new_centroids[at] = (p + q) / 2;
+            face_segments[at] = k;
+            ++at;
+        }
+    }
+    volumes[i] = m.area / 2;
+    const REAL cx = m.cx / (3 * m.area), cy = m.cy / (3 * m.area);
+    offsets[i] = (REAL2)(cx, cy);
+    covariances[3 * i] = m.xx / (12 * m.area) - cx * cx;
+    covariances[3 * i + 1] = m.xy / (12 * m.area) - cx * cy;
+    covariances[3 * i + 2] = m.yy / (12 * m.area) - cy * cy;
+    outlines[i] = (REAL2)(o.sides, 6 - o.missing);
+}
+
+/* Per touched cell: the places of its loops are its own. */
+kernel void name_places(const int size, global const int *list_starts, global int *place_cells)
+{
+    WORK_ITEM(u);
+    for (int place = list_starts[u] + u; place < list_starts[u + 1] + u + 1; ++place)
+        place_cells[place] = u;
+}
+
+/* Per generator of the domain: the outline of a cell that the boundary does not pass through. */
+kernel void draw_whole(const int size, global const int *starts, global REAL2 *outlines)
+{
+    WORK_ITEM(i);
+    outlines[i] = (REAL2)(starts[i + 1] - starts[i], 6);
+}

@@ -1,0 +1,139 @@
+"""The boundary of a polygonal domain, cut by the cells of the convex diagram into chords (`chords.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Room, Scan
+from ._program import Engine
+from .bins import BinnedPoints
+from .cells import Tessellation
+from .errors import InputError
+from .polygon import Polygon
+
+LOST, OUTSIDE = 1, 2  # of the bits in chords.cl
+UNTOUCHED = 0x7FFFFFFF
+
+
+@dataclass(frozen=True)
+class Chords:
+    """Chords, edge by edge, and the cells that they lie in, on the device; see common/boundary.h.
+
+    Attributes
+    ----------
+    count : int
+    arrays : tuple of arrays
+        What kernels take as CHORD_ARGS.
+    slots : (n,) int32
+        Number of each cell among those that the boundary passes through, `UNTOUCHED` for the others.
+    touched : (t,) int32
+        Those cells.
+    list_starts : (t + 1,) int32
+    listed : (count,) int32
+        The chords of each, in order.
+    tangents : (edges, 2) real
+        Unit vectors along the edges.
+    """
+
+    count: int
+    touched_count: int
+    arrays: tuple[cla.Array, ...]
+    slots: cla.Array
+    touched: cla.Array
+    list_starts: cla.Array
+    listed: cla.Array
+    tangents: cla.Array
+
+
+class Boundary:
+    """Cut the boundary of one domain into chords."""
+
+    def __init__(self, engine: Engine, domain: Polygon) -> None:
+        self.engine = engine
+        self._scan, self._room = Scan(engine), Room(engine)
+        self._kernels = engine.kernels("chords")
+        origin, scale = domain.frame
+        self.edges = len(domain.vertices)
+        self.vertices = engine.upload((domain.vertices - origin) / scale)
+        self.next_vertex = engine.upload(domain.next_vertex, np.int32)
+        along = domain.vertices[domain.next_vertex] - domain.vertices
+        self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
+        self.owners = engine.zeros(self.edges, np.int32)
+        self._flags = engine.empty(1, np.int32)
+
+    def guess(self, binned: BinnedPoints, n: int) -> None:
+        """Find generators near the vertices, among the `n` that are `binned`."""
+        self.engine.run_each(
+            self._kernels.guess_owners, self.edges, self.vertices, binned.items, binned.bins,
+            binned.grid_frames, binned.grid_shapes, np.int32(n), self.owners,
+        )  # fmt: skip
+
+    def cut(self, t: Tessellation, generators: int) -> Chords | np.ndarray:
+        """Walk along all edges through the cells of `t`.
+
+        Only the first `generators` of its generators lie in the domain. If the boundary passes through cells of others,
+        those are returned, (i,) int, counted from `generators` on.
+
+        Raises
+        ------
+        InputError
+            If rounding lets a walk find no way.
+        """
+        engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
+        graph = (t.starts, t.neighbours, t.points)
+        engine.run_each(k.find_owners, edges, self.vertices, *graph, self.owners)
+        firsts = room("firsts", size=edges + 1, dtype=np.int32)
+        intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
+        self._flags.fill(0)
+        none = np.int32(0), firsts, firsts, firsts, self.vertices
+        walk = (np.int32(generators), self.vertices, self.next_vertex, self.owners, *graph)
+        engine.run_each(k.walk_edges, edges, *walk, *none, intruders, self._flags)
+        self._scan.exclusive(firsts, firsts, edges)
+        count = int(firsts[edges].get())
+        flags = int(self._flags.get()[0])
+        if flags & OUTSIDE:
+            return np.flatnonzero(intruders.get())
+        if flags & LOST:
+            raise InputError(
+                "the boundary of the polygon cannot be followed through the cells: generators are too close to it, or "
+                "to each other, for the precision; move them apart or use dtype='float64'"
+            )
+        cells, of_edges = (room(name, size=count, dtype=np.int32) for name in ("cells", "of_edges"))
+        ends = room("ends", size=count)
+        engine.run_each(
+            k.walk_edges,
+            edges,
+            *walk,
+            np.int32(1),
+            firsts,
+            cells,
+            of_edges,
+            ends,
+            intruders,
+            self._flags,
+        )
+        arrays = (self.vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends)
+        return self._sort(count, arrays, cells, t.n)
+
+    def _sort(self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int) -> Chords:
+        """List the cells, and the chords of each."""
+        engine, k, room = self.engine, self._kernels, self._room
+        slots = room("slots", size=n, dtype=np.int32).fill(UNTOUCHED)
+        ranks = room("ranks", size=count + 1, dtype=np.int32)
+        engine.run_each(k.find_firsts, count, cells, slots)
+        engine.run_each(k.flag_firsts, count, cells, slots, ranks)
+        self._scan.exclusive(ranks, ranks, count)
+        touched_count = int(ranks[count].get())
+        touched = room("touched", size=touched_count, dtype=np.int32)
+        starts = room("starts", size=touched_count + 1, dtype=np.int32)
+        listed = room("listed", size=count, dtype=np.int32)
+        engine.run_each(k.list_touched, count, cells, ranks, touched)
+        engine.run_each(k.number_touched, touched_count, touched, slots, starts)
+        engine.run_each(k.count_chords, count, cells, slots, ranks, starts)
+        self._scan.exclusive(starts, starts, touched_count)
+        engine.run_each(k.place_chords, count, cells, slots, ranks, starts, listed)
+        engine.run_each(k.sort_chords, touched_count, starts, listed)
+        return Chords(count, touched_count, arrays, slots, touched, starts, listed, self.tangents)

@@ -1,0 +1,44 @@
+"""The stages that a diagram takes, and their order in a box with walls."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import pyopencl.array as cla
+
+from ._program import Engine
+from .bins import Bins
+from .cells import Cells, Tessellation
+from .domain import Domain
+from .polyhedra import Polyhedra
+from .repair import Repair
+from .trim import Trim
+
+
+class DiagramStages(Protocol):
+    """The stages that a diagram takes."""
+
+    engine: Engine
+    bins: Bins
+    cells: Cells | Polyhedra
+    repair: Repair
+    trim: Trim
+
+
+def tessellate_box(
+    stages: DiagramStages,
+    domain: Domain,
+    points: cla.Array,
+    n: int,
+    previous: Tessellation | None,
+    exact: bool,
+) -> Tessellation:
+    """Tessellate the box that cells of `domain` are clipped by; see `Tessellator.tessellate`."""
+    if isinstance(stages.cells, Polyhedra):
+        binned = stages.bins.build(domain, points, n)
+        return stages.cells.tessellate(domain, points, n, binned, previous, exact)
+    if previous is not None and not exact:
+        t = stages.repair.follow(stages.cells, domain, points, previous)
+        if t is not None:
+            return t
+    return stages.cells.tessellate(domain, points, n, stages.bins.build(domain, points, n), exact)
