@@ -119,10 +119,10 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
-   square of bins that it has seen covers that circle.
+   square of bins that it has seen covers that circle. Its radius is left in reach[p], which begins as a guess of it.
 
    rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt */
-kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
+kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *rows,
                        global int *row_counts, global int *places, global int *flags)
@@ -144,6 +144,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         inner = w;
         w = fmin(need, 2 * w);
     }
+    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
     store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
     places[i] = i;
 }

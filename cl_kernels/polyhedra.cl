@@ -247,8 +247,8 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
-   cube of bins that it has seen covers that ball. With `warm` the neighbours of an earlier, similar diagram are
-   clipped first, and the search only has to confirm them.
+   cube of bins that it has seen covers that ball. Its radius is left in reach[p], which begins as a guess of it. With
+   `warm` the neighbours of an earlier, similar diagram are clipped first, and the search only has to confirm them.
 
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
@@ -257,7 +257,7 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
                                  order, the next kernels bring them into it
    labels, measures, centroids   of the faces; report[2] counts them
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
-kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global const float *reach,
+kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
                        global const int *old_starts, global const int *old_neighbours, const int again,
@@ -292,6 +292,8 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
         return;
     }
+
+    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
 
     /* A vertex of every face. */
     INDEX start[FACE_CAPACITY];

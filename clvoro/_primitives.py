@@ -105,17 +105,18 @@ class Gather:
 
 
 class Room:
-    """Device arrays by name that grow when needed and else are handed out again."""
+    """Device arrays by name that grow when needed, by a share to `spare` more, and else are handed out again."""
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: Engine, spare: float = 0.0) -> None:
+        self._engine, self._spare = engine, spare
         self._arrays: dict[tuple, cla.Array] = {}
 
     def __call__(self, *name: object, size: int, dtype: object = None) -> cla.Array:
         """Return the first `size` items of the array called `name`; their content is arbitrary."""
         array = self._arrays.get(name)
         if array is None or len(array) < size:
-            array = self._arrays[name] = self._engine.empty(max(size, 1), dtype)
+            room = max(size + int(self._spare * size), 1)
+            array = self._arrays[name] = self._engine.empty(room, dtype)
         return array[:size]
 
     def zeros(self, *name: object, size: int, dtype: object = None) -> cla.Array:

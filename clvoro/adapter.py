@@ -155,12 +155,12 @@ class Adapter:
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
         check_memory(engine, n)
-        origin, scale = domain.frame
-        binned = stages.bins.build(domain, engine.upload((host - origin) / scale), n)
+        binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with _Naming(host, domain, self.dtype):
-            t = Tessellator(stages, domain).tessellate(sorted_points, n, exact=True)
-        return fetch_diagram(engine, domain, t, labels)
+            tessellator = Tessellator(stages, domain)
+            t = tessellator.tessellate(sorted_points, n, exact=True)
+        return fetch_diagram(engine, domain, t, labels, unfolded=tessellator.unfolded)
 
     def run(
         self,
@@ -314,9 +314,8 @@ class Adapter:
                 host = sample_density(sizing, domain, n, options["seed"], self.dtype)
         mesh, near = None, False
         if host is not None and (saved is None or (planned and levels == 0)):
-            origin, scale = domain.frame
             with _Naming(host, domain, self.dtype):
-                unsorted = engine.upload((host - origin) / scale)
+                unsorted = engine.upload(domain.place(host, self.dtype))
                 mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
             near = points is not None and planned and levels == 0
             near = near and self._near(mesh, n_cells, options["effort"])
@@ -390,8 +389,7 @@ class _Naming:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if not isinstance(error, InputError):
             return
-        origin, scale = self.domain.frame
-        pair = coincident_pair(((self.points - origin) / scale).astype(self.real))
+        pair = coincident_pair(self.domain.place(self.points, self.real))
         if pair is not None:
             other = "" if self.real == np.float64 else " or use dtype='float64'"
             raise InputError(

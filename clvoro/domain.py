@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
     from ._program import Engine
@@ -25,10 +25,17 @@ class Domain(ABC):
     ----------
     lower, upper : tuples of d floats
         Opposite corners of the bounding box.
+    periodic : tuple of d bool
+        Directions in which the domain goes on with itself beyond the bounding box.
     """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Directions in which the domain is periodic: none, unless a class says otherwise."""
+        return (False,) * self.dim
 
     @property
     def dim(self) -> int:
@@ -49,6 +56,10 @@ class Domain(ABC):
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool."""
 
+    def wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
+        return np.asarray(points, float)
+
     # The device's view.
 
     @property
@@ -58,6 +69,11 @@ class Domain(ABC):
         The scale is a power of two, so that scaling itself rounds nothing.
         """
         return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
+
+    def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
+        """Return positions (n, d) in the device's coordinates and precision."""
+        origin, scale = self.frame
+        return ((points - origin) / scale).astype(real)
 
     @property
     def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -89,15 +105,26 @@ class Box(Domain):
     ----------
     lower, upper : sequences of 2 or 3 floats
         Opposite corners. Wall ``2 a`` is the lower one of axis a, wall ``2 a + 1`` the upper one.
+    periodic : bool, or a sequence of 2 or 3
+        Directions without walls: what leaves on one side comes in on the other. One bool stands for all directions.
 
     Raises
     ------
     InputError
         If the corners are not 2 or 3 finite numbers each with lower < upper, or too near or far for float64.
+    InputTypeError
+        If `periodic` is something else than truth values.
+
+    Notes
+    -----
+    On the device the lengths of periods, and coordinates along them, are multiples of 2^-52 (2^-23 in float32) of the
+    frame's unit, at most twice the longest edge. Adding a period is then exact and so are differences of positions,
+    which are the same for every image: cells on both sides of a seam see each other with the same numbers.
     """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
+    periodic: tuple[bool, ...] = False  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         lower = np.asarray(self.lower, dtype=float)
@@ -121,6 +148,11 @@ class Box(Domain):
             )
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))
+        object.__setattr__(self, "periodic", _directions(self.periodic, lower.size))
+
+    def __repr__(self) -> str:
+        periodic = f", periodic={self.periodic}" if any(self.periodic) else ""
+        return f"Box(lower={self.lower}, upper={self.upper}{periodic})"
 
     @property
     def measure(self) -> float:
@@ -128,5 +160,80 @@ class Box(Domain):
         return float(np.prod(self.extent))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool."""
-        return np.all((points >= self.lower) & (points <= self.upper), axis=1)
+        """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.
+
+        In a periodic direction every finite position does.
+        """
+        inside = (points >= self.lower) & (points <= self.upper)
+        return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
+
+    def wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
+        points, lower, extent = np.asarray(points, float), np.array(self.lower), self.extent
+        inside = (points >= lower) & (points < self.upper)
+        moved = lower + np.mod(points - lower, extent)
+        last = np.nextafter(np.array(self.upper), lower)  # where rounding has put one on the seam
+        moved = np.clip(moved, lower, last)
+        return np.where(inside | ~np.array(self.periodic), points, moved)
+
+    def periods(self, real: np.dtype) -> np.ndarray:
+        """Return the lengths of periods in the device's coordinates, (d,) float64; 0 across walls.
+
+        Raises
+        ------
+        InputError
+            If a period has no more than a thousand numbers of the precision.
+        """
+        step = float(np.finfo(real).eps)
+        lengths = np.rint(self.extent / self.frame[1] / step) * step
+        short = np.flatnonzero(np.array(self.periodic) & (lengths < 1000 * step))
+        if short.size:
+            raise InputError(
+                f"{self} is too thin along its periodic axis {short[0]} for {np.dtype(real).name}, expected at least "
+                f"{1000 * step:.1g} of the longest edge; use dtype='float64' or a thicker box"
+            )
+        return np.where(self.periodic, lengths, 0.0)
+
+    def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
+        """Return positions (n, d) in the device's coordinates and precision, along periods in [0, period)."""
+        if not any(self.periodic):
+            return super().place(points, real)
+        origin, scale = self.frame
+        x, periods = (self.wrap(points) - origin) / scale, self.periods(real)
+        along, step = np.array(self.periodic), float(np.finfo(real).eps)
+        x = np.where(along, np.rint(x / step) * step, x)
+        return np.where(along & (x >= periods), x - periods, x).astype(real)
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners in the device's coordinates, padded to four numbers as kernels take them."""
+        lower, upper = super().device_corners(real)
+        if any(self.periodic):
+            upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
+        return lower, upper
+
+    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
+        """Say how long the periods are, if there are any; see common/domain.h."""
+        if not any(self.periodic):
+            return ()
+        lengths = np.zeros(3)
+        lengths[: self.dim] = self.periods(real)
+        return (
+            ("PERIODIC", 1),
+            *((f"PERIOD_{a}", float(length).hex()) for a, length in enumerate(lengths)),
+        )
+
+
+def _directions(periodic: object, dim: int) -> tuple[bool, ...]:
+    """Return a truth value for each of `dim` directions."""
+    values = [periodic] * dim if isinstance(periodic, bool | np.bool_) else periodic
+    if not isinstance(values, list | tuple | np.ndarray) or any(
+        not isinstance(v, bool | np.bool_) for v in values
+    ):
+        raise InputTypeError(
+            f"Box got periodic {periodic!r}, expected True, False or one of them for each direction"
+        )
+    if len(values) != dim:
+        raise InputError(
+            f"Box got periodic {periodic!r} for {len(values)} directions, expected {dim}"
+        )
+    return tuple(bool(v) for v in values)

@@ -12,20 +12,53 @@ from .cells import Tessellation
 from .domain import Box
 from .loops import FaceLoops, Loops
 from .results import Diagram
+from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
 
 
 def fetch_diagram(
-    engine: Engine, domain: Box, t: Tessellation, labels: cla.Array, copy: bool = True
+    engine: Engine,
+    domain: Box,
+    t: Tessellation,
+    labels: cla.Array,
+    copy: bool = True,
+    unfolded: Unfolded | None = None,
 ) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for.
 
-    Without `copy`, nobody may use the buffers of `t` any more.
+    Without `copy`, nobody may use the buffers of `t` any more. `unfolded` is what `t` was folded from, in a periodic
+    box.
     """
-    fetched = _Fetched(engine, domain, t, labels, copy)
-    others = "face_vert" if engine.dim == 2 else "cell_vert"
-    names = (name for name in Diagram._NAMES if not name.startswith(others))
+    from .fetch_torus import _FetchedTorus
+
+    if unfolded is None:
+        fetched = _Fetched(engine, domain, t, labels, copy)
+    else:
+        fetched = _FetchedTorus(engine, domain, t, labels, copy, unfolded)
+    others = ["face_vert" if engine.dim == 2 else "cell_vert"]
+    if unfolded is None:
+        others.append("shifts")
+    names = (name for name in Diagram._NAMES if not name.startswith(tuple(others)))
     return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
+
+
+def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
+    """Return `t`, which has `m` faces, or a copy; what lies behind the last face has never been written."""
+
+    def kept(array: cla.Array) -> cla.Array:
+        return array.copy() if copy else array
+
+    return Tessellation(
+        n=t.n,
+        points=kept(t.points[: t.n]),
+        starts=kept(t.starts),
+        neighbours=kept(t.neighbours[:m]),
+        face_measures=kept(t.face_measures[:m]),
+        face_centroids=kept(t.face_centroids[:m]),
+        volumes=kept(t.volumes),
+        offsets=kept(t.offsets),
+        covariances=t.covariances,
+    )
 
 
 class _Fetched:
@@ -38,22 +71,7 @@ class _Fetched:
         self.origin, self.scale = domain.frame
         self.labels = labels.get()[: t.n]
         m = int(t.starts[t.n].get())
-
-        def kept(array: cla.Array) -> cla.Array:
-            return array.copy() if copy else array
-
-        # What lies behind the last face has never been written.
-        self.t = Tessellation(
-            n=t.n,
-            points=kept(t.points[: t.n]),
-            starts=kept(t.starts),
-            neighbours=kept(t.neighbours[:m]),
-            face_measures=kept(t.face_measures[:m]),
-            face_centroids=kept(t.face_centroids[:m]),
-            volumes=kept(t.volumes),
-            offsets=kept(t.offsets),
-            covariances=t.covariances,
-        )
+        self.t = kept_faces(t, m, copy)
 
     @cached_property
     def order(self) -> np.ndarray:

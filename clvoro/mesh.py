@@ -26,6 +26,7 @@ from .projection import Projection
 from .refinement import Refinement
 from .repair import Repair
 from .results import Diagram
+from .seam import Seam
 from .shape import Shape
 from .sizing import Sizing
 from .tessellator import Tessellator
@@ -47,6 +48,7 @@ class Stages:
     bins: Bins
     cells: Cells | Polyhedra
     repair: Repair
+    seam: Seam
     metric: Metric
     density: Density
     poisson: Poisson
@@ -60,7 +62,7 @@ class Stages:
     _CLASSES: ClassVar = {
         "bins": Bins, "cells": Cells, "repair": Repair, "metric": Metric, "density": Density, "poisson": Poisson,
         "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
-        "population": PopulationControl, "gather": Gather,
+        "population": PopulationControl, "gather": Gather, "seam": Seam,
     }  # fmt: skip
 
     def __init__(self, engine: Engine) -> None:
@@ -339,6 +341,8 @@ class Mesh:
 
     def finish(self) -> Diagram:
         """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""
-        t = self.t
+        t, unfolded = self.t, self.tessellator.unfolded
         self.stages.release()
-        return fetch_diagram(self.engine, self.domain, t, self.labels, copy=False)
+        return fetch_diagram(
+            self.engine, self.domain, t, self.labels, copy=False, unfolded=unfolded
+        )

@@ -59,11 +59,16 @@ class Diagram:
     neighbours : (m,) int32
         A generator's index, or ``-1 - b`` for the boundary piece b of the domain. In 2D in
         counter-clockwise order around the cell.
+    shifts : (m, d) int8
+        In a periodic box: face k of cell i lies towards the image of its neighbour j at
+        ``points[j] + shifts[k] * domain.extent``. Zeros in other domains, and towards walls.
     face_measures : (m,) float
         Lengths in 2D, areas in 3D.
     face_centroids : (m, d) float
     vertices : (v, d) float
-        Each Voronoi vertex once.
+        Each Voronoi vertex once. In a periodic box cells are not cut at the seams: their faces and corners lie around
+        their generators, partly outside of the box, and a vertex is there once for each of its images that is a corner
+        of a cell: cells on both sides of a seam have vertices of their own.
     cell_vertex_starts : (n + 1,) int32, 2D only
     cell_vertices : (m,) int32, 2D only
         Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1.
@@ -80,8 +85,8 @@ class Diagram:
     """
 
     _NAMES = (
-        "points", "volumes", "centroids", "neighbour_starts", "neighbours", "face_measures",
-        "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
+        "points", "volumes", "centroids", "neighbour_starts", "neighbours", "shifts",
+        "face_measures", "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
         "face_vertices",
     )  # fmt: skip
 
@@ -92,6 +97,8 @@ class Diagram:
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in Diagram._NAMES:
             raise AttributeError(name)
+        if name == "shifts" and name not in self._arrays:
+            self._arrays[name] = np.zeros((len(self.neighbours), self.domain.dim), np.int8)
         if name not in self._arrays:
             raise AttributeError(f"{name}: a diagram in {self.domain.dim}D has none")
         value = self._arrays[name]

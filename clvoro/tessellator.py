@@ -12,6 +12,8 @@ from .cells import Cells, Tessellation
 from .domain import Domain
 from .polyhedra import Polyhedra
 from .repair import Repair
+from .seam import Seam
+from .torus import Torus, Unfolded
 
 
 class DiagramStages(Protocol):
@@ -21,6 +23,7 @@ class DiagramStages(Protocol):
     bins: Bins
     cells: Cells | Polyhedra
     repair: Repair
+    seam: Seam
 
 
 class Tessellator:
@@ -31,6 +34,12 @@ class Tessellator:
 
     def __init__(self, stages: DiagramStages, domain: Domain) -> None:
         self.stages, self.domain = stages, domain
+        self.torus = Torus(stages, domain) if any(domain.periodic) else None
+
+    @property
+    def unfolded(self) -> Unfolded | None:
+        """What the latest diagram was folded from, in a periodic box."""
+        return None if self.torus is None else self.torus.latest
 
     def tessellate(
         self,
@@ -54,6 +63,8 @@ class Tessellator:
             If generators are too close to each other to be told apart.
         """
         stages, domain = self.stages, self.domain
+        if self.torus is not None:
+            return self.torus.tessellate(points, n, previous, exact, nearest=not exact)
         if isinstance(stages.cells, Polyhedra):
             binned = stages.bins.build(domain, points, n)
             return stages.cells.tessellate(domain, points, n, binned, previous, exact)

@@ -1,0 +1,206 @@
+"""Periodic boxes: generators with their images beyond the seams, and the diagram folded back (`seam.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ._primitives import Room, Scan
+from ._program import Engine
+from .bins import BinnedPoints
+from .cells import Tessellation
+from .domain import Box
+
+DROPPED, FAR, COLLAPSED = 1, 2, 4
+"""Bits of a report: see `seam.cl`."""
+
+
+@dataclass(frozen=True)
+class ExtendedBox:
+    """A periodic box in the device's coordinates, with margins beyond its seams.
+
+    Attributes
+    ----------
+    lower, upper : (d,) float
+        In the device's coordinates.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners, padded to four numbers."""
+        corners = np.zeros((2, 4), real)
+        corners[:, : len(self.lower)] = self.lower, self.upper
+        return corners[0], corners[1]
+
+
+@dataclass(frozen=True)
+class Images:
+    """Generators of a periodic box and their images in an extended one, on the device.
+
+    Attributes
+    ----------
+    n, count : int
+        Generators; generators and images.
+    box : ExtendedBox
+    margins : (4,) real, host
+        How far it goes beyond the seams; 0 along axes with walls.
+    points : (>= count, d) real
+        Generators first, then images in the order of owners and codes.
+    firsts : (n + 1,) int32
+        Images of generator i are those from ``firsts[i]`` on.
+    owners, codes : (>= count - n,) int32
+        Of each image: its generator, and which image of it, sum over the axes of (c + 1) 3^a where it lies c periods
+        away, c = -1, 0 or 1.
+    """
+
+    n: int
+    count: int
+    box: ExtendedBox
+    margins: np.ndarray
+    points: cla.Array
+    firsts: cla.Array
+    owners: cla.Array
+    codes: cla.Array
+
+
+@dataclass(frozen=True)
+class Folded:
+    """The rows of a diagram of generators and images that belong to generators, images replaced by their owners.
+
+    Attributes
+    ----------
+    tessellation : Tessellation
+        Of the n generators. The face's neighbour lies at that generator's place, or at an image of it.
+    codes : (>= m,) int32
+        Of each face's neighbour, as those of `Images`.
+    places : (m,) int32 or None
+        Where each face stands in the extended diagram; None: where it stands here.
+    """
+
+    tessellation: Tessellation
+    codes: cla.Array
+    places: cla.Array | None
+
+
+class Seam:
+    """The kernels of `seam.cl`. Buffers are kept from call to call, those of a folded graph for two calls."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._room = Room(engine, spare=1 / 16)  # sizes change a little from step to step
+        self._kernels = engine.kernels("seam")
+        self._report = engine.empty(3, np.int32)
+        self._turn = 0
+
+    def extend(self, domain: Box, points: cla.Array, n: int, margin: float) -> Images:
+        """Return the first `n` of `points` (n, d) with their images within `margin` (at most a period) of the seams."""
+        engine, k, d = self.engine, self._kernels, self.engine.dim
+        periods = domain.periods(engine.real)
+        # On a coarse grid, so that the corners of the extended box are exact.
+        margins = np.zeros(4, engine.real)
+        margins[:d] = np.minimum(periods, np.ceil(margin * 2.0**20) / 2.0**20)
+        firsts = self._room("firsts", size=n + 1, dtype=np.int32)
+        engine.run_each(k.count_images, n, points, margins, firsts)
+        self._scan.exclusive(firsts, firsts, n)
+        ghosts = int(firsts[n].get())
+        count = n + ghosts
+        extended = self._room("points", size=d * count).reshape(-1, d)
+        owners = self._room("owners", size=ghosts, dtype=np.int32)
+        codes = self._room("image codes", size=ghosts, dtype=np.int32)
+        engine.run_each(k.place_images, n, points, margins, firsts, extended, owners, codes)
+        lower, upper = (
+            corner[:d].astype(np.float64) for corner in domain.device_corners(engine.real)
+        )
+        box = ExtendedBox(lower - margins[:d], upper + margins[:d])
+        return Images(n, count, box, margins, extended, firsts, owners, codes)
+
+    def unfold(self, images: Images, previous: Tessellation) -> tuple[cla.Array, cla.Array]:
+        """Return starts and neighbours of an extended graph whose rows are those of `previous`, or parts of them.
+
+        Of the same generators at earlier positions; what is no neighbour is -1.
+        """
+        engine, k, n, count = self.engine, self._kernels, images.n, images.count
+        starts = self._room("unfolded starts", size=count + 1, dtype=np.int32)
+        engine.run_each(
+            k.count_unfolded, count, np.int32(n), previous.starts, images.owners, starts
+        )
+        self._scan.exclusive(starts, starts, count)
+        m = int(starts[count].get())
+        neighbours = self._room("unfolded", size=m, dtype=np.int32)
+        engine.run_each(
+            k.unfold_rows, count, np.int32(n), previous.starts, previous.neighbours, images.points,
+            images.margins, images.firsts, images.owners, starts, neighbours,
+        )  # fmt: skip
+        return starts, neighbours
+
+    def fold(
+        self,
+        images: Images,
+        binned: BinnedPoints,
+        t: Tessellation,
+        points: cla.Array,
+        share: float,
+        nearest: bool,
+    ) -> tuple[Folded, float, int, int]:
+        """Fold `t`, the diagram of `images`, which lie in `binned`.
+
+        Parameters
+        ----------
+        points : (n, d) real
+            The generators.
+        share : float
+            Of a cell, that a face may make which only one of its cells sees.
+        nearest : bool
+            Whether to look for faces whose neighbour is not the nearest image of its generator.
+
+        Returns
+        -------
+        folded : Folded
+        margin : float
+            What the cells need: if it is more than `images` have, and less than a period, the diagram is not right.
+        flags, generator : int
+            `FAR` and `COLLAPSED` where that is so, and the first generator concerned.
+        """
+        engine, k, n = self.engine, self._kernels, images.n
+        self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
+        engine.run_each(
+            k.measure_margin, images.count, binned.items, binned.reach, images.points, np.int32(n),
+            images.margins, self._report,
+        )  # fmt: skip
+        m = int(t.starts[n].get())
+        self._turn = 1 - self._turn
+        graph = [
+            self._room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbours", "codes")
+        ]
+        kept = self._room("kept", size=m, dtype=np.uint8)
+        starts = self._room("starts", self._turn, size=n + 1, dtype=np.int32)
+        engine.run_each(
+            k.fold_rows, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points,
+            images.owners, images.codes, engine.real.type(share), np.int32(nearest), *graph, kept,
+            starts, self._report,
+        )  # fmt: skip
+        words = self._report.get()
+        flags, places = int(words[1]), None
+        measures = t.face_measures[:m], t.face_centroids[:m]
+        self._scan.exclusive(starts, starts, n)
+        if flags & DROPPED:
+            left = int(starts[n].get())
+            places = engine.empty(left, np.int32)
+            closed = (
+                engine.empty(left, np.int32), engine.empty(left, np.int32), engine.empty(left),
+                engine.empty((left, engine.dim)),
+            )  # fmt: skip
+            engine.run_each(
+                k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places
+            )
+            graph, measures = list(closed[:2]), closed[2:]
+        folded = Tessellation(
+            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n]
+        )
+        margin = float(words[:1].view(np.float32)[0])
+        return Folded(folded, graph[1], places), margin, flags & ~DROPPED, int(words[2])

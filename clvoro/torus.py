@@ -1,0 +1,116 @@
+"""The diagram of a periodic box: that of the generators and their images near the seams, folded back (`seam.py`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pyopencl.array as cla
+
+from .cells import EXACT_SHARE, ROUGH_SHARE, Tessellation
+from .domain import Box
+from .errors import InputError
+from .polyhedra import Polyhedra
+from .seam import COLLAPSED, FAR, Folded, Images
+
+if TYPE_CHECKING:
+    from .tessellator import DiagramStages
+
+FIRST_MARGIN = 4.0
+"""Mean spacings that images are taken from at first."""
+SLACK = 1.15
+"""Margin of the next diagram over what this one needed."""
+
+
+class FewCellsError(InputError):
+    """A cell of a run in a periodic box reaches a neighbour that is not the nearest image of its generator."""
+
+
+@dataclass(frozen=True)
+class Unfolded:
+    """The diagram that a folded one was made of, on the device: its rows are plain cells in the plane, or in space.
+
+    Attributes
+    ----------
+    images : Images
+    tessellation : Tessellation
+        Of the generators, which come first, and their images.
+    folded : Folded
+    """
+
+    images: Images
+    tessellation: Tessellation
+    folded: Folded
+
+
+class Torus:
+    """Tessellate one periodic box again and again.
+
+    Attributes
+    ----------
+    margin : float
+        From the seams, within which images are taken; 0 before the first diagram.
+    latest : Unfolded or None
+        Of the latest diagram, unless that was repaired.
+    """
+
+    def __init__(self, stages: DiagramStages, domain: Box) -> None:
+        self.stages, self.domain = stages, domain
+        self.periods = domain.periods(stages.engine.real)
+        self.margin = 0.0
+        self.latest: Unfolded | None = None
+
+    def tessellate(
+        self,
+        points: cla.Array,
+        n: int,
+        previous: Tessellation | None = None,
+        exact: bool = False,
+        nearest: bool = True,
+    ) -> Tessellation:
+        """Tessellate by the first `n` of `points`; see `Tessellator.tessellate`.
+
+        Parameters
+        ----------
+        nearest : bool
+            Refuse cells whose neighbours are not the nearest images of their generators: whoever reads positions of
+            neighbours off the graph takes these.
+
+        Raises
+        ------
+        InputError
+            If generators are too close to each other to be told apart.
+        FewCellsError
+        """
+        stages, longest = self.stages, float(self.periods.max())
+        seam, cells = stages.seam, stages.cells
+        if self.margin == 0:
+            volume = self.domain.measure / self.domain.frame[1] ** self.domain.dim
+            self.margin = FIRST_MARGIN * (volume / n) ** (1 / self.domain.dim)
+        while True:
+            images = seam.extend(self.domain, points, n, self.margin)
+            binned = stages.bins.build(images.box, images.points, images.count)
+            args = images.box, images.points, images.count, binned
+            if isinstance(cells, Polyhedra):
+                t = cells.tessellate(*args, None, exact)
+            else:
+                t = cells.tessellate(*args, exact)
+            share = EXACT_SHARE if exact else ROUGH_SHARE
+            folded, needed, flags, generator = seam.fold(images, binned, t, points, share, nearest)
+            if needed <= float(images.margins.max()) or self.margin >= longest:
+                break
+            self.margin = min(SLACK * needed, longest)
+        self.margin = min(max(SLACK * needed, 1e-3 * longest), longest)
+        if flags & COLLAPSED:
+            raise InputError(
+                f"generator {generator} is too close to others in {stages.engine.real}; expected distinct generators: "
+                "remove duplicates (numpy.unique(points, axis=0)) or use dtype='float64'"
+            )
+        if flags & FAR:
+            raise FewCellsError(
+                f"generator {generator} of {n} has a neighbour half a period away or farther, expected at least four "
+                f"or five cells across each period of {self.domain}; use a smaller size, more cells (n_cells) or "
+                "fewer levels"
+            )
+        self.latest = Unfolded(images, t, folded)
+        return folded.tessellation
