@@ -12,6 +12,7 @@ from .cells import Cells, Tessellation
 from .domain import Domain
 from .polyhedra import Polyhedra
 from .repair import Repair
+from .seam import Seam
 from .trim import Trim
 
 
@@ -22,6 +23,7 @@ class DiagramStages(Protocol):
     bins: Bins
     cells: Cells | Polyhedra
     repair: Repair
+    seam: Seam
     trim: Trim
 
 

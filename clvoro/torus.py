@@ -14,7 +14,7 @@ from .polyhedra import Polyhedra
 from .seam import COLLAPSED, FAR, Folded, Images
 
 if TYPE_CHECKING:
-    from .tessellator import DiagramStages
+    from .stages import DiagramStages
 
 FIRST_MARGIN = 4.0
 """Mean spacings that images are taken from at first."""
