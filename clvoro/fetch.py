@@ -9,8 +9,9 @@ import pyopencl.array as cla
 
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Box
+from .domain import Domain
 from .loops import FaceLoops, Loops
+from .polygon import Polygon
 from .results import Diagram
 from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
@@ -18,7 +19,7 @@ from .vertices import VertexNumbering, Vertices
 
 def fetch_diagram(
     engine: Engine,
-    domain: Box,
+    domain: Domain,
     t: Tessellation,
     labels: cla.Array,
     copy: bool = True,
@@ -29,15 +30,19 @@ def fetch_diagram(
     Without `copy`, nobody may use the buffers of `t` any more. `unfolded` is what `t` was folded from, in a periodic
     box.
     """
+    from .fetch_polygon import _FetchedPolygon
     from .fetch_torus import _FetchedTorus
 
-    if unfolded is None:
-        fetched = _Fetched(engine, domain, t, labels, copy)
-    else:
-        fetched = _FetchedTorus(engine, domain, t, labels, copy, unfolded)
     others = ["face_vert" if engine.dim == 2 else "cell_vert"]
     if unfolded is None:
         others.append("shifts")
+    if isinstance(domain, Polygon):
+        fetched: _Fetched = _FetchedPolygon(engine, domain, t, labels, copy)
+        others.remove("face_vert")
+    elif unfolded is None:
+        fetched = _Fetched(engine, domain, t, labels, copy)
+    else:
+        fetched = _FetchedTorus(engine, domain, t, labels, copy, unfolded)
     names = (name for name in Diagram._NAMES if not name.startswith(tuple(others)))
     return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
 
@@ -65,7 +70,7 @@ class _Fetched:
     """A tessellation, by default a copy since the stages reuse their buffers, and how to read it."""
 
     def __init__(
-        self, engine: Engine, domain: Box, t: Tessellation, labels: cla.Array, copy: bool
+        self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool
     ) -> None:
         self.engine, self.domain, self.n = engine, domain, t.n
         self.origin, self.scale = domain.frame

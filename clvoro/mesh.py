@@ -30,6 +30,7 @@ from .seam import Seam
 from .shape import Shape
 from .sizing import Sizing
 from .tessellator import Tessellator
+from .trim import Trim
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
@@ -58,11 +59,12 @@ class Stages:
     refinement: Refinement
     population: PopulationControl
     gather: Gather
+    trim: Trim
 
     _CLASSES: ClassVar = {
         "bins": Bins, "cells": Cells, "repair": Repair, "metric": Metric, "density": Density, "poisson": Poisson,
         "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
-        "population": PopulationControl, "gather": Gather, "seam": Seam,
+        "population": PopulationControl, "gather": Gather, "trim": Trim, "seam": Seam,
     }  # fmt: skip
 
     def __init__(self, engine: Engine) -> None:
@@ -173,7 +175,7 @@ class Mesh:
     ) -> None:
         self.engine = stages.engine
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
-        self.tessellator = Tessellator(stages, domain)
+        self.tessellator = Tessellator(stages, domain, self._spacing)
         self.summaries = Summaries(self.engine, SUMMARIES)
         n = len(points)
         self.next_label = n
@@ -183,6 +185,10 @@ class Mesh:
             points, labels, self.engine.zeros(points.shape), self.engine.zeros(n, np.uint64),
             self.engine.zeros(n),
         )  # fmt: skip
+
+    def _spacing(self, points: np.ndarray) -> np.ndarray:
+        """Return the size that cells are to have at `points` (k, d) on this level, (k,)."""
+        return self.coarsening * np.asarray(self.sizing(points))
 
     def adopt(
         self,

@@ -2,39 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
 
+import numpy as np
 import pyopencl.array as cla
 
-from ._program import Engine
-from .bins import Bins
-from .cells import Cells, Tessellation
+from .cells import Tessellation
 from .domain import Domain
-from .polyhedra import Polyhedra
-from .repair import Repair
-from .seam import Seam
+from .polygon import Polygon
+from .polygonal import PolygonTessellator
+from .stages import DiagramStages, tessellate_box
 from .torus import Torus, Unfolded
-
-
-class DiagramStages(Protocol):
-    """The stages that a diagram takes."""
-
-    engine: Engine
-    bins: Bins
-    cells: Cells | Polyhedra
-    repair: Repair
-    seam: Seam
 
 
 class Tessellator:
     """Tessellate one domain again and again.
 
     Buffers are the stages': the call after next overwrites the graph of a `Tessellation`, the next one its measures.
+
+    Parameters
+    ----------
+    spacing : callable, optional
+        Of a polygonal domain: distance of generators near points (k, 2) of its boundary, (k,); see `place_sentinels`.
     """
 
-    def __init__(self, stages: DiagramStages, domain: Domain) -> None:
+    def __init__(
+        self,
+        stages: DiagramStages,
+        domain: Domain,
+        spacing: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> None:
         self.stages, self.domain = stages, domain
         self.torus = Torus(stages, domain) if any(domain.periodic) else None
+        self._polygon = (
+            PolygonTessellator(stages, domain, spacing) if isinstance(domain, Polygon) else None
+        )
 
     @property
     def unfolded(self) -> Unfolded | None:
@@ -62,16 +64,8 @@ class Tessellator:
         InputError
             If generators are too close to each other to be told apart.
         """
-        stages, domain = self.stages, self.domain
         if self.torus is not None:
             return self.torus.tessellate(points, n, previous, exact, nearest=not exact)
-        if isinstance(stages.cells, Polyhedra):
-            binned = stages.bins.build(domain, points, n)
-            return stages.cells.tessellate(domain, points, n, binned, previous, exact)
-        if previous is not None and not exact:
-            t = stages.repair.follow(stages.cells, domain, points, previous)
-            if t is not None:
-                return t
-        return stages.cells.tessellate(
-            domain, points, n, stages.bins.build(domain, points, n), exact
-        )
+        if self._polygon is not None:
+            return self._polygon.tessellate(points, n, previous, exact)
+        return tessellate_box(self.stages, self.domain, points, n, previous, exact)
