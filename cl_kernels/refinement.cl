@@ -77,7 +77,8 @@ kernel void place_children(const int size, global const int *starts, global cons
 #endif
         } else if (has_middle(i, j, face_measures[k], volumes[i])) {
             for (int a = 0; a < DIM; ++a)
-                child[a] = points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2;
+                child[a] = PLACED(a, points[DIM * i + a] +
+                                         DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
 #ifdef POLYGON
             /* Around a corner of the boundary the middle of the common face is in sight of both. */
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};

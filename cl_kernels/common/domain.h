@@ -35,6 +35,9 @@ inline REAL wrapped(REAL y, REAL period)
 #define wrapped(y, period) (y)
 #endif
 
+/* Coordinate y along axis a, where an image that is beyond the seam is to stand for it in the domain. */
+#define PLACED(a, y) (PERIOD(a) > 0 ? wrapped(y, PERIOD(a)) : (y))
+
 /* The difference along axis a from one position to another: to its nearest image, where the axis is periodic. */
 #define DIFFERENCE(a, from, to) nearest_image((to) - (from), PERIOD(a))
 
