@@ -123,9 +123,11 @@ class Engine:
         Each kernel knows its `stage`, for a profile.
         """
         real = "double" if self.real == np.float64 else "float"
+        # What a source does not name would only have it built anew for every domain.
+        text = source_text(f"{stage}.cl")
+        named = {name: value for name, value in self.domain_defines if name in text}
         full = {
-            "DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size,
-            **dict(self.domain_defines), **(defines or {}),
+            "DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size, **named, **(defines or {}),
         }  # fmt: skip
         program = build_program(self.ctx, f"{stage}.cl", full, prelude)
         kernels = program.all_kernels()

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .errors import ClvoroError
+from .faces import face_keys
 from .rebuilt import Doubts, Rebuilt
 
 if TYPE_CHECKING:
@@ -175,6 +176,7 @@ def _check_structure(check: _Check) -> None:
     check.shape("centroids", d.centroids, (n, dim))
     check.shape("neighbour_starts", d.neighbour_starts, (n + 1,), "iu")
     check.shape("neighbours", d.neighbours, (m,), "i")
+    check.shape("shifts", d.shifts, (m, dim), "i")
     check.shape("face_measures", d.face_measures, (m,))
     check.shape("face_centroids", d.face_centroids, (m, dim))
     check.shape("vertices", d.vertices, (len(d.vertices), dim))
@@ -205,21 +207,49 @@ def _check_structure(check: _Check) -> None:
     used = np.bincount(corners, minlength=len(d.vertices))
     check.note("vertices used", used == 0, lambda v: f"vertex {v} is no cell's corner")
 
+    _check_shifts(check)
     i = np.repeat(np.arange(n), np.diff(d.neighbour_starts))
-    check.note("neighbours", i == j, lambda f: f"cell {j[f]} is its own neighbour")
+    check.note(
+        "neighbours", (i == j) & ~d.shifts.any(axis=1),
+        lambda f: f"cell {j[f]} is its own neighbour",
+    )  # fmt: skip
     inner = np.flatnonzero(j >= 0)
-    there = np.sort(i[inner].astype(np.int64) * n + j[inner])
+    there, back = (np.sort(keys) for keys in face_keys(d, inner))
+
+    def pair(key: int) -> tuple[int, int]:
+        """Return the cells of a face."""
+        return int(key // 3**dim // n), int(key // 3**dim % n)
+
     twice = np.flatnonzero(there[1:] == there[:-1])
     check.note(
         "neighbours", np.isin(np.arange(len(there)), twice),
-        lambda k: f"cell {there[k] // n} lists cell {there[k] % n} twice",
+        lambda k: "cell {} lists cell {} twice".format(*pair(there[k])),
     )  # fmt: skip
-    back = np.sort(j[inner].astype(np.int64) * n + i[inner])
     lone = np.setdiff1d(there, back)
     check.note(
         "graph symmetric", np.ones(len(lone)),
-        lambda k: f"cell {lone[k] // n} lists cell {lone[k] % n}, which does not list it", stop=True,
+        lambda k: "cell {} lists cell {}, which does not list it".format(*pair(lone[k])), stop=True,
     )  # fmt: skip
+
+
+def _check_shifts(check: _Check) -> None:
+    """Check that only faces in periodic directions lead to images, and none to walls there."""
+    d = check.diagram
+    periodic = np.array(d.domain.periodic)
+    shifts, j = d.shifts, d.neighbours
+    allowed = np.where(periodic & (j >= 0)[:, None], 1, 0)
+    check.note(
+        "shifts", (np.abs(shifts) > allowed).any(axis=1),
+        lambda f: f"shifts[{f}] of the face to {j[f]} is {shifts[f]}, expected -1 to 1 along periodic axes, else 0",
+        stop=True,
+    )  # fmt: skip
+    if periodic.any():
+        walls = np.flatnonzero(j < 0)
+        check.note(
+            "walls", periodic[(-1 - j[walls]) // 2],
+            lambda k: f"face {walls[k]} leads to wall {-1 - j[walls[k]]}, across a periodic axis",
+            stop=True,
+        )  # fmt: skip
 
 
 def _check_starts(check: _Check, name: str, starts: np.ndarray, total: int) -> None:
@@ -237,7 +267,7 @@ def _check_geometry(check: _Check, g: Rebuilt) -> None:
     slack = ROUNDINGS * g.unit
     doubts = g.doubts(slack)
     check.note(
-        "generators inside", ~domain.contains(d.points),
+        "generators inside", ~domain.contains(d.points) | (domain.wrap(d.points) != d.points).any(axis=1),
         lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
     )  # fmt: skip
     check.note(
@@ -335,8 +365,7 @@ def _check_faces(check: _Check, g: Rebuilt, slack: float, doubts: Doubts) -> Non
         lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
     )  # fmt: skip
     # The same face from both sides.
-    i, j = g.owner[inner].astype(np.int64), d.neighbours[inner].astype(np.int64)
-    here, there = inner[np.argsort(i * n + j)], inner[np.argsort(j * n + i)]
+    here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
     off = np.abs(d.face_measures[here] - d.face_measures[there])
     wide = np.maximum(width[here], width[there])
     check.note(
@@ -351,7 +380,11 @@ def _check_nearest(check: _Check, g: Rebuilt, slack: float) -> None:
     d = check.diagram
     corners = d.vertices[g.corners]
     own = np.linalg.norm(corners - d.points[g.cells], axis=1)
-    nearest = cKDTree(d.points).query(d.vertices)[0][g.corners]
+    # A length of 0 is that of no period.
+    lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
+    last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
+    tree = cKDTree(np.minimum(d.points - lower, last), boxsize=periods)
+    nearest = tree.query(d.vertices - lower)[0][g.corners]
     check.note(
         "nearest generators", np.maximum(own - nearest - slack, 0),
         lambda k: f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by "

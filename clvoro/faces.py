@@ -15,6 +15,23 @@ def face_owners(diagram: Diagram) -> np.ndarray:
     return np.repeat(np.arange(len(diagram), dtype=np.int32), np.diff(starts))
 
 
+def neighbour_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
+    """Return where the neighbours across `faces` (k,) stand, which lead to generators: (k, d), images where they do."""
+    shifts = diagram.shifts[faces] * diagram.domain.extent
+    return diagram.points[diagram.neighbours[faces]] + shifts
+
+
+def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers that name each of `faces` (k,), which lead to generators, and the same face from the other side.
+
+    Both are made of cell, neighbour and shift, in this order; (k,) int64 each.
+    """
+    n, dim = len(diagram), diagram.domain.dim
+    i, j = face_owners(diagram)[faces].astype(np.int64), diagram.neighbours[faces].astype(np.int64)
+    codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
+    return (i * n + j) * 3**dim + codes, (j * n + i) * 3**dim + (3**dim - 1 - codes)
+
+
 def following(starts: np.ndarray) -> np.ndarray:
     """Return, for each item of ragged rows that are loops, where the next one of its loop stands."""
     places = np.arange(1, starts[-1] + 1)
@@ -69,8 +86,8 @@ class Faces:
     Attributes
     ----------
     owner, neighbour : (f,) int32
-        Cells on both sides, owner < neighbour; on a wall b the neighbour is -1 - b. The walls stand one after
-        the other, each in the order of the owners.
+        Cells on both sides, owner < neighbour (or the same, in a periodic box); on a wall b the neighbour is
+        -1 - b. The walls stand one after the other, each in the order of the owners.
     rows : (f,) int
         Where in the diagram's graph the face is described.
     starts : (f + 1,) int, corners : int
@@ -99,8 +116,9 @@ def faces_once(diagram: Diagram) -> Faces:
     low = np.minimum(owner[inner], neighbour[inner]).astype(np.int64)
     high = np.maximum(owner[inner], neighbour[inner])
     # Of both descriptions the one from the lower cell comes first, if there are both.
-    flipped = owner[inner] > neighbour[inner]
-    key = (low * len(diagram) + high) * 2 + flipped
+    here, there = face_keys(diagram, inner)
+    flipped = here > there
+    key = np.minimum(here, there) * 2 + flipped
     order = np.argsort(key, kind="stable")
     pair = key[order] // 2
     order = order[np.concatenate([[True], pair[1:] != pair[:-1]])] if len(order) else order

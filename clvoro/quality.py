@@ -92,7 +92,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
     starts = diagram.neighbour_starts
     inner = neighbour >= 0
     other = np.where(inner, neighbour, 0)
-    line = points[other] - points[owner]
+    line = points[other] + diagram.shifts * diagram.domain.extent - points[owner]
     walls = np.flatnonzero(~inner)
     normal_axis, side, gap = _walls(diagram, owner[walls], -1 - neighbour[walls])
     line[walls] = 0.0
@@ -104,7 +104,8 @@ def measure_mesh(diagram: Diagram) -> Measures:
     np.divide(offset, distance, out=skewness, where=distance > 0)
 
     angle = np.zeros(len(line))
-    angle[inner] = _angles(line[inner], centroids[neighbour[inner]] - centroids[owner[inner]])
+    between = centroids[other] + diagram.shifts * diagram.domain.extent - centroids[owner]
+    angle[inner] = _angles(line[inner], between[inner])
 
     counts = np.diff(starts)
     surface = np.add.reduceat(areas, starts[:-1])

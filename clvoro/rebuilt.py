@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .faces import neighbour_points
+
 if TYPE_CHECKING:
     from .results import Diagram
 
@@ -201,7 +203,7 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit vector across each face, outward, and the distance of its generators (infinite at a wall)."""
     inner, walls = np.flatnonzero(d.neighbours >= 0), np.flatnonzero(d.neighbours < 0)
     across = np.zeros((len(owner), d.domain.dim))
-    across[inner] = d.points[d.neighbours[inner]] - d.points[owner[inner]]
+    across[inner] = neighbour_points(d, inner) - d.points[owner[inner]]
     axis, upper = (-1 - d.neighbours[walls]) // 2, (-1 - d.neighbours[walls]) % 2
     across[walls, axis] = 2.0 * upper - 1
     distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
