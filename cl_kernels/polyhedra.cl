@@ -6,6 +6,7 @@
 #define FLAG_COINCIDE 2  /* two generators at the same place; report[1] is the smallest index of one */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision; report[1] likewise */
 #define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be matched with their neighbours */
+#define FLAG_NARROW 16   /* nor is it that some faces may be no wider than their vertices round; see loops.cl */
 
 #define UNFINISHED INT_MIN /* count of a cell that was full: to be clipped again with more room */
 
@@ -305,9 +306,10 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     const int face_count = cell.n / 2 + 2; /* Euler's formula */
     const int place = atomic_add(report + 2, face_count);
     const bool fits = place + face_count <= room;
-    const REAL near2 = sqrt(REAL_EPS) * cell.reach2;
+    const REAL reach_length = sqrt(cell.reach2), near2 = sqrt(REAL_EPS) * cell.reach2;
+    const REAL slim = 512 * noise_length(reach_length);
     int count = 0;
-    bool doubtful = false;
+    bool doubtful = false, narrow = false;
     REAL volume = 0, lost = 0;
     REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
     for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
@@ -341,18 +343,19 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
         const int label = cell.labels[f];
         /* Faces below rounding are none; smaller ones than a neighbour is sure to see, too, are doubtful. */
         const REAL across2 = label >= 0 ? d2 : cell.reach2;
-        if (!(area > sqrt(REAL_EPS) * across2)) {
+        const bool small = !(area > sqrt(REAL_EPS) * across2);
+        if (small || !(area > slim * reach_length)) {
             REAL width2 = 0;
             for (v = vertex_after(&cell, first_vertex, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
                 const REAL4 e = vertex_at(&cell, v) - a;
                 width2 = fmax(width2, dot3(e, e));
             }
+            doubtful |= small && label >= 0;
             if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2))) {
                 lost += fabs(normal.s3 * area);
-                doubtful |= label >= 0;
                 continue;
             }
-            doubtful |= label >= 0;
+            narrow |= !(area > slim / 2 * sqrt(width2));
         }
         doubtful |= across2 < near2;
         if (fits) {
@@ -367,8 +370,8 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
     }
     row_places[i] = place;
     row_counts[i] = count;
-    if (doubtful)
-        atomic_or(report, FLAG_DOUBT);
+    if (doubtful || narrow)
+        atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
     /* In a box as thin as rounding all faces are below it. */
     if (count < 4 || !(volume > 0 && lost <= share * volume))
         raise_flag(report, FLAG_COLLAPSED, i);

@@ -25,7 +25,7 @@ LARGEST_ROW = 512
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
 # FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
-FULL, COINCIDE, DOUBT = 1, 2, 8
+FULL, COINCIDE, DOUBT, NARROW = 1, 2, 8, 16
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class Tessellation:
         Of a diagram trimmed by a boundary what kernels take as OUTLINE_ARGS (common/outline.h); else empty.
     trimmed : Trimmed, optional
         How such a diagram came to be.
+    narrow : bool
+        Whether faces (in 3D) may be as narrow as their vertices round: of those, what has no loop in `Loops` is none.
     """
 
     n: int
@@ -64,6 +66,7 @@ class Tessellation:
     covariances: cla.Array
     outlines: tuple[cla.Array, ...] = ()
     trimmed: Trimmed | None = None
+    narrow: bool = False
 
 
 @dataclass

@@ -63,6 +63,7 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
         volumes=kept(t.volumes),
         offsets=kept(t.offsets),
         covariances=t.covariances,
+        narrow=t.narrow,
     )
 
 
@@ -84,9 +85,20 @@ class _Fetched:
         return np.argsort(self.labels, kind="stable")
 
     @cached_property
+    def kept(self) -> np.ndarray | None:
+        """Which of the device's faces are in the result, (m,) bool; None if all are.
+
+        A face in 3D that is no polygon, as narrow as its vertices round, is none.
+        """
+        return np.diff(self.loop_starts) > 0 if self.t.narrow else None
+
+    @cached_property
     def starts(self) -> np.ndarray:
-        """Device `starts` (n + 1,)."""
-        return self.t.starts.get()
+        """Device `starts` (n + 1,), of the faces that are kept."""
+        starts = self.t.starts.get()
+        if self.kept is None:
+            return starts
+        return np.concatenate([[0], np.cumsum(self.kept)])[starts]
 
     @cached_property
     def owners(self) -> np.ndarray:
@@ -97,11 +109,12 @@ class _Fetched:
     def slots(self) -> np.ndarray:
         """Place in the device's arrays of each face of the result, (m,)."""
         m = len(self.owners)
-        return (
+        places = (
             self.starts[self.owners]
             + np.arange(m)
             - self.neighbour_starts()[self.ranks[self.owners]]
         )
+        return places if self.kept is None else np.flatnonzero(self.kept)[places]
 
     @cached_property
     def ranks(self) -> np.ndarray:

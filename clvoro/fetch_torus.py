@@ -52,6 +52,11 @@ class _FetchedTorus(_Fetched):
         return FaceLoops(self.engine).walk(self.box, self.whole)
 
     @cached_property
+    def kept(self) -> np.ndarray | None:
+        """Which of the folded faces are in the result; see `_Fetched.kept`."""
+        return np.diff(self.loop_starts)[self.places] > 0 if self.whole.narrow else None
+
+    @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices of the extended diagram that are corners of the box's cells, and the number of each corner's."""
         return np.unique(self.extended_corners(), return_inverse=True)

@@ -12,13 +12,13 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Tessellation
+from .corners import Corners, Views
 from .domain import Box
-from .errors import MemoryLimitError
+from .errors import ClvoroError
 
-FACE_CAPACITY = 64
-MOST_TURNS = 2**31 - 1
-MOST_ROUNDS = 16
-"""Vertices that may be put into one edge."""
+MOST_ROUNDS = 200
+"""Steps in which cells may come to agree; spheres of a hundred generators take some thirty."""
+JOINED, PUT = 1, 2
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,9 @@ class Loops:
     ----------
     positions : (v, 3) real
     starts : (m + 1,) int32
-        Loop k is ``vertices[starts[k]:starts[k + 1]]``, counter-clockwise seen from outside of its cell.
+        Loop k is ``vertices[starts[k]:starts[k + 1]]``, counter-clockwise seen from outside of its cell, the other way
+        around in the neighbour's row. Both are empty where the face is no wider than its vertices round: the other
+        faces close both cells without it.
     vertices : (l,) int32
     """
 
@@ -44,6 +46,7 @@ class FaceLoops:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
+        self._kernels = engine.kernels("loops")
 
     def walk(self, box: Box, t: Tessellation) -> Loops:
         """Return the loops of `t`, vertices numbered in the order of the first cell they belong to.
@@ -53,90 +56,109 @@ class FaceLoops:
         MemoryLimitError
             If the loops are too long for 32-bit indices.
         """
-        engine, n = self.engine, t.n
+        engine, n, k = self.engine, t.n, self._kernels
         m = int(t.starts[n].get())
-        corner_starts, turn_starts = engine.empty(n + 1, np.int32), engine.empty(m + 1, np.int32)
-        cell = (t.points, *box.device_corners(engine.real), t.starts, t.neighbours)
-        capacity, flag = FACE_CAPACITY, engine.zeros(1, np.int32)
-        while True:
-            k = engine.kernels("loops", {"FACE_CAPACITY": capacity})
-            # Private arrays of a whole group lie on the stack of a CPU's thread.
-            group = None if capacity == FACE_CAPACITY else 1
-            engine.run_each(
-                k.count_corners, n, *cell, corner_starts, turn_starts, flag, group=group
-            )
-            if not int(flag[0].get()):
-                break
-            capacity *= 2
-            flag.fill(0)
-        self._scan.exclusive(corner_starts, corner_starts, n)
-        self._scan.exclusive(turn_starts, turn_starts, m)
-        c, turn_count = int(corner_starts[n].get()), int(turn_starts[m].get())
-        if not (0 < turn_count <= MOST_TURNS and 0 < c <= MOST_TURNS // 3):
-            raise MemoryLimitError(
-                f"{n} cells have more vertices than 32-bit indices can tell apart; use fewer cells"
-            )
-        corners, same = engine.empty((c, 3)), engine.empty(c, np.int32)
-        sharpness = engine.empty(c, np.float32)
-        turns, partners = engine.empty(turn_count, np.int32), engine.empty(turn_count, np.int32)
-        twins = engine.empty(m, np.int32)
-        engine.run_each(
-            k.list_corners, n, *cell, corner_starts, turn_starts, corners, sharpness, same, turns,
-            group=group,
-        )  # fmt: skip
-        engine.run_each(
-            k.match_corners, n, t.points, t.starts, t.neighbours, corners, turn_starts, turns,
-            twins, partners,
-        )  # fmt: skip
-        labels, new = same.copy(), same.copy()
-        spread = ((k.spread_over_faces, turn_count, turns, partners), (k.spread_in_cells, c, same))
-        while True:
-            flag.fill(0)
-            for kernel, size, *links in spread:
-                engine.run_each(kernel, size, *links, labels, new, flag)
-                cl.enqueue_copy(engine.queue, labels.data, new.data)
-            if not int(flag[0].get()):
-                break
-        best, chosen = engine.zeros(c, np.uint32), new
-        chosen.fill(2**31 - 1)
-        engine.run_each(k.rate_corners, c, labels, sharpness, best)
-        engine.run_each(k.choose_corners, c, labels, sharpness, best, chosen)
+        corners = Corners(engine)
+        views = corners.list(box, t)
+        twins = engine.empty(len(views.view_labels), np.int32)
+        engine.run_each(k.find_twins, n, t.starts, views.starts, views.view_labels, twins)
+        reduced, counts, chosen = self._agree(k, corners, t, views, twins)
+        c = len(views.owners)
         loop_starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
-        engine.run_each(k.measure_loops, m, twins, turn_starts, turns, labels, loop_starts, ids)
+        engine.run_each(
+            k.measure_loops, n, t.starts, views.starts, views.turn_starts, reduced, counts, loop_starts, ids
+        )  # fmt: skip
         self._scan.exclusive(loop_starts, loop_starts, m)
         self._scan.exclusive(ids, ids, c)
         loops = engine.empty(int(loop_starts[m].get()), np.int32)
         positions = engine.empty((int(ids[c].get()), 3))
         engine.run_each(
-            k.write_loops, m, twins, turn_starts, turns, labels, ids, loop_starts, loops
-        )
+            k.write_loops, n, t.starts, views.starts, views.turn_starts, reduced, ids, loop_starts, loops
+        )  # fmt: skip
         engine.run_each(
-            k.place_vertices, n, *cell[:3], corner_starts, corners, labels, chosen, ids, positions
-        )
-        starts, loops = self._mended(k, t, twins, loop_starts, loops)
-        return Loops(positions, starts, loops)
+            k.place_vertices, c, t.points, *box.device_corners(engine.real), views.owners,
+            views.corners, views.labels, chosen, ids, positions,
+        )  # fmt: skip
+        return Loops(positions, loop_starts, loops)
 
-    def _mended(
+    def _agree(
+        self, k: SimpleNamespace, corners: Corners, t: Tessellation, views: Views, twins: cla.Array
+    ) -> tuple[cla.Array, cla.Array, cla.Array]:
+        """Change `views` until both cells of every face see the same loop.
+
+        Returns the loops (in the places of the turns), their lengths, and for each label the corner that lies where its
+        vertex does.
+        """
+        engine, v, c = self.engine, len(twins), len(views.owners)
+        counts, differs = engine.empty(v, np.int32), engine.empty(v, np.uint8)
+        any_, done, levels = engine.empty(1, np.int32), engine.empty(1, np.int32), None
+        reduced = engine.empty(len(views.turns), np.int32)
+        opposites = chains = joined = None
+        chosen = self._chosen(k, views)
+        for _ in range(MOST_ROUNDS):
+            engine.run_each(
+                k.reduce_views, v, views.turn_starts, views.turns, views.labels, reduced, counts
+            )
+            any_.fill(0)
+            engine.run_each(
+                k.compare_views, v, twins, views.turn_starts, reduced, counts, differs, any_
+            )
+            if not int(any_[0].get()):
+                return reduced, counts, chosen
+            if levels is None:
+                levels, joined = engine.zeros(v, np.uint8), engine.empty(c, np.int32)
+                opposites, chains = (engine.empty(len(views.turns), np.int32) for _ in range(2))
+                engine.run_each(
+                    k.find_opposites, v, views.owners, views.corner_faces, views.starts, views.view_labels,
+                    views.turn_starts, views.turns, opposites, chains,
+                )  # fmt: skip
+            cl.enqueue_copy(engine.queue, joined.data, views.labels.data)
+            done.fill(0)
+            proposals = engine.empty(len(views.turns), np.int32).fill(-1)
+            engine.run_each(
+                k.snap_views, v, t.points, views.corners, views.owners, views.labels, chosen, twins,
+                views.turn_starts, views.turns, chains, differs, levels, joined, proposals, done,
+            )  # fmt: skip
+            what = int(done[0].get())
+            if what & JOINED:
+                corners.name_vertices(views, joined)
+                chosen = self._chosen(k, views)
+            if what & PUT:
+                opposites, chains = self._put(k, views, opposites, chains, proposals)
+                reduced = engine.empty(len(views.turns), np.int32)
+        raise ClvoroError(
+            "the cells' views of their common faces do not come together; perturb generators that are "
+            "cospherical, or use dtype='float64'"
+        )
+
+    def _chosen(self, k: SimpleNamespace, views: Views) -> cla.Array:
+        """Return the sharpest corner of each vertex, by label."""
+        engine, c = self.engine, len(views.owners)
+        best, chosen = engine.zeros(c, np.uint32), engine.empty(c, np.int32).fill(2**31 - 1)
+        engine.run_each(k.rate_corners, c, views.labels, views.sharpness, best)
+        engine.run_each(k.choose_corners, c, views.labels, views.sharpness, best, chosen)
+        return chosen
+
+    def _put(
         self,
         k: SimpleNamespace,
-        t: Tessellation,
-        twins: cla.Array,
-        starts: cla.Array,
-        loops: cla.Array,
+        views: Views,
+        opposites: cla.Array,
+        chains: cla.Array,
+        proposals: cla.Array,
     ) -> tuple[cla.Array, cla.Array]:
-        """Put vertices into edges that they lie on where a cell would not close without."""
-        engine, m = self.engine, len(twins)
-        changed = engine.empty(1, np.int32)
-        for _ in range(MOST_ROUNDS):
-            missing = engine.empty(max(len(loops), 1), np.int32)
-            changed.fill(0)
-            engine.run_each(k.find_missing, t.n, t.starts, starts, loops, missing, changed)
-            if not int(changed[0].get()):
-                break
-            longer = engine.empty(m + 1, np.int32)
-            engine.run_each(k.measure_mended, m, twins, starts, loops, missing, longer)
-            self._scan.exclusive(longer, longer, m)
-            mended = engine.empty(int(longer[m].get()), np.int32)
-            engine.run_each(k.write_mended, m, twins, starts, loops, missing, longer, mended)
-            starts, loops = longer, mended
-        return starts, loops
+        """Put the vertices proposed into edges; return the new opposites and chains."""
+        engine, v = self.engine, len(views.view_labels)
+        starts, places = engine.empty(v + 1, np.int32), engine.empty(len(views.turns), np.int32)
+        engine.run_each(k.measure_views, v, views.turn_starts, opposites, proposals, starts)
+        self._scan.exclusive(starts, starts, v)
+        engine.run_each(k.place_turns, v, views.turn_starts, opposites, proposals, starts, places)
+        turns, new_opposites, new_chains = (
+            engine.empty(int(starts[v].get()), np.int32) for _ in range(3)
+        )
+        engine.run_each(
+            k.write_views, v, views.turn_starts, views.turns, opposites, chains, proposals, places,
+            turns, new_opposites, new_chains,
+        )  # fmt: skip
+        views.turn_starts, views.turns = starts, turns
+        return new_opposites, new_chains

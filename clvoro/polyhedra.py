@@ -10,7 +10,7 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .bins import MAX_LEVELS, BinnedPoints
-from .cells import COINCIDE, DOUBT, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
+from .cells import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import ClvoroError, InputError, MemoryLimitError
 
@@ -139,7 +139,7 @@ class Polyhedra:
                 group=1 if again else None,
             )  # fmt: skip
             flags, generator, m = (int(v) for v in self._report.get())
-            if flags & ~(FULL | DOUBT):
+            if flags & ~(FULL | DOUBT | NARROW):
                 self._refuse(flags, generator)
             if m > self._room:
                 # All anew: what did not fit was not kept.
@@ -155,7 +155,7 @@ class Polyhedra:
                         "many generators on a common sphere are not supported: remove or perturb "
                         "some"
                     )
-                self._report.set(np.array([flags & DOUBT, 2**31 - 1, m], np.int32))
+                self._report.set(np.array([flags & (DOUBT | NARROW), 2**31 - 1, m], np.int32))
             else:
                 break
         arrays = self._set(n, m)
@@ -164,7 +164,7 @@ class Polyhedra:
             arrays["volumes"], points, share, np.int32(flags & DOUBT), self._kept, arrays["starts"], self._report,
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
-        if flags & ~DOUBT:
+        if flags & ~(DOUBT | NARROW):
             self._refuse(flags, generator)
         self._scan.exclusive(arrays["starts"], arrays["starts"], n)
         engine.run_each(
@@ -174,7 +174,7 @@ class Polyhedra:
         )  # fmt: skip
         # Only now: a call that was broken off leaves the previous diagram as it is.
         self._turn = 1 - self._turn
-        return Tessellation(n=n, points=points, **arrays)
+        return Tessellation(n=n, points=points, **arrays, narrow=bool(flags & NARROW))
 
     def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"

@@ -188,9 +188,36 @@ def test_invariants(adapter, name):
     diagram = adapter.diagram(BOX, POINTS[name])
     eps = float(np.finfo(adapter.dtype).eps)
     check_invariants(diagram, eps, CROWDING.get(name, 1))
-    # In single precision some faces of these are as narrow as their vertices round, and are no polygons.
-    if eps < 1e-10 or name not in ("sphere", "clusters"):
-        check_loops(diagram, eps, CROWDING.get(name, 1))
+    check_loops(diagram, eps, CROWDING.get(name, 1))
+
+
+@pytest.mark.parametrize("kind", list(LATTICES))
+@pytest.mark.parametrize("roundings", [1, 50, 500, 5000])
+def test_lattices_off_by_roundings(adapter, kind, roundings):
+    """Up to eight cells nearly meet in a point, four at an edge: from ties to faces hundreds of roundings wide."""
+    rng = np.random.default_rng(8231)
+    cube, eps = clvoro.Box((0, 0, 0), (1, 1, 1)), float(np.finfo(adapter.dtype).eps)
+    straight = lattice(kind, 5 if kind == "cubic" else 3) / BOX.extent
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    for points in (straight, 0.5 + 0.55 * (straight - 0.5) @ turn):
+        diagram = adapter.diagram(
+            cube, points + roundings * eps * rng.standard_normal(points.shape)
+        )
+        # Faces that are left out, as they are no polygons, are up to some ten roundings wide.
+        check_invariants(diagram, eps, 2)
+        check_loops(diagram, eps, 2)
+
+
+@pytest.mark.parametrize("n", [40, 90, 160])
+def test_cells_of_points_on_spheres(adapter, n):
+    """All cells of a sphere meet in its centre, or nearly so: what each sees there differs by rounding."""
+    rng = np.random.default_rng(n)
+    centre, eps = np.array([1.0, 0.75, 0.5]), float(np.finfo(adapter.dtype).eps)
+    for radii in ([0.4], [0.4, 0.2]):
+        points = np.concatenate([centre + r * directions(n // len(radii), rng) for r in radii])
+        diagram = adapter.diagram(BOX, points)
+        check_invariants(diagram, eps, 8)
+        check_loops(diagram, eps, 8)
 
 
 @pytest.mark.parametrize("name", FINE)

@@ -6,7 +6,7 @@
    triangulated sphere: a vertex is the triangle of its three faces, counter-clockwise seen from outside. A clip takes
    out the triangles of the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new
    face. Only that structure, never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
-#include "common/real.h"
+#include "common/noise.h"
 
 #ifndef FACE_CAPACITY
 #error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 64"
@@ -295,20 +295,6 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
         return steps == n;
     }
     return true;
-}
-
-/* How deep beyond the bisector with the neighbour at x + d, times |d|, a vertex must lie to be cut off: deeper than what
-   rounds in the vertex, and than what rounded in the positions of generators in the unit box, unless generators are so
-   near each other that they must differ by less. Cells of a lattice are thus not shredded. */
-#if IS_DOUBLE
-#define FINEST R(4e-11)
-#else
-#define FINEST R(2e-5)
-#endif
-
-inline REAL noise_length(REAL distance)
-{
-    return 4 * REAL_EPS * distance + fmin(4 * REAL_EPS, FINEST * distance);
 }
 
 /* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbours that are seen are known to have a face. */
