@@ -361,6 +361,15 @@ inline void add_side(outline_t *o, REAL2 e, bool chord)
     o->ahead = e;
 }
 
+/* A segment between two pieces of the cell: a run that ends there goes on in the other piece, straight on. */
+inline void join_runs(outline_t *o)
+{
+    const bool goes_on = o->ahead.s0 != 0 || o->ahead.s1 != 0;
+    o->sides -= goes_on;
+    o->missing -= 2 * goes_on;
+    o->ahead = 0;
+}
+
 /* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that have
    changed cells, in order; segments_of[place] is the touched cell that they lie in.
 
@@ -391,8 +400,11 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
             const REAL2 p = s.p[k] + shift, q = s.q[k] + shift, e = q - p;
             add_triangle(&m, p, q);
             int other;
-            if (!is_face(&s, k, home, i, slots, roots, &other))
+            if (!is_face(&s, k, home, i, slots, roots, &other)) {
+                if (other == i)
+                    join_runs(&o);
                 continue;
+            }
             if (other >= 0 || s.to[k] != ISLAND)
                 add_side(&o, e, other < 0);
             new_neighbours[at] = other;

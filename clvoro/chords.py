@@ -62,6 +62,7 @@ class Boundary:
         along = domain.vertices[domain.next_vertex] - domain.vertices
         self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
         self.owners = engine.zeros(self.edges, np.int32)
+        self._known = 0  # cells that owners are among
         self._flags = engine.empty(1, np.int32)
 
     def guess(self, binned: BinnedPoints, n: int) -> None:
@@ -84,6 +85,9 @@ class Boundary:
         """
         engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
         graph = (t.starts, t.neighbours, t.points)
+        if t.n < self._known:
+            self.owners.fill(0)
+        self._known = t.n
         engine.run_each(k.find_owners, edges, self.vertices, *graph, self.owners)
         firsts = room("firsts", size=edges + 1, dtype=np.int32)
         intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
