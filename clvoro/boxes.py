@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from .domain import Box
+    from .domain import Domain
 
 _HALVED = 0.5 ** np.arange(64)
 _ALL = slice(None)
@@ -60,7 +60,7 @@ def hilbert_tables(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 class Boxes:
-    """Boxes that tile the domain, in the order of a Hilbert curve.
+    """Boxes that tile the domain's bounding box, in the order of a Hilbert curve.
 
     Attributes
     ----------
@@ -73,10 +73,10 @@ class Boxes:
     root : (d,) float
         Physical edges of the root boxes.
     end : (d,) float
-        Number of root boxes per axis: the domain's upper corner in root units.
+        Number of root boxes per axis: the upper corner in root units.
     """
 
-    def __init__(self, domain: Box):
+    def __init__(self, domain: Domain):
         self.origin = np.array(domain.lower)
         # As many roots per axis as make them nearly cubes; a needle's stay long.
         shape = np.clip(np.rint(domain.extent / domain.extent.min()), 1, 64).astype(int)

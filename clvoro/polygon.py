@@ -66,6 +66,9 @@ class Polygon(Domain):
         too large, small or far from the origin for float64.
     """
 
+    framed_by: Polygon | None = None
+    """The polygon whose frame this one, a part of it, is to have on the device."""
+
     def __init__(self, outer: object, holes: Sequence[object] = ()):
         try:
             rings = [outer, *holes]
@@ -258,7 +261,7 @@ class Polygon(Domain):
         coordinate: points on slanted edges can be met no better.
         """
         points = np.asarray(points, dtype=float)
-        inside = np.asarray(shapely.intersects_xy(self.geometry, points[:, 0], points[:, 1]))
+        inside = self.covers(points)
         near = self.lower - np.full(2, self._rounding), self.upper + np.full(2, self._rounding)
         rest = np.flatnonzero(~inside & ((points >= near[0]) & (points <= near[1])).all(axis=1))
         if rest.size:
@@ -267,6 +270,33 @@ class Polygon(Domain):
             )
             inside[rest[rows]] = True
         return inside
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether it lies in the domain exactly, boundary included; (n,) bool."""
+        return np.array(shapely.intersects_xy(self.geometry, points[:, 0], points[:, 1]))
+
+    def contains_well(self, points: np.ndarray, margin: float) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether it lies inside, more than `margin` from the boundary; (n,) bool."""
+        inside = self.covers(points)
+        rows = np.flatnonzero(inside)
+        near, _ = self._edges.query(
+            shapely.points(points[rows]), predicate="dwithin", distance=margin
+        )
+        inside[rows[near]] = False
+        return inside
+
+    def piece_of(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
+        found = np.full(len(points), -1)
+        rows, pieces = shapely.STRtree(self.pieces).query(
+            shapely.points(points), predicate="intersects"
+        )
+        found[rows] = pieces
+        return found
+
+    def inner_point(self, piece: int) -> np.ndarray:
+        """Return a place (2,) inside of a piece, off its boundary."""
+        return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])
 
     def nearest_edge(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return for each of `points` (n, 2) an edge that is nearest, (n,) int, and the nearest point on it (n, 2)."""
@@ -293,6 +323,8 @@ class Polygon(Domain):
     @property
     def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the bounding box enlarged by 1/64 of its longest edge on every side."""
+        if self.framed_by is not None:
+            return self.framed_by.clip_box
         margin = _MARGIN * self.extent.max()
         return self.lower - np.full(2, margin), self.upper + np.full(2, margin)
 

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .boxes import Boxes, hilbert_tables
+from .cover import cover_of
 from .errors import InputTypeError, SizeFieldError
 
 if TYPE_CHECKING:
-    from .domain import Box
+    from .domain import Domain
 
 _BASE = {2: 1024, 3: 4096}  # boxes that are looked at in any case
+_MOST_BASE = {2: 16384, 3: 65536}  # counting those outside the domain
 _MOST = {2: 1 << 17, 3: 1 << 17}  # boxes after which refinement ends, whatever the error
 _BATCH = 1 << 19  # points evaluated at once
 
@@ -61,15 +63,19 @@ class DensityTree:
     ----------
     field : callable
         h(points (n, d)) -> (n,); a `Field`, or a `Sizing` (evaluated on its device).
-    domain : Box
+    domain : Domain
+        Boxes that its boundary cuts count by their share in it, exactly; those outside hold no cells. h is
+        evaluated inside only: places of the rules that lie outside are replaced by one inside, box by box.
     tolerance : float
         Relative to the integral.
 
     Attributes
     ----------
     boxes : Boxes
+    cover : Cover
+        What of each box lies in the domain.
     cells : (m,) float
-        Integral of h^-d over each box.
+        Integral of h^-d over each box's part of the domain.
     slopes : (m, d) float
         Mean change of log(h^-d) from side to side of each box.
     error : float
@@ -83,16 +89,20 @@ class DensityTree:
     """
 
     def __init__(
-        self, field: Callable[[np.ndarray], np.ndarray], domain: Box, tolerance: float = 1e-4
+        self, field: Callable[[np.ndarray], np.ndarray], domain: Domain, tolerance: float = 1e-4
     ):
         if not callable(field):
             raise InputTypeError(
                 f"field is {type(field).__name__}, expected a field of clvoro.sizing"
             )
         self.field, self.boxes = field, Boxes(domain)
+        self.cover = cover_of(self.boxes, domain)
         dim = domain.dim
-        while len(self.boxes) << dim < _BASE[dim]:
-            self.boxes.split(np.ones(len(self.boxes), bool))
+        while (
+            np.count_nonzero(self.cover.reached) << dim < _BASE[dim]
+            and len(self.boxes) << dim < _MOST_BASE[dim]
+        ):
+            self.cover.split(self.cover.reached)
         m = len(self.boxes)
         self.cells, self._differences, self._low, self._high = np.zeros((4, m))
         self.slopes = np.zeros((m, dim))
@@ -134,8 +144,12 @@ class DensityTree:
 
     def _integrate(self, chosen: np.ndarray) -> None:
         """Apply the rules to the boxes where `chosen` is true."""
+        outside = chosen & ~self.cover.reached
+        self.cells[outside], self.slopes[outside] = 0, 0
+        self._low[outside], self._high[outside] = np.inf, 0
+        chosen = chosen & ~outside
         at, weight = _rule(self.boxes.dim)
-        points = self.boxes.points(at, chosen)
+        points = self.cover.keep(self.boxes.points(at, chosen), chosen)
         m, p, dim = points.shape
         h = self.sizes(points.reshape(-1, dim)).reshape(m, p)
         edges = self.boxes.edges(chosen)
@@ -150,16 +164,17 @@ class DensityTree:
                 "bound it, for instance by clvoro.sizing.maximum(field, 1e-3)"
             )
         offset = at - 0.5
-        self.cells[chosen] = density @ weight
+        self.cells[chosen] = self.cover.weigh(density @ weight, chosen)
         self._low[chosen], self._high[chosen] = h.min(axis=1), h.max(axis=1)
         self.slopes[chosen] = -dim * (np.log(h) @ offset) / (offset[:, 0] ** 2).sum()
 
-    def _mark(self, domain: Box) -> None:
+    def _mark(self, domain: Domain) -> None:
         """Evaluate the landmarks: a grid of corners of base boxes and what the field names."""
         boxes, dim = self.boxes, self.boxes.dim
-        step = 0.5 ** (1 + int(boxes.level[0]))
+        step = 0.5 ** (1 + int(boxes.level.max()))
         axes = [np.arange(round(end / step) + 1) * step for end in boxes.end]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
+        grid = grid[self.cover.holds(boxes.origin + boxes.root * grid)]
         named = getattr(self.field, "landmarks", None)
         if named is not None:
             named = named(domain)
@@ -188,9 +203,12 @@ class DensityTree:
         # (a) All but the small errors whose sum is within the tolerance. What a jump cuts off
         # between two samples goes unseen by the rule; up to 0.056 of the box lies beyond the last
         # sample.
-        volumes = np.prod(boxes.edges(), axis=1)
-        sliver = 0.056 * volumes * (low**-dim - high**-dim)
-        self._errors = np.maximum(self._differences, np.where(high > _JUMP * low, sliver, 0.0))
+        volumes = self.cover.weigh(np.prod(boxes.edges(), axis=1), np.ones(len(boxes), bool))
+        reached = self.cover.reached
+        jumps = reached & (high > _JUMP * low)
+        sliver = np.zeros(len(boxes))
+        sliver[jumps] = 0.056 * volumes[jumps] * (low[jumps] ** -dim - high[jumps] ** -dim)
+        self._errors = np.maximum(self._differences, sliver)
         by_error = np.argsort(self._errors, kind="stable")
         within = np.cumsum(self._errors[by_error]) <= tolerance * self.integral
         chosen = np.zeros(len(boxes), bool)
@@ -200,7 +218,7 @@ class DensityTree:
         chosen |= (longest > low) & (high > _STEEP * low)
         # (c) Neighbours of much smaller boxes.
         chosen[there[boxes.level[there] < boxes.level[here] - 1]] = True
-        chosen &= boxes.level < boxes.deepest
+        chosen &= reached & (boxes.level < boxes.deepest)
 
         room = (_MOST[dim] - len(boxes)) // ((1 << dim) - 1)
         if np.count_nonzero(chosen) > room:
@@ -217,7 +235,7 @@ class DensityTree:
         half = 0.5 ** (boxes.level[box] + 1.0)[:, None]
         bits = (self._landmarks >= boxes.corner[box] + half) @ (1 << np.arange(boxes.dim))
         child_rank = np.where(chosen[box], rank[boxes.state[box], bits], 0)
-        parent, child = boxes.split(chosen)
+        parent, child = self.cover.split(chosen)
         first = np.searchsorted(parent, np.arange(len(chosen)))
         self._landmark_box = first[box] + child_rank
         fresh = child >= 0
@@ -231,4 +249,6 @@ class DensityTree:
         # chance.
         family = self.cells[fresh].reshape(-1, 1 << boxes.dim)
         change = np.abs(family.sum(axis=1) - before) / 2
-        self._differences[fresh] = np.repeat(change, 1 << boxes.dim) / (1 << boxes.dim)
+        reached = self.cover.reached[fresh].reshape(family.shape)
+        change /= np.maximum(np.count_nonzero(reached, axis=1), 1)
+        self._differences[fresh] = (change[:, None] * reached).ravel()

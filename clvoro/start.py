@@ -8,17 +8,22 @@ from numbers import Integral, Real
 import numpy as np
 from numpy.typing import DTypeLike
 
-from .domain import Box
+from .boxes import Boxes
+from .cover import PolygonCover, cover_of
+from .domain import Domain
 from .errors import InputError, InputTypeError
+from .polygon import Polygon
 from .quadrature import DensityTree
 from .sizing import as_field
 
 _TRIES = 40
+_ROUNDINGS = 4  # of the precision, within which of a polygon's boundary no point is put
+_MOST_COVER = 1 << 15  # boxes that cover a polygon for uniform points
 _SHARE = 1.0  # most points that a box of the sampling may expect
 
 
 def count_cells(
-    field: Callable[[np.ndarray], np.ndarray] | float, domain: Box, tolerance: float = 1e-4
+    field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4
 ) -> float:
     """Return the number of cells that `field` asks for: the integral of h^-d over the domain.
 
@@ -26,7 +31,7 @@ def count_cells(
     ----------
     field : Field, Sizing, callable or number
         A `Sizing` is evaluated on its device, anything else on the host.
-    domain : Box
+    domain : Domain
     tolerance : float
         Relative error aimed at; see `clvoro.quadrature.DensityTree` for what is guaranteed.
 
@@ -47,7 +52,7 @@ def count_cells(
 
 def sample_density(
     field: Callable[[np.ndarray], np.ndarray] | float,
-    domain: Box,
+    domain: Domain,
     n: int,
     seed: int,
     real: DTypeLike | None = None,
@@ -62,7 +67,7 @@ def sample_density(
     Parameters
     ----------
     field : Field, Sizing, callable or number
-    domain : Box
+    domain : Domain
     n : int
         At least 1.
     seed : int
@@ -86,7 +91,7 @@ def sample_density(
     n, seed = _checked(n, seed)
     field = _evaluator(field)
     tree = DensityTree(field, domain, tolerance=1e-3)
-    boxes, slopes = tree.boxes, tree.slopes
+    boxes, cover, slopes = tree.boxes, tree.cover, tree.slopes
     share = tree.cells * (n / tree.integral)
     while (chosen := (share > _SHARE) & (boxes.level < 45)).any():
         share, slopes = _halve(tree, chosen, share, slopes)
@@ -95,20 +100,21 @@ def sample_density(
     marks = (np.arange(n) + rng.random()) * (reached[-1] / n)
     box = np.minimum(np.searchsorted(reached, marks, side="right"), len(boxes) - 1)
 
-    def draw(rows: np.ndarray) -> np.ndarray:
-        at = _log_linear(rng.random((len(rows), domain.dim)), slopes[box[rows]])
-        return boxes.points(at[:, None, :], box[rows])[:, 0]
+    def draw(rows: np.ndarray, attempt: int) -> np.ndarray:
+        mine = box[rows]
+        slope = slopes[mine] * cover.sides(mine)
+        return cover.draw(_log_linear(rng.random((len(rows), domain.dim)), slope), mine, attempt)
 
     precision = getattr(field, "real", np.float64) if real is None else real
     return _distinct(draw, domain, n, np.dtype(precision))
 
 
-def sample_uniform(domain: Box, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
+def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
     """Return `n` independent uniform random points, the paper's start.
 
     Parameters
     ----------
-    domain : Box
+    domain : Domain
     n : int
         At least 1.
     seed : int
@@ -128,9 +134,11 @@ def sample_uniform(domain: Box, n: int, seed: int, real: DTypeLike = np.float64)
     """
     n, seed = _checked(n, seed)
     rng = np.random.Generator(np.random.PCG64(seed))
+    place = _uniform_in(domain, rng)
 
-    def draw(rows: np.ndarray) -> np.ndarray:
-        return domain.lower + domain.extent * rng.random((len(rows), domain.dim))
+    def draw(rows: np.ndarray, attempt: int) -> np.ndarray:
+        del attempt
+        return place(len(rows))
 
     return _distinct(draw, domain, n, np.dtype(real))
 
@@ -156,14 +164,22 @@ def _halve(
 
     Returns the new shares, and slopes: for a child, those between the centres of its siblings.
     """
-    boxes, dim = tree.boxes, tree.boxes.dim
-    parent, child = boxes.split(chosen)
+    boxes, cover, dim = tree.boxes, tree.cover, tree.boxes.dim
+    parent, child = cover.split(chosen)
     new = child >= 0
     share, slopes = share[parent], slopes[parent]
-    centres = boxes.points(np.full((1, dim), 0.5), new)[:, 0]
-    log_density = (-dim * np.log(tree.sizes(centres))).reshape(-1, 1 << dim)
-    weight = np.exp(log_density - log_density.max(axis=1, keepdims=True))
-    weight /= weight.sum(axis=1, keepdims=True)
+    centres = boxes.points(np.full((1, dim), 0.5), new)
+    reached = cover.reached[new]
+    log_density = np.full(len(reached), -np.inf)
+    log_density[reached] = -dim * np.log(tree.sizes(cover.keep(centres, new)[reached, 0]))
+    log_density = log_density.reshape(-1, 1 << dim)
+    densest = log_density.max(axis=1, keepdims=True)
+    # A family without any part in the domain: slivers that were lost.
+    densest[densest == -np.inf] = 0
+    weight = cover.weigh(np.exp(log_density - densest).ravel(), new).reshape(log_density.shape)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+    # No slope towards where there is no domain.
+    log_density = np.where(log_density == -np.inf, densest, log_density)
     share[new] *= weight.ravel()
     # Which side of its parent each child is on, -1 or 1 per axis.
     middle = centres.reshape(-1, 1 << dim, dim)
@@ -182,29 +198,88 @@ def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def _distinct(
-    draw: Callable[[np.ndarray], np.ndarray], domain: Box, n: int, real: np.dtype
+    draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, n: int, real: np.dtype
 ) -> np.ndarray:
     """Draw points; draw again those that coincide or lie on a wall in precision `real`."""
     origin, scale = domain.frame
-    lower, upper = (
-        ((np.array(c) - origin) / scale).astype(real) for c in (domain.lower, domain.upper)
-    )
     points = np.empty((n, domain.dim))
-    rows = np.arange(n)
-    for _ in range(_TRIES):
-        points[rows] = draw(rows)
+    rows, inside = np.arange(n), np.zeros(n, bool)
+    for attempt in range(_TRIES):
+        points[rows] = draw(rows, attempt)
         working = ((points - origin) / scale).astype(real)
-        bad = ((working <= lower) | (working >= upper)).any(axis=1)
-        bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
-        bad |= _repeated(working)
-        rows = np.flatnonzero(bad)
+        inside[rows] = _strictly_inside(domain, points[rows], working[rows])
+        rows = np.flatnonzero(~inside | _repeated(working))
         if not rows.size:
-            return points
+            return _in_all_pieces(domain, points)
     raise InputError(
         f"n is {n}: that many distinct points do not fit the size field in {real.name}; "
         + ("use dtype='float64' or " if real != np.float64 else "")
         + "ask for fewer cells"
     )
+
+
+def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) -> np.ndarray:
+    """Tell for each of `points` (n, d) whether it and what the precision makes of it lies off the boundary.
+
+    `working` are the points in the domain's frame.
+    """
+    origin, scale = domain.frame
+    if isinstance(domain, Polygon):
+        margin = _ROUNDINGS * float(np.finfo(working.dtype).eps) * scale
+        return domain.contains_well(points, margin)
+    lower, upper = (
+        ((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper)
+    )
+    bad = ((working <= lower) | (working >= upper)).any(axis=1)
+    bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
+    return np.asarray(~bad)
+
+
+def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
+    """Give each piece of a domain a point, from the end of those of the piece that has most."""
+    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+        return points
+    if len(points) < domain.n_pieces:
+        raise InputError(
+            f"n is {len(points)}, expected at least {domain.n_pieces}: each piece of the domain holds a cell"
+        )
+    piece = domain.piece_of(points)
+    counts = np.bincount(piece, minlength=domain.n_pieces)
+    for missing in np.flatnonzero(counts == 0).tolist():
+        most = int(np.argmax(counts))
+        row = np.flatnonzero(piece == most)[-1]
+        points[row] = domain.inner_point(missing)
+        piece[row] = missing
+        counts[[most, missing]] += [-1, 1]
+    return points
+
+
+def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
+    """Return a function that draws so many uniform random points of the domain.
+
+    In a polygon: of boxes that cover it, at least half of them inside, those that lie in it.
+    """
+    boxes = Boxes(domain)
+    cover = cover_of(boxes, domain)
+    if not isinstance(cover, PolygonCover):
+        return lambda n: domain.lower + domain.extent * rng.random((n, domain.dim))
+    while True:
+        areas = np.where(cover.reached, np.prod(boxes.edges(), axis=1), 0)
+        if areas.sum() <= 2 * domain.measure or len(boxes) >= _MOST_COVER:
+            break
+        cover.split(cover.reached & (cover.share < 1))
+    ends = np.cumsum(areas) / areas.sum()
+
+    def place(n: int) -> np.ndarray:
+        found = np.empty((0, 2))
+        while len(found) < n:
+            m = 2 * (n - len(found)) + 16
+            box = np.minimum(np.searchsorted(ends, rng.random(m), side="right"), len(boxes) - 1)
+            x = boxes.points(rng.random((m, 1, 2)), box)[:, 0]
+            found = np.concatenate([found, x[cover.holds(x)]])
+        return found[:n]
+
+    return place
 
 
 def _repeated(points: np.ndarray) -> np.ndarray:

@@ -7,45 +7,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import shapely
+from polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
 
 import clvoro
 from clvoro.domain import LARGEST_EDGE
 from clvoro.errors import InputError, InputTypeError
-
-SQUARE = np.array([(0.0, 0), (4, 0), (4, 3), (0, 3)])
-HOLE = np.array([(1.0, 1), (2, 1), (2, 2), (1, 2)])
-OTHER = HOLE * 0.5 + (2.5, 0.5)
-RAGGED_SEED = 11
-
-
-def ragged(k: int, seed: int = RAGGED_SEED, centre=(0.0, 0.0), radius=1.0) -> np.ndarray:
-    """A star-shaped ring of `k` vertices, counter-clockwise."""
-    rng = np.random.default_rng(seed)
-    angle = (np.arange(k) + rng.uniform(0, 0.9, k)) * (2 * np.pi / k)
-    r = radius * rng.uniform(0.5, 1.0, k)
-    return np.column_stack([r * np.cos(angle), r * np.sin(angle)]) + centre
-
-
-def crossings(points: np.ndarray, rings: list) -> np.ndarray:
-    """Even-odd rule, edge by edge."""
-    inside = np.zeros(len(points), bool)
-    for ring in rings:
-        for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-            spans = (a[1] > points[:, 1]) != (b[1] > points[:, 1])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                x = a[0] + (points[:, 1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0])
-            inside ^= spans & (points[:, 0] < x)
-    return inside
-
-
-def distances(points: np.ndarray, rings: list) -> np.ndarray:
-    """Distance to the nearest of all edges, edge by edge."""
-    best = np.full(len(points), np.inf)
-    for ring in rings:
-        for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-            t = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-            best = np.minimum(best, np.linalg.norm(a + t[:, None] * (b - a) - points, axis=1))
-    return best
 
 
 def test_rings_are_kept_with_the_interior_on_the_left() -> None:
@@ -311,7 +277,8 @@ def test_checkpoints_tell_domains_apart() -> None:
     from clvoro.checkpoint import describe
 
     domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
-    described = [json.dumps(describe(d, {}, np.dtype(float), None)) for d in domains]
+    options: dict = {"layers": []}
+    described = [json.dumps(describe(d, options, np.dtype(float), None)) for d in domains]
     assert len(set(described)) == 3
-    again = describe(clvoro.Polygon(SQUARE.copy()), {}, np.dtype(float), None)
+    again = describe(clvoro.Polygon(SQUARE.copy()), options, np.dtype(float), None)
     assert json.dumps(again) == described[0]

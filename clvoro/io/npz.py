@@ -154,7 +154,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         raise FileError(f"its points have {arrays['points'].shape[1]} coordinates in {domain}")
     other = "face_vert" if domain.dim == 2 else "cell_vert"
     for name in Diagram._NAMES:
-        if not name.startswith(other) and f"diagram.{name}" not in arrays:
+        if not name.startswith((other, "shifts")) and f"diagram.{name}" not in arrays:
             raise FileError(f"it has no diagram.{name}")
     stored = arrays["history"]
     history = np.zeros(len(stored), HISTORY_DTYPE)
