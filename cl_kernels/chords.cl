@@ -31,12 +31,13 @@ kernel void guess_owners(const int size, global const REAL2 *vertices, global co
     }
 }
 
-/* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is nearer. */
-kernel void find_owners(const int size, global const REAL2 *vertices, global const int *starts, global const int *neighbours,
+/* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is nearer.
+   `inner` are the vertices a few roundings further inside, so that what lies on faces counts to the cells within. */
+kernel void find_owners(const int size, global const REAL2 *inner, global const int *starts, global const int *neighbours,
                         global const REAL *points, global int *owners)
 {
     WORK_ITEM(v);
-    const REAL2 y = vertices[v];
+    const REAL2 y = inner[v];
     int cell = owners[v], next = cell;
     REAL least = squared_distance(y, cell, points);
     do {
@@ -44,7 +45,7 @@ kernel void find_owners(const int size, global const REAL2 *vertices, global con
         for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
             const int j = neighbours[k];
             const REAL d2 = j >= 0 ? squared_distance(y, j, points) : REAL_MAX;
-            if (d2 < least) {
+            if (d2 < least || (d2 == least && j < next)) {
                 least = d2;
                 next = j;
             }
@@ -62,15 +63,29 @@ inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
     return dot(x - a + d / 2, d) / dot(e, d);
 }
 
-/* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, which ends in cell `target`; -1 if there is none. Of
-   the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends. Where rounding
-   has led past the end of the edge, the neighbour that is nearest to the target's generator: that way leads to it. */
-inline int step_along(int cell, int target, REAL2 a, REAL2 e, global const int *starts, global const int *neighbours,
-                      global const REAL *points, REAL *t)
+/* What lies so near to a face is on it. */
+#define ON_FACE (4 * REAL_EPS)
+
+inline bool is_on_face(REAL beyond, REAL d2)
+{
+    return beyond * beyond <= ON_FACE * ON_FACE * d2;
+}
+
+/* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, from cell `origin` to cell `target`; -1 if there is none.
+   Of the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends. Where rounding
+   has led past the end of the edge, the neighbour that is nearest to the target's generator: that way leads to it.
+
+   Rounding must not choose an order of crossings that no edges could have. An end of the edge on a face counts as a little
+   inside the cell that it is in, a share of the way to its generator, and faces there are crossed in that order (rank), at
+   the end itself. An edge on a face counts to the cell on its left. */
+inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
+                      global const int *neighbours, global const REAL *points, REAL *t)
 {
     const REAL2 x = (REAL2)(points[2 * cell], points[2 * cell + 1]);
+    const REAL2 start = (REAL2)(points[2 * origin], points[2 * origin + 1]);
     const REAL2 goal = (REAL2)(points[2 * target], points[2 * target + 1]);
-    REAL first = REAL_MAX, least = squared_distance(goal, cell, points);
+    const REAL e2 = dot(e, e), short2 = 16 * ON_FACE * ON_FACE;
+    REAL first = REAL_MAX, first_rank = 0, least = squared_distance(goal, cell, points);
     int next = -1, towards = -1;
     for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
         const int j = neighbours[k];
@@ -82,15 +97,32 @@ inline int step_along(int cell, int target, REAL2 a, REAL2 e, global const int *
             least = d2;
             towards = j;
         }
-        if (dot(e, d) > 0) {
-            const REAL at = crossing(cell, j, a, e, points);
-            if (at < first) {
-                first = at;
-                next = j;
+        const REAL along = dot(e, d), dd = dot(d, d);
+        const bool begins_on = is_on_face(dot(a - x - d / 2, d), dd), ends_on = is_on_face(dot(a + e - x - d / 2, d), dd);
+        REAL at = 0, rank = -REAL_MAX;
+        if (begins_on && ends_on) {
+            if (e.s0 * d.s1 - e.s1 * d.s0 <= 0)
+                continue;
+        } else {
+            if (along <= 0)
+                continue;
+            at = crossing(cell, j, a, e, points);
+            rank = 0;
+            if (begins_on && at * at * e2 <= short2) {
+                at = 0;
+                rank = dot(a - start, d) / along;
+            } else if (ends_on && (1 - at) * (1 - at) * e2 <= short2) {
+                at = 1;
+                rank = dot(a + e - goal, d) / along;
             }
         }
+        if (at < first || (at == first && rank < first_rank)) {
+            first = at;
+            first_rank = rank;
+            next = j;
+        }
     }
-    const bool past = !(first < 1);
+    const bool past = !(first < 1 || (first == 1 && first_rank < 0));
     *t = past ? 1 : fmax(*t, first);
     return past ? towards : next;
 }
@@ -110,7 +142,7 @@ kernel void walk_edges(const int size, const int generators, global const REAL2 
     /* A walk meets a cell once, whatever rounding does. */
     for (int steps = 0; cell >= 0; ++steps) {
         const bool last = cell == target || steps > size + generators;
-        const int next = last ? -1 : step_along(cell, target, a, e, starts, neighbours, points, &t);
+        const int next = last ? -1 : step_along(cell, owners[v], target, a, e, starts, neighbours, points, &t);
         if (cell >= generators) {
             intruders[cell - generators] = 1;
             atomic_or(flags, FLAG_OUTSIDE);

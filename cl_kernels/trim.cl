@@ -8,7 +8,8 @@
 #define FLAG_LOST 1   /* as in chords.cl */
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
 #define UNTOUCHED 0x7fffffff
-#define ISLAND -2 /* the end of a chord that belongs to an island within its cell */
+#define ISLAND -2 /* the end of a chord that belongs to a hole within its cell */
+#define ON_BOUNDARY (4 * REAL_EPS)
 
 #define CONVEX_ARGS                                                                                                  \
     global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,        \
@@ -48,6 +49,17 @@ inline bool winds_around(const convex_t *cell, const chords_t *c, int chord, REA
     return turns > 0;
 }
 
+/* Does a loop leave the boundary for faces of the cell? */
+inline bool is_open(const convex_t *cell, const chords_t *c, int chord)
+{
+    cursor_t cursor = loop_begin(chord);
+    do {
+        if (next_segment(&cursor, cell, c).label >= 0)
+            return true;
+    } while (!is_complete(&cursor, chord));
+    return false;
+}
+
 /* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
 
    loop_chords   a chord with which each loop begins; -1: around the whole cell; -2: no loop
@@ -61,8 +73,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     const chords_t c = CHORDS;
     const convex_t cell = convex_cell(u, CONVEX);
     const int first = list_starts[u] + u;
-    int loops = 0, outer = 0, turns = 0, main = -1, total = 0;
-    bool crossed = false, main_winds = false;
+    int loops = 0, outer = 0, main = -1, total = 0;
+    bool crossed = false, rim = false, main_winds = false;
     REAL nearest = REAL_MAX;
     for (int k = 0; k < cell.chord_count; ++k)
         chord_loops[cell.chords[k]] = -1;
@@ -72,32 +84,35 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         if (chord_loops[begin] >= 0 || (turn < cell.chord_count && begins_inside(&c, begin)))
             continue;
         cursor_t cursor = loop_begin(begin);
-        REAL area = 0, near = REAL_MAX;
+        REAL near = REAL_MAX;
         int around = 0, count = 0;
-        bool open = false;
+        bool open = false, lost = false;
         /* A loop that takes more segments than there are has lost its way. */
         const int most = 2 * (cell.chord_count + 1) * (cell.n + 2);
         do {
-            if (cursor.chord >= 0)
+            const bool on_chord = cursor.chord >= 0;
+            if (on_chord)
                 chord_loops[cursor.chord] = loops;
             const segment_t s = next_segment(&cursor, &cell, &c);
-            area += difference_of_products(s.p.s0, s.q.s1, s.p.s1, s.q.s0);
             around += winding(s, 0);
             near = fmin(near, squared_distance_to(s));
-            open |= s.label >= 0;
+            open |= !on_chord;
+            lost |= !on_chord && s.label < 0; /* at a wall of the box, which is far outside */
         } while (!is_complete(&cursor, begin) && ++count < most);
-        if (count == most)
+        if (lost || count == most)
             atomic_or(flags, FLAG_LOST);
-        const bool is_outer = open || area > 0;
+        const int shell = c.shells[c.edges[begin]];
+        const bool is_outer = open || shell < 0;
+        /* A hole within the cell whose piece goes on beyond it: the cell's faces lie in the domain, if no chord leaves it. */
+        rim |= !is_outer && c.cells[c.firsts[shell]] != cell.i;
         const int place = first + loops;
         loop_chords[place] = begin;
         loop_pieces[place] = is_outer ? place : -1;
         loop_roots[place] = -1;
         crossed |= open;
-        turns += around;
         total += count + 1;
-        /* The generator's own piece winds around it; for a generator on the boundary rounding decides, or the distance. */
-        const bool winds = around > 0;
+        /* The generator's own piece winds around it, closest of all that do; or the generator lies on its boundary. */
+        const bool winds = around > 0 || near <= ON_BOUNDARY * ON_BOUNDARY;
         if (is_outer && (main < 0 || winds > main_winds || (winds == main_winds && near < nearest))) {
             main = place;
             main_winds = winds;
@@ -106,13 +121,16 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         outer += is_outer;
         ++loops;
     }
-    if (!crossed && turns == 0) {
-        /* No chord leaves the cell, and loops do not enclose the generator: the cell's own faces do. */
-        main = first + loops++;
-        loop_chords[main] = -1;
-        loop_pieces[main] = main;
+    if (!crossed && rim) {
+        const int place = first + loops++;
+        loop_chords[place] = -1;
+        loop_pieces[place] = place;
+        loop_roots[place] = -1;
         ++outer;
         total += cell.n;
+        /* Unless the generator is on an island in a hole. */
+        if (!main_winds)
+            main = place;
     }
     if (main < 0) {
         atomic_or(flags, FLAG_LOST);
@@ -120,10 +138,18 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     }
     for (int place = first; place < first + loops; ++place)
         if (loop_pieces[place] < 0) {
+            /* A hole lies in the outer ring of its piece. Where that leaves the cell, one of the pieces that it leaves by has it. */
+            const int shell = c.firsts[c.shells[c.edges[loop_chords[place]]]];
+            const int ring = c.cells[shell] == cell.i ? first + chord_loops[shell] : -1;
             loop_pieces[place] = main;
+            if (ring >= 0 && !is_open(&cell, &c, loop_chords[ring])) {
+                loop_pieces[place] = ring;
+                continue;
+            }
             const REAL2 y = chord_begin(&c, loop_chords[place]) - (REAL2)(cell.x[0], cell.x[1]);
             for (int other = first; outer > 1 && other < first + loops; ++other)
-                if (loop_pieces[other] == other && winds_around(&cell, &c, loop_chords[other], y))
+                if (loop_pieces[other] == other && is_open(&cell, &c, loop_chords[other]) &&
+                    winds_around(&cell, &c, loop_chords[other], y))
                     loop_pieces[place] = other;
         }
     loop_roots[main] = cell.i;
@@ -171,7 +197,8 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
                 do {
                     const segment_t s = next_segment(&cursor, &cell, &c);
                     labels[at] = s.label;
-                    from[at] = s.from;
+                    /* Empty ones end where they begin; on the boundary -1. */
+                    from[at] = !s.empty ? s.from : (s.label < 0 ? -1 : s.to);
                     to[at] = turn ? ISLAND : s.to;
                     places[at] = piece;
                     p[at] = s.p;
@@ -182,21 +209,65 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
     }
 }
 
-/* The generator that the piece on the other side of segment k of cell i goes to, -1 if it is not known yet. */
-inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
+inline bool is_empty(const segments_t *s, int k)
 {
-    const int j = s->labels[k], u = slots[j];
-    if (u == UNTOUCHED)
-        return j;
+    return s->labels[k] < 0 ? s->from[k] < 0 : s->from[k] == s->to[k];
+}
+
+/* The segment of cell j, number u of those that the boundary passes through, that is segment k of cell i from the other side;
+   -1 if there is none. */
+inline int other_side(const segments_t *s, int k, int i, int u)
+{
     for (int m = s->starts[u]; m < s->starts[u + 1]; ++m) {
-        if (s->labels[m] != i)
+        if (s->labels[m] != i || is_empty(s, m))
             continue;
         const bool ends_meet = s->from[k] < 0 ? s->to[m] < 0 : s->to[m] == s->from[k];
         const bool begins_meet = s->to[k] < 0 ? s->from[m] < 0 : s->from[m] == s->to[k];
         if (ends_meet && begins_meet)
-            return roots[s->places[m]];
+            return m;
     }
-    return j; /* a face that rounding lets only one of the two see */
+    return -1;
+}
+
+/* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a generator
+   outside the domain, and so the cells tile the domain. Where edges cross a face closer to each other than rounding, they do
+   not. `n` generators are in the domain. */
+kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                           global const int *starts, global const int *neighbours, global int *flags)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    bool fits = true;
+    for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
+        const int j = s.labels[k];
+        if (j < 0 || is_empty(&s, k))
+            continue;
+        if (j >= n)
+            fits = false;
+        else if (slots[j] == UNTOUCHED)
+            fits &= s.from[k] < 0 && s.to[k] < 0;
+        else
+            fits &= other_side(&s, k, i, slots[j]) >= 0;
+    }
+    for (int f = starts[i]; f < starts[i + 1]; ++f) {
+        const int j = neighbours[f];
+        if (j < 0 || j >= n || slots[j] != UNTOUCHED)
+            continue;
+        bool found = false;
+        for (int k = s.starts[u]; k < s.starts[u + 1] && !found; ++k)
+            found = s.labels[k] == j;
+        fits &= found;
+    }
+    if (!fits)
+        atomic_or(flags, FLAG_LOST);
+}
+
+/* The generator that the piece on the other side of segment k of cell i goes to, -1 if it is not known yet. */
+inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
+{
+    const int j = s->labels[k], u = slots[j];
+    return u == UNTOUCHED ? j : roots[s->places[other_side(s, k, i, u)]];
 }
 
 /* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is known.
@@ -214,7 +285,7 @@ kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched
         REAL longest = -1;
         if (root < 0)
             for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
-                if (s.places[k] != piece || s.labels[k] < 0)
+                if (s.places[k] != piece || s.labels[k] < 0 || is_empty(&s, k))
                     continue;
                 const int other = other_root(&s, k, i, slots, roots);
                 const REAL2 e = s.q[k] - s.p[k];
@@ -264,9 +335,12 @@ inline bool is_face(const segments_t *s, int k, int i, int root, global const in
                     int *other)
 {
     const int label = s->labels[k];
+    if (is_empty(s, k)) {
+        *other = -1;
+        return false;
+    }
     *other = label < 0 ? label : other_root(s, k, i, slots, roots);
-    const REAL2 p = s->p[k], q = s->q[k];
-    return *other != root && !(p.s0 == q.s0 && p.s1 == q.s1 && (label < 0 || (s->from[k] >= 0 && s->to[k] >= 0)));
+    return *other != root;
 }
 
 /* Per generator of the domain: faces of its cell, if the boundary does not pass through it. */

@@ -16,6 +16,7 @@ from .polygon import Polygon
 
 LOST, OUTSIDE = 1, 2  # of the bits in chords.cl
 UNTOUCHED = 0x7FFFFFFF
+_ROUNDINGS = 4  # by which vertices lie off a face for sure; ON_FACE in chords.cl
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,32 @@ class Chords:
     tangents: cla.Array
 
 
+def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
+    """Return vectors (k, 2), a few roundings long, from the vertices of `domain` inwards: between the edges."""
+    ahead = domain.vertices[domain.next_vertex] - domain.vertices
+    ahead /= np.hypot(*ahead.T)[:, None]
+    before = np.empty_like(ahead)
+    before[domain.next_vertex] = ahead
+    across = before + ahead
+    # Between the normals to the left; in a needle's tip, whose normals cancel, along it.
+    along = ahead - before
+    turn = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
+    sharp = np.hypot(*across.T) < np.hypot(*along.T)
+    way = np.where(
+        sharp[:, None],
+        np.where(turn > 0, 1, -1)[:, None] * along,
+        np.column_stack([-across[:, 1], across[:, 0]]),
+    )
+    return _ROUNDINGS * float(np.finfo(real).eps) * way / np.hypot(*way.T)[:, None]
+
+
+def shells(domain: Polygon) -> np.ndarray:
+    """Return for each edge of `domain` an edge of the outer ring of its piece, (k,); -1 on that ring itself."""
+    first = np.searchsorted(domain.piece_of_ring, domain.piece_of_ring)  # outer rings come first
+    found = np.where(first == np.arange(len(first)), -1, domain.ring_starts[first])
+    return np.repeat(found, np.diff(domain.ring_starts))
+
+
 class Boundary:
     """Cut the boundary of one domain into chords."""
 
@@ -59,6 +86,11 @@ class Boundary:
         self.edges = len(domain.vertices)
         self.vertices = engine.upload((domain.vertices - origin) / scale)
         self.next_vertex = engine.upload(domain.next_vertex, np.int32)
+        inner = (domain.vertices - origin) / scale + inward(domain, engine.real)
+        # Rings that touch in a vertex have it in the same cell.
+        same = np.unique(domain.vertices, axis=0, return_index=True, return_inverse=True)
+        self.inner = engine.upload(inner[same[1]][same[2].ravel()])
+        self.shells = engine.upload(shells(domain), np.int32)
         along = domain.vertices[domain.next_vertex] - domain.vertices
         self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
         self.owners = engine.zeros(self.edges, np.int32)
@@ -88,7 +120,7 @@ class Boundary:
         if t.n < self._known:
             self.owners.fill(0)
         self._known = t.n
-        engine.run_each(k.find_owners, edges, self.vertices, *graph, self.owners)
+        engine.run_each(k.find_owners, edges, self.inner, *graph, self.owners)
         firsts = room("firsts", size=edges + 1, dtype=np.int32)
         intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
         self._flags.fill(0)
@@ -102,8 +134,8 @@ class Boundary:
             return np.flatnonzero(intruders.get())
         if flags & LOST:
             raise InputError(
-                "the boundary of the polygon cannot be followed through the cells: generators are too close to it, or "
-                "to each other, for the precision; move them apart or use dtype='float64'"
+                "the boundary of the polygon cannot be followed through the cells: edges of it are too close to each "
+                "other, or generators are, for the precision; use dtype='float64', or a polygon without such slits"
             )
         cells, of_edges = (room(name, size=count, dtype=np.int32) for name in ("cells", "of_edges"))
         ends = room("ends", size=count)
@@ -119,7 +151,9 @@ class Boundary:
             intruders,
             self._flags,
         )
-        arrays = (self.vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends)
+        arrays = (
+            self.vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells
+        )  # fmt: skip
         return self._sort(count, arrays, cells, t.n)
 
     def _sort(self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int) -> Chords:

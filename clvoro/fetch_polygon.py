@@ -18,8 +18,8 @@ from .vertices import VertexNumbering, Vertices
 class _FetchedPolygon(_Fetched):
     """A trimmed tessellation.
 
-    Its vertices are corners of convex cells, corners of the polygon, and places where its edges cross faces of cells. Each
-    face knows both its ends, as a cell may be bounded by several loops.
+    Its vertices are corners of convex cells, corners of the polygon, and places where its edges cross faces of cells.
+    Each face knows both its ends, as a cell may be bounded by several loops.
     """
 
     def __init__(
@@ -37,7 +37,8 @@ class _FetchedPolygon(_Fetched):
         self.touched = made.chords.touched.get()[: made.chords.touched_count]
         arrays = [a.get() for a in made.chords.arrays]
         self.owners_of_vertices, self.firsts, self.chord_cells, self.chord_edges = arrays[2:6]
-        self.chord_ends = arrays[6].astype(np.float64)[: made.chords.count]
+        self.chord_ends = arrays[6][: made.chords.count]
+        self.device_vertices = arrays[0]
         starts, segment_labels, begins, ends = (a.get() for a in made.segments[:4])
         n_segments = made.segment_count
         self.segment_cells = np.repeat(self.touched, np.diff(starts[: len(self.touched) + 1]))
@@ -52,14 +53,19 @@ class _FetchedPolygon(_Fetched):
 
     @cached_property
     def crossings(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (k, 2) of the polygon's corners and of crossings, each once, and the number of each chord's end."""
-        a = self.domain.vertices[self.chord_edges]
-        b = self.domain.vertices[self.domain.next_vertex[self.chord_edges]]
-        t = self.chord_ends[:, None]
-        ends = np.where(t >= 1, b, np.where(t <= 0, a, a + t * (b - a)))
-        both = np.concatenate([self.domain.vertices, ends])
-        positions, numbers = np.unique(both, axis=0, return_inverse=True)
-        return positions, numbers.ravel()
+        """Positions (k, 2) of the polygon's corners and of crossings, each once, and the number of each chord's end.
+
+        Those are the same that are the same on the device, where segments between them are left out.
+        """
+        found = []
+        for vertices in (self.device_vertices, self.domain.vertices):
+            a = vertices[self.chord_edges]
+            b = vertices[self.domain.next_vertex[self.chord_edges]]
+            t = self.chord_ends[:, None]
+            ends = np.where(t >= 1, b, np.where(t <= 0, a, a + t * (b - a)))
+            found.append(np.concatenate([vertices, ends]))
+        _, first, numbers = np.unique(found[0], axis=0, return_index=True, return_inverse=True)
+        return found[1][first], numbers.ravel()
 
     @cached_property
     def face_ends(self) -> np.ndarray:
@@ -136,7 +142,7 @@ class _FetchedPolygon(_Fetched):
 
     @cached_property
     def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
-        """One closed chain of corners per cell: where it has several loops, they are joined by a bridge there and back."""
+        """One closed chain of corners per cell: several loops are joined by a bridge there and back."""
         corners, starts = self._numbered[1][:, 0], self.neighbour_starts()
         several = self._chained[1]
         if not several:

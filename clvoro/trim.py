@@ -80,17 +80,17 @@ class Trim:
         )  # fmt: skip
         self._scan.exclusive(starts, starts, u)
         count = int(starts[u].get())
-        flags = int(self._flags.get()[0])
-        if flags & LOST:
-            raise InputError(
-                "cells cannot be trimmed by the boundary of the polygon: generators are too close to it, or to each "
-                "other, for the precision; move them apart or use dtype='float64'"
-            )
+        flags = self._demand(int(self._flags.get()[0]))
         names = ("labels", "from", "to", "places")
         parts = [room(name, size=count, dtype=np.int32) for name in names]
         parts += [room(name, size=2 * count) for name in ("p", "q")]
         engine.run_each(k.write_segments, u, *cells, loops, pieces, starts, *parts)
         segments = (starts, *parts)
+        engine.run_each(
+            k.check_segments, u, np.int32(n), *segments, chords.touched, chords.slots,
+            convex.starts, convex.neighbours, self._flags,
+        )  # fmt: skip
+        self._demand(int(self._flags.get()[0]))
         marks = room.zeros("marks", size=n, dtype=np.int32)
         orphans, orphan_count = self._adopt(
             chords, segments, pieces, roots, marks, bool(flags & ORPHANS), places
@@ -98,6 +98,15 @@ class Trim:
         return self._write(
             points, convex, chords, segments, count, roots, orphans, orphan_count, marks, n
         )
+
+    @staticmethod
+    def _demand(flags: int) -> int:
+        if flags & LOST:
+            raise InputError(
+                "cells cannot be trimmed by the boundary of the polygon: edges of it are too close to each other, or "
+                "generators are, for the precision; use dtype='float64', or a polygon without such slits"
+            )
+        return flags
 
     def _adopt(
         self,

@@ -5,20 +5,22 @@
    chord_firsts   (edges + 1) prefix sums: chords of each edge
    chord_cells    whose cell the chord lies in
    chord_edges
-   chord_ends     where along its edge it ends, 0 to 1; it begins where the one before on the edge ends */
+   chord_ends     where along its edge it ends, 0 to 1; it begins where the one before on the edge ends
+   shells[v]      of edges of holes: an edge of the outer ring of their piece; -1 for edges of outer rings */
 #include "common/corner.h"
 
 typedef struct {
     global const REAL2 *vertices;
     global const int *next_vertex, *owners, *firsts, *cells, *edges;
     global const REAL *ends;
+    global const int *shells;
 } chords_t;
 
 #define CHORD_ARGS                                                                                                 \
     global const REAL2 *vertices, global const int *next_vertex, global const int *vertex_owners,                  \
         global const int *chord_firsts, global const int *chord_cells, global const int *chord_edges,              \
-        global const REAL *chord_ends
-#define CHORDS {vertices, next_vertex, vertex_owners, chord_firsts, chord_cells, chord_edges, chord_ends}
+        global const REAL *chord_ends, global const int *shells
+#define CHORDS {vertices, next_vertex, vertex_owners, chord_firsts, chord_cells, chord_edges, chord_ends, shells}
 
 /* Does the chord begin, or end, inside its cell, at a corner of the polygon? Else on a face of the cell. */
 inline bool begins_inside(const chords_t *c, int chord)

@@ -12,14 +12,21 @@ typedef struct {
 } convex_t;
 
 /* A piece of a loop from p to q, relative to the generator. It lies on the boundary's edge -1 - label, or on the face with
-   generator `label`. from, to: a chord that ends there, where a segment ends on a face; else -1 - corner of the cell. */
+   generator `label`. from, to: a chord that ends there, where a segment ends on a face; else -1 - corner of the cell; on
+   the boundary the chord. A segment is empty if both ends are in the same place: for all cells that see it. */
 typedef struct {
     REAL2 p, q;
     int label, from, to;
+    bool empty;
 } segment_t;
 
+inline bool same_place(REAL2 p, REAL2 q)
+{
+    return p.s0 == q.s0 && p.s1 == q.s1;
+}
+
 /* Where chords cross a cell's boundary, in counter-clockwise order: by face, along the face, and, where a corner of the
-   polygon lies on the face, as if it lay a little inside the cell that it is counted to. */
+   polygon lies on the face, as if it lay a little inside the cell that it is counted to, as in chords.cl. */
 typedef struct {
     int face;
     REAL along, turn;
@@ -33,12 +40,16 @@ inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord
     const REAL2 x = (REAL2)(cell->points[2 * o], cell->points[2 * o + 1]);
     const REAL2 d = (REAL2)(cell->points[2 * q], cell->points[2 * q + 1]) - x, along = (REAL2)(-d.s1, d.s0);
     const REAL2 e = c->vertices[c->next_vertex[edge]] - c->vertices[edge];
-    const int owner = c->owners[c->ends[chord] < R(0.5) ? edge : c->next_vertex[edge]];
-    const REAL sign = cell->i == o ? 1 : -1;
+    const int v = c->ends[chord] < R(0.5) ? edge : c->next_vertex[edge], owner = c->owners[v];
+    const REAL2 inside = (REAL2)(cell->points[2 * owner], cell->points[2 * owner + 1]) - c->vertices[v];
+    const REAL sign = cell->i == o ? 1 : -1, ahead = c->cells[chord] == o ? 1 : -1;
+    /* The edge goes ahead over the face, though rounding may have it otherwise. */
+    const REAL across = fmax(ahead * dot(e, d), R(0)), shift = -ahead * dot(inside, d) * dot(e, along);
+    const REAL turn = across > 0 ? shift / across : (shift > 0 ? REAL_MAX : (shift < 0 ? -REAL_MAX : 0));
     place_t place;
     place.face = place_in_row(cell->row, cell->n, j);
     place.along = sign * dot(chord_end(c, chord) - x, along);
-    place.turn = sign * (owner == o ? 1 : -1) * dot(e, along) / dot(e, d);
+    place.turn = sign * (turn + dot(inside, along));
     return place;
 }
 
@@ -108,6 +119,7 @@ inline segment_t next_segment(cursor_t *cursor, const convex_t *cell, const chor
         s.p = chord_begin(c, chord) - x;
         s.q = chord_end(c, chord) - x;
         s.from = s.to = chord;
+        s.empty = same_place(chord_begin(c, chord), chord_end(c, chord));
         if (ends_inside(c, chord))
             cursor->chord = chord_after(c, chord);
         else
@@ -117,11 +129,13 @@ inline segment_t next_segment(cursor_t *cursor, const convex_t *cell, const chor
     const int face = cursor->face, after = face + 1 == cell->n ? 0 : face + 1;
     s.label = cell->row[face];
     s.from = cursor->from >= 0 ? cursor->from : -1 - face;
+    s.empty = false;
     s.p = cursor->from >= 0 ? chord_end(c, cursor->from) - x : cell_corner(cell, face);
     if (cursor->entry >= 0 && face == cursor->entered.face &&
         (cursor->from < 0 || is_after(cursor->entered, cursor->left))) {
         s.to = cursor->entry - 1;
         s.q = chord_end(c, s.to) - x;
+        s.empty = s.from >= 0 && same_place(chord_end(c, s.from), chord_end(c, s.to));
         *cursor = along_chord(cursor->entry);
     } else {
         s.to = -1 - after;
