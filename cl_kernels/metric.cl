@@ -79,6 +79,14 @@ kernel void compare_neighbours(const int size, global const int *starts, global 
     ever[i] = first ? 0 : fmax(ever[i], (REAL)differs);
 }
 
+/* Per generator i that does not move, labels[i] < fixed: the size that its cell has is the right one. */
+kernel void hold_sizes(const int size, global const int *labels, const int fixed, global const REAL *volumes, global REAL *h)
+{
+    WORK_ITEM(i);
+    if (labels[i] < fixed)
+        h[i] = DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i]);
+}
+
 /* Per generator i: h times a factor: the size on a coarser level. */
 kernel void scale_sizes(const int size, const REAL factor, global REAL *h)
 {

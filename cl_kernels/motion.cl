@@ -75,11 +75,22 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
         x[c] = points[DIM * i + c];
         y[c] = x[c] + scale * d[c];
     }
-    reflect_inside(x, y, DOMAIN);
+    /* Generators that stay where they are may stand outside of the part of the domain that is left to the others. */
+    if (d2 > 0)
+        reflect_inside(x, y, DOMAIN);
     EACH_AXIS(c) {
         points[DIM * i + c] = y[c];
         velocity[DIM * i + c] = DIFFERENCE(c, x[c], y[c]);
     }
+}
+
+/* Per generator i that does not move, labels[i] < fixed: no displacement. */
+kernel void hold_generators(const int size, global const int *labels, const int fixed, global REAL *displacement)
+{
+    WORK_ITEM(i);
+    if (labels[i] < fixed)
+        EACH_AXIS(a)
+            displacement[DIM * i + a] = 0;
 }
 
 /* Per generator i: lloyd = factor * lloyd + share * velocity. */

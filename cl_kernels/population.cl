@@ -155,6 +155,18 @@ kernel void drop_sites(const int size, global const ulong *spread, global ulong 
         keys[i] = 0;
 }
 
+/* Per generator i: no site where it does not move (labels less than `fixed`) or, with `around`, one of its neighbours. */
+kernel void exempt_fixed(const int size, global const int *starts, global const int *neighbours, global const int *labels,
+                         const int fixed, const int around, global ulong *keys)
+{
+    WORK_ITEM(i);
+    bool near = labels[i] < fixed;
+    for (int k = starts[i]; around && k < starts[i + 1] && !near; ++k)
+        near = neighbours[k] >= 0 && labels[neighbours[k]] < fixed;
+    if (near)
+        keys[i] = 0;
+}
+
 /* Per chosen site: count it in the histogram of the keys from `low` on, HISTOGRAM bins of `width`. */
 kernel void count_sites(const int size, global const ulong *chosen, const ulong low, const ulong width,
                         global int *histogram)

@@ -53,14 +53,15 @@ inline float penalty_of(float penalty, float lenience, float worst, float bound,
 
 /* Per generator i: own[i] = dr_i/dx_i h_i; for each face the derivatives across it, rows[k] = dr_i/dx_j h_j and
    columns[k] = dr_j/dx_i h_i; eps; the inverse of the diagonal of B B^T + eps; and the start of the iteration from u = 0,
-   r = b = excess + J displacement. Lengths are divided by h before they are rounded, so that any size is in range. */
+   r = b = excess + J displacement. Generators of labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any size is in range. */
 kernel void assemble(int n, global const int *starts, global const int *neighbours, global const REAL *face_measures,
                      global const REAL *face_centroids, global const REAL *volumes, global const REAL *points,
                      global const REAL *gradient, global const REAL *h, global const REAL *quality,
                      global const REAL *excess, global const REAL *displacement, const REAL penalty,
                      const REAL lenience, const REAL bound, global float *rows, global float *columns,
                      global STORE *own, global STORE *eps, global STORE *inverse_diagonal, global STORE *r,
-                     global STORE *z, global STORE *p, global STORE *s, global STORE *u, global REAL *partial)
+                     global STORE *z, global STORE *p, global STORE *s, global STORE *u, global REAL *partial,
+                     global const int *labels, const int fixed)
 {
     local REAL scratch[GROUP_SIZE];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
@@ -70,6 +71,7 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
         const REAL hi = h[i], unit = 1 / hi, content = DIM == 2 ? hi * hi : hi * hi * hi;
         const float shrink = content / volumes[i];
         float diagonal = 0, worst = quality[i];
+        const bool still = fixed > 0 && labels[i] < fixed;
         EACH_AXIS(a)
         {
             x[a] = points[DIM * i + a];
@@ -85,6 +87,7 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
                 d[a] = DIFFERENCE(a, x[a], points[DIM * j + a]) * unit;
                 d2 += d[a] * d[a];
             }
+            const bool stands = fixed > 0 && labels[j] < fixed;
             const float w = (float)(face_measures[k] * (DIM == 2 ? unit : unit * unit)) / sqrt(d2);
             const float there = w * ((float)content / (float)volumes[j]), here = w * shrink, ratio = h[j] * unit;
             EACH_AXIS(a)
@@ -93,15 +96,16 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
                 moved += other * (float)(displacement[DIM * j + a] * unit);
                 square += other * other;
                 self[a] += here * m;
-                rows[DIM * k + a] = other * ratio;
-                columns[DIM * k + a] = -there * m;
+                rows[DIM * k + a] = stands ? 0 : other * ratio;
+                columns[DIM * k + a] = still ? 0 : -there * m;
             }
-            diagonal += square * ratio * ratio;
+            diagonal += stands ? 0 : square * ratio * ratio;
             worst = fmin(worst, (float)quality[j]);
         }
         EACH_AXIS(a)
         {
-            const float t = self[a] - DIM * (float)(gradient[DIM * i + a] * hi);
+            /* The size of a cell whose generator does not move does not change by its motion. */
+            const float t = still ? 0 : self[a] - DIM * (float)(gradient[DIM * i + a] * hi);
             moved += t * (float)(displacement[DIM * i + a] * unit);
             diagonal += t * t;
             own[DIM * i + a] = t;

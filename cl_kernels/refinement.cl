@@ -12,6 +12,12 @@ inline bool has_middle(int i, int j, REAL measure, REAL volume)
     return j > i && measure > SHORT_FACE * (DIM == 2 ? length : length * length);
 }
 
+/* Generators that do not move, labels less than `fixed`, have the number that they are to have. */
+inline bool is_fixed(int i, int j, global const int *labels, int fixed)
+{
+    return fixed > 0 && (labels[i] < fixed || (j >= 0 && labels[j] < fixed));
+}
+
 #ifdef POLYGON
 /* A cell at the boundary brings one, before its longest edge there: of two equally long, the first. */
 inline bool is_wall_side(int k, int begin, int end, global const int *neighbours, global const REAL *face_measures, REAL volume)
@@ -28,12 +34,14 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbours
 
 /* Per generator i: how many new generators it brings. */
 kernel void count_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
-                           global const REAL *volumes, global int *counts)
+                           global const REAL *volumes, global const int *labels, const int fixed, global int *counts)
 {
     WORK_ITEM(i);
     int count = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
+        if (is_fixed(i, j, labels, fixed))
+            continue;
         count += j < 0 ? is_wall_side(k, starts[i], starts[i + 1], neighbours, face_measures, volumes[i])
                        : has_middle(i, j, face_measures[k], volumes[i]);
     }
@@ -43,7 +51,8 @@ kernel void count_children(const int size, global const int *starts, global cons
 /* Per generator i: write itself to row i of `finer` and its new generators behind row n. firsts are the prefix sums of
    the counts; h is the size on the new level. */
 kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
-                           global const REAL *volumes, global const REAL *points, global const REAL *h, const int n,
+                           global const REAL *volumes, global const REAL *points, global const int *labels,
+                           const int fixed, global const REAL *h, const int n,
                            DOMAIN_ARGS, global const int *firsts, global REAL *finer, global const REAL *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
@@ -53,6 +62,8 @@ kernel void place_children(const int size, global const int *starts, global cons
     global REAL *child = finer + DIM * (n + firsts[i]);
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
+        if (is_fixed(i, j, labels, fixed))
+            continue;
         if (j < 0) {
             if (!is_wall_side(k, starts[i], starts[i + 1], neighbours, face_measures, volumes[i]))
                 continue;

@@ -6,6 +6,7 @@ from .device import create_context, list_devices
 from .domain import Box
 from .errors import ClvoroError
 from .io import load
+from .layers import Layers
 from .polygon import Polygon
 from .results import Diagram, Displacements, Result
 
@@ -17,6 +18,7 @@ __all__ = [
     "ClvoroError",
     "Diagram",
     "Displacements",
+    "Layers",
     "Polygon",
     "Result",
     "create_context",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from typing import Any
@@ -18,6 +18,7 @@ from .checkpoint import Checkpointer, Saved, describe
 from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
+from .layers import Layers, apart_from, bounded, free_domain, place_layers
 from .loop import Loop
 from .mesh import Mesh, Stages, check_memory
 from .methods import PUBLISHED, Relaxation, make_method
@@ -180,6 +181,7 @@ class Adapter:
         effort: str = "default",
         levels: int | str = "auto",
         error_target: float | None = None,
+        layers: Layers | Sequence[Layers] = (),
         checkpoint: str | PathLike[str] | None = None,
         checkpoint_every: float = 60.0,
         resume: str | PathLike[str] | None = None,
@@ -227,6 +229,9 @@ class Adapter:
         error_target : float, optional
             Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0025 (.0035 for "fast", .0039 for
             "best"). The larger, the better the cells' shape.
+        layers : Layers or sequence of them
+            Rows of generators along walls, in 2D, that stay where they are: the first of the result. Beyond them sizes
+            are bounded by what grows from there; see `Layers`. Their cells count as being of the right size.
         checkpoint : path, optional
             File to which the run's state is written every so often, and where the callback stops it. It is replaced
             at one stroke: whenever the process dies, the file is a whole one.
@@ -270,6 +275,7 @@ class Adapter:
                 f"callback is {callback!r} of type {type(callback).__name__}, expected a function "
                 "of a row of the history"
             )
+        options["layers"] = (layers,) if isinstance(layers, Layers) else tuple(layers)
         every = check_number("checkpoint_every", checkpoint_every, least=0)
         files = checkpoint, every, resume
         with self._alone():
@@ -300,23 +306,41 @@ class Adapter:
                 f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} "
                 "keeps their number; leave n_cells out, or use method='adaptive'"
             )
+        rows, free = np.empty((0, domain.dim)), domain
+        if options["layers"]:
+            rows, free = (
+                place_layers(domain, options["layers"]),
+                free_domain(domain, options["layers"]),
+            )
+            size = bounded(size, domain, options["layers"])
         sizing = Sizing(engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
-        asked = count_cells(sizing, domain) if host is None or planned else float(len(host))
+        given = host is not None and not planned
+        asked = float(len(host)) if given else count_cells(sizing, free) + len(rows)
         target = n_cells if n_cells is not None else max(1, round(asked))
         check_memory(engine, max(target, 0 if host is None else len(host)))
         factor = (asked / target) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
         levels = self._levels(options["levels"], engine, target, host) if planned else 0
         if host is None and saved is None:
-            n = max(1, round(target / 2 ** (domain.dim * levels)))
+            n = max(1, round((target - len(rows)) / 2 ** (domain.dim * levels)))
             if options["start"] == "uniform":
-                host = sample_uniform(domain, n, options["seed"], self.dtype)
+                host = sample_uniform(free, n, options["seed"], self.dtype)
             else:
-                host = sample_density(sizing, domain, n, options["seed"], self.dtype)
+                host = sample_density(sizing, free, n, options["seed"], self.dtype)
+        if host is not None and len(rows):
+            host = np.concatenate([rows, apart_from(host, rows, free)])
         mesh, near = None, False
         if host is not None and (saved is None or (planned and levels == 0)):
             with _Naming(host, domain, self.dtype):
                 unsorted = engine.upload(domain.place(host, self.dtype))
-                mesh = Mesh(stages, domain, sizing, unsorted, coarsening=factor * 2.0**levels)
+                mesh = Mesh(
+                    stages,
+                    domain,
+                    sizing,
+                    unsorted,
+                    coarsening=factor * 2.0**levels,
+                    free=free,
+                    fixed=len(rows),
+                )
             near = points is not None and planned and levels == 0
             near = near and self._near(mesh, n_cells, options["effort"])
         plan: list[Action]
@@ -332,13 +356,14 @@ class Adapter:
         tol = None if planned else options["tol"]
         writer = None if checkpoint is None else Checkpointer(checkpoint, every, made_by, plan)
         if saved is not None:
-            mesh = saved.restore(stages, domain, sizing, plan)
+            mesh = saved.restore(stages, domain, sizing, plan, free, len(rows))
         assert mesh is not None
         loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
         loop.checkpoint = writer
         if saved is not None:
             saved.set(loop)
         settings = {**options, "levels": levels, "dtype": self.dtype.name}
+        settings["layers"] = [repr(layer) for layer in options["layers"]]
         if points is not None:
             settings["start"] = "points"
         return loop.run(n_cells if planned else None, float(target), settings)

@@ -122,6 +122,10 @@ class Mesh:
         Names that stay with them; by default 0, 1, ...
     coarsening : float
         Factor on the size field: 2^k on level k above the finest.
+    free : Domain, optional
+        The part of the domain, in its frame, in which generators may move; by default all of it.
+    fixed : int
+        Generators of smaller labels stay where they are, and the size that their cells have is right.
 
     Attributes
     ----------
@@ -172,8 +176,11 @@ class Mesh:
         points: cla.Array,
         labels: cla.Array | None = None,
         coarsening: float = 1.0,
+        free: Domain | None = None,
+        fixed: int = 0,
     ) -> None:
-        self.engine = stages.engine
+        self.engine, self.fixed = stages.engine, fixed
+        self.free = domain if free is None else free
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
         self.tessellator = Tessellator(stages, domain, self._spacing)
         self.summaries = Summaries(self.engine, SUMMARIES)
@@ -253,9 +260,16 @@ class Mesh:
         self.sizing.check(self.points, self.h, self.coarsening)
 
     def _evaluate_metric(self) -> None:
+        if self.fixed:
+            self.stages.metric.hold_sizes(self.labels, self.fixed, self.t.volumes, self.h)
         self.stages.metric.evaluate(
             self.t, self.h, self.error, self.quality, self.energy, self.reach
         )
+
+    def hold(self, displacement: cla.Array) -> None:
+        """Set `displacement` (n, d) to zero for the generators that stay where they are."""
+        if self.fixed:
+            self.stages.motion.hold_generators(self.labels, self.fixed, displacement)
 
     def weigh(self) -> Weighting:
         """Evaluate density, excess and weighted centroids of the present cells; valid until the next call."""
@@ -302,8 +316,8 @@ class Mesh:
         total = self.missing(w) if n_cells is None else float(n_cells - self.n)
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(
-            self.domain, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,
-            climb, theta,
+            self.free, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,
+            climb, theta, self.fixed,
         )  # fmt: skip
         if new is None:
             return 0, 0
@@ -331,10 +345,12 @@ class Mesh:
         """Return the mesh of the next finer level; the present generators keep their labels."""
         finer = self.coarsening / 2
         self.stages.metric.scale_sizes(0.5, self.h)
-        points = self.stages.refinement.refine(self.domain, self.t, self.h)
+        points = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, self.fixed)
         labels = self.engine.upload(self.next_label + np.arange(len(points)) - self.n, np.int32)
         labels[: self.n] = self.labels
-        mesh = Mesh(self.stages, self.domain, self.sizing, points, labels, finer)
+        mesh = Mesh(
+            self.stages, self.domain, self.sizing, points, labels, finer, self.free, self.fixed
+        )
         mesh.next_label = self.next_label + len(points) - self.n
         return mesh
 

@@ -69,6 +69,7 @@ class PublishedMethod:
             laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
         )
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
+        mesh.hold(mesh.correction)
         mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
         alpha = mesh.engine.dim if r.alpha is None else r.alpha
         motion.relax_globally(
@@ -78,8 +79,9 @@ class PublishedMethod:
 
     def move(self, mesh: Mesh) -> None:
         """Apply the displacements that the method uses."""
+        mesh.hold(mesh.lloyd)
         mesh.stages.motion.move_generators(
-            mesh.domain, mesh.points, mesh.lloyd, float(self.lloyd), mesh.correction,
+            mesh.free, mesh.points, mesh.lloyd, float(self.lloyd), mesh.correction,
             float(self.poisson), mesh.h, mesh.velocity,
         )  # fmt: skip
 
@@ -104,6 +106,7 @@ class WeightedMethod:
         motion, poisson = stages.motion, stages.poisson
         w = mesh.weigh()
         mesh.lloyd = w.lloyd
+        mesh.hold(mesh.lloyd)
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         laplacian = poisson.assemble(
             t.starts, t.neighbours, t.face_measures, mesh.points, w.density
@@ -115,12 +118,13 @@ class WeightedMethod:
             from_zero=True,
         )  # fmt: skip
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
+        mesh.hold(mesh.correction)
         return solution
 
     def move(self, mesh: Mesh) -> None:
         """Apply both, at most k h."""
         mesh.stages.motion.move_generators(
-            mesh.domain, mesh.points, mesh.lloyd, 1.0, mesh.correction, float(self.poisson),
+            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, float(self.poisson),
             mesh.reach if self.cautious else mesh.h, mesh.velocity, clip=self.k,
         )  # fmt: skip
 
@@ -192,13 +196,15 @@ class ProjectedMethod:
                 t, mesh.reach, mesh.quality, mesh.lloyd, emphasis=self.emphasis, rate=self.rate
             )
         stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
+        mesh.hold(mesh.lloyd)
         stages.motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         if not self.keep_mean:
             stages.density.remove_mean(w)
         solution = stages.projection.project(
             t, mesh.reach, w.gradient, w.excess, mesh.lloyd, mesh.correction, mesh.quality,
             eps=self.eps, lenience=self.lenience, bound=self.bound,
-            max_iterations=self.iterations, tolerance=self.tolerance,
+            max_iterations=self.iterations, tolerance=self.tolerance, labels=mesh.labels,
+            fixed=mesh.fixed,
         )  # fmt: skip
         stages.motion.measure_displacement(mesh.correction, mesh.h, mesh.correction_speed)
         return solution
@@ -206,7 +212,7 @@ class ProjectedMethod:
     def move(self, mesh: Mesh) -> None:
         """Apply both, at most k h."""
         mesh.stages.motion.move_generators(
-            mesh.domain, mesh.points, mesh.lloyd, 1.0, mesh.correction, 1.0, mesh.reach,
+            mesh.free, mesh.points, mesh.lloyd, 1.0, mesh.correction, 1.0, mesh.reach,
             mesh.velocity, clip=self.k,
         )  # fmt: skip
 

@@ -49,6 +49,10 @@ class Metric:
             signatures, changed, ever,
         )  # fmt: skip
 
+    def hold_sizes(self, labels: cla.Array, fixed: int, volumes: cla.Array, h: cla.Array) -> None:
+        """Write the size that they have to `h` (n,) of cells whose label is less than `fixed`."""
+        self.engine.run_each(self._kernels.hold_sizes, len(h), labels, np.int32(fixed), volumes, h)
+
     def scale_sizes(self, factor: float, h: cla.Array) -> None:
         """Multiply `h` (n,) by `factor`."""
         self.engine.run_each(self._kernels.scale_sizes, len(h), self.engine.real.type(factor), h)

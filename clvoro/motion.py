@@ -73,6 +73,12 @@ class Motion:
             real(clip), *domain.device_args(self.engine), points, velocity,
         )  # fmt: skip
 
+    def hold_generators(self, labels: cla.Array, fixed: int, displacement: cla.Array) -> None:
+        """Set `displacement` (n, d) to 0 for generators whose label is less than `fixed`."""
+        self.engine.run_each(
+            self._kernels.hold_generators, len(labels), labels, np.int32(fixed), displacement
+        )
+
     def add_momentum(
         self, factor: float, lloyd: cla.Array, velocity: cla.Array, share: float
     ) -> None:

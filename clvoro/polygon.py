@@ -318,6 +318,27 @@ class Polygon(Domain):
         """Return the distance of each of `points` (n, 2) to the boundary, inside and outside; (n,)."""
         return np.hypot(*(self.nearest_edge(points)[1] - points).T)
 
+    def boundary(self, edges: object = None) -> Any:
+        """Return edges as a shape for `clvoro.sizing.Distance`.
+
+        Parameters
+        ----------
+        edges : int, sequence of int or bool, optional
+            Numbers of edges as in `next_vertex`, or which ones; by default all. Numbers of the rings as they
+            were given are found in `edge_numbers`.
+        """
+        from .sizing.shapes import Edges
+
+        rows = np.arange(len(self.vertices))
+        if edges is not None:
+            try:
+                rows = np.atleast_1d(rows[edges])  # type: ignore[call-overload]
+            except IndexError as error:
+                raise InputError(
+                    f"edges is {edges!r:.60} ({error}), expected numbers below {len(rows)}"
+                ) from error
+        return Edges(self.vertices[rows], self.vertices[self.next_vertex[rows]])
+
     # The device's view: the polygon never touches the box that cells are clipped by.
 
     @property

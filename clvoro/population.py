@@ -75,6 +75,7 @@ class PopulationControl:
         nuclei: int = 0,
         climb: bool = True,
         theta: float = THETA,
+        fixed: int = 0,
     ) -> Population | None:
         """Make pairs (`nuclei` of each kind), let pairs climb, and bring the count to what the field asks for.
 
@@ -95,6 +96,8 @@ class PopulationControl:
             2D only. Without it only the count is corrected, to the last generator.
         theta : float
             Strain from which on a pair climbs; above `THETA`, pairs at walls are left alone.
+        fixed : int
+            Generators of smaller labels stay where they are, and what is done beside them is for the count alone.
 
         Returns
         -------
@@ -107,6 +110,7 @@ class PopulationControl:
         most = max(4, int(LARGEST_CHANGE * n))
         need = max(-most, min(most, need))
         marks = _Marks.clean(self._room, n, self.engine.dim)
+        self._labels, self._fixed = rows.labels, fixed
         if climb:
             kinds, strain_1, strain_2 = self._measure(t, h)
             if nuclei:
@@ -124,7 +128,9 @@ class PopulationControl:
         engine, k, n = self.engine, self._kernels, t.n
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
         raw, once, twice = (self._room("strain", rings, size=4 * n) for rings in range(3))
-        engine.run_each(k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines)
+        engine.run_each(
+            k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines
+        )
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, twice)
         return kinds, once, twice
@@ -139,6 +145,7 @@ class PopulationControl:
             k.score_strain, n, t.starts, t.neighbours, kinds, strain,
             engine.real.type(NUCLEATION_STRAIN), keys,
         )  # fmt: skip
+        self._exempt(t, keys, around=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
         self._limit(chosen, n, 2 * nuclei)
         ranks = self._room("ranks", size=n + 1, dtype=np.int32)
@@ -169,6 +176,7 @@ class PopulationControl:
             k.score_pairs, n, t.starts, t.neighbours, t.points, kinds, strain,
             np.int32(theta <= THETA), partners, pull, keys,
         )  # fmt: skip
+        self._exempt(t, keys, around=True)
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
@@ -192,12 +200,21 @@ class PopulationControl:
         sign = engine.real.type(math.copysign(1, rest))
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(k.score_excess, n, t.starts, excess, sign, keys)
+        self._exempt(t, keys, around=False)
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, EXCESS_RINGS), keys)
         chosen = self._choose(t, keys, EXCESS_RINGS)
         self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
         engine.run_each(
             k.mark_excess, n, chosen, sign, t.offsets, t.covariances, t.volumes, *marks.arrays
         )
+
+    def _exempt(self, t: Tessellation, keys: cla.Array, around: bool) -> None:
+        """Strike out sites at generators that stay where they are, or beside them."""
+        if self._fixed:
+            self.engine.run_each(
+                self._kernels.exempt_fixed, t.n, t.starts, t.neighbours, self._labels,
+                np.int32(self._fixed), np.int32(around), keys,
+            )  # fmt: skip
 
     def _spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
         """Return the largest key within `rings` rings of each generator."""

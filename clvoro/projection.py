@@ -80,6 +80,8 @@ class Projection:
         bound: float = 0.0,
         max_iterations: int,
         tolerance: float = 1e-6,
+        labels: cla.Array | None = None,
+        fixed: int = 0,
     ) -> Solution:
         """Write the correction of `displacement` (n, d) to `correction` (n, d).
 
@@ -96,6 +98,9 @@ class Projection:
         max_iterations : int
         tolerance : float
             Of the relative residual, by the recurrence. From `SINGLE` on the vectors are in single precision.
+        labels : (n,) int32, optional
+        fixed : int
+            Generators with smaller labels do not move.
 
         Returns
         -------
@@ -117,7 +122,7 @@ class Projection:
             k.assemble, np.int32(n), *faces, t.face_measures, t.face_centroids, t.volumes,
             t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
             real(bound), self._rows, self._columns, v.own, v.eps, v.inverse, v.r, v.z, v.p, v.s,
-            v.u, partial,
+            v.u, partial, t.starts if labels is None else labels, np.int32(fixed),
         )  # fmt: skip
         descend = Launch(
             engine, k.descend, np.int32(0), np.int32(n), np.int32(max_iterations),

@@ -22,19 +22,30 @@ class Refinement:
         self._scan = Scan(engine)
         self._kernels = engine.kernels("refinement", {"SHORT_FACE": SHORT_FACE})
 
-    def refine(self, domain: Domain, t: Tessellation, h: cla.Array) -> cla.Array:
+    def refine(
+        self,
+        domain: Domain,
+        t: Tessellation,
+        h: cla.Array,
+        labels: cla.Array | None = None,
+        fixed: int = 0,
+    ) -> cla.Array:
         """Return about 2^d times as many generators, (n', d): those of `t` first, then the new ones.
 
         Parameters
         ----------
         h : (n,) real
             Size on the new level, at the generators of `t`.
+        labels : (n,) int32, optional
+        fixed : int
+            Generators of smaller labels, and edges that end in them, bring no new ones.
         """
         engine, k, n = self.engine, self._kernels, t.n
-        firsts = self._children(t)
+        still = t.starts if labels is None else labels, np.int32(fixed)
+        firsts = self._children(t, *still)
         finer = engine.empty((n + int(firsts[n].get()), engine.dim))
         engine.run_each(
-            k.place_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points, h,
+            k.place_children, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points, *still, h,
             np.int32(n), *domain.device_args(engine), firsts, finer,
             t.face_centroids, *t.outlines,
         )  # fmt: skip
@@ -42,13 +53,14 @@ class Refinement:
 
     def count(self, t: Tessellation) -> int:
         """Return how many generators `refine` would make of `t`."""
-        return t.n + int(self._children(t)[t.n].get())
+        return t.n + int(self._children(t, t.starts, np.int32(0))[t.n].get())
 
-    def _children(self, t: Tessellation) -> cla.Array:
+    def _children(self, t: Tessellation, labels: cla.Array, fixed: np.int32) -> cla.Array:
         """Return the prefix sums (n + 1,) int32 of how many new generators each one brings."""
         firsts = self.engine.empty(t.n + 1, np.int32)
         self.engine.run_each(
-            self._kernels.count_children, t.n, t.starts, t.neighbours, t.face_measures, t.volumes, firsts
+            self._kernels.count_children, t.n, t.starts, t.neighbours, t.face_measures, t.volumes,
+            labels, fixed, firsts,
         )  # fmt: skip
         self._scan.exclusive(firsts, firsts, t.n)
         return firsts

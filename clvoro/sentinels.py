@@ -1,8 +1,9 @@
 """Auxiliary generators outside a polygonal domain.
 
-The convex cells of generators at the boundary reach far out, as far as to the middle of a hole, and what they would have
-to be clipped by is sought as far away. Generators out there cost little and end those cells. They change nothing within
-the domain as long as none of their own cells reaches into it, which is checked whenever the boundary is cut (`chords.py`).
+The convex cells of generators at the boundary reach far out, as far as to the middle of a hole, and what they would
+have to be clipped by is sought as far away. Generators out there cost little and end those cells. They change nothing
+within the domain as long as none of their own cells reaches into it, which is checked whenever the boundary is cut
+(`chords.py`).
 """
 
 from __future__ import annotations

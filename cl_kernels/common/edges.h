@@ -11,9 +11,12 @@
         global const int *edge_starts, global const REAL4 *edge_ends
 #define DOMAIN box_lower, box_upper, edge_frame, edge_shape, edge_starts, edge_ends
 
-/* Where the way from x to y, t = 0 to 1, leaves the domain first; 2 if it does not. Corners are seen by both their edges with
-   the same numbers, so that no way slips through between them. */
-inline REAL leaves_at(const REAL *x, const REAL *y, DOMAIN_ARGS)
+/* Generators that are pressed against the boundary come as near to it as rounding, and may then lie behind it by so much. */
+#define BEHIND (1024 * REAL_EPS)
+
+/* Where the way from x to y, t = 0 to 1, leaves the domain first, and over which edge (a place in edge_ends); 2 if it does
+   not. Corners are seen by both their edges with the same numbers, so that no way slips through between them. */
+inline REAL leaves_over(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
 {
     const REAL2 from = (REAL2)(x[0], x[1]), way = (REAL2)(y[0], y[1]) - from;
     const REAL2 least = fmin(from, from + way), most = fmax(from, from + way);
@@ -27,14 +30,26 @@ inline REAL leaves_at(const REAL *x, const REAL *y, DOMAIN_ARGS)
         const int begin = edge_starts[row * edge_shape.s0 + left], end = edge_starts[row * edge_shape.s0 + right + 1];
         for (int k = begin; k < end; ++k) {
             const REAL2 a = edge_ends[k].s01 - from, b = edge_ends[k].s23 - from, e = b - a;
-            const REAL here = a.s1 * e.s0 - a.s0 * e.s1; /* e x (x - a): positive inside */
+            const REAL here = a.s0 * e.s1 - a.s1 * e.s0; /* e x (x - a): positive inside */
             const REAL there = here + e.s0 * way.s1 - e.s1 * way.s0;
             const REAL side_a = way.s0 * a.s1 - way.s1 * a.s0, side_b = way.s0 * b.s1 - way.s1 * b.s0;
-            if (here > 0 && there <= 0 && (side_a < 0 ? side_b >= 0 : side_b <= 0))
-                first = fmin(first, here / (here - there));
+            if (there <= 0 && there < here && here * fabs(here) > -BEHIND * BEHIND * dot(e, e) &&
+                (side_a < 0 ? side_b >= 0 : side_b <= 0)) {
+                const REAL t = fmax(here, 0) / (fmax(here, 0) - there);
+                if (t < first) {
+                    first = t;
+                    *edge = k;
+                }
+            }
         }
     }
     return first;
+}
+
+inline REAL leaves_at(const REAL *x, const REAL *y, DOMAIN_ARGS)
+{
+    int edge;
+    return leaves_over(x, y, &edge, DOMAIN);
 }
 
 /* Where a generator that is to go from x to y ends: if its way leads out of the domain, half-way to the boundary. */
@@ -46,7 +61,19 @@ inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
             y[a] = x[a] + t / 2 * (y[a] - x[a]);
 }
 
+/* The same, but a generator that would leave comes back from the edge, if that is not over another one. */
 inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
-    keep_inside(x, y, DOMAIN);
+    int edge;
+    if (leaves_over(x, y, &edge, DOMAIN) > 1)
+        return;
+    const REAL2 a = edge_ends[edge].s01, e = edge_ends[edge].s23 - a;
+    const REAL beyond = ((y[0] - a.s0) * e.s1 - (y[1] - a.s1) * e.s0) / dot(e, e);
+    REAL back[2] = {y[0] - 2 * beyond * e.s1, y[1] + 2 * beyond * e.s0};
+    if (leaves_at(x, back, DOMAIN) > 1) {
+        y[0] = back[0];
+        y[1] = back[1];
+    } else {
+        keep_inside(x, y, DOMAIN);
+    }
 }

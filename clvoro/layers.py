@@ -1,0 +1,328 @@
+"""Rows of generators along a boundary, which stay where they are: cells of a given height, in layers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from ._arrays import check_integer, check_number
+from .domain import Box, Domain
+from .errors import InputError, InputTypeError
+from .polygon import Polygon
+from .sizing import Distance, Segment, as_field, minimum
+from .sizing.field import Field
+
+_SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin anew
+_NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
+_APART = 0.3  # of a width, between the last row and the generators that move
+_NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
+_OWN = 0.9  # of its distance from the wall: a generator that another wall is nearer to than this is not in its place
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Layers of cells along walls, for `Adapter.run`, in 2D.
+
+    Generators stand in columns across the wall, row over row, and do not move. Where the wall is straight their cells
+    are rectangles, layer k of height ``height * growth**k``; one row more, on the far side of the last layer, makes
+    that one's outer faces as regular. From there on sizes grow from `spacing` by `growth` a cell (see
+    `sizing.Distance`), up to the size field's.
+
+    Parameters
+    ----------
+    height : float
+        Of the first layer, in the domain's unit.
+    count : int
+        Number of layers.
+    growth : float
+        Ratio of the heights of neighbouring layers, at least 1.
+    spacing : float, optional
+        Width of the cells along the wall; by default the height of the last layer.
+    edges : sequence of int, optional
+        Walls of the `Box` (0 to 3), or edges of the `Polygon` (see `Polygon.edge_numbers` for their numbers in the
+        rings as they were given); by default all.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is out of range.
+    """
+
+    height: float
+    count: int = 1
+    growth: float = 1.2
+    spacing: float | None = None
+    edges: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        check_number("Layers height", self.height, above=0)
+        check_integer("Layers count", self.count, 1)
+        check_number("Layers growth", self.growth, least=1)
+        if self.spacing is not None:
+            check_number("Layers spacing", self.spacing, above=0)
+        if self.edges is not None:
+            object.__setattr__(
+                self, "edges", tuple(check_integer("Layers edges", e, 0) for e in self.edges)
+            )
+
+    @property
+    def heights(self) -> np.ndarray:
+        """Heights of the layers, (count,)."""
+        return self.height * self.growth ** np.arange(self.count)
+
+    @property
+    def thickness(self) -> float:
+        """Height of all layers together."""
+        return float(self.heights.sum())
+
+    @property
+    def width(self) -> float:
+        """Width of the cells along the wall."""
+        return float(self.heights[-1]) if self.spacing is None else self.spacing
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Distances of the generators from the wall, (count + 1,), so that bisectors are where layers meet.
+
+        At the share 1 / (1 + g) of each layer the bisectors of all layers fit; the last row mirrors the one before.
+        """
+        tops = np.cumsum(self.heights)
+        rows = tops - self.heights * (1 - 1 / (1 + self.growth))
+        return np.append(rows, 2 * tops[-1] - rows[-1])
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Edges of the boundary one after the other, without a sharp turn.
+
+    Attributes
+    ----------
+    corners : (k, 2) float
+        The domain on the left.
+    closed : bool
+        Do the ends, which are then the same, meet smoothly?
+    fan : float
+        Angle at the end by which the boundary turns away from the domain, to the next chain; 0 if it does not.
+    """
+
+    corners: np.ndarray
+    closed: bool
+    fan: float
+
+
+def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
+    """Return the generators (n, 2) of `layers` in `domain`.
+
+    Where layers meet, in corners and narrow gaps, each wall has what is nearer to it.
+
+    Raises
+    ------
+    InputError
+        If a layer does not fit the domain at all, or an edge is not there.
+    InputTypeError
+        If the domain is neither a `Box` nor a `Polygon` in 2D.
+    """
+    polygon, number = as_polygon(domain)
+    found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
+    for layer in layers:
+        if not isinstance(layer, Layers):
+            raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
+        for chain in _chains(polygon, _chosen(polygon, number, layer)):
+            feet, normals = _columns(chain, layer.width, layer.thickness)
+            for y in layer.rows:
+                found.append(feet + y * normals)
+                limits.append(np.full(len(feet), _NEAR * min(layer.width, layer.heights.min())))
+                walls.append(np.full(len(feet), y))
+    points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
+    kept = polygon.contains(points)
+    walls_of_all = np.concatenate([chosen_segments(domain, layer) for layer in layers])
+    tree = shapely.STRtree(shapely.linestrings(walls_of_all))
+    _, nearest = tree.query_nearest(
+        shapely.points(points[kept]), return_distance=True, all_matches=False
+    )
+    kept[kept] = nearest >= _OWN * wall[kept]
+    points, limit = points[kept], limit[kept]
+    # Those nearest to the wall come first, in every chain; of two that are too near the later one goes.
+    close = (
+        cKDTree(points).query_pairs(limit.max(), output_type="ndarray")
+        if len(points)
+        else np.empty((0, 2), int)
+    )
+    apart = np.hypot(*(points[close[:, 0]] - points[close[:, 1]]).T)
+    close = close[apart < np.minimum(limit[close[:, 0]], limit[close[:, 1]])]
+    gone = np.zeros(len(points), bool)
+    for i, j in close[np.lexsort(close.T[::-1])].tolist():
+        if not gone[i]:
+            gone[j] = True
+    points = points[~gone]
+    if not len(points):
+        raise InputError(
+            f"layers of {[layer.thickness for layer in layers]} do not fit between the walls of the domain; "
+            "make them thinner"
+        )
+    return points
+
+
+def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
+    """Return a domain in 2D as a polygon, and for each of its edges the number by which `Layers.edges` means it."""
+    if isinstance(domain, Polygon):
+        return domain, np.arange(len(domain.vertices))
+    if not isinstance(domain, Box) or domain.dim != 2 or any(domain.periodic):
+        raise InputTypeError(
+            f"layers are for a Box with walls or a Polygon in 2D, not for {domain}"
+        )
+    (a, b), (c, d) = domain.lower, domain.upper
+    return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
+
+
+def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
+    """Return the edges along which `layer` lies, (k, 2, 2): both ends of each."""
+    polygon, number = as_polygon(domain)
+    chosen = _chosen(polygon, number, layer)
+    ends = np.stack([polygon.vertices, polygon.vertices[polygon.next_vertex]], axis=1)
+    return ends[chosen]
+
+
+def _chosen(polygon: Polygon, number: np.ndarray, layer: Layers) -> np.ndarray:
+    if layer.edges is None:
+        return np.ones(len(number), bool)
+    missing = np.setdiff1d(layer.edges, number)
+    if missing.size or not layer.edges:
+        raise InputError(
+            f"Layers edges has {missing.tolist() or 'none'}, expected some of 0 to {len(number) - 1}"
+        )
+    return np.isin(number, layer.edges)
+
+
+def _chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
+    """Join the chosen edges to chains."""
+    vertices, following = polygon.vertices, polygon.next_vertex
+    along = vertices[following] - vertices
+    after = along[following]
+    turn = np.arctan2(
+        along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
+    )
+    # Does edge e go on smoothly in the next one?
+    onward = chosen & chosen[following] & (np.abs(turn) < _SHARP)
+    starts = chosen.copy()
+    starts[following[onward]] = False
+    chains, seen = [], np.zeros(len(chosen), bool)
+    for e in [*np.flatnonzero(starts).tolist(), *np.flatnonzero(chosen).tolist()]:
+        if seen[e]:
+            continue
+        edges = [e]
+        while onward[edges[-1]] and following[edges[-1]] != e:
+            edges.append(int(following[edges[-1]]))
+        seen[edges] = True
+        last = edges[-1]
+        fan = (
+            -turn[last] if chosen[following[last]] and not onward[last] and turn[last] < 0 else 0.0
+        )
+        chains.append(
+            Chain(
+                np.vstack([vertices[edges], vertices[following[last]]]),
+                bool(onward[last]),
+                float(fan),
+            )
+        )
+    return chains
+
+
+def _columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return feet (c, 2) on the wall and unit normals (c, 2) into the domain of columns about `width` apart."""
+    corners = chain.corners
+    along = np.diff(corners, axis=0)
+    lengths = np.hypot(*along.T)
+    reached = np.concatenate([[0], np.cumsum(lengths)])
+    count = max(1, round(reached[-1] / width))
+    at = (np.arange(count) + 0.5) * (reached[-1] / count)
+    edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
+    share = ((at - reached[edge]) / lengths[edge])[:, None]
+    normal = np.column_stack([-along[:, 1], along[:, 0]]) / lengths[:, None]
+    # Normals turn from corner to corner, so that columns neither cross nor gape where the wall is bent.
+    first, last = (normal[-1], normal[0]) if chain.closed else (normal[0], normal[-1])
+    at_corners = np.vstack([first, normal]) + np.vstack([normal, last])
+    at_corners /= np.hypot(*at_corners.T)[:, None]
+    # Half an edge's normal, at most a width from its corner, is bent.
+    bend = np.minimum(0.5, width / lengths[edge])[:, None]
+    to_first, to_last = np.clip(1 - share / bend, 0, 1), np.clip(1 - (1 - share) / bend, 0, 1)
+    mixed = (
+        normal[edge]
+        + to_first * (at_corners[edge] - normal[edge])
+        + to_last * (at_corners[edge + 1] - normal[edge])
+    )
+    feet, normals = corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
+    fan = round(chain.fan * (thickness / 2 + width / 2) / width)
+    angles = -chain.fan * (np.arange(fan) + 0.5) / max(fan, 1)
+    end = math.atan2(normal[-1, 1], normal[-1, 0])
+    spokes = np.column_stack([np.cos(end + angles), np.sin(end + angles)])
+    return np.vstack([feet, np.tile(corners[-1], (fan, 1))]), np.vstack([normals, spokes])
+
+
+def bounded(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
+    """Return the field that is nowhere larger than what grows from the layers into the domain."""
+    field = as_field(size)
+    for layer in layers:
+        segments = [Segment(a, b) for a, b in chosen_segments(domain, layer).tolist()]
+        slope = math.log(layer.growth) if layer.growth > 1 else math.log(1.2)
+        field = minimum(field, Distance(segments, h_min=layer.width, slope=slope))
+    return field
+
+
+def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
+    """Return what is left of `domain` to generators that move, in its frame.
+
+    They keep a third of a width away from the last row.
+
+    Raises
+    ------
+    InputError
+        If nothing is left.
+    """
+    distances = [float(layer.rows[-1]) + _APART * layer.width for layer in layers]
+    if isinstance(domain, Box):
+        corners = np.array([domain.lower, domain.upper])
+        for layer, distance in zip(layers, distances, strict=True):
+            for wall in range(4) if layer.edges is None else layer.edges:
+                axis, end = divmod(wall, 2)
+                moved = (domain.lower, domain.upper)[end][axis] + (-distance if end else distance)
+                corners[end, axis] = (min if end else max)(corners[end, axis], moved)
+        if not (corners[0] < corners[1]).all():
+            raise InputError(_NO_ROOM)
+        return _FreeBox(tuple(corners[0]), tuple(corners[1]), whole=domain)
+    strips = [
+        shapely.union_all(shapely.linestrings(chosen_segments(domain, layer)), axis=0).buffer(
+            distance
+        )
+        for layer, distance in zip(layers, distances, strict=True)
+    ]
+    left = domain.geometry.difference(shapely.union_all(strips))
+    parts = [part for part in getattr(left, "geoms", [left]) if part.area > 1e-6 * domain.measure]
+    if not parts:
+        raise InputError(_NO_ROOM)
+    inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
+    inner.framed_by = domain
+    return inner
+
+
+@dataclass(frozen=True)
+class _FreeBox(Box):
+    """A box in the frame of another."""
+
+    whole: Box = None  # type: ignore[assignment]
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Those of the whole."""
+        return self.whole.frame
+
+
+def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
+    """Return those of `points` (n, 2) that lie in the `free` domain, and not on one of `rows` (k, 2)."""
+    apart = free.contains(points) & (cKDTree(rows).query(points)[0] > 0)
+    return points[apart]

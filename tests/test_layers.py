@@ -1,0 +1,128 @@
+"""Layers of cells along walls: generators that stay where they are."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError
+from clvoro.layers import Layers, free_domain, place_layers
+
+BOX = clvoro.Box((0, 0), (2, 1))
+HOLE = 0.2 * np.stack(
+    [np.cos(np.arange(80) * np.pi / 40), np.sin(np.arange(80) * np.pi / 40)], axis=1
+)
+CHANNEL = clvoro.Polygon([(-1, -0.5), (2, -0.5), (2, 0.5), (-1, 0.5)], [HOLE])
+
+
+@pytest.fixture(scope="module")
+def adapter():
+    return clvoro.Adapter()
+
+
+def test_bisectors_lie_where_layers_meet():
+    layers = Layers(0.01, count=4, growth=1.3)
+    tops = np.cumsum(layers.heights)
+    assert layers.heights == pytest.approx(0.01 * 1.3 ** np.arange(4))
+    assert (layers.rows[1:] + layers.rows[:-1]) / 2 == pytest.approx(tops)
+    assert layers.thickness == pytest.approx(tops[-1])
+    # Every generator lies at the same share of its layer.
+    assert (tops - layers.rows[:-1]) / layers.heights == pytest.approx(1.3 / 2.3)
+
+
+def test_layers_of_a_straight_wall_are_rectangles(adapter):
+    layers = Layers(0.02, count=2, growth=1.5, edges=[2])
+    result = adapter.run(BOX, 0.1, layers=layers, effort="fast")
+    rows = place_layers(BOX, [layers])
+    n, d = len(rows), result.diagram
+    # They are the first, and have not moved (to the rounding of the device's coordinates).
+    assert np.abs(result.points[:n] - rows).max() < 1e-14
+    first = np.flatnonzero(np.isclose(rows[:, 1], layers.rows[0]))
+    columns = round(2 / layers.width)
+    assert len(first) == columns
+    assert d.volumes[first] == pytest.approx(0.02 * 2 / columns, rel=1e-12)
+    second = np.flatnonzero(np.isclose(rows[:, 1], layers.rows[1]))
+    assert d.volumes[second] == pytest.approx(0.03 * 2 / columns, rel=1e-12)
+    for i in first:
+        assert d.neighbour_starts[i + 1] - d.neighbour_starts[i] == 4
+    # The others are what a run without layers gives.
+    error = np.abs(result.error)
+    assert error[:n].max() == 0
+    assert error[n:].mean() < 0.02
+    assert result.check()
+
+
+def test_sizes_grow_from_the_layers(adapter):
+    layers = Layers(0.02, count=3, growth=1.2, edges=range(4, 84))
+    result = adapter.run(CHANNEL, 0.2, layers=layers, effort="fast")
+    distance = np.hypot(*result.points.T) - 0.2
+    beyond = np.flatnonzero((distance > layers.rows[-1] * 1.01) & (distance < 0.25))
+    # Sizes by the distance from the edges; the middles of edges lie a little within the circle.
+    expected = layers.width + np.log(1.2) * distance[beyond]
+    assert result.size[beyond] == pytest.approx(expected, abs=1e-3)
+    n = len(place_layers(CHANNEL, [layers]))
+    assert np.abs(result.error[n:]).mean() < 0.02
+    assert CHANNEL.contains(result.points).all()
+    assert result.diagram.volumes.sum() == pytest.approx(CHANNEL.measure, rel=1e-12)
+
+
+@pytest.mark.parametrize("method", ["lloyd", "coupled", "weighted", "exact"])
+def test_every_method_leaves_them_where_they_are(adapter, method):
+    layers = Layers(0.04, count=2, edges=range(4, 84))
+    options = {"max_steps": 8} if method != "exact" else {"effort": "fast", "levels": 1}
+    result = adapter.run(CHANNEL, 0.1, layers=layers, method=method, **options)
+    rows, free = place_layers(CHANNEL, [layers]), free_domain(CHANNEL, [layers])
+    assert np.abs(result.points[: len(rows)] - rows).max() < 1e-14
+    assert free.contains(result.points[len(rows) :]).all()
+
+
+def test_walls_share_corners_and_gaps():
+    comb = clvoro.Polygon([(0, 0), (3, 0), (3, 1), (2, 1), (2, 0.15), (1, 0.15), (1, 1), (0, 1)])
+    layers = Layers(0.02, count=3, growth=1.2)
+    rows = place_layers(comb, [layers])
+    assert comb.contains(rows).all()
+    near = comb.boundary_distance(rows)
+    # On one of the rows each, counted from the wall that is nearest.
+    off = np.abs(near[:, None] - layers.rows).min(axis=1)
+    assert off.max() < 0.1 * layers.rows[-1] + 1e-12
+    gaps = np.hypot(*(rows[:, None] - rows).T) + np.eye(len(rows))
+    assert gaps.min() >= 0.6 * 0.02 - 1e-12
+
+
+def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
+    layers = Layers(0.04, count=2, edges=range(4, 84))
+    options = {"layers": layers, "effort": "fast", "levels": 1}
+    whole = adapter.run(CHANNEL, 0.1, **options)
+    steps = []
+    adapter.run(
+        CHANNEL, 0.1, checkpoint=tmp_path / "half", checkpoint_every=0,
+        callback=lambda row: steps.append(row) or len(steps) == 9, **options,
+    )  # fmt: skip
+    resumed = adapter.run(CHANNEL, 0.1, resume=tmp_path / "half", **options)
+    assert np.array_equal(whole.points, resumed.points)
+    with pytest.raises(InputError, match="layers"):
+        adapter.run(CHANNEL, 0.1, resume=tmp_path / "half", effort="fast", levels=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Layers(0), "height"),
+        (lambda: Layers(0.1, count=0), "count"),
+        (lambda: Layers(0.1, growth=0.9), "growth"),
+        (lambda: place_layers(BOX, [Layers(0.1, edges=[4])]), r"\[4\]"),
+        (lambda: place_layers(BOX, [Layers(0.1, edges=[])]), "none"),
+        (lambda: free_domain(BOX, [Layers(0.4, edges=[2, 3])]), "no room"),
+        (lambda: free_domain(CHANNEL, [Layers(0.4)]), "no room"),
+    ],
+)
+def test_what_cannot_be_is_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_domains_without_walls_in_2d_are_refused():
+    for domain in (clvoro.Box((0, 0, 0), (1, 1, 1)), clvoro.Box((0, 0), (1, 1), periodic=True)):
+        with pytest.raises(InputTypeError, match="walls"):
+            place_layers(domain, [Layers(0.1)])
+    with pytest.raises(InputTypeError, match="Layers"):
+        place_layers(BOX, [0.1])
