@@ -1,3 +1,4 @@
+#include "common/outline.h"
 #include "common/trimmed.h"
 
 /* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a cell, what
@@ -452,7 +453,8 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
                           global const int *slots, global const int *roots, global const int *orphans, const int orphan_count,
                           global const int *place_cells, global const int *new_starts, global int *new_neighbours,
                           global REAL *new_measures, global REAL2 *new_centroids, global int *face_segments,
-                          global REAL *volumes, global REAL2 *offsets, global REAL *covariances, global REAL2 *outlines)
+                          global REAL *volumes, global REAL2 *offsets, global REAL *covariances, global REAL2 *outlines,
+                          global const REAL2 *tangents)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;
@@ -480,7 +482,7 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
                 continue;
             }
             if (other >= 0 || s.to[k] != ISLAND)
-                add_side(&o, e, other < 0);
+                add_side(&o, other < 0 ? BOUNDARY_TANGENT(other) : e, other < 0);
             new_neighbours[at] = other;
             new_measures[at] = sqrt(dot(e, e));
             new_centroids[at] = (p + q) / 2;

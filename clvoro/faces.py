@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .outlines import face_ends
+from .polygon import Polygon
 from .results import Diagram
 
 
@@ -24,12 +26,23 @@ def neighbour_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
 def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return numbers that name each of `faces` (k,), which lead to generators, and the same face from the other side.
 
-    Both are made of cell, neighbour and shift, in this order; (k,) int64 each.
+    Both are in the order of cell, neighbour and shift; in a polygon, where two cells may have several faces in common,
+    then of their vertices; (k,) int64 each.
     """
     n, dim = len(diagram), diagram.domain.dim
     i, j = face_owners(diagram)[faces].astype(np.int64), diagram.neighbours[faces].astype(np.int64)
     codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
-    return (i * n + j) * 3**dim + codes, (j * n + i) * 3**dim + (3**dim - 1 - codes)
+    here = (i * n + j) * 3**dim + codes
+    there = (j * n + i) * 3**dim + (3**dim - 1 - codes)
+    if not isinstance(diagram.domain, Polygon):
+        return here, there
+    begin, end = face_ends(diagram)[faces].T
+    columns = [np.concatenate(c) for c in ((end, begin), (begin, end), (here, there))]
+    order = np.lexsort(columns)
+    new = np.any([np.diff(c[order], prepend=-1) != 0 for c in columns], axis=0)
+    numbers = np.empty(len(order), np.int64)
+    numbers[order] = np.cumsum(new)
+    return numbers[: len(faces)], numbers[len(faces) :]
 
 
 def following(starts: np.ndarray) -> np.ndarray:
@@ -64,8 +77,7 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     once; a face that has then no measure (fewer than 2 corners in 2D, 3 in 3D) has an empty row.
     """
     if diagram.domain.dim == 2:
-        starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
-        ends = np.stack([corners, corners[following(starts)]], axis=1)
+        ends = face_ends(diagram)
         least, starts, corners = 2, 2 * np.arange(len(ends) + 1), ends.ravel()
     else:
         least, starts, corners = 3, diagram.face_vertex_starts, diagram.face_vertices

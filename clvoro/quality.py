@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from .faces import face_owners
+from .outlines import count_sides
+from .polygon import Polygon
 from .results import Diagram
+from .walls import wall_planes
 
 
 @dataclass(frozen=True)
@@ -21,12 +24,13 @@ class Measures:
     Attributes
     ----------
     quality : (n,) float
-        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon. 3D: the isoperimetric quotient
-        36 pi V^2 / S^3, 1 for a ball, .753 for a truncated octahedron, .524 for a cube.
+        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon; n is the number of faces, of which
+        those on the boundary of a polygonal domain count as one as long as they turn by no more than 30 degrees.
+        3D: the isoperimetric quotient 36 pi V^2 / S^3, 1 for a ball, .753 for a truncated octahedron, .524 for a cube.
     skewness : (m,) float
         Distance from the centroid of the face to the point where the line between the generators meets its
-        plane, over the distance of the generators; infinite for a generator on a wall. A linear interpolation
-        along the line is off the face's centroid by so much.
+        plane, over the distance of the generators; infinite for a generator on a wall, or behind it (a cell may reach
+        around a corner of a polygon). A linear interpolation along the line is off the face's centroid by so much.
     centroid_angle : (m,) float
         Angle in degrees between the normal of the face and the line from centroid to centroid: the
         non-orthogonality of solvers that keep their unknowns at the centroids. 0 on walls.
@@ -38,6 +42,8 @@ class Measures:
         Number of faces of the cell.
     inner : (m,) bool
         Which faces are between two cells.
+    polygonal : bool
+        Whether the domain is a polygon.
     """
 
     quality: np.ndarray
@@ -47,6 +53,7 @@ class Measures:
     volume_ratio: np.ndarray
     faces: np.ndarray
     inner: np.ndarray
+    polygonal: bool = False
 
     def worst_of_cell(self, name: str) -> np.ndarray:
         """Return the largest value of `name`, a measure of faces, among the faces of each cell, (n,)."""
@@ -60,18 +67,22 @@ class Measures:
     def summary(self) -> dict[str, float]:
         """Return the mean and the worst of every measure, by name.
 
-        Means of `centroid_angle` and `volume_ratio` are over the faces between cells.
+        Means of `centroid_angle` and `volume_ratio` are over the faces between cells, and so are mean and maximum of
+        `skewness` in a polygonal domain, whose walls may have generators behind them.
         """
         angle, ratio = (
             values[self.inner] if self.inner.any() else values
             for values in (self.centroid_angle, self.volume_ratio)
         )
+        skewness = (
+            self.skewness[self.inner] if self.polygonal and self.inner.any() else self.skewness
+        )
         return {
             "mean_faces": float(self.faces.mean()),
             "mean_quality": float(self.quality.mean()),
             "min_quality": float(self.quality.min()),
-            "mean_skewness": float(self.skewness.mean()),
-            "max_skewness": float(self.skewness.max()),
+            "mean_skewness": float(skewness.mean()),
+            "max_skewness": float(skewness.max()),
             "mean_centroid_angle": float(angle.mean()),
             "max_centroid_angle": float(angle.max()),
             "mean_face_ratio": float(self.face_ratio.mean()),
@@ -84,7 +95,7 @@ class Measures:
 def measure_mesh(diagram: Diagram) -> Measures:
     """Measure the cells and faces of a diagram in 2D or 3D.
 
-    Walls are those of the `Box`: wall 2 a is the lower one of axis a, wall 2 a + 1 the upper one.
+    A wall is a plane, whatever part of it is in the domain: one of a box, or through an edge of a polygon.
     """
     owner, neighbour = face_owners(diagram), diagram.neighbours
     points, centroids, volumes = diagram.points, diagram.centroids, diagram.volumes
@@ -94,10 +105,11 @@ def measure_mesh(diagram: Diagram) -> Measures:
     other = np.where(inner, neighbour, 0)
     line = points[other] + diagram.shifts * diagram.domain.extent - points[owner]
     walls = np.flatnonzero(~inner)
-    normal_axis, side, gap = _walls(diagram, owner[walls], -1 - neighbour[walls])
-    line[walls] = 0.0
-    line[walls, normal_axis] = 2 * side * gap
+    normals, anchors = wall_planes(diagram.domain, -1 - neighbour[walls])
+    gaps = ((anchors - points[owner[walls]]) * normals).sum(axis=1)
+    line[walls] = 2 * gaps[:, None] * normals
     distance = np.linalg.norm(line, axis=1)
+    distance[walls[gaps <= 0]] = 0
     meeting = points[owner] + 0.5 * line
     offset = np.linalg.norm(middles - meeting, axis=1)
     skewness = np.where(offset > 0, np.inf, 0.0)  # stays where the distance is none
@@ -111,21 +123,14 @@ def measure_mesh(diagram: Diagram) -> Measures:
     surface = np.add.reduceat(areas, starts[:-1])
     largest, smallest = (f.reduceat(areas, starts[:-1]) for f in (np.maximum, np.minimum))
     if diagram.domain.dim == 2:
-        quality = 4 * volumes * counts * np.tan(np.pi / counts) / surface**2
+        sides = np.maximum(count_sides(diagram), 3)
+        quality = 4 * volumes * sides * np.tan(np.pi / sides) / surface**2
     else:
         quality = 36 * np.pi * volumes**2 / surface**3
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
     ratio = np.maximum(here, there) / np.minimum(here, there)
-    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner)
-
-
-def _walls(
-    diagram: Diagram, cells: np.ndarray, walls: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return axis and direction (-1 or 1) of the normals of `walls`, and how far the generators are, (k,) each."""
-    planes = np.stack([diagram.domain.lower, diagram.domain.upper], axis=1).ravel()
-    axis = walls // 2
-    return axis, 2 * (walls % 2) - 1, np.abs(planes[walls] - diagram.points[cells, axis])
+    polygonal = isinstance(diagram.domain, Polygon)
+    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal)
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .faces import neighbour_points
+from .outlines import face_ends, next_faces
+from .polygon import Polygon
+from .walls import wall_planes
 
 if TYPE_CHECKING:
     from .results import Diagram
+
+ADOPTED = 1024
+"""Roundings of a position by which a face may be off the bisector of its generators and still be a part of it."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,10 @@ class Rebuilt:
     """
 
     directions: np.ndarray
-    """(m, d): from the cell's generator to the neighbour's or the wall, of length 1."""
+    """(m, d): from the cell's generator to the neighbour's or the wall, of length 1; of adopted faces the normal."""
+    adopted: np.ndarray
+    """(m,) bool: faces between cells of a polygon that do not lie between their generators, as the boundary has cut one
+    of the parts beside them off from its own generator."""
 
     def __init__(self, d: Diagram) -> None:
         dim, n = d.domain.dim, len(d)
@@ -65,18 +74,14 @@ class Rebuilt:
         # All lengths relative to the cell's generator: small cells far from the origin keep their digits.
         at = d.points[self.owner]
         if dim == 2:
-            following = np.arange(1, len(d.cell_vertices) + 1)
-            ends = d.cell_vertex_starts[1:]
-            following[ends[ends > d.cell_vertex_starts[:-1]] - 1] = d.cell_vertex_starts[:-1][
-                ends > d.cell_vertex_starts[:-1]
-            ]
-            a = x[d.cell_vertices] - at
-            b = x[d.cell_vertices[following]] - at
+            first, last = face_ends(d).T
+            a, b = x[first] - at, x[last] - at
             edge = b - a
             self.areas = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
             self.middles = (a + b) / 2
-            self.cells, self.corners = self.owner, d.cell_vertices
-            self._following = following
+            self.cells, self.corners = self.owner, first
+            self._on_wall = d.neighbours < 0
+            self._following = next_faces(d)
         else:
             face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
             first = d.face_vertex_starts[:-1][face]
@@ -101,6 +106,7 @@ class Rebuilt:
             self.edges = (face, d.face_vertices, d.face_vertices[following])
             self._tails, self._edge, self._before = a, b - a, np.argsort(following)
         self.measures = np.linalg.norm(self.areas, axis=1)
+        self._find_adopted(d)
         # The cell as the sum of the cones from its generator to its faces.
         cones = np.einsum("ij,ij->i", self.areas, self.middles) / dim
         self.volumes = np.bincount(self.owner, cones, minlength=n)
@@ -115,6 +121,19 @@ class Rebuilt:
         self.reach = np.zeros(n)
         np.maximum.at(self.reach, self.cells, self._distances)
         self._vertex_count = len(x)
+
+    def _find_adopted(self, d: Diagram) -> None:
+        self.adopted = np.zeros(len(self.owner), bool)
+        if not isinstance(d.domain, Polygon):
+            return
+        inner = d.neighbours >= 0
+        across = np.where(inner, self.spacings, 0.0)
+        off = np.abs((self.middles * self.directions).sum(axis=1) - across / 2)
+        far = np.linalg.norm(self.middles, axis=1)
+        noise = ADOPTED * self.unit * (1 + far / np.maximum(across, 1e-300))
+        self.adopted = inner & (off > noise) & (self.measures > 0)
+        normals = self.areas / np.maximum(self.measures, 1e-300)[:, None]
+        self.directions[self.adopted] = normals[self.adopted]
 
     def are_slits(self, places: np.ndarray, width: float) -> np.ndarray:
         """Tell which edges of faces' loops (3D), open ones of their cells, border slits no wider than `width`.
@@ -156,6 +175,7 @@ class Rebuilt:
         with np.errstate(all="ignore"):
             off = slack * np.hypot(one, two) / sine
         off = np.where(off < self.reach[self.cells], off, self.reach[self.cells])
+        off[self._on_wall[before] & self._on_wall[here]] = slack  # a corner of the domain
         # A vertex is where several cells have a corner, of which it is one.
         worst = np.full(self._vertex_count, slack)
         np.maximum.at(worst, self.corners, off)
@@ -204,8 +224,7 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     inner, walls = np.flatnonzero(d.neighbours >= 0), np.flatnonzero(d.neighbours < 0)
     across = np.zeros((len(owner), d.domain.dim))
     across[inner] = neighbour_points(d, inner) - d.points[owner[inner]]
-    axis, upper = (-1 - d.neighbours[walls]) // 2, (-1 - d.neighbours[walls]) % 2
-    across[walls, axis] = 2.0 * upper - 1
+    across[walls] = wall_planes(d.domain, -1 - d.neighbours[walls])[0]
     distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
     spacing = distance.copy()
     spacing[walls] = np.inf

@@ -176,7 +176,7 @@ class Trim:
         engine.run_each(
             k.write_trimmed, u, *segments, convex.points, *owners, orphans, np.int32(orphan_count),
             place_cells, starts, neighbours, measures, centroids, face_segments, convex.volumes,
-            convex.offsets, convex.covariances, outlines,
+            convex.offsets, convex.covariances, outlines, chords.tangents,
         )  # fmt: skip
         return Tessellation(
             n=n,

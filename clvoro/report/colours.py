@@ -79,7 +79,8 @@ def _around_most(values: np.ndarray) -> tuple[float, float]:
 
 
 def _from_zero(values: np.ndarray) -> tuple[float, float]:
-    """Limits from 0 to a round number that 99 % of the values keep."""
+    """Limits from 0 to a round number that 99 % of the values keep, of those that are finite."""
+    values = values[np.isfinite(values)]
     return 0.0, nice(float(np.quantile(values, 0.99))) if values.size else 1.0
 
 

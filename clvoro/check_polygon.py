@@ -1,0 +1,125 @@
+"""What holds of diagrams of polygonal domains beside what holds of all (`check.py`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+
+from .outlines import face_ends, next_faces
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+    from .check import _Check
+    from .rebuilt import Rebuilt
+    from .results import Diagram
+
+
+def check_outlines(check: _Check) -> None:
+    """Check that faces chain up to loops, and that the corners go along all of them, and bridges there and back."""
+    d = check.diagram
+    n, ends, following = len(d), face_ends(d), next_faces(d)
+    owner = np.repeat(np.arange(n), np.diff(d.neighbour_starts))
+    check.note(
+        "faces closed", ends[:, 1] != ends[following, 0],
+        lambda f: f"face {f} of cell {owner[f]} ends in vertex {ends[f, 1]}, where no face of it begins",
+    )  # fmt: skip
+    corners, starts = d.cell_vertices, d.cell_vertex_starts
+    places = np.arange(1, len(corners) + 1)
+    filled = starts[1:] > starts[:-1]
+    places[starts[1:][filled] - 1] = starts[:-1][filled]
+    cell = np.repeat(np.arange(n), np.diff(starts))
+    # Each way from vertex to vertex, less the ways back: what is left over of a bridge is nothing.
+    of = np.concatenate([owner, cell])
+    a = np.concatenate([ends[:, 0], corners])
+    b = np.concatenate([ends[:, 1], corners[places]])
+    times = np.repeat([1, -1], [len(owner), len(cell)]) * np.sign(b - a)
+    order = np.lexsort((np.maximum(a, b), np.minimum(a, b), of))
+    new = np.zeros(len(order), bool)
+    for key in (of, np.minimum(a, b), np.maximum(a, b)):
+        new |= np.diff(key[order], prepend=-1) != 0
+    left = np.bincount(np.cumsum(new) - 1, times[order])
+    where = order[new]
+    check.note(
+        "outlines", left != 0,
+        lambda k: f"the corners of cell {of[where[k]]} do not go along its faces between vertices "
+        f"{a[where[k]]} and {b[where[k]]}",
+    )  # fmt: skip
+
+
+def check_edges(check: _Check, g: Rebuilt, slack: float) -> None:
+    """Check that the faces on each edge of the polygon cover it, one after the other."""
+    d, domain = check.diagram, check.diagram.domain
+    rows = np.flatnonzero(d.neighbours < 0)
+    edge = -1 - d.neighbours[rows]
+    begin, end = domain.vertices, domain.vertices[domain.next_vertex]
+    length = np.hypot(*(end - begin).T)
+    along = (end - begin) / length[:, None]
+    first, last = (
+        ((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in face_ends(d)[rows].T
+    )
+    order = np.lexsort((first + last, edge))
+    edge, first, last = edge[order], first[order], last[order]
+    # Each begins where the one before ends, the first at 0; and behind the last one is the end.
+    new = np.diff(edge, prepend=-1) != 0
+    gap = np.abs(first - np.where(new, 0.0, np.roll(last, 1)))
+    check.note(
+        "edges covered", np.maximum(gap - 2 * slack, 0),
+        lambda k: f"on edge {edge[k]} there is a gap or an overlap of {gap[k]:.3g} before the face of cell "
+        f"{g.owner[rows[order[k]]]}",
+    )  # fmt: skip
+    reached = np.zeros(len(length))
+    reached[edge] = last  # the last one written is the last on the edge
+    rest = np.abs(length - reached)
+    check.note(
+        "edges covered", np.maximum(rest - 2 * slack, 0),
+        lambda e: f"the faces on edge {e} of length {length[e]:.6g} end {rest[e]:.3g} from its end",
+    )  # fmt: skip
+
+
+def check_cells(check: _Check, g: Rebuilt, slack: float) -> None:
+    """Check that each cell holds its generator: its faces go around it once."""
+    d = check.diagram
+    begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)
+    angle = np.arctan2(begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0], (begin * end).sum(axis=1))
+    turns = np.bincount(g.owner, angle, len(d)) / (2 * np.pi)
+    # A generator on the boundary is half inside, or as rounding will have it.
+    edge = end - begin
+    t = -(begin * edge).sum(axis=1) / np.maximum((edge**2).sum(axis=1), 1e-300)
+    off = np.linalg.norm(begin + np.clip(t, 0, 1)[:, None] * edge, axis=1)
+    near = np.full(len(d), np.inf)
+    np.minimum.at(near, g.owner, off)
+    check.note(
+        "generators in their cells", (np.abs(turns - 1) > 1e-3) & (near > slack),
+        lambda i: f"the faces of cell {i} go {turns[i]:.3g} times around its generator, expected once",
+    )  # fmt: skip
+
+
+def hidden(
+    d: Diagram, tree: cKDTree, places: np.ndarray, corners: np.ndarray, slack: float, unit: float
+) -> np.ndarray:
+    """Return those of `places` in the cells' `corners` from which one of the nearest generators cannot be seen.
+
+    A corner belongs to the cell of the generator nearest to it if the way between them is all in the domain. Otherwise
+    the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
+    the domain touch in a point, either side sees both.
+    """
+    domain = d.domain
+    at = d.vertices[corners[places]]
+    distances = tree.query(at - np.array(domain.lower))[0]
+    nearest = tree.query_ball_point(at - np.array(domain.lower), distances + 4 * slack)
+    place = np.repeat(np.arange(len(places)), [len(some) for some in nearest])
+    goal = d.points[np.array([j for some in nearest for j in some], int)]
+    way = goal - at[place]
+    # The corner itself may be off the domain by a few roundings.
+    part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
+    lines = shapely.linestrings(np.stack([at[place] + part[:, None] * way, goal], axis=1))
+    away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
+    once, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    if (times > 1).any():
+        touching = shapely.STRtree(shapely.points(once[times > 1]))
+        rows, _ = touching.query(shapely.points(at), predicate="dwithin", distance=slack)
+        away[rows] = True
+    return places[away]

@@ -1,0 +1,246 @@
+"""Polygonal domains on the host: checks, measures, files, pictures, transfer."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import shapely
+from test_check import add, put, spoilt, swap
+
+import clvoro
+from clvoro.outlines import count_sides, face_ends, next_faces
+from clvoro.polygon import Polygon
+from clvoro.walls import surface, wall_groups, wall_planes
+
+SQUARE = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+ROUND = np.array([(np.cos(t), np.sin(t)) for t in np.arange(12) * np.pi / 6])
+
+
+def bay() -> Polygon:
+    """A concave outline; a triangle, a slit that cuts cells apart, a speck that is an island within a cell."""
+    outer = [(0, 0), (4, 0), (4, 1), (2.5, 1.2), (2.4, 3), (0, 3)]
+    slit = [(1.5, 2.0), (1.505, 2.0), (1.505, 2.7), (1.5, 2.7)]
+    speck = [(3, 0.4), (3.03, 0.41), (3.02, 0.44)]
+    return Polygon(outer, [[(0.5, 0.5), (1.1, 0.5), (1.0, 1.3)], slit, speck])
+
+
+def ring() -> Polygon:
+    """A ragged ring around a hole whose corners turn by 30 degrees, where rounding decides what is a side."""
+    rng, k = np.random.default_rng(3), 150
+    angle = (np.arange(k) + rng.uniform(0, 0.9, k)) * 2 * np.pi / k
+    r = 1 + 0.25 * np.sin(5 * angle) + rng.uniform(-0.05, 0.05, k)
+    outer = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+    return Polygon(outer, [ROUND * (0.2, 0.1) + (0.1, 0)])
+
+
+def comb() -> Polygon:
+    """Narrow teeth that cut cells into many parts."""
+    teeth = [(0.06, 1.0), (0.05, 0.25), (0.04, 1.0)]
+    top = [(0.1 * k + x, y) for k in range(39, -1, -1) for x, y in teeth]
+    return Polygon([(0, 0), (4, 0), (4, 1), *top, (0, 1)])
+
+
+def three() -> Polygon:
+    """Three pieces: one with a hole, one in the hole, one that touches the first in a corner."""
+    return Polygon.from_pieces([[SQUARE, SQUARE * 0.3 + 0.3], [SQUARE * 0.1 + 0.4], [SQUARE + 1]])
+
+
+DOMAINS = {"bay": bay, "ring": ring, "comb": comb, "three": three}
+
+
+def scattered(domain: Polygon, n: int, seed: int = 1) -> np.ndarray:
+    """Return `n` places well inside, some in every piece."""
+    rng = np.random.default_rng(seed)
+    inner = np.array([domain.inner_point(p) for p in range(domain.n_pieces)])
+    x = rng.uniform(domain.lower, domain.upper, (20 * n, 2))
+    x = x[domain.contains(x) & (domain.boundary_distance(x) > 1e-3)]
+    return np.concatenate([inner, x])[:n]
+
+
+def size(x: np.ndarray) -> np.ndarray:
+    return 0.2 + 0.02 * x[:, 0] ** 2
+
+
+def mesh(ctx, domain: Polygon, n: int, dtype: str = "float64") -> clvoro.Result:
+    points, steps = scattered(domain, n), 2 if domain.n_pieces == 1 else 0
+    adapter = clvoro.Adapter(ctx, dtype)
+    return adapter.run(domain, size, points=points, method="lloyd", max_steps=steps)
+
+
+@pytest.fixture(scope="module")
+def result(ctx) -> clvoro.Result:
+    return mesh(ctx, bay(), 60)
+
+
+# Checks.
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("n", [3, 60, 900])
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_right_meshes_pass(ctx, name: str, n: int, dtype: str) -> None:
+    report = mesh(ctx, DOMAINS[name](), n, dtype).check()
+    assert report.ok, report
+    expected = {
+        "outlines", "edges covered", "generators in their cells", "volumes sum", "faces closed",
+        "nearest generators", "quality", "faces the same from both sides", "walls",
+    }  # fmt: skip
+    assert expected <= set(report.checked)
+    assert report.precision == dtype
+
+
+SPOILT = {
+    "volume": ({"volumes": add(7, 1e-9)}, "volumes"),
+    "sum": ({"volumes": lambda v: v * (1 + 1e-9)}, "volumes sum"),
+    "centroid": ({"centroids": add((4, 1), 1e-7)}, "centroids"),
+    "measure": ({"face_measures": add(11, 1e-7)}, "face measures"),
+    "middle": ({"face_centroids": add((11, 0), 1e-6)}, "face centroids"),
+    "neighbour": ({"neighbours": lambda j: np.where(j == 3, 4, j)}, "graph symmetric"),
+    "no such edge": ({"neighbours": put(5, -17)}, "neighbours exist"),
+    "other edge": ({"neighbours": lambda j: np.where(j == -1, -3, j)}, "walls"),
+    "edges": ({"neighbours": lambda j: np.where(j == -1, -3, j)}, "edges covered"),
+    "generators": ({"points": swap(8, 30)}, "nearest generators"),
+    "cells": ({"points": swap(8, 30)}, "generators in their cells"),
+    "outside": ({"points": put(8, (0.9, 0.8))}, "generators inside"),
+    "vertex": ({"vertices": add((20, 0), 1e-5)}, "face measures"),
+    "vertex outside": ({"vertices": add((20, 0), 3.0)}, "vertices inside"),
+    "ends": ({"face_vertices": swap(3, 12)}, "graph symmetric"),
+    "corners": ({"cell_vertices": swap(3, 12)}, "outlines"),
+    "starts": ({"face_vertex_starts": add(3, 1)}, "shapes"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(SPOILT))
+def test_what_is_wrong_is_named(result, case: str) -> None:
+    changes, name = SPOILT[case]
+    report = spoilt(result, **changes).check()
+    assert name in {finding.name for finding in report.findings}, report
+
+
+def test_open_loops_are_found(result) -> None:
+    face = int(np.flatnonzero(result.diagram.neighbours < 0)[0])
+    report = spoilt(result, face_vertices=put(2 * face + 1, 0)).check()
+    assert "faces closed" in {finding.name for finding in report.findings}
+
+
+def test_diagram_of_other_generators_is_found(result) -> None:
+    # Closed, symmetric, of the right sum; only not the Voronoi diagram of these generators.
+    d = result.diagram
+    i, j = 8, int(d.neighbours[d.neighbour_starts[8] : d.neighbour_starts[9]].max())
+    x = d.points.copy()
+    x[i] += 0.2 * (x[j] - x[i])
+    names = {f.name for f in spoilt(result, points=lambda _: x).check().findings}
+    assert "nearest generators" in names
+
+
+@pytest.mark.parametrize("name", ["error", "quality", "size"])
+def test_numbers_of_a_result_are_recomputed(result, name: str) -> None:
+    values = getattr(result, name).copy()
+    values[17] *= 1.001
+    report = dataclasses.replace(result, **{name: values}).check()
+    assert ("error" if name == "size" else name) in {f.name for f in report.findings}
+
+
+# What the boundary looks like to faces.
+
+
+def test_walls_of_polygons() -> None:
+    domain = bay()
+    walls = np.arange(len(domain.vertices))
+    normals, anchors = wall_planes(domain, walls)
+    middle = (domain.vertices + domain.vertices[domain.next_vertex]) / 2
+    assert np.abs(((middle - anchors) * normals).sum(axis=1)).max() < 1e-15
+    assert not domain.contains(middle + 1e-3 * normals).any()
+    assert domain.contains(middle - 1e-3 * normals).all()
+    assert surface(domain) == pytest.approx(domain.geometry.length, rel=1e-15)
+    assert surface(clvoro.Box((0, 0, 0), (1, 2, 3))) == 22
+    names, groups = wall_groups(domain)
+    assert names == ["outer", "hole-1", "hole-2", "hole-3"]
+    assert groups.tolist() == [0] * 6 + [1] * 3 + [2] * 4 + [3] * 3
+    names, groups = wall_groups(three())
+    assert names == ["outer-1", "hole-1", "outer-2", "outer-3"]
+    assert wall_groups(clvoro.Box((0, 0), (1, 1)))[0] == ["xMin", "xMax", "yMin", "yMax"]
+
+
+def cells_of(diagram) -> list:
+    """Each cell as a shapely geometry, from the ends of its faces alone."""
+    x, ends = diagram.vertices, face_ends(diagram)
+    found = []
+    for a, b in zip(diagram.neighbour_starts[:-1], diagram.neighbour_starts[1:], strict=True):
+        lines = [shapely.LineString(x[e]) for e in ends[a:b] if (x[e[0]] != x[e[1]]).any()]
+        parts = shapely.get_parts(shapely.polygonize(lines))
+        # What is on the left of its outline is the cell; islands in it are not.
+        islands = [shapely.Polygon(hole) for part in parts for hole in part.interiors]
+        kept = [p for p in parts if not any(p.equals(island) for island in islands)]
+        found.append(shapely.union_all(kept))
+    return found
+
+
+def test_faces_are_the_outlines_of_cells(result) -> None:
+    cells = cells_of(result.diagram)
+    # Sums of a dozen products of numbers up to 4.
+    assert np.abs(shapely.area(cells) - result.diagram.volumes).max() < 1e-13
+    assert any(len(part.interiors) for cell in cells for part in shapely.get_parts(cell))
+    following = next_faces(result.diagram)
+    ends = face_ends(result.diagram)
+    assert (ends[:, 1] == ends[following, 0]).all()
+    assert sorted(following.tolist()) == list(range(len(following)))
+
+
+def sides_by_hand(diagram, i: int) -> int:
+    """Walk around a cell, face by face."""
+    rows = range(diagram.neighbour_starts[i], diagram.neighbour_starts[i + 1])
+    ends, x = face_ends(diagram), diagram.vertices
+    after = {f: g for f in rows for g in rows if ends[f, 1] == ends[g, 0]}
+    inner = [f for f in rows if diagram.neighbours[f] >= 0]
+    count = len(inner)
+    for f in inner:
+        f, turned, before = after[f], 0.0, None
+        while diagram.neighbours[f] < 0:
+            e = complex(*(x[ends[f, 1]] - x[ends[f, 0]]))
+            turned += np.angle(e / before) if before is not None else 0.0
+            if before is None or abs(turned) > np.pi / 6:
+                count, turned = count + 1, 0.0
+            before, f = e, after[f]
+    return count
+
+
+def test_sides(ctx) -> None:
+    for domain in (comb(), Polygon(ring().rings[0])):
+        diagram = mesh(ctx, domain, 150).diagram
+        counts = count_sides(diagram)
+        assert counts.tolist() == [sides_by_hand(diagram, i) for i in range(150)]
+        assert (counts < np.diff(diagram.neighbour_starts)).any()
+
+
+def test_a_cell_without_neighbours_has_the_sides_of_its_piece(ctx) -> None:
+    square_and_hole = Polygon(SQUARE, [SQUARE * 0.2 + 0.4])
+    diagram = clvoro.Adapter(ctx).diagram(square_and_hole, np.array([(0.3, 0.3)]))
+    assert count_sides(diagram).tolist() == [4]
+    circle = Polygon([(np.cos(t), np.sin(t)) for t in np.arange(100) * np.pi / 50])
+    diagram = clvoro.Adapter(ctx).diagram(circle, np.array([(0.0, 0.0)]))
+    # 100 turns of 3.6 degrees: after each 9 of them a new side; the last turn goes on in the first side.
+    assert count_sides(diagram).tolist() == [11]
+    begun_amid = Polygon(np.vstack([(0.5, 0), SQUARE[1:], SQUARE[:1]]))
+    diagram = clvoro.Adapter(ctx).diagram(begun_amid, np.array([(0.5, 0.5)]))
+    assert count_sides(diagram).tolist() == [4]
+
+
+def test_measures(result) -> None:
+    d, m = result.diagram, result.measures
+    assert np.abs(m.quality - result.quality).max() < 1e-13
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
+    behind = 0
+    for f in np.flatnonzero(d.neighbours < 0):
+        a = d.domain.vertices[-1 - d.neighbours[f]]
+        b = d.domain.vertices[d.domain.next_vertex[-1 - d.neighbours[f]]]
+        along = (b - a) / np.linalg.norm(b - a)
+        x = d.points[owner[f]]
+        gap = along[0] * (x - a)[1] - along[1] * (x - a)[0]
+        foot = a + along * ((x - a) @ along)
+        expected = np.linalg.norm(d.face_centroids[f] - foot) / (2 * gap) if gap > 0 else np.inf
+        assert m.skewness[f] == pytest.approx(expected, rel=1e-9)
+        behind += gap <= 0
+    assert behind
+    assert np.isfinite(list(m.summary().values())).all()
+    assert m.summary()["max_skewness"] == m.skewness[m.inner].max()
