@@ -71,13 +71,23 @@ inline bool is_on_face(REAL beyond, REAL d2)
     return beyond * beyond <= ON_FACE * ON_FACE * d2;
 }
 
+/* On which side of the faces between generators at x and x + d does a corner v of the polygon count that lies on their line?
+   On that of its own generator at `own`, if v is a point of the cell of x. Elsewhere on the left of edge e. Positive: of x + d. */
+inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
+{
+    const REAL2 between = x - own;
+    const bool touches = is_on_face(dot(v - own - between / 2, between), dot(between, between));
+    const REAL side = touches ? dot(own - v, d) : 0;
+    return side != 0 ? side : e.s0 * d.s1 - e.s1 * d.s0;
+}
+
 /* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, from cell `origin` to cell `target`; -1 if there is none.
    Of the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends. Where rounding
    has led past the end of the edge, the neighbour that is nearest to the target's generator: that way leads to it.
 
    Rounding must not choose an order of crossings that no edges could have. An end of the edge on a face counts as a little
    inside the cell that it is in, a share of the way to its generator, and faces there are crossed in that order (rank), at
-   the end itself. An edge on a face counts to the cell on its left. */
+   the end itself. An edge on a face counts to the side of its ends: to the cell on its left, as ends are moved inwards. */
 inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
                       global const int *neighbours, global const REAL *points, REAL *t)
 {
@@ -101,8 +111,9 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
         const bool begins_on = is_on_face(dot(a - x - d / 2, d), dd), ends_on = is_on_face(dot(a + e - x - d / 2, d), dd);
         REAL at = 0, rank = -REAL_MAX;
         if (begins_on && ends_on) {
-            if (e.s0 * d.s1 - e.s1 * d.s0 <= 0)
+            if (side_of(a + e, goal, x, d, e) <= 0)
                 continue;
+            at = side_of(a, start, x, d, e) > 0 ? 0 : 1;
         } else {
             if (along <= 0)
                 continue;
