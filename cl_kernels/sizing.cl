@@ -2,7 +2,7 @@
    `size_at` and its data come from the host (see common/size_fields.h). Work-item i serves point i;
    points are (size, DIM). `bad` keeps the smallest index with an h that is not positive, or above MOST_SIZE (NaN, too):
    a minimum of integers, so the order of the atomics does not matter. */
-#include "common/real.h"
+#include "common/domain.h"
 
 #ifndef MOST_SIZE
 #error "build with -DMOST_SIZE=largest h' whose error and density are numbers"
@@ -27,13 +27,12 @@ kernel void evaluate(const int size, global const REAL *restrict points, global 
 }
 
 /* grad_a log h = (h(x + s e_a) - h(x - s e_a)) / (2 s h), s = GRADIENT_STEP * h. Both sample points are kept inside
-   the domain's bounding box `box` (lower, upper), where alone the field must be defined; 2 s is then the distance
-   that was really stepped. */
+   the domain, where alone the field must be defined; 2 s is then the distance that was really stepped. */
 kernel void evaluate_with_gradient(const int size, global const REAL *restrict points,
-                                   global const REAL *restrict data, global const REAL *restrict box,
-                                   global REAL *restrict h_out, global REAL *restrict gradient, global int *bad)
+                                   global const REAL *restrict data, DOMAIN_ARGS, global REAL *restrict h_out, global REAL *restrict gradient, global int *bad)
 {
     WORK_ITEM(i);
+    BOX_CORNERS(lower, upper);
     REAL x[DIM];
     for (int a = 0; a < DIM; ++a)
         x[a] = points[i * DIM + a];
@@ -43,7 +42,16 @@ kernel void evaluate_with_gradient(const int size, global const REAL *restrict p
     const REAL step = fmax(R(GRADIENT_STEP) * h, 8 * REAL_EPS);
     for (int a = 0; a < DIM; ++a) {
         const REAL here = x[a];
-        const REAL ahead = fmin(here + step, box[DIM + a]), behind = fmax(here - step, box[a]);
+        REAL ahead = fmin(here + step, upper[a]), behind = fmax(here - step, lower[a]);
+#ifdef POLYGON
+        REAL y[DIM] = {x[0], x[1]};
+        y[a] = ahead;
+        if (leaves_at(x, y, DOMAIN) <= 1)
+            ahead = here;
+        y[a] = behind;
+        if (leaves_at(x, y, DOMAIN) <= 1)
+            behind = here;
+#endif
         x[a] = ahead;
         const REAL h_ahead = size_at(x, data);
         x[a] = behind;

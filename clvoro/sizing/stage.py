@@ -68,7 +68,6 @@ class Sizing:
         if self.field.on_device:
             self.prelude, numbers = bind(self.field, domain, engine.real, engine)
             self.data = engine.upload(numbers)
-            self._box = engine.upload(self._walls.ravel())
             self._bad = engine.upload([_NONE_BAD], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
@@ -123,6 +122,9 @@ class Sizing:
                 ahead, behind = x.copy(), x.copy()
                 ahead[:, a] = np.minimum(x[:, a] + step, self._walls[1, a])
                 behind[:, a] = np.maximum(x[:, a] - step, self._walls[0, a])
+                for way in (ahead, behind):
+                    out = ~self.domain.contains(self._physical(way))
+                    way[out] = x[out]
                 rise = self._on_host(self._physical(ahead)) - self._on_host(self._physical(behind))
                 rise /= self._scale
                 run = ahead[:, a] - behind[:, a]
@@ -131,8 +133,8 @@ class Sizing:
             grad_out[:n].set(gradient.astype(self.engine.real))
             return
         self.engine.run_each(
-            self._kernels.evaluate_with_gradient, n, points, self.data, self._box, h_out, grad_out,
-            self._bad,
+            self._kernels.evaluate_with_gradient, n, points, self.data,
+            *self.domain.device_args(self.engine), h_out, grad_out, self._bad,
         )  # fmt: skip
 
     def check(self, points: cla.Array, h: cla.Array, factor: float = 1.0) -> None:
