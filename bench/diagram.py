@@ -120,7 +120,11 @@ SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
 SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, bcc_3d)}
 
 
-KERNELS = {"clip": ("clip", "check", "list", "place"), "match": ("match",), "measure": ("measure",)}
+KERNELS = {
+    "clip": ("wrap", "clip", "check", "list", "place"),
+    "match": ("match",),
+    "measure": ("measure",),
+}
 """How the names of the kernels begin that make up a column."""
 
 
@@ -158,9 +162,11 @@ class Tessellator:
     def bin(self) -> None:
         """Bin the ordered generators."""
         self.binned = self.bins.build(self.box, self.points, self.n)
+        self.reach = self.binned.reach.copy()
 
     def diagram(self) -> Any:
-        """Tessellate from nothing."""
+        """Tessellate from nothing, with the radii to begin with as the binning has left them."""
+        self.binned.reach[:] = self.reach
         self.t = self.cells.tessellate(self.box, self.points, self.n, self.binned)
         return self.t
 

@@ -13,14 +13,19 @@ kernel void count_root(const int size, global const REAL *points, const FRAME fr
     ranks[i] = atomic_inc(counts + key);
 }
 
-/* Bins per axis of the grid that divides a bin of `count` generators; 0 keeps the bin whole. */
+/* Bins per axis of the grid that divides a bin of `count` generators; 0 keeps the bin whole. In 3D a power of two. */
 inline int child_side(int count)
 {
     if (count <= SPLIT_COUNT)
         return 0;
     int side = 2;
-    while (side < MAX_CHILD_SIDE && count > OCCUPANCY * (DIM == 2 ? 4 * side * side : 8 * side * side * side))
+#if DIM == 2
+    while (side < MAX_CHILD_SIDE && count >= OCCUPANCY * (side + 1) * (side + 1))
+        ++side;
+#else
+    while (side < MAX_CHILD_SIDE && count > OCCUPANCY * 8 * side * side * side)
         side *= 2;
+#endif
     return side;
 }
 

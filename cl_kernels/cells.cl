@@ -121,14 +121,18 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
    square of bins that it has seen covers that circle. Its radius is left in reach[p], which begins as a guess of it.
 
-   rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt */
+   rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt
+
+   If `wrapped`, rows that have faces are there already (`hulls.cl`). */
 kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *rows,
-                       global int *row_counts, global int *places, global int *flags)
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int wrapped,
+                       global int *rows, global int *row_counts, global int *places, global int *flags)
 {
     WORK_ITEM(p);
     const int i = items[p];
+    if (wrapped && row_counts[i] > 0)
+        return;
     const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};

@@ -22,6 +22,10 @@ CELL_CAPACITY = 24
 ROW_CAPACITY = 20
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
 LARGEST_ROW = 512
+LANES, WRAP_GROUP = 8, 16
+"""Cells that a CPU's work-item makes at a time (`hulls.cl`), and its work-items per group."""
+FIRST_REACH = 2.0
+"""How far it looks for neighbours at first, in edges of a bin."""
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
 # FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
@@ -113,7 +117,11 @@ class Cells:
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
-        self._kernels = self.engine.kernels("cells", {**self.defines, "MAX_DEPTH": MAX_LEVELS})
+        engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
+        self._kernels = engine.kernels("cells", defines)
+        self._wrap = None
+        if engine.group_size == 1 and engine.real == np.float64:
+            self._wrap = engine.kernels("hulls", defines).wrap_cells
 
     @property
     def defines(self) -> dict[str, int]:
@@ -183,10 +191,17 @@ class Cells:
         self._reserve(n)
         while True:
             self.clear_flags()
+            corners = box.device_corners(engine.real)
+            search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+            if self._wrap is not None:
+                engine.run_each(
+                    self._wrap, -(-n // LANES), np.int32(n), binned.points, binned.items, *search,
+                    *corners, engine.real.type(FIRST_REACH), rows.slots, rows.counts, rows.places,
+                    group=WRAP_GROUP,
+                )  # fmt: skip
             engine.run_each(
-                self._kernels.clip_cells, n, binned.points, binned.items, binned.reach, binned.bins,
-                binned.grid_frames, binned.grid_shapes, points, *box.device_corners(engine.real),
-                rows.slots, rows.counts, rows.places, rows.flags,
+                self._kernels.clip_cells, n, binned.points, binned.items, *search, points, *corners,
+                np.int32(self._wrap is not None), rows.slots, rows.counts, rows.places, rows.flags,
             )  # fmt: skip
             # Every row is new: there are none from before.
             flags, generator = self._match(box, points, n, rows.places, rows.places, exact)

@@ -1,0 +1,128 @@
+"""Rows by wrapping hulls against rows by clipping, and against SciPy's hulls."""
+
+import numpy as np
+import patch
+import pytest
+from scipy.spatial import ConvexHull
+
+from clvoro.bins import Bins
+from clvoro.cells import FIRST_REACH, LANES, WRAP_GROUP, Cells
+
+BOX = patch.BOX
+
+
+@pytest.fixture(scope="module")
+def engine(ctx):
+    made = patch.make_engine(ctx)
+    if Cells(made)._wrap is None:
+        pytest.skip("hulls are for CPUs")
+    return made
+
+
+def point_sets():
+    rng = np.random.default_rng(61001)
+    extent = np.array([1, 0.75])
+    random = rng.random((5000, 2)) * extent
+    grid = np.stack(np.meshgrid(np.arange(24) / 24, np.arange(18) / 24), axis=-1).reshape(-1, 2)
+    turn = np.linspace(0, 2 * np.pi, 41)[:-1]
+    ring = 0.375 + 0.3 * np.column_stack([np.cos(turn), np.sin(turn)])
+    spot = np.array([0.4, 0.3])
+    return {
+        **{f"{n} random": random[:n] for n in (1, 2, 3, 7, 8, 9, 100)},
+        "random": random,
+        "cubed": rng.random((3000, 2)) ** 3 * extent,
+        "radial": spot + 0.3 * np.exp(-9 * rng.random((3000, 1))) * unit(rng, 3000),
+        "clusters": np.concatenate(
+            [spot + s * (rng.random((300, 2)) - 0.5) for s in (1e-3, 1e-6, 1e-9)] + [random[:50]]
+        ),
+        "a dense and an empty half": np.concatenate([random[:3000] * [0.5, 1], [[0.99, 0.7]]]),
+        "lattice": grid + 1 / 48,
+        "lattice to the walls": grid,
+        "lattice, rounded": grid + 1 / 48 + 1e-15 * rng.standard_normal(grid.shape),
+        "lattice, nearly": grid + 1 / 48 + 1e-9 * rng.standard_normal(grid.shape),
+        "hexagons": patch.hexagons(0.02),
+        "ring": ring,
+        "ring and centre": np.concatenate([ring, [[0.375, 0.375]]]),
+        "line": np.column_stack([np.linspace(0.01, 0.99, 777), np.full(777, 0.3)]),
+        "walls": np.column_stack([rng.random(400), 0.75 * rng.integers(0, 2, 400)]),
+        "near walls": np.concatenate([random[:300] * [1, 1e-5], random[300:900]]),
+        "pairs": np.concatenate([random[:500], random[:500] + 1e-6 * (random[500:1000] - 0.5)]),
+    }
+
+
+def unit(rng, n):
+    turn = 2 * np.pi * rng.random(n)
+    return np.column_stack([np.cos(turn), np.sin(turn)])
+
+
+POINTS = point_sets()
+
+
+def wrapped_rows(engine, points):
+    """Return the counts of faces after wrapping alone, 0 where a cell is left, and the rows."""
+    n, x = len(points), engine.upload(points)
+    cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
+    cells._reserve_rows(n)
+    cells._reserve(n)
+    engine.run_each(
+        cells._wrap, -(-n // LANES), np.int32(n), binned.points, binned.items, binned.reach,
+        binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
+        engine.real.type(FIRST_REACH), cells.rows.slots, cells.rows.counts, cells.rows.places,
+        group=WRAP_GROUP,
+    )  # fmt: skip
+    counts = cells.rows.counts.get()[:n]
+    rows = cells.rows.slots.get()[: n * cells.row_capacity].reshape(n, -1)
+    assert (cells.rows.places.get()[:n] == np.arange(n)).all()
+    return counts, rows
+
+
+@pytest.mark.parametrize("name", list(POINTS))
+def test_rows_are_those_of_clipping(engine, name):
+    points = np.clip(POINTS[name], 0, [1, 0.75])
+    n, x = len(points), engine.upload(points)
+    found = []
+    for wrap in (True, False):
+        cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
+        if not wrap:
+            cells._wrap = None
+        t = patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False))
+        found.append((t, cells.rows.counts.get()[:n], binned.reach.get()[:n]))
+    (a, counts_a, reach_a), (b, counts_b, reach_b) = found
+    assert np.array_equal(counts_a, counts_b), "other faces, or other doubts"
+    assert np.array_equal(a.neighbours, b.neighbours)
+    assert np.array_equal(a.volumes, b.volumes)
+    # The radius is computed from inverted positions, which round by eps of the ratio of distances.
+    assert reach_a == pytest.approx(reach_b, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "share"), [("random", 0.99), ("hexagons", 0.99), ("cubed", 0.95), ("radial", 0.9)]
+)
+def test_most_cells_are_wrapped(engine, name, share):
+    """Else the kernel would be right but useless; lattices, where every decision is near to rounding, are left."""
+    counts, _ = wrapped_rows(engine, np.clip(POINTS[name], 0, [1, 0.75]))
+    assert np.count_nonzero(counts) >= share * len(counts)
+
+
+def test_against_scipy(engine):
+    points = POINTS["random"][:300]
+    counts, rows = wrapped_rows(engine, points)
+    assert np.count_nonzero(counts) > 290
+    lower, upper = np.zeros(2), np.array([1, 0.75])
+    for i in np.flatnonzero(counts):
+        x = points[i]
+        walls = [[2 * (lower[0] - x[0]), 0], [2 * (upper[0] - x[0]), 0],
+                 [0, 2 * (lower[1] - x[1])], [0, 2 * (upper[1] - x[1])]]  # fmt: skip
+        d = np.concatenate([np.delete(points, i, axis=0) - x, walls])
+        labels = np.append(np.delete(np.arange(300), i), [-1, -2, -3, -4])
+        hull = labels[ConvexHull(d / (d**2).sum(axis=1)[:, None]).vertices]
+        least = int(np.argmin(hull))
+        assert rows[i, : counts[i]].tolist() == np.roll(hull, -least).tolist()
+
+
+def test_coinciding_generators_are_left(engine):
+    points = POINTS["random"][:200].copy()
+    points[[30, 77]] = points[123]
+    counts, _ = wrapped_rows(engine, points)
+    assert (counts[[30, 77, 123]] == 0).all()
+    assert np.count_nonzero(counts) > 150
