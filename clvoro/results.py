@@ -253,14 +253,14 @@ class Result:
         """Carry cell data (n,) or (n, k) over to another mesh of the same domain; see `Diagram.transfer`."""
         return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: str | PathLike[str], **options: Any) -> None:
         """Write the mesh to `path`: `.npz` (reload with `clvoro.load`), `.vtu`, OpenFOAM's `polyMesh`, ...
 
-        See `clvoro.io.save` for all formats.
+        See `clvoro.io.save` for all formats and their options.
         """
         from .io import save
 
-        save(self, path)
+        save(self, path, **options)
 
     def plot(self, colour: str = "error", **options: Any) -> Any:
         """Draw the cells coloured by "error", "quality", "size", "sides" or "skewness"; returns the Matplotlib figure.

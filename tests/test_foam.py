@@ -61,7 +61,7 @@ def read(folder):
         assert len(lists[-1]) == count
     count, text = entries(folder / "boundary")
     found = re.findall(
-        r"(\w+)\s*\{\s*type\s+(\w+);\s*nFaces\s+(\d+);\s*startFace\s+(\d+);\s*\}", text
+        r"([\w-]+)\s*\{\s*type\s+(\w+);\s*nFaces\s+(\d+);\s*startFace\s+(\d+);\s*\}", text
     )
     assert len(found) == count
     return points, faces, *lists, {name: (t, int(n), int(s)) for name, t, n, s in found}

@@ -257,6 +257,7 @@ def result_of(domain: clvoro.Polygon) -> clvoro.Result:
         "points": np.ones((1, 2)), "volumes": ones, "centroids": np.ones((1, 2)), "neighbour_starts": starts,
         "neighbours": np.array([-8], np.int32), "face_measures": ones, "face_centroids": np.ones((1, 2)),
         "vertices": np.ones((1, 2)), "cell_vertex_starts": starts, "cell_vertices": np.array([0], np.int32),
+        "face_vertex_starts": np.array([0, 2], np.int32), "face_vertices": np.zeros(2, np.int32),
     }  # fmt: skip
     return clvoro.Result(
         points=arrays["points"], diagram=Diagram(domain, arrays), size=ones, error=ones, quality=ones,

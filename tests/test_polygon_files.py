@@ -5,9 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import shapely
+import solids
+import test_foam
 from test_check import add, put, spoilt, swap
 
 import clvoro
+from clvoro import cli
+from clvoro.errors import InputError
+from clvoro.io.vtu_read import load_vtu
 from clvoro.outlines import count_sides, face_ends, next_faces
 from clvoro.polygon import Polygon
 from clvoro.walls import surface, wall_groups, wall_planes
@@ -244,3 +249,185 @@ def test_measures(result) -> None:
     assert behind
     assert np.isfinite(list(m.summary().values())).all()
     assert m.summary()["max_skewness"] == m.skewness[m.inner].max()
+
+
+# Files.
+
+
+def same_diagram(one, other) -> None:
+    assert one.domain == other.domain
+    for name in one._arrays:
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_npz_loses_nothing(ctx, tmp_path, name: str) -> None:
+    made = mesh(ctx, DOMAINS[name](), 40)
+    made.save(tmp_path / "mesh.npz")
+    again = clvoro.load(tmp_path / "mesh.npz")
+    same_diagram(made.diagram, again.diagram)
+    assert again.check().ok
+    made.save(tmp_path / "twice.npz")
+    assert (tmp_path / "mesh.npz").read_bytes() == (tmp_path / "twice.npz").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("diagram.neighbours", lambda j: np.where(j == -1, -17, j), "neighbours points to what"),
+        ("diagram.face_vertex_starts", lambda s: s // 2 * 3, "face_vertex_starts does not cut"),
+        ("diagram.face_vertices", lambda v: v + 10_000, "face_vertices points to what"),
+        ("diagram.face_vertices", None, "lacks diagram.face_vertices"),
+    ],
+)  # fmt: skip
+def test_damaged_npz_is_refused(result, tmp_path, name: str, change, says: str) -> None:
+    path = tmp_path / "mesh.npz"
+    result.save(path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    if change is None:
+        del arrays[name]
+    else:
+        arrays[name] = change(arrays[name]).astype(arrays[name].dtype)
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match=says):
+        clvoro.load(path)
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
+    made = mesh(ctx, DOMAINS[name](), 40)
+    path = tmp_path / "mesh.vtu"
+    made.save(path)
+    again = load_vtu(path)
+    assert again.check().ok, again.check()
+    d, e = made.diagram, again.diagram
+    assert e.domain == d.domain
+    assert np.array_equal(e.cell_vertices, d.cell_vertices)
+    assert np.array_equal(e.neighbour_starts, d.neighbour_starts)
+    rows = [[sorted(zip(m.neighbours[a:b].tolist(), face_ends(m)[a:b].tolist(), strict=True))
+             for a, b in zip(m.neighbour_starts[:-1], m.neighbour_starts[1:], strict=True)]
+            for m in (d, e)]  # fmt: skip
+    assert rows[0] == rows[1]
+    assert cli.main(["check", str(path)]) == 0
+
+
+def test_a_moved_corner_in_a_vtu_is_found(result, tmp_path) -> None:
+    d = spoilt(result, vertices=add((20, 0), 1e-3))
+    path = tmp_path / "mesh.vtu"
+    dataclasses.replace(result, diagram=d).save(path)
+    assert not load_vtu(path).check()
+    assert cli.main(["check", str(path)]) == 1
+
+
+def test_other_programs_read_the_cells(result, tmp_path) -> None:
+    meshio = pytest.importorskip("meshio")
+    d = result.diagram
+    for name in ("mesh.vtu", "mesh.vtk", "mesh.ply", "mesh.obj"):
+        result.save(tmp_path / name)
+        read = meshio.read(tmp_path / name)
+        assert sum(len(block) for block in read.cells) == len(d)
+        x = read.points[:, :2]
+        areas = [
+            ((z := x[c] @ (1, 1j)).conj() * np.roll(z, -1)).imag.sum() / 2
+            for block in read.cells for c in block.data
+        ]  # fmt: skip
+        slack = 1e-13 if name[-3:] in ("vtu", "vtk") else 1e-5  # the others hold fewer digits
+        assert np.sort(areas) == pytest.approx(np.sort(d.volumes), abs=slack)
+    read = meshio.read(tmp_path / "mesh.vtu")
+    assert np.array_equal(read.field_data["domain_vertices"][:, :2], d.domain.vertices)
+
+
+@pytest.fixture(scope="module")
+def pond(ctx) -> clvoro.Result:
+    """A mesh without islands in cells, in which some cells have two faces in common."""
+    domain = Polygon(bay().rings[0][::-1], [ring[::-1] for ring in bay().rings[1:3]])
+    return mesh(ctx, domain, 60)
+
+
+def test_openfoam_cells_are_closed(pond, tmp_path) -> None:
+    pond.save(tmp_path / "constant" / "polyMesh")
+    points, faces, owner, neighbour, _ = test_foam.read(tmp_path / "constant" / "polyMesh")
+    inner, n = len(neighbour), len(pond.points)
+    pairs = list(zip(owner[:inner].tolist(), neighbour.tolist(), strict=True))
+    assert pairs == sorted(pairs)
+    assert len(set(pairs)) < len(pairs)
+    assert all(i < j for i, j in pairs)
+    areas = np.array([solids.loop_area(points[f]) for f in faces])
+    # Of a face that is not convex the mean of its corners is not the centroid, but lies in its plane.
+    cones = (areas * np.array([points[f].mean(axis=0) for f in faces])).sum(axis=1) / 3
+    openness, volumes = np.zeros((n, 3)), np.zeros(n)
+    np.add.at(openness, owner, areas)
+    np.add.at(volumes, owner, cones)
+    np.subtract.at(openness, neighbour, areas[:inner])
+    np.subtract.at(volumes, neighbour, cones[:inner])
+    depth = points[:, 2].max()
+    assert np.abs(openness).max() < 1e-13
+    assert volumes == pytest.approx(pond.diagram.volumes * depth, abs=1e-13)
+    count: dict = {}
+    for k, face in enumerate(faces):
+        for cell in [owner[k], *([neighbour[k]] if k < inner else [])]:
+            for a, b in zip(face, face[1:] + face[:1], strict=True):
+                key = cell, min(a, b), max(a, b)
+                count[key] = count.get(key, 0) + 1
+    assert set(count.values()) == {2}
+
+
+def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
+    """Length of each patch, by its first edge's prisms."""
+    depth = points[:, 2].max()
+    area = {
+        name: sum(np.linalg.norm(solids.loop_area(points[f])) for f in faces[start : start + count])
+        for name, (kind, count, start) in patches.items() if kind == "patch"
+    }  # fmt: skip
+    return {name: a / depth for name, a in area.items()}
+
+
+def test_openfoam_patches(pond, tmp_path) -> None:
+    domain, folder = pond.diagram.domain, tmp_path / "polyMesh"
+    pond.save(folder)
+    points, faces, *_, patches = test_foam.read(folder)
+    assert list(patches) == ["outer", "hole-1", "hole-2", "back", "front"]
+    rings = [shapely.LinearRing(ring).length for ring in domain.rings]
+    assert list(lengths_of(patches, points, faces).values()) == pytest.approx(rings, rel=1e-12)
+    # By the numbers that the user gave the edges: the rings came in the other order of turning.
+    given = [*bay().rings[0][::-1], *bay().rings[1][::-1]]
+    edges = {"in": [0], "walls": [3, 7, 1]}
+    pond.save(folder, patches=edges)
+    points, faces, *_, patches = test_foam.read(folder)
+    assert list(patches) == ["in", "walls", "outer", "hole-1", "hole-2", "back", "front"]
+
+    def length(k: int) -> float:
+        first, count = (0, 6) if k < 6 else (6, 3)
+        return np.linalg.norm(given[k] - given[first + (k + 1 - first) % count])
+
+    found = lengths_of(patches, points, faces)
+    assert found["in"] == pytest.approx(length(0), rel=1e-12)
+    assert found["walls"] == pytest.approx(length(3) + length(7) + length(1), rel=1e-12)
+    assert sum(found.values()) == pytest.approx(sum(rings), rel=1e-12)
+    pond.save(folder, patches={"all": range(6)})
+    assert list(test_foam.read(folder)[-1]) == ["all", "hole-1", "hole-2", "back", "front"]
+
+
+@pytest.mark.parametrize(
+    ("patches", "says"),
+    [
+        ({"a": [99]}, r"has for a the edges \[99\]"), ({"a": []}, "has for a no edges"),
+        ({"a": [1], "b": [0, 1]}, "edge 1 both in a and in b"), ({"a b": [1]}, "the name 'a b'"),
+        ({"outer": [1]}, "the name outer, which is that of a ring"),
+    ],
+)  # fmt: skip
+def test_wrong_patches_are_refused(pond, tmp_path, patches: dict, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        pond.save(tmp_path / "case.foam", patches=patches)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_openfoam_cannot_hold_is_refused(result, pond, tmp_path) -> None:
+    with pytest.raises(
+        InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"
+    ):
+        result.save(tmp_path / "case.foam")
+    with pytest.raises(InputError, match="they are for OpenFOAM"):
+        pond.save(tmp_path / "mesh.vtu", patches={"a": [1]})
+    assert not list(tmp_path.iterdir())

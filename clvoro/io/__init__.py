@@ -5,10 +5,11 @@ Every writer works on a temporary file beside the target and puts it in place wh
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 
-from ..errors import InputTypeError
+from ..errors import InputError, InputTypeError
 from ..results import Result
 from .atomic import check_writable
 from .foam import write_foam
@@ -19,10 +20,15 @@ from .vtu import write_vtu
 
 __all__ = ["check_writable", "load", "save", "write_history"]
 
-_WRITERS = {".npz": write_npz, ".vtu": write_vtu, ".foam": write_foam}
+_WRITERS = {".npz": write_npz, ".vtu": write_vtu}
 
 
-def save(result: Result, path: str | PathLike[str]) -> None:
+def save(
+    result: Result,
+    path: str | PathLike[str],
+    *,
+    patches: Mapping[str, Iterable[int]] | None = None,
+) -> None:
     """Write `result` to `path`; the suffix chooses the format.
 
     Parameters
@@ -35,6 +41,9 @@ def save(result: Result, path: str | PathLike[str]) -> None:
         case, for ParaView, too (2D: one layer of prisms between patches of type `empty`); ``.vtk``,
         ``.ply`` and ``.obj`` hold 2D meshes and are written through meshio (``pip install
         "clvoro[formats]"``), the latter two without cell data.
+    patches : mapping, optional
+        For OpenFOAM and a polygonal domain: names of patches, and the numbers of the edges in each, as in
+        `Polygon.edge_numbers`. Edges in none are in the patch of their ring, ``outer``, ``hole-1``, ...
 
     Raises
     ------
@@ -48,5 +57,11 @@ def save(result: Result, path: str | PathLike[str]) -> None:
             "Adapter.run returned"
         )
     path = Path(path)
-    writer = write_foam if path.name == "polyMesh" else _WRITERS.get(path.suffix.lower())
-    (writer or write_foreign)(result, path)
+    if path.name == "polyMesh" or path.suffix.lower() == ".foam":
+        write_foam(result, path, patches)
+        return
+    if patches is not None:
+        raise InputError(
+            f"cannot write patches to {path}: they are for OpenFOAM; save as .foam or leave them out"
+        )
+    _WRITERS.get(path.suffix.lower(), write_foreign)(result, path)

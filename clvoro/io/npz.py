@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from ..domain import Box
+from ..domain import Box, Domain
 from ..polygon import Polygon
 from ..results import HISTORY_DTYPE, Diagram, Displacements, Result
+from ..walls import wall_count
 from .arrays import FileError, explained, list_members, read_member, write_arrays
 
 FORMAT, VERSION = "clvoro-result", 1
@@ -38,11 +39,16 @@ _PARTS = {
 _SHAPES = {
     "points": "nd", "size": "n", "error": "n", "quality": "n", "history": "h",
     "diagram.points": "nd", "diagram.volumes": "n", "diagram.centroids": "nd",
-    "diagram.neighbour_starts": "N", "diagram.neighbours": "m", "diagram.face_measures": "m",
+    "diagram.neighbour_starts": "N", "diagram.neighbours": "m", "diagram.shifts": "md", "diagram.face_measures": "m",
     "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
     "diagram.cell_vertices": "c", "diagram.face_vertex_starts": "M", "diagram.face_vertices": "f",
     "initial.points": "ad", "initial.lloyd": "ad", "initial.poisson": "ad",  # before any were inserted
     "final.points": "nd", "final.lloyd": "nd", "final.poisson": "nd",
+}  # fmt: skip
+
+_INTEGERS = {
+    "diagram.neighbour_starts", "diagram.neighbours", "diagram.shifts", "diagram.cell_vertex_starts",
+    "diagram.cell_vertices", "diagram.face_vertex_starts", "diagram.face_vertices",
 }  # fmt: skip
 
 
@@ -109,7 +115,7 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
             if array.ndim != 1 or array.dtype.names is None:
                 raise FileError(f"history has shape {array.shape} and dtype {array.dtype}")
             continue
-        integer = axes in ("N", "m", "c", "M", "f") and name != "diagram.face_measures"
+        integer = name in _INTEGERS
         if array.dtype.kind not in ("iu" if integer else "f"):
             raise FileError(f"{name} has dtype {array.dtype}")
         expected = tuple(sizes.setdefault(a, s) for a, s in zip(axes, array.shape, strict=False))
@@ -152,10 +158,10 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         raise FileError(f"its description is damaged ({error})") from error
     if arrays["points"].shape[1] != domain.dim:
         raise FileError(f"its points have {arrays['points'].shape[1]} coordinates in {domain}")
-    other = "face_vert" if domain.dim == 2 else "cell_vert"
     for name in Diagram._NAMES:
-        if not name.startswith((other, "shifts")) and f"diagram.{name}" not in arrays:
+        if not name.startswith(_not_in(domain)) and f"diagram.{name}" not in arrays:
             raise FileError(f"it has no diagram.{name}")
+    _check_domain(arrays, domain)
     stored = arrays["history"]
     history = np.zeros(len(stored), HISTORY_DTYPE)
     for column in set(stored.dtype.names or ()) & set(HISTORY_DTYPE.names or ()):
@@ -172,6 +178,31 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         final=_displacements(arrays, "final"),
         settings=settings,
     )
+
+
+def _not_in(domain: Domain) -> tuple[str, ...]:
+    """Return how the names of those arrays begin that a diagram of `domain` does without."""
+    others = [] if any(domain.periodic) else ["shifts"]
+    if domain.dim == 3:
+        others.append("cell_vert")
+    elif not isinstance(domain, Polygon):
+        others.append("face_vert")
+    return tuple(others)
+
+
+def _check_domain(arrays: Mapping[str, np.ndarray], domain: Domain) -> None:
+    """Check what must fit the domain, so that nobody indexes out of bounds later."""
+    neighbours = arrays["diagram.neighbours"]
+    if neighbours.size and neighbours.min() < -wall_count(domain):
+        raise FileError("diagram.neighbours points to what does not exist")
+    if isinstance(domain, Polygon):
+        starts = arrays["diagram.face_vertex_starts"]
+        if not np.array_equal(starts, 2 * np.arange(len(neighbours) + 1)):
+            raise FileError("diagram.face_vertices does not have two ends for each face")
+    else:
+        same = arrays.get("diagram.cell_vertex_starts", arrays["diagram.neighbour_starts"])
+        if not np.array_equal(same, arrays["diagram.neighbour_starts"]):
+            raise FileError("diagram.cell_vertices does not have as many corners as faces")
 
 
 def _part(arrays: Mapping[str, np.ndarray], part: str) -> dict[str, np.ndarray]:

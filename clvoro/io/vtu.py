@@ -15,7 +15,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from ..domain import Domain
 from ..faces import face_corners, face_owners
+from ..polygon import Polygon
 from ..results import Diagram, Result
 from .atomic import atomic_file
 
@@ -29,6 +31,7 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
 
     Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces_of_cell`),
     `label` (the cell's row in the result), and the vector `generator`, from the origin to the cell's generator.
+    A polygonal domain goes along as field data.
     """
     diagram = result.diagram
     n = len(diagram)
@@ -41,13 +44,17 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
     topology["types"] = np.full(n, kind, np.uint8)
     cells = [appended.add(name, array) for name, array in topology.items()]
     data = [appended.add(name, values) for name, values in cell_data(result).items()]
+    field = [
+        appended.add(name, array, tuples=True)
+        for name, array in _domain_data(diagram.domain).items()
+    ]
     compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
     head = f"""<?xml version="1.0"?>
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
 header_type="UInt64"{compressor}>
 {_comment("clvoro settings: " + json.dumps(result.settings, default=repr))}
 <UnstructuredGrid>
-<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
+{_field_data(field)}<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
 <Points>
 {points}
 </Points>
@@ -66,6 +73,18 @@ _"""
         for chunk in appended.chunks:
             file.write(chunk)
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _domain_data(domain: Domain) -> dict[str, np.ndarray]:
+    """Return what describes a domain that its cells' bounding box does not."""
+    if not isinstance(domain, Polygon):
+        return {}
+    return {
+        "domain_vertices": in_space(domain.vertices),
+        "domain_ring_starts": domain.ring_starts,
+        "domain_piece_of_ring": domain.piece_of_ring,
+        "domain_edge_numbers": domain.edge_numbers,
+    }
 
 
 def _polygons(diagram: Diagram) -> dict[str, np.ndarray]:
@@ -138,11 +157,12 @@ class _Appended:
         self.compress = compress
         self._offset = 0
 
-    def add(self, name: str | None, array: np.ndarray) -> str:
-        """Append `array` and return the XML element that refers to it."""
+    def add(self, name: str | None, array: np.ndarray, tuples: bool = False) -> str:
+        """Append `array` and return the XML element that refers to it; it says how long it is if `tuples`."""
         data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("="), copy=False)
         components = f' NumberOfComponents="{data.shape[1]}"' if data.ndim == 2 else ""
         label = "" if name is None else f" Name={quoteattr(name)}"
+        components += f' NumberOfTuples="{len(data)}"' if tuples else ""
         kind = _TYPES[data.dtype.str[1:]]
         element = (
             f'<DataArray type="{kind}"{label}{components} format="appended" '
@@ -170,6 +190,10 @@ def _packed(raw: bytes) -> bytes:
 def _comment(text: str) -> str:
     # A field of type String would show up in ParaView, but meshio cannot read such a file.
     return f"<!-- {text.replace('--', '- -')} -->"
+
+
+def _field_data(elements: list[str]) -> str:
+    return f"<FieldData>\n{_lines(elements)}\n</FieldData>\n" if elements else ""
 
 
 def _lines(elements: list[str]) -> str:

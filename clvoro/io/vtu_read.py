@@ -17,8 +17,9 @@ from xml.parsers import expat
 
 import numpy as np
 
-from ..domain import Box
+from ..domain import Box, Domain
 from ..errors import InputError
+from ..polygon import Polygon
 from ..rebuilt import rebuild
 from ..results import HISTORY_DTYPE, Diagram, Result
 
@@ -38,8 +39,8 @@ class _FileError(Exception):
 def load_vtu(path: str | PathLike[str]) -> Result:
     """Read the cells and what is known of them from a `.vtu` file that `Result.save` wrote.
 
-    The domain is the vertices' bounding box. The graph is made anew from the corners that cells share; volumes, sizes,
-    errors and quality are the file's. The history is empty.
+    The domain is the polygon that the file describes, or else the vertices' bounding box. The graph is made anew from
+    the corners that cells share; volumes, sizes, errors and quality are the file's. The history is empty.
 
     Raises
     ------
@@ -182,7 +183,8 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
     lower, upper = vertices.min(axis=0)[:dim], vertices.max(axis=0)[:dim]
     if not (lower < upper).all():
         raise _FileError("its vertices lie on a line")
-    domain = Box(tuple(lower), tuple(upper))
+    polygon = _polygon(arrays) if dim == 2 else None
+    domain = Box(tuple(lower), tuple(upper)) if polygon is None else polygon
     x = np.ascontiguousarray(vertices[:, :dim])
     points = arrays["CellData.generator"][:, :dim].astype(float)
     owner = np.repeat(np.arange(len(kinds)), np.diff(cell_starts))
@@ -190,8 +192,11 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         following = np.arange(1, len(corners) + 1)
         following[cell_starts[1:] - 1] = cell_starts[:-1]
         loops = np.stack([corners, corners[following]], axis=1)
-        face = np.repeat(np.arange(len(corners)), 2)
-        flat, starts = loops.ravel(), 2 * np.arange(len(corners) + 1)
+        if polygon is not None:
+            faces = ~_bridges(owner, loops)
+            owner, loops = owner[faces], loops[faces]
+        face = np.repeat(np.arange(len(loops)), 2)
+        flat, starts = loops.ravel(), 2 * np.arange(len(loops) + 1)
     else:
         flat, starts = corners, face_starts
         face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
@@ -200,6 +205,10 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         "points": points, "volumes": arrays["CellData.volume"].astype(float),
         "neighbour_starts": cell_starts, "neighbours": neighbours, "vertices": x,
     }  # fmt: skip
+    if polygon is not None:
+        rows = np.bincount(owner, minlength=len(kinds))
+        known["neighbour_starts"] = np.concatenate([[0], np.cumsum(rows)])
+        known |= {"face_vertex_starts": starts, "face_vertices": flat}
     if face_starts is None:
         known |= {"cell_vertex_starts": cell_starts, "cell_vertices": corners}
     else:
@@ -213,6 +222,27 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         points=points, diagram=diagram, **values, history=np.zeros(0, HISTORY_DTYPE),
         converged=False, stop_reason="read from a .vtu file",
     )  # fmt: skip
+
+
+def _polygon(arrays: dict[str, np.ndarray]) -> Polygon | None:
+    """Return the polygonal domain, if the file has one."""
+    prefix = "FieldData.domain_"
+    values = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+    if not values:
+        return None
+    if "vertices" in values:
+        values["vertices"] = values["vertices"].reshape(-1, 3)[:, :2]
+    return Polygon.described(**values)
+
+
+def _bridges(owner: np.ndarray, loops: np.ndarray) -> np.ndarray:
+    """Tell which ways from corner to corner (m, 2) their cell also goes back: they join its loops, and are no faces."""
+    low, high = loops.min(axis=1), loops.max(axis=1)
+    order = np.lexsort((high, low, owner))
+    same = np.all([np.diff(key[order]) == 0 for key in (owner, low, high)], axis=0)
+    found = np.zeros(len(loops), bool)
+    found[order[1:][same]] = found[order[:-1][same]] = True
+    return found & (low < high)
 
 
 def _indices(array: np.ndarray, bound: int, name: str) -> np.ndarray:
@@ -261,7 +291,7 @@ def _neighbours(
     corners: np.ndarray,
     starts: np.ndarray,
     x: np.ndarray,
-    domain: Box,
+    domain: Domain,
 ) -> np.ndarray:
     """Return the cell behind each face: the one whose face has the same corners; or else the wall it lies on."""
     order = np.lexsort((corners, face))
@@ -284,6 +314,9 @@ def _neighbours(
         ]
         / sides[alone][:, None]
     )
+    if isinstance(domain, Polygon):
+        result[alone] = -1 - domain.nearest_edge(middle)[0]
+        return result
     gaps = np.stack([middle - domain.lower, domain.upper - middle], axis=2).reshape(len(alone), -1)
     result[alone] = -1 - gaps.argmin(axis=1)
     return result
