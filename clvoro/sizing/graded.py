@@ -11,6 +11,7 @@ import numpy as np
 
 from ..domain import Box
 from ..errors import InputError, InputTypeError
+from ..polygon import Polygon
 from .field import Field, as_field, slope_of
 from .raster import Raster
 
@@ -129,7 +130,13 @@ class Graded(Field):
         from ..gradation import Gradation
         from .stage import Sizing
 
-        evaluate = Sizing(engine, box, self.field)
+        stage = Sizing(engine, box, self.field)
+        # In a polygon a function need not be defined everywhere in the box around it.
+        within = isinstance(box, Polygon) and not self.field.on_device
+
+        def evaluate(points: np.ndarray) -> np.ndarray:
+            return stage(box.nearest(points) if within else points)
+
         marks = self.field.landmarks(box)
         marks = marks[box.contains(marks)]
         at_marks = evaluate(marks) if len(marks) else np.zeros(0)

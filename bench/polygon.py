@@ -1,0 +1,195 @@
+"""What a polygonal domain costs, and how good its meshes are.
+
+    python bench/polygon.py [--cells 1e6] [--edges 10000] [--runs 5] [--only cost,meshes]
+                            [--device NAME] [--dtype float32] [--json]
+
+The first table sets the diagram of a polygon of so many edges, a coast with an island, beside that
+of a box with as many generators: made anew, and repaired after no motion, where only the boundary
+is cut again. Process time over the number of cores, medians of several runs in turn.
+
+The second table runs the fields F2 and F3 of `bench/convergence.py` on such a polygon, against one
+and a half times the errors and .01 less than the mean Q that are asked for in the box. Quality
+counts the cells that have no face on the boundary; those that have are given apart.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from _common import (
+    BOX,
+    Report,
+    counts,
+    device_name,
+    figures,
+    heading,
+    make_adapter,
+    names,
+    off_walls,
+    parser,
+    test_field,
+)
+
+import clvoro
+from clvoro._program import Engine
+from clvoro.mesh import Stages
+from clvoro.tessellator import Tessellator
+
+MOST_RATIO = 1.3
+MESHES = (
+    ("fast", "F2", {"effort": "fast"}, {"mean_error": 0.006, "mean_quality": 0.975}),
+    ("default", "F2", {}, {"mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990}),
+    ("default", "F3", {}, {"mean_error": 0.004, "max_error": 0.04, "mean_quality": 0.990}),
+    ("exact", "F2", {"method": "exact"},
+     {"mean_deviation": 1e-4, "max_deviation": 2e-3, "mean_quality": 0.986}),
+)  # fmt: skip
+
+
+def coast(k: int, seed: int, centre: tuple[float, float], radii: tuple[float, float]) -> np.ndarray:
+    """Return a closed curve of `k` corners, a rough ellipse: a random Fourier series of falling amplitude."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    t = 2 * np.pi * np.arange(k) / k
+    waves = np.arange(2, min(400, k // 4))
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    bulge = np.cos(np.outer(t, waves) + phases) @ waves**-1.4
+    r = np.exp(0.08 * bulge)[:, None]
+    return np.array(centre) + np.array(radii) * r * np.column_stack([np.cos(t), np.sin(t)])
+
+
+def lake(edges: int) -> clvoro.Polygon:
+    """Return a lake with an island, within `BOX` and around the circles of F2 and F3."""
+    outer = coast(7 * edges // 10, 1, (1.2, 0.75), (1.0, 0.6))
+    island = coast(edges - len(outer), 2, (1.5, 0.75), (0.12, 0.12))
+    return clvoro.Polygon(outer, [island])
+
+
+def random_points(domain: clvoro.Polygon | clvoro.Box, n: int) -> np.ndarray:
+    """Return uniform random points in `domain`, (n, 2)."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    found = np.empty((0, 2))
+    while len(found) < n:
+        more = rng.uniform(domain.lower, domain.upper, (n, 2))
+        found = np.concatenate([found, more[domain.contains(more)]])
+    return found[:n]
+
+
+class Sets:
+    """Generators of one domain, in the order of their bins, and what tessellates them."""
+
+    def __init__(self, adapter: clvoro.Adapter, domain: Any, n: int) -> None:
+        engine = Engine(adapter.ctx, adapter.queue, 2, adapter.dtype, domain.defines(adapter.dtype))
+        stages = Stages(engine)
+        unsorted = engine.upload(domain.place(random_points(domain, n), adapter.dtype))
+        items = stages.bins.build(domain, unsorted, n).items[:n].copy()
+        self.n, self.points = n, stages.gather.rows(items, unsorted)
+        self.queue = adapter.queue
+        spacing = (domain.measure / n) ** 0.5
+        self.tessellator = Tessellator(stages, domain, lambda x: np.full(len(x), spacing))
+        self.latest = self.tessellator.tessellate(self.points, n)
+
+    def seconds(self, repaired: bool) -> float:
+        """Return the processor time of one diagram, divided by the cores."""
+        self.queue.finish()
+        begin = time.process_time()
+        previous = self.latest if repaired else None
+        self.latest = self.tessellator.tessellate(self.points, self.n, previous)
+        self.queue.finish()
+        return (time.process_time() - begin) / len(os.sched_getaffinity(0))
+
+
+def cost(adapter: clvoro.Adapter, n: int, edges: int, runs: int, report: Report) -> bool:
+    """Add the table of costs; False if the polygon costs too much."""
+    sets = {"box": Sets(adapter, BOX, n), f"polygon, {edges} edges": Sets(adapter, lake(edges), n)}
+    good = True
+    for what, repaired in (("anew", False), ("repaired", True)):
+        for one in sets.values():
+            one.seconds(repaired)
+        taken: dict[str, list[float]] = {name: [] for name in sets}
+        for _ in range(runs):
+            for name, one in sets.items():
+                taken[name].append(one.seconds(repaired))
+        medians = {name: statistics.median(values) for name, values in taken.items()}
+        for name, seconds in medians.items():
+            ratio = seconds / medians["box"]
+            report.add(
+                {"diagram": what, "domain": name, "cells": n, "seconds": seconds, "ratio": ratio}
+            )
+        good &= repaired or ratio <= MOST_RATIO
+    return good
+
+
+def meshes(adapter: clvoro.Adapter, edges: int, report: Report) -> bool:
+    """Add the table of meshes; False if one misses its targets."""
+    domain, good = lake(edges), True
+    for name, field, arguments, targets in MESHES:
+        begin = time.perf_counter()
+        result = adapter.run(domain, test_field(field), **arguments)
+        found = figures(result.diagram, result.size, result.quality)
+        boundary = ~off_walls(result.diagram)
+        record = {
+            "row": name, "field": field, **found, "seconds": time.perf_counter() - begin,
+            "boundary_cells": int(boundary.sum()),
+            "boundary_error": float(np.abs(result.error[boundary]).mean()),
+            "boundary_quality": float(result.quality[boundary].mean()),
+            "boundary_least": float(result.quality[boundary].min()),
+            "sum": float(result.diagram.volumes.sum() / domain.measure - 1),
+        }  # fmt: skip
+        missed = [
+            key for key, bound in targets.items()
+            if (found[key] < bound - 0.01 if "quality" in key else found[key] > 1.5 * bound)
+        ]  # fmt: skip
+        record["missed"] = ", ".join(missed)
+        good &= not missed
+        report.add(record, f"{name} {field}: {found['cells']} cells")
+    return good
+
+
+def main() -> int:
+    """Run the bench."""
+    made = parser(__doc__)
+    made.add_argument("--cells", type=lambda text: counts(text)[0], default=1_000_000)
+    made.add_argument("--edges", type=lambda text: counts(text)[0], default=10_000)
+    made.add_argument("--runs", type=int, default=5)
+    made.add_argument("--only", type=names, default=["cost", "meshes"])
+    options = made.parse_args()
+    adapter, good = make_adapter(options), True
+    if "cost" in options.only:
+        table = Report(
+            options.json,
+            {
+                "diagram": lambda r: r["diagram"], "domain": lambda r: r["domain"],
+                "cells": lambda r: r["cells"], "s": lambda r: f"{r['seconds']:.3f}",
+                "over the box": lambda r: f"{r['ratio']:.2f}",
+            },
+        )  # fmt: skip
+        good &= cost(adapter, options.cells, options.edges, options.runs, table)
+        table.finish(heading(adapter, "Diagrams of a box and of a polygon"))
+    if "meshes" in options.only:
+        table = Report(
+            options.json,
+            {
+                "run": lambda r: f"{r['row']} {r['field']}", "cells": lambda r: r["cells"],
+                "mean e": lambda r: f"{r['mean_error']:.4f}", "max e": lambda r: f"{r['max_error']:.3f}",
+                "mean deviation": lambda r: f"{r['mean_deviation']:.1e}",
+                "max deviation": lambda r: f"{r['max_deviation']:.1e}",
+                "Q": lambda r: f"{r['mean_quality']:.4f}", "min Q": lambda r: f"{r['min_quality']:.3f}",
+                "boundary": lambda r: r["boundary_cells"],
+                "its mean e": lambda r: f"{r['boundary_error']:.4f}",
+                "its Q": lambda r: f"{r['boundary_quality']:.4f}",
+                "its min Q": lambda r: f"{r['boundary_least']:.3f}",
+                "s": lambda r: f"{r['seconds']:.1f}",
+                "missed": lambda r: r["missed"] or "-",
+            },
+        )  # fmt: skip
+        good &= meshes(adapter, options.edges, table)
+        table.finish(f"Meshes of a polygon of {options.edges} edges, {device_name(adapter)}")
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
