@@ -23,6 +23,7 @@ from .loop import Loop
 from .mesh import Mesh, Stages, check_memory
 from .methods import PUBLISHED, Relaxation, make_method
 from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
+from .precision import check_precision
 from .results import Diagram, Result
 from .sizing import Sizing, as_field
 from .start import count_cells, sample_density, sample_uniform
@@ -326,6 +327,8 @@ class Adapter:
                 host = sample_uniform(free, n, options["seed"], self.dtype)
             else:
                 host = sample_density(sizing, free, n, options["seed"], self.dtype)
+        if host is not None:
+            check_precision(sizing, domain, host, factor)
         if host is not None and len(rows):
             host = np.concatenate([rows, apart_from(host, rows, free)])
         mesh, near = None, False

@@ -35,3 +35,7 @@ class SolverError(ClvoroError, ArithmeticError):
 
 class Aborted(BaseException):
     """The user wants to quit at once; unlike KeyboardInterrupt, which a run answers with what it has so far."""
+
+
+class PrecisionWarning(UserWarning):
+    """A run cannot meet its size field as well as usual in the precision asked for; says what limits it."""
