@@ -3,10 +3,11 @@
 from .bind import bind
 from .distance import Distance
 from .expression import Expression
+from .feature import FeatureSize
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
 from .raster import Raster, Scattered
-from .shapes import Circle, Polygon, Polyline, Segment, Sphere
+from .shapes import Circle, Edges, Polygon, Polyline, Segment, Sphere
 from .solution import gradient_size, hessian_size
 from .stage import Sizing
 from .surface import Surface
@@ -15,7 +16,9 @@ __all__ = [
     "Circle",
     "Constant",
     "Distance",
+    "Edges",
     "Expression",
+    "FeatureSize",
     "Field",
     "Function",
     "Graded",

@@ -11,8 +11,9 @@ import numpy as np
 
 from ..domain import Box
 from ..errors import InputError, InputTypeError
+from ..polygon import Polygon as PolygonalDomain
 from .field import Field, positive, slope_of
-from .shapes import Circle, Polygon, Polyline, Segment
+from .shapes import Circle, Edges, Polygon, Polyline, Segment
 from .surface import Surface, box_surface
 from .tree import Tree
 from .triangles import segment_distance2
@@ -25,8 +26,8 @@ _LANDMARKS = 1 << 14  # about so many landmarks at most, beside one per piece
 # Kinds of items that the device knows: see size_item_distance2.
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
-Curve = Circle | Segment | Polyline
-Shape = Curve | Surface | Box
+Curve = Circle | Segment | Polyline | Edges
+Shape = Curve | Surface | Box | PolygonalDomain
 
 
 class Distance(Field):
@@ -37,7 +38,8 @@ class Distance(Field):
     shapes : shape or iterable of shapes
         `Circle`, `Segment`, `Polyline`, `Polygon`; in 3D `Sphere`, `Segment`, `Polyline`,
         `Polygon` (the closed chain, not its area), `Surface`; in both a `clvoro.Box`, which means
-        its sides. The distance is to the curve or surface itself, from both sides.
+        its sides, and a `clvoro.Polygon`, which means its edges (``domain.boundary(edges)`` some of
+        them). The distance is to the curve or surface itself, from both sides.
     h_min : float
         Size on the shapes.
     growth : float, optional
@@ -76,7 +78,7 @@ class Distance(Field):
             if not isinstance(shape, Shape):
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
-                    "Sphere, Segment, Polyline, Polygon, Surface or Box"
+                    "Sphere, Segment, Polyline, Polygon, Edges, Surface, Box or clvoro.Polygon"
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")
@@ -106,10 +108,11 @@ class Distance(Field):
 
     def _landmarks_of_curves(self, spacing: float) -> np.ndarray:
         length = np.linalg.norm(self._end - self._begin, axis=1)
-        around = 2 * np.pi * self._radius
+        radius = np.maximum(self._radius, 0)
+        around = 2 * np.pi * radius
         counts = np.maximum(np.maximum(length, around) / spacing, 1)
         if self.dim == 3:
-            counts = np.maximum(counts, 4 * np.pi * (self._radius / spacing) ** 2)
+            counts = np.maximum(counts, 4 * np.pi * (radius / spacing) ** 2)
         counts *= min(1.0, _LANDMARKS / counts.sum())
         counts = np.ceil(counts).astype(int)
         item = np.repeat(np.arange(len(counts)), counts)
@@ -122,7 +125,7 @@ class Distance(Field):
             turn = np.pi * (3 - math.sqrt(5)) * t * counts[item]
             flat = np.sqrt(1 - z**2)
             offset = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
-        return np.concatenate([points + self._radius[item, None] * offset, self._end])
+        return np.concatenate([points + radius[item, None] * offset, self._end])
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of `points` (n, d) to the nearest shape, (n,) float64."""
@@ -136,7 +139,7 @@ class Distance(Field):
             begin = self._begin[item]
             d2 = segment_distance2(x, begin, self._end[item] - begin)
             radius = self._radius[item]
-            return np.where(radius > 0, (np.sqrt(d2) - radius) ** 2, d2)
+            return np.where(radius != 0, (np.sqrt(d2) - radius) ** 2, d2)
 
         # The nearest of a few items spread over all of them is a first bound.
         for item in np.unique(np.linspace(0, len(self._begin) - 1, 16).astype(int)):
@@ -193,7 +196,9 @@ class Distance(Field):
 
 
 def _plain(shape: Shape) -> Curve | Surface:
-    """Return the sides of a box, and any other shape as it is."""
+    """Return the sides of a domain, and any other shape as it is."""
+    if isinstance(shape, PolygonalDomain):
+        return shape.boundary()
     if not isinstance(shape, Box):
         return shape
     if shape.dim == 3:
@@ -205,6 +210,7 @@ def _plain(shape: Shape) -> Curve | Surface:
 def _item_boxes(
     begin: np.ndarray, end: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    # What a negative radius adds is not in a box, and need not be: distances to boxes stay lower bounds.
     # Rounding of centre -+ radius may cut a circle's box by an ulp: widen those.
-    wide = (radius * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]
+    wide = (np.maximum(radius, 0) * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]
     return np.minimum(begin, end) - wide, np.maximum(begin, end) + wide

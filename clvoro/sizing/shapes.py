@@ -87,6 +87,34 @@ class Polygon(Polyline):
 
 
 @dataclass(frozen=True, eq=False)
+class Edges:
+    """Straight segments that need not hang together, from `begin` (m, d) to `end` (m, d).
+
+    `clvoro.Polygon.boundary` gives them for edges of a domain.
+    """
+
+    begin: np.ndarray
+    end: np.ndarray
+
+    def __post_init__(self) -> None:
+        begin, end = (
+            coordinates("Edges begin", self.begin, 2),
+            coordinates("Edges end", self.end, 2),
+        )
+        if begin.shape != end.shape or not len(begin):
+            raise InputError(
+                f"Edges got begins of shape {begin.shape} and ends of shape {end.shape}, expected the same, "
+                "at least one"
+            )
+        object.__setattr__(self, "begin", begin)
+        object.__setattr__(self, "end", end)
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        return self.begin, self.end, np.zeros(len(self.begin))
+
+
+@dataclass(frozen=True, eq=False)
 class Segment:
     """Straight segment from `a` to `b`."""
 

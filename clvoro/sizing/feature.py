@@ -1,0 +1,169 @@
+"""A size field that follows the shape of a polygonal domain: its narrow places and its curves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError
+from ..polygon import Polygon
+from .distance import Distance
+from .field import Constant, Field, positive, slope_of
+from .gaps import gaps, radii_of_curvature
+from .shapes import Edges
+
+if TYPE_CHECKING:
+    from ..domain import Domain
+    from .bind import Binder
+
+_FINEST, _COARSEST = 1e-3, 0.1  # of the domain's longest side, by default
+_MOST_LANDMARKS = 1 << 14  # sources that have any
+_THIN = 16  # of sources that are nearer than 1/16 of their size or so one stays
+
+
+@dataclass(frozen=True, eq=False)
+class _Sources(Edges):
+    """Segments each with a size of its own; a radius of -r makes a distance d count as d + r."""
+
+    extra: np.ndarray
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.begin, self.end, -self.extra
+
+
+class FeatureSize(Field):
+    r"""Size by the local features of a polygonal domain.
+
+    ``h(x) = min over k of size_k + slope * (distance of x to segment k)``, at most `h_max`. The segments are
+
+    - chords across narrow places, from wall to wall, with their length / `cells_across` as size: gaps between walls
+      that face each other, as in channels, straits or beside an island. Walls that meet in a corner of more than
+      45 degrees do not face each other: corners alone ask for no small cells. In a sharper one the gap goes to zero
+      towards its tip, and the size to `h_min`.
+    - edges of curved parts of the boundary, with the radius of curvature / `curvature` as size. Turns of more than
+      30 degrees are corners, and do not count as curved.
+
+    Parameters
+    ----------
+    domain : clvoro.Polygon
+    cells_across : float
+        Number of cells across a gap, at least.
+    growth : float, optional
+        Geometric growth rate of cells away from the features; the slope is ln(growth), as for `Distance`. By
+        default 1.2.
+    h_min : float, optional
+        Lower bound of h; by default 1/1000 of the domain's longest side.
+    h_max : float, optional
+        Upper bound of h; by default a tenth of the domain's longest side.
+    curvature : float
+        Number of cells per radius of curvature, as many as per radian; 0 looks at gaps only.
+    slope : float, optional
+        dh/dx itself, in place of `growth`.
+
+    Attributes
+    ----------
+    sources : (begin (m, 2), end (m, 2), size (m,))
+        The segments.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is out of range or the domain is no Polygon.
+
+    Examples
+    --------
+    At least six cells across every strait of a lake::
+
+        lake = clvoro.Polygon.from_geojson("lake.geojson")
+        size = clvoro.sizing.FeatureSize(lake, cells_across=6, h_min=0.01, h_max=0.3)
+    """
+
+    dim = 2
+
+    def __init__(
+        self,
+        domain: Polygon,
+        cells_across: float = 4,
+        growth: float | None = None,
+        h_min: float | None = None,
+        h_max: float | None = None,
+        curvature: float = 3,
+        slope: float | None = None,
+    ):
+        if not isinstance(domain, Polygon):
+            raise InputTypeError(
+                f"FeatureSize domain is a {type(domain).__name__}, expected a clvoro.Polygon"
+            )
+        self.domain, longest = domain, float(domain.extent.max())
+        self.cells_across = positive("FeatureSize cells_across", cells_across)
+        self.slope = slope_of(
+            "FeatureSize", 1.2 if growth is None and slope is None else growth, slope
+        )
+        if self.slope == 0:
+            raise InputError("FeatureSize got no growth, expected growth above 1 or slope above 0")
+        self.h_min = positive("FeatureSize h_min", _FINEST * longest if h_min is None else h_min)
+        usual = max(_COARSEST * longest, self.h_min)
+        self.h_max = positive("FeatureSize h_max", usual if h_max is None else h_max)
+        if self.h_max < self.h_min:
+            raise InputError(
+                f"FeatureSize h_max is {self.h_max:g}, expected at least h_min = {self.h_min:g}"
+            )
+        self.curvature = 0.0 if curvature == 0 else positive("FeatureSize curvature", curvature)
+        self.sources = self._find()
+        begin, end, size = self.sources
+        if len(size):
+            shape = _Sources(begin, end, (size - self.h_min) / self.slope)
+            self._field: Field = Distance(shape, self.h_min, slope=self.slope, h_max=self.h_max)
+        else:
+            self._field = Constant(self.h_max)
+
+    def _find(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        domain, across = self.domain, self.cells_across
+        begin, end = gaps(domain, across * self.h_min, across * self.h_max)
+        size = np.hypot(*(end - begin).T) / across
+        if self.curvature:
+            radius = radii_of_curvature(domain)
+            curved = np.flatnonzero(radius < self.curvature * self.h_max)
+            begin = np.concatenate([begin, domain.vertices[curved]])
+            end = np.concatenate([end, domain.vertices[domain.next_vertex[curved]]])
+            size = np.concatenate([size, radius[curved] / self.curvature])
+        size = np.maximum(size, self.h_min)
+        kept = size < self.h_max
+        begin, end, size = begin[kept], end[kept], size[kept]
+        kept = _thinned(domain, 0.5 * (begin + end), size)
+        return begin[kept], end[kept], size[kept]
+
+    def landmarks(self, domain: Domain) -> np.ndarray:
+        """Return the ends and middles of the sources, of which the least come first if there are many."""
+        begin, end, size = self.sources
+        least = np.argsort(size, kind="stable")[:_MOST_LANDMARKS]
+        points = np.concatenate([begin[least], 0.5 * (begin[least] + end[least]), end[least]])
+        return points if len(points) else np.zeros((0, domain.dim))
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        return self._field._evaluate(points)
+
+    def _emit(self, binder: Binder) -> str:
+        return self._field._emit(binder)
+
+    def __repr__(self) -> str:
+        return (
+            f"FeatureSize({self.domain!r}, {len(self.sources[2])} sources, h_min={self.h_min:g}, "
+            f"slope={self.slope:g}, h_max={self.h_max:g})"
+        )
+
+
+def _thinned(domain: Polygon, middle: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return which sources to keep: of those with middles in the same small square the one of least size.
+
+    The squares' edges are the power of two next below 1/16 of the size, so what is lost is at most slope / 11 of it.
+    """
+    level = np.floor(np.log2(size / _THIN))
+    place = np.floor((middle - domain.lower) / 2.0 ** level[:, None])
+    order = np.lexsort((size, place[:, 1], place[:, 0], level))
+    key = np.column_stack([level, place])[order]
+    first = np.ones(len(order), bool)
+    first[1:] = (key[1:] != key[:-1]).any(axis=1)
+    return np.sort(order[first])

@@ -1,0 +1,142 @@
+"""How wide a polygonal domain is at its boundary, and how its boundary turns."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..polygon import Polygon
+
+FACING = math.radians(135)
+"""Least angle between the directions from the middle of a gap to its walls: two walls that meet in a corner of
+more than 45 degrees do not face each other."""
+CORNER = math.radians(30)
+"""Turns of more than this are corners, and not parts of a curve."""
+_FAN = math.radians(7.5)  # between the directions that a corner looks in
+_PER_RADIUS = 4  # samples of an edge per radius of the balls beside it
+_MOST_SAMPLES = 2048  # of one edge
+_ROUNDS = 40
+_CLOSE = 1e-9
+
+
+def gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return chords across the narrow places of a domain, from wall to wall.
+
+    From places on the boundary a ball grows inwards, touching it there, until it touches it a second time: a ball of
+    the medial axis. It is found by shrinking a large one onto the nearest place of the boundary in it, again and
+    again (Ma, Bae, Choi 2012). If both walls face each other, their distance is the width of a gap. Corners
+    that stand out into the domain look in all directions between those of their edges.
+
+    Parameters
+    ----------
+    domain : Polygon
+    least : float
+        Width below which gaps need not be told apart: bounds the work.
+    most : float
+        Width beyond which gaps do not matter.
+
+    Returns
+    -------
+    begin, end : (m, 2) float64
+        Where the balls touch.
+    """
+    start, edge = domain.vertices, domain.vertices[domain.next_vertex] - domain.vertices
+    length = np.hypot(*edge.T)
+    normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
+    found = [_from_corners(domain, normal, most)]
+    # Edges are sampled as finely as the gaps beside them are narrow.
+    counts = np.clip(np.ceil(length / (most / 2)), 1, _MOST_SAMPLES).astype(np.int64)
+    rows = np.arange(len(counts))
+    while rows.size:
+        row = np.repeat(rows, counts[rows])
+        t = np.arange(len(row)) - np.repeat(np.cumsum(counts[rows]) - counts[rows], counts[rows])
+        points = start[row] + ((t + 0.5) / counts[row])[:, None] * edge[row]
+        begin, end, radius = _balls(domain, points, normal[row], most)
+        narrowest = np.full(len(counts), math.inf)
+        np.minimum.at(narrowest, row[np.isfinite(radius)], radius[np.isfinite(radius)])
+        finer = np.ceil(_PER_RADIUS * length[rows] / np.maximum(narrowest[rows], least / 2))
+        finer = np.minimum(finer, _MOST_SAMPLES).astype(np.int64)
+        again = finer > 1.5 * counts[rows]
+        done = np.isin(row, rows[~again]) & np.isfinite(radius)
+        found.append((begin[done], end[done]))
+        # Step by step, as an edge may leave the narrow place soon.
+        counts[rows[again]] = np.minimum(finer[again], 4 * counts[rows[again]])
+        rows = rows[again]
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
+
+
+def _from_corners(
+    domain: Polygon, normal: np.ndarray, most: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return chords from corners whose angle inside the domain is more than 180 degrees."""
+    before = np.empty(len(normal), np.int64)
+    before[domain.next_vertex] = np.arange(len(normal))
+    first = normal[before]
+    turn = np.arctan2(
+        first[:, 0] * normal[:, 1] - first[:, 1] * normal[:, 0], (first * normal).sum(axis=1)
+    )
+    rows = np.flatnonzero(turn < -_FAN)
+    counts = np.ceil(-turn[rows] / _FAN).astype(np.int64) - 1
+    row = np.repeat(rows, counts)
+    step = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    angle = np.arctan2(first[row, 1], first[row, 0]) + turn[row] * step / np.repeat(
+        counts + 1, counts
+    )
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])
+    begin, end, radius = _balls(domain, domain.vertices[row], direction, most)
+    return begin[np.isfinite(radius)], end[np.isfinite(radius)]
+
+
+def _balls(
+    domain: Polygon, points: np.ndarray, normal: np.ndarray, most: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where balls touch the boundary, at `points` and elsewhere, and their radii.
+
+    The radius is infinite where the walls do not face each other, or are farther apart than `most`.
+    """
+    n = len(points)
+    # A gap is at least as wide as its ball's radius times 2 sin(FACING / 2).
+    radius = np.full(n, most / (2 * math.sin(FACING / 2)))
+    touched = points.copy()
+    met = np.zeros(n, bool)
+    active = np.arange(n)
+    for _ in range(_ROUNDS):
+        if not active.size:
+            break
+        centre = points[active] + radius[active, None] * normal[active]
+        _, nearest = domain.nearest_edge(centre)
+        inside = np.hypot(*(nearest - centre).T) < radius[active] * (1 - _CLOSE)
+        across = nearest - points[active]
+        along = (across * normal[active]).sum(axis=1)
+        inside &= along > 0
+        active, across, along = active[inside], across[inside], along[inside]
+        radius[active] = (across**2).sum(axis=1) / (2 * along)
+        touched[active], met[active] = nearest[inside], True
+    centre = points + radius[:, None] * normal
+    away = touched - centre
+    facing = -(away * normal).sum(axis=1) <= math.cos(FACING) * np.hypot(*away.T)
+    wide = np.hypot(*(touched - points).T) > most
+    radius[~met | ~facing | wide] = math.inf
+    return points, touched, radius
+
+
+def radii_of_curvature(domain: Polygon) -> np.ndarray:
+    """Return for each edge the radius of the curve that it is part of, (k,); infinite beside corners or if straight.
+
+    At a vertex where the boundary turns by an angle a between edges of lengths p and q, the radius is that of the
+    circle that touches both at half the shorter one's length, ``min(p, q) / (2 tan(a / 2))``.
+    """
+    edge = domain.vertices[domain.next_vertex] - domain.vertices
+    length = np.hypot(*edge.T)
+    before = np.empty(len(edge), np.int64)
+    before[domain.next_vertex] = np.arange(len(edge))
+    last = edge[before]
+    turn = np.abs(
+        np.arctan2(last[:, 0] * edge[:, 1] - last[:, 1] * edge[:, 0], (last * edge).sum(axis=1))
+    )
+    smooth = (turn > 1e-9) & (turn <= CORNER)
+    radius = np.full(len(edge), math.inf)
+    shorter = np.minimum(length, length[before])
+    radius[smooth] = shorter[smooth] / (2 * np.tan(turn[smooth] / 2))
+    return np.minimum(radius, radius[domain.next_vertex])
