@@ -10,11 +10,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..domain import Box
+from ..domain import Domain
 from ..errors import InputError
 from ..io.atomic import atomic_file
 from . import schema, toml
-from .fields import FOLDER, build_size, load_array, locate, named_files
+from .domains import build_domain
+from .fields import build_size, load_array, named_files
+from .files import FOLDER, locate
 from .naca import naca4
 
 __all__ = ["Case", "builtin_cases", "load_case", "naca4"]
@@ -33,21 +35,24 @@ class Case:
     Attributes
     ----------
     name, title : str
-    domain : Box
+    domain : Domain
     size : dict
         The size field's tree of tables; `size_field` builds it.
     run : dict
         The keys of the file's `[run]` table.
     folder : Path
         Files that the case names are looked for here, then among those of the built-in cases.
+    place : dict
+        The keys of the file's `[domain]` table; empty for a box that is not from a file.
     """
 
     name: str
     title: str
-    domain: Box
+    domain: Domain
     size: dict[str, Any]
     run: dict[str, Any] = field(default_factory=dict)
     folder: Path = Path()
+    place: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
@@ -75,14 +80,14 @@ class Case:
         if "method" in run and "methods" in run:
             raise InputError(f"{place} run has both method and methods; keep one of them")
         stem = str(checked.get("name", Path(name).stem))
-        box = checked["domain"]
         return cls(
             name=stem,
             title=str(checked.get("title", stem)),
-            domain=Box(box["lower"], box["upper"]),
+            domain=build_domain(checked["domain"], folder),
             size=checked["size"],
             run=run,
             folder=folder,
+            place=checked["domain"],
         )
 
     @property
@@ -114,7 +119,8 @@ class Case:
         return {
             "name": self.name,
             "title": self.title,
-            "domain": {"lower": list(self.domain.lower), "upper": list(self.domain.upper)},
+            "domain": self.place
+            or {"lower": list(self.domain.lower), "upper": list(self.domain.upper)},
             "size": self.size,
             "run": {key: self.run[key] for key in _RUN_ORDER if key in self.run},
         }
@@ -124,8 +130,11 @@ class Case:
 
         Reading it gives this case again, wherever the folder is moved to.
         """
-        moved = replace(self, size=copy.deepcopy(self.size), run=dict(self.run))
+        moved = replace(
+            self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place)
+        )
         entries = [(node, "file") for node in named_files(moved.size)]
+        entries += [(moved.place, "file")] * ("file" in moved.place)
         entries += [(moved.run, "points")] * ("points" in moved.run)
         taken: dict[str, Path] = {}
         for node, key in entries:

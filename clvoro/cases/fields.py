@@ -10,23 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from ..domain import Box
+from ..domain import Box, Domain
 from ..errors import InputError
 from ..io.arrays import read_array
+from ..polygon import Polygon
+from .files import locate
 from .naca import naca4
 
-FOLDER = Path(__file__).parent
-"""Where the built-in cases and their files lie."""
 
-
-def locate(folder: Path, name: str) -> Path:
-    """Return the path of a file that a case names: beside the case, else a built-in case's own."""
-    path, own = folder / name, FOLDER / name
-    alone = Path(name).name == name
-    return own if alone and own.is_file() and not path.exists() else path
-
-
-def build_size(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
+def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     """Return the size field that `node` describes.
 
     Parameters
@@ -35,7 +27,7 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
         A tree that `schema.size` has passed.
     folder : Path
         Where the files that it names are looked for.
-    domain : Box
+    domain : Domain
         What a raster covers if it does not say so itself.
     """
     from .. import sizing
@@ -62,9 +54,17 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
         options = _given(node, "growth", "slope", "h_max")
         shapes = [_shape(s, folder, domain) for s in node["shapes"]]
         return sizing.Distance(shapes, node["h_min"], **options)
+    if kind == "feature":
+        if not isinstance(domain, Polygon):
+            raise InputError(
+                f"size.kind is 'feature', which needs a polygon as domain, not {domain}"
+            )
+        options = _given(node, "cells_across", "growth", "h_min", "h_max", "curvature")
+        return sizing.FeatureSize(domain, **options)
     if kind == "graded":
         options = _given(node, "growth", "slope", "resolution")
-        return sizing.Graded(inner(node["field"]), box=domain, **options)
+        box = domain if isinstance(domain, Box) else Box(domain.lower, domain.upper)
+        return sizing.Graded(inner(node["field"]), box=box, **options)
     if kind == "min":
         return sizing.minimum(*map(inner, node["fields"]))
     if kind == "max":
@@ -84,7 +84,7 @@ def _given(node: Mapping[str, Any], *keys: str) -> dict[str, Any]:
     return {key: node[key] for key in keys if key in node}
 
 
-def _shape(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
+def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     from .. import sizing
 
     kind = node["kind"]
@@ -95,6 +95,8 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
             if "join" not in node:  # corners a hair apart let their triangles cross by a hair
                 surface.check()
         return surface
+    if kind == "boundary":
+        return _boundary(domain, node.get("edges"))
     if kind == "box":
         return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
     if kind in ("circle", "sphere"):
@@ -106,6 +108,21 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Box) -> Any:
     if kind == "polygon":
         return sizing.Polygon(node["points"])
     return sizing.Polygon(naca4(**{key: value for key, value in node.items() if key != "kind"}))
+
+
+def _boundary(domain: Domain, edges: list[int] | None) -> Any:
+    """Return the domain's own boundary; `edges` number the rings as the case gives them."""
+    if not isinstance(domain, (Box, Polygon)) or (edges is not None and isinstance(domain, Box)):
+        raise InputError(f"edges of a boundary need a polygon as domain, not {domain}")
+    if isinstance(domain, Box) or edges is None:
+        return domain
+    unknown = np.setdiff1d(edges, domain.edge_numbers)
+    if unknown.size:
+        raise InputError(
+            f"edges has {unknown[0]}, expected numbers of edges of the domain's rings, from 0 to "
+            f"{domain.edge_numbers.max()}"
+        )
+    return domain.boundary(np.flatnonzero(np.isin(domain.edge_numbers, edges)))
 
 
 def load_array(path: Path, place: str) -> np.ndarray:

@@ -183,6 +183,7 @@ SHAPE = Kinds(
         "circle": Table({"centre": vector(2, 3), "radius": not_negative}, {}),
         "sphere": Table({"centre": vector(3), "radius": not_negative}, {}),
         "box": Table({}, {"lower": vector(2, 3), "upper": vector(2, 3)}),
+        "boundary": Table({}, {"edges": list_of(whole(0))}),
         "surface": Table({"file": text}, {"closed": true_or_false, "join": positive}),
         "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
         "polyline": Table({"points": vectors(2)}, {}),
@@ -247,6 +248,16 @@ _SIZE = Kinds(
             },
             choice=("n_cells", "eps"),
         ),
+        "feature": Table(
+            {},
+            {
+                "cells_across": positive,
+                "growth": positive,
+                "h_min": positive,
+                "h_max": positive,
+                "curvature": not_negative,
+            },
+        ),
         "graded": Table(
             {"field": size},
             {"growth": positive, "slope": positive, "resolution": whole(2)},
@@ -261,7 +272,50 @@ _SIZE = Kinds(
     }
 )
 
-DOMAIN = Kinds({"box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {})}, default="box")
+_RING = Kinds(
+    {
+        "circle": Table({"centre": vector(2), "radius": positive}, {"n_points": whole(3)}),
+        "naca4": Table(
+            {"digits": text},
+            {"chord": positive, "leading_edge": vector(2), "angle": number, "n_points": whole(3)},
+        ),
+    }
+)
+
+
+def ring(value: object, place: str) -> Any:
+    """Check for the vertices of a ring, or a shape that has some."""
+    if isinstance(value, Mapping):
+        return _RING(value, place)
+    if not isinstance(value, (list, tuple)) or len(value) < 3:
+        raise refuse(place, value, "a list of 3 or more points, [x, y] each, or a shape")
+    return [vector(2)(v, f"{place}[{i}]") for i, v in enumerate(value)]
+
+
+_DOMAINS = Kinds(
+    {
+        "box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {}),
+        "polygon": Table(
+            {}, {"file": text, "outer": ring, "holes": list_of(ring)}, choice=("file", "outer")
+        ),
+    },
+    default="box",
+)
+
+
+def domain(value: object, place: str) -> dict[str, Any]:
+    """Check a domain: a box by its corners, a polygon by a file or its rings."""
+    if isinstance(value, Mapping) and "kind" not in value:
+        if "polygon" in value:
+            rest = {key: item for key, item in value.items() if key != "polygon"}
+            value = {"kind": "polygon", "file": text(value["polygon"], f"{place}.polygon"), **rest}
+        elif "outer" in value:
+            value = {"kind": "polygon", **value}
+    checked = _DOMAINS(value, place)
+    if "file" in checked and "holes" in checked:
+        raise InputError(f"{place} has both a file and holes, expected holes beside outer only")
+    return checked
+
 
 RUN = Table(
     {},
@@ -283,4 +337,4 @@ RUN = Table(
     },
 )
 
-CASE = Table({"domain": DOMAIN, "size": size}, {"name": text, "title": text, "run": RUN})
+CASE = Table({"domain": domain, "size": size}, {"name": text, "title": text, "run": RUN})
