@@ -11,8 +11,10 @@
         global const int *edge_starts, global const REAL4 *edge_ends
 #define DOMAIN box_lower, box_upper, edge_frame, edge_shape, edge_starts, edge_ends
 
-/* Generators that are pressed against the boundary come as near to it as rounding, and may then lie behind it by so much. */
-#define BEHIND (1024 * REAL_EPS)
+/* Generators come no nearer to the boundary than this, so that no rounding carries them out. Those that the caller has put on
+   it, or on it but for rounding, may leave it inwards. */
+#define OFF_EDGE (2 * REAL_EPS)
+#define BEHIND (16 * REAL_EPS)
 
 /* Where the way from x to y, t = 0 to 1, leaves the domain first, and over which edge (a place in edge_ends); 2 if it does
    not. Corners are seen by both their edges with the same numbers, so that no way slips through between them. */
@@ -30,10 +32,11 @@ inline REAL leaves_over(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
         const int begin = edge_starts[row * edge_shape.s0 + left], end = edge_starts[row * edge_shape.s0 + right + 1];
         for (int k = begin; k < end; ++k) {
             const REAL2 a = edge_ends[k].s01 - from, b = edge_ends[k].s23 - from, e = b - a;
-            const REAL here = a.s0 * e.s1 - a.s1 * e.s0; /* e x (x - a): positive inside */
+            const REAL length = sqrt(dot(e, e));
+            const REAL here = a.s0 * e.s1 - a.s1 * e.s0 - OFF_EDGE * length; /* e x (x - a): positive inside */
             const REAL there = here + e.s0 * way.s1 - e.s1 * way.s0;
             const REAL side_a = way.s0 * a.s1 - way.s1 * a.s0, side_b = way.s0 * b.s1 - way.s1 * b.s0;
-            if (there <= 0 && there < here && here * fabs(here) > -BEHIND * BEHIND * dot(e, e) &&
+            if (there <= 0 && there < here && here > -BEHIND * length &&
                 (side_a < 0 ? side_b >= 0 : side_b <= 0)) {
                 const REAL t = fmax(here, 0) / (fmax(here, 0) - there);
                 if (t < first) {
