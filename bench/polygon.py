@@ -50,21 +50,23 @@ MESHES = (
 )  # fmt: skip
 
 
-def coast(k: int, seed: int, centre: tuple[float, float], radii: tuple[float, float]) -> np.ndarray:
+def coast(
+    k: int, seed: int, centre: tuple[float, float], radii: tuple[float, float], rough: float
+) -> np.ndarray:
     """Return a closed curve of `k` corners, a rough ellipse: a random Fourier series of falling amplitude."""
     rng = np.random.Generator(np.random.PCG64(seed))
     t = 2 * np.pi * np.arange(k) / k
     waves = np.arange(2, min(400, k // 4))
     phases = rng.uniform(0, 2 * np.pi, len(waves))
     bulge = np.cos(np.outer(t, waves) + phases) @ waves**-1.4
-    r = np.exp(0.08 * bulge)[:, None]
+    r = np.exp(rough * bulge)[:, None]
     return np.array(centre) + np.array(radii) * r * np.column_stack([np.cos(t), np.sin(t)])
 
 
-def lake(edges: int) -> clvoro.Polygon:
+def lake(edges: int, rough: float = 0.08) -> clvoro.Polygon:
     """Return a lake with an island, within `BOX` and around the circles of F2 and F3."""
-    outer = coast(7 * edges // 10, 1, (1.2, 0.75), (1.0, 0.6))
-    island = coast(edges - len(outer), 2, (1.5, 0.75), (0.12, 0.12))
+    outer = coast(7 * edges // 10, 1, (1.2, 0.75), (1.0, 0.6), rough)
+    island = coast(edges - len(outer), 2, (1.5, 0.75), (0.12, 0.12), rough)
     return clvoro.Polygon(outer, [island])
 
 
