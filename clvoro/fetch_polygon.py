@@ -46,6 +46,13 @@ class _FetchedPolygon(_Fetched):
         self.segment_from, self.segment_to = begins[:n_segments], ends[:n_segments]
         self.face_segments = made.face_segments.get()[: self.m]
 
+    def points(self) -> np.ndarray:
+        positions = super().points()
+        # A rounding may not carry a generator on the boundary out of the domain.
+        near = self.ranks[self.touched]
+        positions[near] = self.domain.nearest(positions[near])
+        return positions
+
     @cached_property
     def shared(self) -> Vertices:
         """Corners of the convex cells."""
