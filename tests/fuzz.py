@@ -1,7 +1,7 @@
 """Throw everything at clvoro: `python -m tests.fuzz --minutes 10`.
 
 Each input is made from one seed: generators (clusters down to one ulp, lattices, circles, lines, walls, corners, one to
-three points, scales 1e-300 to 1e300), size fields, options, and files with bits changed. It must end in a mesh that
+three points, scales 1e-300 to 1e300), size fields, options, in the plane and in space, and files with bits changed. It must end in a mesh that
 passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError that says what is wrong). Whatever else
 happens is printed with its seed and saved; `python -m tests.fuzz --repeat SEED` does it again.
 """
@@ -368,11 +368,11 @@ def try_file(rng: np.random.Generator) -> str:
 
 
 WORK = {
-    "diagram": (try_diagram, 0.62),
-    "run": (try_run, 0.18),
-    "file": (try_file, 0.2),
-    "solid": (try_solid, 0.0),
-    "solid-run": (try_solid_run, 0.0),
+    "diagram": (try_diagram, 0.5),
+    "run": (try_run, 0.16),
+    "file": (try_file, 0.16),
+    "solid": (try_solid, 0.13),
+    "solid-run": (try_solid_run, 0.05),
 }
 
 
