@@ -17,9 +17,10 @@ import numpy as np
 from .cases import Case
 from .errors import Aborted, ClvoroError, InputError
 from .io import check_writable, save, write_history
+from .polygon import Polygon
 from .profile import Profile
 from .results import Result
-from .summary import measures_line, summary
+from .summary import boundary_line, measures_line, summary
 
 _REPEATED = (
     "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
@@ -265,6 +266,8 @@ class Job:
         for name, result in results.items():
             if result.diagram.domain.dim == 3:
                 print(f"{name}: {measures_line(result)}")
+            if isinstance(result.diagram.domain, Polygon):
+                print(f"{name}: {boundary_line(result)}")
         first = "report.html" if self.report else "mesh.vtu"
         print(f"written: {self.out / first} and what lies beside it")
         for name, profile in profiles.items():

@@ -431,3 +431,82 @@ def test_what_openfoam_cannot_hold_is_refused(result, pond, tmp_path) -> None:
     with pytest.raises(InputError, match="they are for OpenFOAM"):
         pond.save(tmp_path / "mesh.vtu", patches={"a": [1]})
     assert not list(tmp_path.iterdir())
+
+
+# Pictures and reports.
+
+
+def pixel(figure, place) -> list:
+    """Colour (red, green, blue; 0 to 255) of a figure's first axes at a place of its plane."""
+    figure.canvas.draw()
+    image = np.asarray(figure.canvas.buffer_rgba())
+    x, y = figure.axes[0].transData.transform(place)
+    return image[image.shape[0] - 1 - int(y), int(x), :3].tolist()
+
+
+OUTSIDE = [(0.85, 0.8), (3.5, 2.0), (3.017, 0.417)]  # the triangle, beyond the outline, the speck
+INSIDE = [(0.2, 2.8), (2.0, 0.3), (2.0, 1.7)]
+
+
+@pytest.mark.parametrize("colour", ["error", "quality", "size", "sides", "skewness"])
+def test_cells_fill_the_domain_and_nothing_else(result, colour: str) -> None:
+    pytest.importorskip("matplotlib")
+    figure = result.plot(colour, edges=False)
+    figure.set_dpi(200)
+    assert all(pixel(figure, place) == [255, 255, 255] for place in OUTSIDE)
+    if colour not in ("error", "sides"):  # whose middle is white, or nearly
+        assert all(pixel(figure, place) != [255, 255, 255] for place in INSIDE)
+    lines = [patch for patch in figure.axes[0].patches if len(patch.get_path().vertices) == 20]
+    assert len(lines) == 1  # all four rings, closed
+
+
+def test_size_is_asked_for_inside_only(result) -> None:
+    pytest.importorskip("matplotlib")
+    from clvoro.report import plot_size
+
+    domain = result.diagram.domain
+
+    def asked(x: np.ndarray) -> np.ndarray:
+        assert domain.contains(x).all()
+        return size(x)
+
+    figure = plot_size(asked, domain)
+    figure.set_dpi(200)
+    assert all(pixel(figure, place) == [255, 255, 255] for place in OUTSIDE)
+    assert all(max(pixel(figure, place)) < 250 for place in INSIDE)
+    # Up to the boundary: a hundredth beside it, where a raster would end in steps.
+    beside = domain.vertices + (domain.vertices[domain.next_vertex] - domain.vertices) / 2
+    inward = beside - 0.02 * wall_planes(domain, np.arange(len(beside)))[0]
+    kept = inward[:9][domain.contains(inward[:9])]
+    assert len(kept) == 9
+    assert all(pixel(figure, place) != [255, 255, 255] for place in kept)
+
+
+def test_boundary_cells_are_reported_apart(result, tmp_path) -> None:
+    pytest.importorskip("matplotlib")
+    from clvoro.report import write_report
+    from clvoro.summary import boundary_line, summary
+
+    d = result.diagram
+    touching = [
+        (d.neighbours[a:b] < 0).any()
+        for a, b in zip(d.neighbour_starts[:-1], d.neighbour_starts[1:], strict=True)
+    ]
+    s = summary(result)
+    assert (s["boundary_cells"], s["inner_cells"]) == (sum(touching), 60 - sum(touching))
+    for name, which in (("boundary", np.array(touching)), ("inner", ~np.array(touching))):
+        assert s[f"{name}_mean_error"] == pytest.approx(np.abs(result.error[which]).mean())
+        assert s[f"{name}_mean_quality"] == pytest.approx(result.quality[which].mean())
+        assert s[f"{name}_min_quality"] == result.quality[which].min()
+    assert f"{sum(touching)} boundary cells: mean |e|" in boundary_line(result)
+    page = write_report(result, tmp_path, size=size)[0].read_text()
+    assert "Cells on the boundary" in page
+    assert f"<td>{sum(touching)}</td>" in page
+
+
+def test_a_piece_with_one_cell_has_no_inner_cells(ctx) -> None:
+    from clvoro.summary import boundary_line, summary
+
+    alone = mesh(ctx, Polygon(SQUARE), 1)
+    assert summary(alone)["inner_mean_error"] is None
+    assert "inner" not in boundary_line(alone)

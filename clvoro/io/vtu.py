@@ -17,6 +17,7 @@ import numpy as np
 
 from ..domain import Domain
 from ..faces import face_corners, face_owners
+from ..outlines import count_sides
 from ..polygon import Polygon
 from ..results import Diagram, Result
 from .atomic import atomic_file
@@ -132,13 +133,14 @@ def _polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
 def cell_data(result: Result) -> dict[str, np.ndarray]:
     """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
     diagram = result.diagram
-    count = "sides" if diagram.domain.dim == 2 else "faces_of_cell"
+    flat = diagram.domain.dim == 2
+    counts = count_sides(diagram) if flat else np.diff(diagram.neighbour_starts)
     return {
         "size": result.size,
         "error": result.error,
         "quality": result.quality,
         "volume": diagram.volumes,
-        count: np.diff(diagram.neighbour_starts).astype(np.int32),
+        "sides" if flat else "faces_of_cell": counts.astype(np.int32),
         "label": np.arange(len(diagram), dtype=np.int32),
         "generator": in_space(result.points),
     }

@@ -12,10 +12,15 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import ArrayLike
 
+from ..domain import Domain
 from ..errors import InputError
+from ..faces import face_owners
+from ..outlines import face_ends
+from ..polygon import Polygon
 from ..results import Diagram, Result
+from .boundary import clip_to_domain, frame_part
 from .colours import COLOURINGS, Colouring, cell_norm, colouring
-from .style import WIDTH, frame_domain, grid_height, interactive_figure, styled
+from .style import WIDTH, grid_height, interactive_figure, styled
 
 
 def require_plane(diagram: Diagram) -> None:
@@ -78,7 +83,7 @@ def plot_cells(
         values = scheme.values(result)
         low, high = scheme.limits(values) if limits is None else limits
         cells = draw_cells(ax, diagram, shown, values, scheme, (low, high))
-        frame_domain(ax, lower, upper)
+        frame_part(ax, diagram.domain, lower, upper)
         if edges:
             draw_edges(ax, diagram, shown, np.subtract(upper, lower))
         if title is not None:
@@ -115,8 +120,7 @@ def draw_cells(
 
 def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, extent: np.ndarray) -> None:
     """Add each face once, as a line whose width follows the size of the cells beside it."""
-    starts, neighbours = diagram.cell_vertex_starts, diagram.neighbours
-    owner = np.repeat(np.arange(len(diagram)), np.diff(starts))
+    neighbours, owner = diagram.neighbours, face_owners(diagram)
     inside = np.zeros(len(diagram), bool)
     inside[shown] = True
     # A wall has no thickness of its own: there the cell counts twice.
@@ -124,11 +128,8 @@ def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, extent: np.ndarray)
     lengths = np.sqrt(diagram.volumes)
     thin, colours = edge_style(ax, np.minimum(lengths[owner], lengths[beyond]), extent)
     once = np.flatnonzero((neighbours < owner) & inside[owner] & (thin > 0.06))
-    following = np.arange(len(owner)) + 1
-    following[starts[1:] - 1] = starts[:-1]
-    corners = diagram.vertices[diagram.cell_vertices]
     lines = LineCollection(
-        list(np.stack([corners[once], corners[following[once]]], axis=1)),
+        list(diagram.vertices[face_ends(diagram)[once]]),
         colors=colours[once],
         linewidths=thin[once],
         capstyle="round",
@@ -209,7 +210,8 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     ----------
     size : callable h(points (n, 2)) -> (n,)
         Any field of `clvoro.sizing`, or a function of one's own.
-    domain : Box
+    domain : Box or Polygon
+        The field is asked for sizes inside only.
     ax : matplotlib axes, optional
         Drawn into; a new figure by default.
 
@@ -228,11 +230,16 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
         )
     scheme = COLOURINGS["size"]
     extent = domain.extent
-    counts = np.maximum((extent * np.sqrt(60_000 / domain.measure)).astype(int), 2)
+    counts = np.maximum(
+        (extent * np.sqrt(60_000 / max(domain.measure, extent.prod() / 8))).astype(int), 2
+    )
     x, y = (np.linspace(domain.lower[a], domain.upper[a], counts[a]) for a in (0, 1))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    values = np.asarray(size(points), float).reshape(len(y), len(x))
-    low, high = scheme.limits(values)
+    shown, places = _inside(domain, points, 2 * float(np.hypot(*(extent / counts))))
+    values = np.full(len(points), np.nan)
+    values[shown] = np.asarray(size(places), float)
+    low, high = scheme.limits(values[shown])
+    values = np.ma.masked_invalid(values).reshape(len(y), len(x))
     with styled():
         if ax is None:
             height = grid_height(domain.lower, domain.upper, 1, 1, 0.55, 0)
@@ -249,9 +256,24 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
         if levels:
             lines = ax.contour(x, y, values, levels=levels, colors="white", linewidths=0.6)
             ax.clabel(lines, fmt="%g", fontsize=7)
-        frame_domain(ax, domain.lower, domain.upper)
+            clip_to_domain(ax, domain, lines)
+        frame_part(ax, domain, domain.lower, domain.upper)
+        clip_to_domain(ax, domain, image)
         add_colour_bar(image, ax, scheme, values, (low, high))
     return ax.figure
+
+
+def _inside(domain: Domain, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Tell which of `points` are in the domain or nearer to it than `reach`, (n,) bool, and where inside to ask them.
+
+    What is drawn up to the boundary is interpolated from some that lie beyond.
+    """
+    shown = domain.contains(points)
+    if isinstance(domain, Polygon):
+        rest = np.flatnonzero(~shown)
+        shown[rest] = domain.boundary_distance(points[rest]) <= reach
+        return shown, domain.nearest(points[shown])
+    return shown, points[shown]
 
 
 def _round_numbers(low: float, high: float) -> list[float]:

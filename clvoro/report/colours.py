@@ -17,6 +17,7 @@ from matplotlib.colors import (
 )
 
 from ..errors import InputError
+from ..outlines import count_sides
 from ..results import Result
 from .style import nice
 
@@ -102,7 +103,7 @@ COLOURINGS = {
     ),
     "sides": Colouring(
         "number of sides",
-        lambda r: np.clip(np.diff(r.diagram.neighbour_starts), 4, 8),
+        lambda r: np.clip(count_sides(r.diagram), 4, 8),
         ListedColormap(_SIDES),
         lambda v: (3.5, 8.5),
         classes=tuple(f"{label} sides" for label in _SIDES_LABELS),

@@ -12,10 +12,10 @@ from scipy.spatial import KDTree
 
 from ..errors import InputError
 from ..results import Displacements, Result
+from .boundary import frame_part
 from .style import (
     METHOD_COLOURS,
     WIDTH,
-    frame_domain,
     interactive_figure,
     nice,
     styled,
@@ -133,7 +133,8 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
                 step = "coarse step" if coarse and when == "first" else "step"
                 ax.set_title(f"{name}, {when} {step} ({note})")
                 _draw_arrows(ax, field.points, arrows * factor, colour)
-                frame_domain(ax, lower, upper, ticks=len(result.points) > MOST_ARROWS)
+                domain = result.diagram.domain
+                frame_part(ax, domain, lower, upper, ticks=len(result.points) > MOST_ARROWS)
                 ax.locator_params(nbins=4)
     return figure
 

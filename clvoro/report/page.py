@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ..io.atomic import atomic_file
+from ..polygon import Polygon
 from ..results import Result
-from ..summary import summary
+from ..summary import beside_boundary, summary
 from .pictures import pictures_of, render
 
 _STYLE = """
@@ -128,6 +129,8 @@ def _page(
         f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
         f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else
         f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
+        f"<h2>Cells on the boundary</h2>{_apart(results, name)}"
+        if isinstance(main.diagram.domain, Polygon) else "",
         f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
         "<h2>Pictures</h2>",
     ]  # fmt: skip
@@ -174,6 +177,29 @@ def _measures(name: str, result: Result) -> str:
         "non-orthogonality; the angle is what remains between a face's normal and the line from centroid to "
         "centroid. Skewness: from a face's centroid to that line of the generators, over their distance.</p>"
     )
+
+
+def _apart(results: Mapping[str, Result], main: str) -> str:
+    """Return the table of cells on the boundary, whose shape it decides, and of the others."""
+    rows = []
+    for method, result in results.items():
+        for part, s in beside_boundary(result).items():
+            numbers = (
+                f"{s['mean_error']:.4f}",
+                f"{s['mean_quality']:.4f}",
+                f"{s['min_quality']:.3f}",
+            )
+            texts = (
+                method,
+                f"{part} cells",
+                str(s["cells"]),
+                *(numbers if s["cells"] else ("–",) * 3),
+            )
+            columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
+            rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
+    names = ("method", "", "number", "mean |e|", "mean Q", "min Q")
+    head = "".join(f"<th>{_safe(n)}</th>" for n in names)
+    return f"<table class=measures><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
 
 
 def _table(results: Mapping[str, Result], main: str) -> str:
