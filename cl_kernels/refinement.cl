@@ -91,10 +91,14 @@ kernel void place_children(const int size, global const int *starts, global cons
                 child[a] = PLACED(a, points[DIM * i + a] +
                                          DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
 #ifdef POLYGON
-            /* Around a corner of the boundary the middle of the common face is in sight of both. */
+            /* Around a corner of the boundary the middle of the common face is in sight of both; where cells meet on
+               both sides of an obstacle, each face but the first brings its own middle, too. */
+            bool met = false;
+            for (int m = starts[i]; m < k && !met; ++m)
+                met = neighbours[m] == j && has_middle(i, j, face_measures[m], volumes[i]);
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {child[0], child[1]};
-            if (leaves_at(x, y, DOMAIN) <= 1) {
+            if (met || leaves_at(x, y, DOMAIN) <= 1) {
                 y[0] = x[0] + face_centroids[2 * k];
                 y[1] = x[1] + face_centroids[2 * k + 1];
                 keep_inside(x, y, DOMAIN);
