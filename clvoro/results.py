@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from .adapter import Adapter
     from .check import Report
-    from .domain import Box
+    from .domain import Domain
     from .quality import Measures
 
 HISTORY_DTYPE = np.dtype(
@@ -46,9 +46,15 @@ HISTORY_DTYPE = np.dtype(
 class Diagram:
     """A Voronoi diagram clipped to its domain. Every attribute is a NumPy array, fetched when first asked for.
 
+    In a polygonal domain a cell is the part of its generator's Voronoi region (all that is nearer to it than to the
+    others, as the crow flies) that lies in the domain and is connected to the generator there. Parts of the region that
+    the boundary cuts off go to the cell beside them with which they share the longest face, and stay with their
+    generator if there is none. A cell need not be convex, may go around holes and then has several loops of faces, and
+    may have several faces in common with one neighbour, which its row then names as often.
+
     Attributes
     ----------
-    domain : Box
+    domain : Box or Polygon
     points : (n, d) float
         Generators.
     volumes : (n,) float
@@ -57,8 +63,10 @@ class Diagram:
     neighbour_starts : (n + 1,) int32
         Row i of the graph is ``neighbours[neighbour_starts[i]:neighbour_starts[i + 1]]``.
     neighbours : (m,) int32
-        A generator's index, or ``-1 - b`` for the boundary piece b of the domain. In 2D in
-        counter-clockwise order around the cell.
+        A generator's index, or ``-1 - b`` for the wall b of the domain: in a box wall 2 a is the lower one of axis a,
+        wall 2 a + 1 the upper one; in a polygon wall e is the edge e, and ``domain.edge_numbers[e]`` the number that
+        it was given. In 2D in counter-clockwise order around the cell, in a polygon loop by loop, clockwise around
+        holes.
     shifts : (m, d) int8
         In a periodic box: face k of cell i lies towards the image of its neighbour j at
         ``points[j] + shifts[k] * domain.extent``. Zeros in other domains, and towards walls.
@@ -71,17 +79,20 @@ class Diagram:
         of a cell: cells on both sides of a seam have vertices of their own.
     cell_vertex_starts : (n + 1,) int32, 2D only
     cell_vertices : (m,) int32, 2D only
-        Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1.
-    face_vertex_starts : (m + 1,) int32, 3D only
-    face_vertices : (k,) int32, 3D only
-        Corners of face f of the graph, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``,
-        counter-clockwise as seen from outside of the cell to whose row the face belongs; the other cell has
-        them in the opposite order. Empty where the face is as narrow as its vertices round.
+        Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1. In a
+        polygonal domain a cell of several loops has them joined to one by bridges there and back: it has more corners
+        than faces, and `face_vertices` tells which are whose.
+    face_vertex_starts : (m + 1,) int32, in 3D and in polygonal domains
+    face_vertices : (k,) int32, in 3D and in polygonal domains
+        Corners of face f of the graph, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``.
+        In 3D counter-clockwise as seen from outside of the cell to whose row the face belongs; the other cell has
+        them in the opposite order. Empty where the face is as narrow as its vertices round. In a polygonal domain the
+        two ends, the cell on the left on the way from the first to the second.
 
     Raises
     ------
     AttributeError
-        For the arrays that the diagram's dimension does not have.
+        For the arrays that diagrams of such a domain do not have.
     """
 
     _NAMES = (
@@ -90,7 +101,7 @@ class Diagram:
         "face_vertices",
     )  # fmt: skip
 
-    def __init__(self, domain: Box, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]):
+    def __init__(self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]):
         self.domain = domain
         self._arrays = dict(arrays)
 
@@ -205,7 +216,8 @@ class Result:
     error : (n,) float
         Signed metric error, the paper's (3.1).
     quality : (n,) float
-        Cell quality, the paper's (4.1).
+        Cell quality, the paper's (4.1). In a polygonal domain faces on the boundary count as one side as long as they
+        turn by no more than 30 degrees in sum, and holes within a cell as none.
     history : structured array of `HISTORY_DTYPE`
     converged : bool
     stop_reason : str
