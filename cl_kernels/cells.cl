@@ -120,18 +120,19 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
    square of bins that it has seen covers that circle. Its radius is left in reach[p], which begins as a guess of it.
+   Only the first `rows_wanted` generators get cells.
 
    rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt
 
    If `wrapped`, rows that have faces are there already (`hulls.cl`). */
-kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global float *reach,
+kernel void clip_cells(const int size, const int rows_wanted, global const REAL *binned, global const int *items, global float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int wrapped,
                        global int *rows, global int *row_counts, global int *places, global int *flags)
 {
     WORK_ITEM(p);
     const int i = items[p];
-    if (wrapped && row_counts[i] > 0)
+    if (i >= rows_wanted || (wrapped && row_counts[i] > 0))
         return;
     const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -175,7 +176,8 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
 /* Per generator i: bit k of keep[KEEP_WORDS * its slot ...] marks a neighbour that also lists i. Rounding may let one of
    two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
    the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two cells,
-   generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is flagged. */
+   generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is flagged. What
+   borders on a generator without a row is not looked at. */
 kernel void match_faces(const int size, global const int *places, global const int *slots, global const int *slot_counts,
                         global const int *old_starts, global const int *old_neighbours, global const REAL *points,
                         const REAL4 box_lower, const REAL4 box_upper, const int repaired, const REAL share,
@@ -195,8 +197,9 @@ kernel void match_faces(const int size, global const int *places, global const i
     int count = 0;
     for (int k = 0; k < n; ++k) {
         const int j = row[k];
-        const bool doubtful = some && j >= 0 && (slot_counts[place] < 0 || is_doubtful_row(&rows, j));
-        bool mutual = j < 0 || !(doubtful || repaired);
+        const bool known = j >= 0 && j < size;
+        const bool doubtful = some && known && (slot_counts[place] < 0 || is_doubtful_row(&rows, j));
+        bool mutual = !known || !(doubtful || repaired);
         if (!mutual) {
             int m;
             global const int *other = face_row(&rows, j, &m);
@@ -321,7 +324,7 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     const bool doubtful = slot_counts[places[i]] < 0;
     bool any = doubtful;
     for (int k = 0; k < n && !any; ++k)
-        any = row[k] >= 0 && places[row[k]] >= 0 && slot_counts[places[row[k]]] < 0;
+        any = row[k] >= 0 && row[k] < size && places[row[k]] >= 0 && slot_counts[places[row[k]]] < 0;
     if (!any)
         return;
     REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
@@ -334,6 +337,8 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             right = right && !(after < 0 && (-1 - j) / 2 == (-1 - after) / 2);
             continue;
         }
+        if (j >= size)
+            continue;
         global const int *other = neighbours + starts[j];
         const int m = starts[j + 1] - starts[j];
         const int q = place_in_row(other, m, i);

@@ -364,8 +364,9 @@ inline long8 choose_lanes(long8 todo, const double *xs, const double *ys, double
 }
 
 /* Per eight places in bin order: the rows of the generators there (see `clip_cells`), or row_counts[i] = 0 where a cell is
-   left to be clipped. `first_reach` is how far the first lists go, in edges of the generator's leaf. */
-kernel void wrap_cells(const int size, const int n, global const double *binned, global const int *items,
+   left to be clipped. `first_reach` is how far the first lists go, in edges of the generator's leaf. Only the first
+   `rows_wanted` generators get rows. */
+kernel void wrap_cells(const int size, const int n, const int rows_wanted, global const double *binned, global const int *items,
                        global float *reach, global const int2 *bins, global const FRAME *grid_frames,
                        global const int4 *grid_shapes, const double4 box_lower, const double4 box_upper,
                        const double first_reach, global int *rows, global int *row_counts, global int *places)
@@ -373,8 +374,10 @@ kernel void wrap_cells(const int size, const int n, global const double *binned,
     WORK_ITEM(group);
     const int own = group * LANES;
     double xs[LANES], ys[LANES], rs[LANES];
+    long wanted[LANES];
     for (int lane = 0; lane < LANES; ++lane) {
         const int p = min(own + lane, n - 1);
+        wanted[lane] = items[p] < rows_wanted ? -1 : 0;
         xs[lane] = binned[2 * p];
         ys[lane] = binned[2 * p + 1];
         rs[lane] = first_reach * reach[p];
@@ -387,7 +390,9 @@ kernel void wrap_cells(const int size, const int n, global const double *binned,
     list.inverted = 0;
     /* Of the generators nearer than `done` all are in the list that can be neighbours; now those nearer than `r` are added. */
     double8 done2 = 0, r = vload8(0, rs), need = 0;
-    long8 todo = -1, doubt = 0, walled = 0;
+    long8 todo = vload8(0, wanted), doubt = 0, walled = 0;
+    if (!any(todo))
+        return;
     for (int round = 0; any(todo) && round < MAX_ROUNDS; ++round) {
         double2 lower, upper;
         long8 chosen = choose_lanes(todo, xs, ys, r, SPREAD, &lower, &upper);
@@ -429,6 +434,8 @@ kernel void wrap_cells(const int size, const int n, global const double *binned,
     vstore8(hull.sizes, 0, sizes);
     for (int lane = 0; lane < LANES && own + lane < n; ++lane) {
         const int i = items[own + lane];
+        if (!wanted[lane])
+            continue;
         const int count = failed[lane] ? 0 : sizes[lane];
         int labels[HULL_CAPACITY];
         /* The least label first: label and place in one number. */

@@ -249,7 +249,8 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
    cube of bins that it has seen covers that ball. Its radius is left in reach[p], which begins as a guess of it. With
-   `warm` the neighbours of an earlier, similar diagram are clipped first, and the search only has to confirm them.
+   `warm` the neighbours of an earlier, similar diagram are clipped first, and the search only has to confirm them. Only
+   the first `rows` generators get cells.
 
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
@@ -258,7 +259,7 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
                                  order, the next kernels bring them into it
    labels, measures, centroids   of the faces; report[2] counts them
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
-kernel void clip_cells(const int size, global const REAL *binned, global const int *items, global float *reach,
+kernel void clip_cells(const int size, const int rows, global const REAL *binned, global const int *items, global float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
                        global const int *old_starts, global const int *old_neighbours, const int again,
@@ -268,7 +269,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
 {
     WORK_ITEM(p);
     const int i = items[p];
-    if (again && row_counts[i] != UNFINISHED)
+    if (i >= rows || (again && row_counts[i] != UNFINISHED))
         return;
     const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
@@ -395,7 +396,7 @@ kernel void clip_cells(const int size, global const REAL *binned, global const i
    of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
    If it is wider than rounding explains, generators are too close to tell apart (from far away, two an ulp apart have
    the same bisector), and that is flagged. So it is where both see a face, but of areas that differ by more than a share
-   of the cell. */
+   of the cell. What borders on a generator without a row is not looked at. */
 kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *volumes,
                         global const REAL *points, const REAL share, const int some_doubtful, global uchar *kept,
@@ -410,7 +411,7 @@ kernel void match_faces(const int size, global const int *row_places, global con
     REAL apart = 0; /* the volume of the cones to what faces differ by */
     for (int k = row_places[i]; k < row_places[i] + n; ++k) {
         const int j = labels[k];
-        bool mutual = j < 0;
+        bool mutual = j < 0 || j >= size;
         if (!mutual) {
             const int m = row_counts[j];
             global const int *row = labels + row_places[j];

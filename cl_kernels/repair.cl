@@ -7,7 +7,10 @@
    corner of C_i the cells that meet there name each other as neighbours, in the order of that corner, the C_i fit together
    without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbours from before, check
    that every cell is still convex and fits its neighbours (`check_rows`), clip those that do not by all the neighbours
-   of their neighbours (`clip_marked`), check these (`check_clipped`), and so on until all fit. */
+   of their neighbours (`clip_marked`), check these (`check_clipped`), and so on until all fit.
+
+   In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbours are nearest images. Cells without gap might cover
+   that more than once; their volumes tell. */
 
 /* A cell with more is clipped anew each time: it is rare, and would hold up its work-group. */
 #define CHECKED_FACES 16
@@ -133,7 +136,7 @@ inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n
         const int j = row[k];
         if (j < 0 || j == cell->generator)
             continue;
-        const REAL d[2] = {points[2 * j] - x[0], points[2 * j + 1] - x[1]};
+        const REAL d[2] = {BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1])};
         const REAL d2 = d[0] * d[0] + d[1] * d[1];
         if (d2 >= 4 * cell->reach2)
             continue;
@@ -167,6 +170,12 @@ kernel void clip_marked(const int size, global const int *listed, const int base
             global const int *other = face_row(&rows, row[k], &m);
             flag = clip_by_row(&cell, x, other, m, points);
         }
+#ifdef FOLD_0
+    /* There is no wall across a period: whoever is left with one has lost his neighbours. */
+    for (int k = 0; k < cell.n; ++k)
+        if (cell.faces[k] < 0 && FOLD((-1 - cell.faces[k]) / 2) > 0)
+            flag = FLAG_FULL;
+#endif
     store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags);
 }
 

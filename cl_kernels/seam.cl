@@ -161,49 +161,33 @@ kernel void close_rows(const int size, global const int *starts, global const uc
     }
 }
 
-/* Per generator or image e: the row of its owner in a folded graph, as a row of the extended one, with -1 for whom it does
-   not hold: where to begin with the cells. What is no neighbour now does no harm. */
-kernel void unfold_rows(const int size, const int n, global const int *old_starts, global const int *old_neighbours,
+/* Per generator i: its row in an earlier folded graph as one of the extended graph: images in the place of their owners,
+   where they are nearest now, -1 for whom there is no image. Where to begin with the cells: nobody is relied on. */
+kernel void unfold_rows(const int size, global const int *starts, global const int *neighbours,
                         global const REAL *points, const REAL4 margins, global const int *firsts,
-                        global const int *owners, global const int *starts, global int *neighbours)
+                        global int *unfolded)
 {
-    WORK_ITEM(e);
-    const int i = e < n ? e : owners[e - n];
-    int to = starts[e];
-    for (int k = old_starts[i]; k < old_starts[i + 1]; ++k) {
-        const int j = old_neighbours[k];
+    WORK_ITEM(i);
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
         int label = -1;
         if (j >= 0) {
-            int wanted = 0;
-            bool there = true;
             REAL x[DIM], y[DIM];
+            int wanted = 0;
             EACH_AXIS(a) {
-                /* The image of j that is nearest to i, carried along to e. */
                 const REAL period = PERIOD(a);
                 x[a] = points[DIM * j + a];
-                const REAL goal = points[DIM * e + a] +
-                                  DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
-                const int step = period > 0 ? convert_int_rte((goal - x[a]) / period) : 0;
-                there = there && step >= -1 && step <= 1;
+                const int step = period > 0 ? -convert_int_rte((x[a] - points[DIM * i + a]) / period) : 0;
                 wanted += (step + 1) * (a == 0 ? 1 : a == 1 ? 3 : 9);
             }
-            if (there && wanted == CENTRE) {
+            if (wanted == CENTRE) {
                 label = j;
-            } else if (there && make_image(x, wanted, margins, y)) {
-                label = n + firsts[j];
+            } else if (make_image(x, wanted, margins, y)) {
+                label = size + firsts[j];
                 for (int code = 0; code < wanted; ++code)
                     label += code != CENTRE && make_image(x, code, margins, y);
             }
         }
-        neighbours[to++] = label;
+        unfolded[k] = label;
     }
-}
-
-/* Per generator or image e: the length of its owner's row. */
-kernel void count_unfolded(const int size, const int n, global const int *old_starts, global const int *owners,
-                           global int *counts)
-{
-    WORK_ITEM(e);
-    const int i = e < n ? e : owners[e - n];
-    counts[e] = old_starts[i + 1] - old_starts[i];
 }

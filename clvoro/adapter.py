@@ -28,6 +28,7 @@ from .results import Diagram, Result
 from .sizing import Sizing, as_field
 from .start import count_cells, sample_density, sample_uniform
 from .tessellator import Tessellator
+from .torus import FewCellsError
 
 METHODS = ("adaptive", "exact", *PUBLISHED)
 STARTS = ("density", "uniform")
@@ -68,6 +69,7 @@ class Adapter:
         self._stages: dict[tuple[object, ...], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
+        self._tried = 0
         self._watch: Callable[[np.void], None] | None = None
 
     @contextmanager
@@ -288,12 +290,31 @@ class Adapter:
         size: object,
         points: np.ndarray | None,
         options: dict[str, Any],
+        *rest: Any,
+    ) -> Result:
+        """Run with as many coarse levels as a periodic box allows for: one more would have too few cells around it."""
+        most = 99
+        while True:
+            try:
+                return self._try(domain, size, points, options, *rest, most)
+            except FewCellsError:
+                if options["levels"] != "auto" or self._tried == 0:
+                    raise
+                most = self._tried - 1
+
+    def _try(
+        self,
+        domain: Domain,
+        size: object,
+        points: np.ndarray | None,
+        options: dict[str, Any],
         callback: Callable[[np.void], object] | None,
         checkpoint: str | PathLike[str] | None,
         every: float,
         resume: str | PathLike[str] | None,
+        most: int,
     ) -> Result:
-        """Build mesh and plan, and carry the plan out; the options are checked."""
+        """Build mesh and plan, and carry the plan out, with at most `most` levels; the options are checked."""
         stages = self._stages_for(domain)
         engine, method, n_cells = stages.engine, options["method"], options["n_cells"]
         planned = method not in PUBLISHED
@@ -321,6 +342,9 @@ class Adapter:
         check_memory(engine, max(target, 0 if host is None else len(host)))
         factor = (asked / target) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
         levels = self._levels(options["levels"], engine, target, host) if planned else 0
+        if options["levels"] == "auto":
+            levels = min(levels, most, most if saved is None else saved.levels)
+        self._tried = levels
         if host is None and saved is None:
             n = max(1, round((target - len(rows)) / 2 ** (domain.dim * levels)))
             if options["start"] == "uniform":

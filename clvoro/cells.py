@@ -124,7 +124,7 @@ class Cells:
             self._wrap = engine.kernels("hulls", defines).wrap_cells
 
     @property
-    def defines(self) -> dict[str, int]:
+    def defines(self) -> dict[str, object]:
         """The capacities, as kernels that work on the rows must be built with."""
         return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity}
 
@@ -164,7 +164,13 @@ class Cells:
             self._n = n
 
     def tessellate(
-        self, box: Box, points: cla.Array, n: int, binned: BinnedPoints, exact: bool = True
+        self,
+        box: Box,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        exact: bool = True,
+        wanted: int | None = None,
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
 
@@ -173,6 +179,8 @@ class Cells:
         exact : bool
             Refuse generators so close together that rounding makes more than `EXACT_SHARE` of a cell uncertain. Without
             it only more than `ROUGH_SHARE`.
+        wanted : int, optional
+            Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
 
         Raises
         ------
@@ -184,6 +192,7 @@ class Cells:
             If a cell has more than `LARGEST_ROW` faces, or a little more.
         """
         engine, rows = self.engine, self.rows
+        total, n = n, n if wanted is None else wanted
         if self.row_capacity > ROW_CAPACITY and n * self.row_capacity > rows.slots.size:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
@@ -195,13 +204,14 @@ class Cells:
             search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
             if self._wrap is not None:
                 engine.run_each(
-                    self._wrap, -(-n // LANES), np.int32(n), binned.points, binned.items, *search,
-                    *corners, engine.real.type(FIRST_REACH), rows.slots, rows.counts, rows.places,
-                    group=WRAP_GROUP,
+                    self._wrap, -(-total // LANES), np.int32(total), np.int32(n), binned.points,
+                    binned.items, *search, *corners, engine.real.type(FIRST_REACH), rows.slots,
+                    rows.counts, rows.places, group=WRAP_GROUP,
                 )  # fmt: skip
             engine.run_each(
-                self._kernels.clip_cells, n, binned.points, binned.items, *search, points, *corners,
-                np.int32(self._wrap is not None), rows.slots, rows.counts, rows.places, rows.flags,
+                self._kernels.clip_cells, total, np.int32(n), binned.points, binned.items, *search,
+                points, *corners, np.int32(self._wrap is not None), rows.slots, rows.counts,
+                rows.places, rows.flags,
             )  # fmt: skip
             # Every row is new: there are none from before.
             flags, generator = self._match(box, points, n, rows.places, rows.places, exact)

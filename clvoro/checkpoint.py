@@ -57,10 +57,12 @@ def describe(
 
 
 def _identity(domain: Domain) -> list:
-    """Return what tells `domain` from others; of polygons the number of edges and a hash."""
+    """Return what tells `domain` from others: corners, number of walls if that is no plain box's, and what else."""
     corners = [list(domain.lower), list(domain.upper)]
     if isinstance(domain, Polygon):
         return [*corners, len(domain.vertices), domain.digest]
+    if any(domain.periodic):
+        return [*corners, 2 * domain.dim, list(domain.periodic)]
     return corners
 
 
@@ -131,7 +133,8 @@ class Checkpointer:
             "coarsening": float(mesh.coarsening).hex(),
             "elapsed": time.perf_counter() - loop.began,
             "methods": [_state_of(method) for method in _methods(loop.plan)],
-            "capacities": _capacities(mesh.stages),
+            "capacities": _capacities(mesh.stages), "levels": loop.levels,
+            "margin": _margin(mesh),
         }  # fmt: skip
         about = {"made_by": self.made_by, "plan": self.plan, "state": state}
         arrays["about"] = np.array(json.dumps(about))
@@ -164,8 +167,11 @@ class Saved:
                 raise ValueError("counts")
             self.coarsening = float.fromhex(state["coarsening"])
             self.elapsed = float(state["elapsed"])
+            self.levels, self.margin = int(state["levels"]), float(state["margin"])
             if not (0 < self.coarsening < np.inf and 0 <= self.elapsed < np.inf):
                 raise ValueError("coarsening")
+            if not (self.levels >= 0 and 0 <= self.margin <= 1):
+                raise ValueError("levels")
             lower, _, *more = self.made_by["domain"]
             walls = int(more[0]) if more else 2 * len(lower)
             self._check(len(lower), walls, np.dtype(self.made_by["dtype"]))
@@ -280,6 +286,8 @@ class Saved:
         else:
             mesh.tessellation = Tessellation(n=mesh.n, points=mesh.points, **t)
         mesh.next_label = state["next_label"]
+        if mesh.tessellator.torus is not None:
+            mesh.tessellator.torus.margin = self.margin
         mesh._evaluate_metric()
         levels = {
             k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")
@@ -322,6 +330,11 @@ class Saved:
         if all(array is not None for array in initial):
             loop.initial = Displacements(*initial)  # type: ignore[arg-type]
         loop.began = time.perf_counter() - self.elapsed
+
+
+def _margin(mesh: Mesh) -> float:
+    """Return within what images are taken in a periodic box: in 3D, sums of a cell depend on it in their last bits."""
+    return 0.0 if mesh.tessellator.torus is None else mesh.tessellator.torus.margin
 
 
 def _methods(plan: list[Action]) -> list[Any]:

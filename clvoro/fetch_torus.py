@@ -54,7 +54,17 @@ class _FetchedTorus(_Fetched):
     @cached_property
     def kept(self) -> np.ndarray | None:
         """Which of the folded faces are in the result; see `_Fetched.kept`."""
-        return np.diff(self.loop_starts)[self.places] > 0 if self.whole.narrow else None
+        if not self.whole.narrow:
+            return None
+        # Of both sides of a seam each has a loop of its own.
+        seen = np.diff(self.loop_starts)[self.places] > 0
+        i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbours.get()
+        inner, last = np.flatnonzero(j >= 0), 3**self.engine.dim - 1
+        i, j, code = i[inner].astype(np.int64), j[inner].astype(np.int64), self.codes[inner]
+        here = inner[np.lexsort((code, j, i))]
+        there = inner[np.lexsort((last - code, i, j))]
+        seen[here] &= seen[there].copy()
+        return seen
 
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:

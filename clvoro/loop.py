@@ -53,7 +53,7 @@ class Loop:
         tol: float | None,
         callback: Callable[[np.void], object] | None,
     ) -> None:
-        self.mesh, self.plan, self.level = mesh, plan, levels
+        self.mesh, self.plan, self.level, self.levels = mesh, plan, levels, levels
         self.n_start = mesh.n
         self.done = work_of(plan, levels, mesh.engine.dim)
         self.max_steps, self.tol, self.callback = max_steps, tol, callback

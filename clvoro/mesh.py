@@ -17,6 +17,7 @@ from .density import Density, Weighting
 from .domain import Domain
 from .errors import MemoryLimitError
 from .fetch import fetch_diagram
+from .folded import FoldedCells
 from .metric import Metric
 from .motion import Motion
 from .poisson import Poisson
@@ -50,6 +51,7 @@ class Stages:
     cells: Cells | Polyhedra
     repair: Repair
     seam: Seam
+    folded: FoldedCells
     metric: Metric
     density: Density
     poisson: Poisson
@@ -65,6 +67,7 @@ class Stages:
         "bins": Bins, "cells": Cells, "repair": Repair, "metric": Metric, "density": Density, "poisson": Poisson,
         "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
         "population": PopulationControl, "gather": Gather, "trim": Trim, "seam": Seam,
+        "folded": FoldedCells,
     }  # fmt: skip
 
     def __init__(self, engine: Engine) -> None:
@@ -363,7 +366,7 @@ class Mesh:
 
     def finish(self) -> Diagram:
         """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""
-        t, unfolded = self.t, self.tessellator.unfolded
+        t, unfolded = self.tessellator.final(self.t)
         self.stages.release()
         return fetch_diagram(
             self.engine, self.domain, t, self.labels, copy=False, unfolded=unfolded

@@ -94,6 +94,7 @@ class Polyhedra:
         binned: BinnedPoints,
         previous: Tessellation | None = None,
         exact: bool = True,
+        rows: int | None = None,
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
 
@@ -104,6 +105,8 @@ class Polyhedra:
         exact : bool
             Refuse generators so close together that cells differ by more than `EXACT_SHARE` of their volumes about
             their common faces. Without it only by more than `ROUGH_SHARE`.
+        rows : int, optional
+            Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
 
         Raises
         ------
@@ -115,11 +118,14 @@ class Polyhedra:
             If a cell has more than `MOST_FACES` faces.
         """
         engine, k = self.engine, self._kernels(FACE_CAPACITY)
-        self._reserve_cells(n)
-        self._reserve_faces(max(self._room, round(FACES_PER_CELL * n + 6 * n ** (2 / 3)) + 64))
+        rows = n if rows is None else rows
+        self._reserve_cells(rows)
+        self._reserve_faces(
+            max(self._room, round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64)
+        )
         lower, upper = box.device_corners(engine.real)
-        arrays = self._set(n, self._room)
-        warm = previous is not None and previous.n == n
+        arrays = self._set(rows, self._room)
+        warm = previous is not None and previous.n == rows
         old = (
             (previous.starts, previous.neighbours)
             if previous is not None and warm
@@ -130,7 +136,7 @@ class Polyhedra:
         self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
         while True:
             engine.run_each(
-                self._kernels(capacity).clip_cells, n, binned.points, binned.items, binned.reach,
+                self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items, binned.reach,
                 binned.bins, binned.grid_frames, binned.grid_shapes, points, lower, upper,
                 np.int32(warm), *old, np.int32(again), np.int32(self._room), share, self._row_places,
                 self._row_counts, self._labels, self._measures, self._centroids,
@@ -158,23 +164,23 @@ class Polyhedra:
                 self._report.set(np.array([flags & (DOUBT | NARROW), 2**31 - 1, m], np.int32))
             else:
                 break
-        arrays = self._set(n, m)
+        arrays = self._set(rows, m)
         engine.run_each(
-            k.match_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
+            k.match_faces, rows, self._row_places, self._row_counts, self._labels, self._measures,
             arrays["volumes"], points, share, np.int32(flags & DOUBT), self._kept, arrays["starts"], self._report,
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
         if flags & ~(DOUBT | NARROW):
             self._refuse(flags, generator)
-        self._scan.exclusive(arrays["starts"], arrays["starts"], n)
+        self._scan.exclusive(arrays["starts"], arrays["starts"], rows)
         engine.run_each(
-            k.place_faces, n, self._row_places, self._row_counts, self._labels, self._measures,
+            k.place_faces, rows, self._row_places, self._row_counts, self._labels, self._measures,
             self._centroids, self._kept, np.int32(flags & DOUBT), arrays["starts"],
             arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
         )  # fmt: skip
         # Only now: a call that was broken off leaves the previous diagram as it is.
         self._turn = 1 - self._turn
-        return Tessellation(n=n, points=points, **arrays, narrow=bool(flags & NARROW))
+        return Tessellation(n=rows, points=points, **arrays, narrow=bool(flags & NARROW))
 
     def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"

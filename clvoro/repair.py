@@ -27,7 +27,7 @@ class Repair:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._kernels: dict[tuple[int, ...], SimpleNamespace] = {}
+        self._kernels: dict[tuple[object, ...], SimpleNamespace] = {}
         self._n = -1
         self._last: Tessellation | None = None
 

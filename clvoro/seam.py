@@ -68,6 +68,21 @@ class Images:
 
 
 @dataclass(frozen=True)
+class Rows:
+    """Rows of neighbours of `n` generators on the device, to begin their cells with; -1 for none.
+
+    Attributes
+    ----------
+    starts : (n + 1,) int32
+    neighbours : (m,) int32
+    """
+
+    n: int
+    starts: cla.Array
+    neighbours: cla.Array
+
+
+@dataclass(frozen=True)
 class Folded:
     """The rows of a diagram of generators and images that belong to generators, images replaced by their owners.
 
@@ -119,24 +134,15 @@ class Seam:
         box = ExtendedBox(lower - margins[:d], upper + margins[:d])
         return Images(n, count, box, margins, extended, firsts, owners, codes)
 
-    def unfold(self, images: Images, previous: Tessellation) -> tuple[cla.Array, cla.Array]:
-        """Return starts and neighbours of an extended graph whose rows are those of `previous`, or parts of them.
-
-        Of the same generators at earlier positions; what is no neighbour is -1.
-        """
-        engine, k, n, count = self.engine, self._kernels, images.n, images.count
-        starts = self._room("unfolded starts", size=count + 1, dtype=np.int32)
-        engine.run_each(
-            k.count_unfolded, count, np.int32(n), previous.starts, images.owners, starts
-        )
-        self._scan.exclusive(starts, starts, count)
-        m = int(starts[count].get())
+    def unfold(self, images: Images, previous: Tessellation) -> Rows:
+        """Return rows of the extended graph for the generators, from `previous`: the same ones at earlier positions."""
+        m = int(previous.starts[images.n].get())
         neighbours = self._room("unfolded", size=m, dtype=np.int32)
-        engine.run_each(
-            k.unfold_rows, count, np.int32(n), previous.starts, previous.neighbours, images.points,
-            images.margins, images.firsts, images.owners, starts, neighbours,
+        self.engine.run_each(
+            self._kernels.unfold_rows, images.n, previous.starts, previous.neighbours,
+            images.points, images.margins, images.firsts, neighbours,
         )  # fmt: skip
-        return starts, neighbours
+        return Rows(images.n, previous.starts, neighbours)
 
     def fold(
         self,

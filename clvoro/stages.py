@@ -10,6 +10,7 @@ from ._program import Engine
 from .bins import Bins
 from .cells import Cells, Tessellation
 from .domain import Domain
+from .folded import FoldedCells
 from .polyhedra import Polyhedra
 from .repair import Repair
 from .seam import Seam
@@ -24,6 +25,7 @@ class DiagramStages(Protocol):
     cells: Cells | Polyhedra
     repair: Repair
     seam: Seam
+    folded: FoldedCells
     trim: Trim
 
 

@@ -43,6 +43,13 @@ class Tessellator:
         """What the latest diagram was folded from, in a periodic box."""
         return None if self.torus is None else self.torus.latest
 
+    def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
+        """Return `t`, the latest diagram, and in a periodic box what it was folded from: made anew if it was not."""
+        latest = self.unfolded
+        if self.torus is not None and (latest is None or latest.folded.tessellation is not t):
+            t = self.torus.tessellate(t.points, t.n, whole=True)
+        return t, self.unfolded
+
     def tessellate(
         self,
         points: cla.Array,
@@ -65,7 +72,7 @@ class Tessellator:
             If generators are too close to each other to be told apart.
         """
         if self.torus is not None:
-            return self.torus.tessellate(points, n, previous, exact, nearest=not exact)
+            return self.torus.tessellate(points, n, previous, exact, not exact, whole=exact)
         if self._polygon is not None:
             return self._polygon.tessellate(points, n, previous, exact)
         return tessellate_box(self.stages, self.domain, points, n, previous, exact)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pyopencl.array as cla
 
+from ._primitives import Summaries
 from .cells import EXACT_SHARE, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import InputError
 from .polyhedra import Polyhedra
-from .seam import COLLAPSED, FAR, Folded, Images
+from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images
 
 if TYPE_CHECKING:
     from .stages import DiagramStages
@@ -51,12 +53,20 @@ class Torus:
     margin : float
         From the seams, within which images are taken; 0 before the first diagram.
     latest : Unfolded or None
-        Of the latest diagram, unless that was repaired.
+        Of the latest diagram, if that was a whole one.
     """
 
     def __init__(self, stages: DiagramStages, domain: Box) -> None:
         self.stages, self.domain = stages, domain
         self.periods = domain.periods(stages.engine.real)
+        lower, upper = (
+            corner[: domain.dim].astype(np.float64)
+            for corner in domain.device_corners(stages.engine.real)
+        )
+        self._edges = upper - lower
+        # Wide enough for every cell, from wherever its generator is.
+        self._wide = ExtendedBox(lower - self.periods, upper + self.periods)
+        self._sums = Summaries(stages.engine, ("volumes",))
         self.margin = 0.0
         self.latest: Unfolded | None = None
 
@@ -67,6 +77,7 @@ class Torus:
         previous: Tessellation | None = None,
         exact: bool = False,
         nearest: bool = True,
+        whole: bool = False,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points`; see `Tessellator.tessellate`.
 
@@ -75,6 +86,8 @@ class Torus:
         nearest : bool
             Refuse cells whose neighbours are not the nearest images of their generators: whoever reads positions of
             neighbours off the graph takes these.
+        whole : bool
+            Make the cells of images, too, which vertices take, and keep it all as `latest`.
 
         Raises
         ------
@@ -84,6 +97,11 @@ class Torus:
         """
         stages, longest = self.stages, float(self.periods.max())
         seam, cells = stages.seam, stages.cells
+        if previous is not None and not exact and not isinstance(cells, Polyhedra):
+            t = self._repaired(points, n, previous)
+            if t is not None:
+                self.latest = None
+                return t
         if self.margin == 0:
             volume = self.domain.measure / self.domain.frame[1] ** self.domain.dim
             self.margin = FIRST_MARGIN * (volume / n) ** (1 / self.domain.dim)
@@ -92,9 +110,10 @@ class Torus:
             binned = stages.bins.build(images.box, images.points, images.count)
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
-                t = cells.tessellate(*args, None, exact)
+                rows = None if previous is None else seam.unfold(images, previous)
+                t = cells.tessellate(*args, rows, exact, None if whole else n)  # type: ignore[arg-type]
             else:
-                t = cells.tessellate(*args, exact)
+                t = cells.tessellate(*args, exact, None if whole else n)
             share = EXACT_SHARE if exact else ROUGH_SHARE
             folded, needed, flags, generator = seam.fold(images, binned, t, points, share, nearest)
             if needed <= float(images.margins.max()) or self.margin >= longest:
@@ -112,5 +131,17 @@ class Torus:
                 f"or five cells across each period of {self.domain}; use a smaller size, more cells (n_cells) or "
                 "fewer levels"
             )
-        self.latest = Unfolded(images, t, folded)
+        self.latest = Unfolded(images, t, folded) if whole else None
         return folded.tessellation
+
+    def _repaired(self, points: cla.Array, n: int, previous: Tessellation) -> Tessellation | None:
+        """Return `previous` carried over to `points`, in 2D; None where too much has changed."""
+        stages = self.stages
+        stages.folded.reserve(n)
+        t = stages.repair.follow(stages.folded, self._wide, points, previous)
+        if t is None:
+            return None
+        # Cells without gap could still lie twice around the torus.
+        self._sums.collect("volumes", t.volumes, n)
+        total, measure = self._sums.read_one("volumes").sum, float(np.prod(self._edges))
+        return t if abs(total - measure) < measure / 2 else None

@@ -1,5 +1,25 @@
 #include "common/real.h"
 
+/* The difference along axis a from one generator to another. -DFOLD_0, -DFOLD_1: periods of a graph that is folded (see
+   seam.cl), in which a neighbour is the nearest image of its generator; 0 along an axis with walls. */
+#ifdef FOLD_0
+#define FOLD(a) ((a) == 0 ? R(FOLD_0) : R(FOLD_1))
+inline REAL fold(REAL d, REAL period)
+{
+    return period > 0 ? d - period * rint(d * (1 / period)) : d;
+}
+#define BETWEEN(a, from, to) fold((to) - (from), FOLD(a))
+#else
+#define FOLD(a) 0
+#define BETWEEN(a, from, to) ((to) - (from))
+#endif
+
+/* From a place x to generator j. */
+inline REAL2 direction_of(const REAL *x, int j, global const REAL *points)
+{
+    return (REAL2)(BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1]));
+}
+
 /* The point as far from u and from v as from 0; u2 and v2 are their squares. */
 inline REAL2 circumcentre(REAL2 u, REAL2 v, REAL u2, REAL v2)
 {
@@ -14,9 +34,8 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
                     const REAL *upper)
 {
     if (a >= 0 && b >= 0) {
-        const REAL2 xa = (REAL2)(points[2 * a], points[2 * a + 1]);
-        const REAL2 xb = (REAL2)(points[2 * b], points[2 * b + 1]);
-        const REAL2 u = xa - (REAL2)(x[0], x[1]), v = xb - (REAL2)(x[0], x[1]), w = xb - xa;
+        const REAL xa[2] = {points[2 * a], points[2 * a + 1]};
+        const REAL2 u = direction_of(x, a, points), v = direction_of(x, b, points), w = direction_of(xa, b, points);
         const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
         /* The circumcentre of the triangle, relative to x_i; where the other two are near each other its squares would
            cancel, and it is taken relative to one of those. */
@@ -36,10 +55,11 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     const int o = min(i, j), q = max(i, j);
     const REAL level = wall % 2 ? upper[axis] : lower[axis];
     const REAL d_across = points[2 * q + axis] - points[2 * o + axis];
-    const REAL d_along = points[2 * q + 1 - axis] - points[2 * o + 1 - axis];
+    const REAL d_along = BETWEEN(1 - axis, points[2 * o + 1 - axis], points[2 * q + 1 - axis]);
     const REAL across = level - points[2 * o + axis];
     const REAL d2 = d_across * d_across + d_along * d_along;
-    const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along + (points[2 * o + 1 - axis] - x[1 - axis]);
+    const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along +
+                       BETWEEN(1 - axis, x[1 - axis], points[2 * o + 1 - axis]);
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 }
 
@@ -49,7 +69,7 @@ inline REAL corner_gap2(REAL2 mine, int i, int j, int p, int q, global const REA
                         const REAL *upper)
 {
     const REAL x[2] = {points[2 * j], points[2 * j + 1]};
-    const REAL2 from = (REAL2)(points[2 * i] - x[0], points[2 * i + 1] - x[1]);
+    const REAL2 from = direction_of(x, i, points);
     const REAL2 gap = mine + from - corner(j, x, p, q, points, lower, upper);
     return dot(gap, gap);
 }

@@ -166,7 +166,7 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
 inline REAL2 face_direction(int label, const REAL *x, global const REAL *points)
 {
     if (label >= 0)
-        return (REAL2)(points[2 * label] - x[0], points[2 * label + 1] - x[1]);
+        return direction_of(x, label, points);
     const int wall = -1 - label;
     const REAL sign = wall % 2 == 0 ? -1 : 1;
     return wall < 2 ? (REAL2)(sign, 0) : (REAL2)(0, sign);

@@ -1,0 +1,25 @@
+"""Cells of a folded diagram (see `seam.py`) in 2D, whose neighbours are the nearest images of their generators."""
+
+from __future__ import annotations
+
+from ._program import Engine
+from .cells import Cells
+
+
+class FoldedCells(Cells):
+    """The rows and measures of such cells: what `Repair` works on in a periodic box."""
+
+    def __init__(self, engine: Engine) -> None:
+        periods = dict(engine.domain_defines)
+        self._folds = {f"FOLD_{a}": periods[f"PERIOD_{a}"] for a in range(2)}
+        super().__init__(engine)
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """The capacities and the periods, as kernels that work on the rows must be built with."""
+        return {**super().defines, **self._folds}
+
+    def reserve(self, n: int) -> None:
+        """Make room for `n` cells."""
+        self._reserve_rows(n)
+        self._reserve(n)

@@ -1,0 +1,416 @@
+"""Periodic boxes: diagrams against Qhull on generators and images, lattices, seams, few generators; runs; files."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial import Voronoi
+
+import clvoro
+from clvoro import sizing
+from clvoro.errors import InputError, InputTypeError
+from clvoro.faces import face_owners
+from clvoro.torus import FewCellsError
+
+UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
+CHANNEL = clvoro.Box((3, -2), (5.5, -0.5), periodic=(True, False))
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
+SLAB = clvoro.Box((0, 0, 0), (2, 1, 1.3), periodic=(True, False, True))
+ROUNDING = {"float64": 1e-12, "float32": 2e-5}
+"""Of a volume over the mean volume: about 1e4 roundings, as corners are quotients of differences of squares."""
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def adapter(ctx, request):
+    return clvoro.Adapter(ctx, request.param)
+
+
+@pytest.fixture(scope="module")
+def double(ctx):
+    return clvoro.Adapter(ctx)
+
+
+def some_points(box, n, seed=0):
+    rng = np.random.default_rng(100 * n + seed)
+    return np.array(box.lower) + box.extent * rng.random((n, box.dim))
+
+
+def torus_voronoi(box, points):
+    """Faces {(i, j, shift): measure} and volumes (n,), by Qhull on all images a period away, and theirs behind walls.
+
+    Walls are faces (i, -1 - wall, zeros).
+    """
+    n, dim = points.shape
+    steps = [(0, -1, 1) if p else (0,) for p in box.periodic]
+    shifts = list(itertools.product(*steps))
+    assert shifts[0] == (0,) * dim
+    sets = [(points + np.array(s) * box.extent, s, None) for s in shifts]
+    for a in np.flatnonzero(~np.array(box.periodic)):
+        for side, level in enumerate((box.lower[a], box.upper[a])):
+            for x, s, wall in list(sets):
+                if wall is None:
+                    mirrored = x.copy()
+                    mirrored[:, a] = 2 * level - mirrored[:, a]
+                    sets.append((mirrored, s, -1 - 2 * int(a) - side))
+    diagram = Voronoi(np.concatenate([x for x, _, _ in sets]))
+    faces, volumes = {}, np.zeros(n)
+    for (p, q), ridge in zip(diagram.ridge_points, diagram.ridge_vertices, strict=True):
+        for i, j in ((p, q), (q, p)):
+            if i >= n:
+                continue
+            assert -1 not in ridge
+            corners = diagram.vertices[ridge]
+            if dim == 2:
+                measure = np.linalg.norm(corners[1] - corners[0])
+            else:
+                fan = np.cross(corners[1:-1] - corners[0], corners[2:] - corners[0])
+                measure = np.linalg.norm(fan.sum(axis=0)) / 2
+            _, shift, wall = sets[j // n]
+            key = (i, j % n, shift) if wall is None else (i, wall, (0,) * dim)
+            faces[key] = faces.get(key, 0) + measure
+            volumes[i] += measure * np.linalg.norm(diagram.points[i] - diagram.points[j]) / 2 / dim
+    return faces, volumes
+
+
+def faces_of(diagram):
+    keys = zip(
+        face_owners(diagram).tolist(), diagram.neighbours.tolist(),
+        map(tuple, diagram.shifts.tolist()), strict=True,
+    )  # fmt: skip
+    return dict(zip(keys, diagram.face_measures.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 500])
+@pytest.mark.parametrize(
+    "box", [UNIT, CHANNEL, CUBE, SLAB], ids=["unit", "channel", "cube", "slab"]
+)
+def test_against_qhull(adapter, box, n):
+    points = some_points(box, n)
+    diagram = adapter.diagram(box, points)
+    faces, volumes = torus_voronoi(box, box.wrap(points))
+    mean = box.measure / n
+    tolerance = ROUNDING[adapter.dtype.name]
+    assert np.abs(diagram.volumes - volumes).max() < tolerance * mean
+    found = faces_of(diagram)
+    size = mean ** (1 - 1 / box.dim)
+    # Faces of no size may be there or not: rounding decides.
+    for key in found.keys() | faces.keys():
+        assert abs(found.get(key, 0) - faces.get(key, 0)) < 10 * tolerance * size
+    assert len(found) == len(diagram.neighbours)
+    assert {(j, i, tuple(-s for s in shift)) for i, j, shift in found if j >= 0} == {
+        key for key in found if key[1] >= 0
+    }
+    assert diagram.check()
+
+
+@pytest.mark.parametrize("box", [UNIT, CUBE], ids=["2D", "3D"])
+def test_euler(double, box):
+    # Three cells meet in a vertex of the plane, four in space; all vertices are there, once for each image in use.
+    n = 300
+    d = double.diagram(box, some_points(box, n, 3))
+    wrapped = np.rint(d.vertices * 10**9).astype(np.int64) % 10**9
+    vertices, edges_and_faces = len(np.unique(wrapped, axis=0)), len(d.neighbours) // 2
+    if box.dim == 2:
+        assert vertices - edges_and_faces + n == 0
+    else:  # four edges at a vertex
+        assert vertices - 2 * vertices + edges_and_faces - n == 0
+
+
+@pytest.mark.parametrize("box", [UNIT, SLAB], ids=["unit", "slab"])
+def test_translation(adapter, box):
+    """Moved along the periods, by what no rounding changes: the same cells, but for sums in another order."""
+    points = np.round(some_points(box, 200), 3)
+    points = np.round((points - box.lower) * 1024) / 1024 + box.lower
+    points = np.unique(points, axis=0)
+    by = np.where(box.periodic, [0.375, 0.8125, 0.6875][: box.dim], 0.0)
+    one, two = adapter.diagram(box, points), adapter.diagram(box, points + by)
+    steps = np.rint((points + by - two.points) / box.extent)
+
+    def unwrapped(diagram, lifted):
+        return {
+            (i, j, tuple(np.subtract(shift, lifted[j] - lifted[i]).astype(int).tolist()))
+            for i, j, shift in faces_of(diagram)
+            if j >= 0
+        }
+
+    assert steps.any()
+    assert unwrapped(one, np.zeros_like(steps)) == unwrapped(two, steps)
+    tolerance = 64 * np.finfo(adapter.dtype).eps * box.measure / len(points)
+    assert np.abs(one.volumes - two.volumes).max() <= 16 * tolerance
+    moved = one.centroids - one.points - (two.centroids - two.points)
+    assert np.abs(moved).max() < 1e4 * np.finfo(adapter.dtype).eps
+
+
+def square(n):
+    return np.indices((n, n)).reshape(2, -1).T / n, (1, 1), 4
+
+
+def hexagonal(n):
+    at = np.indices((n, n)).reshape(2, -1).T.astype(float)
+    at[:, 0] += 0.5 * (at[:, 1] % 2)
+    at[:, 1] *= np.sqrt(3) / 2
+    return at / n, (1, np.sqrt(3) / 2), 6
+
+
+def cubic(n):
+    return np.indices((n, n, n)).reshape(3, -1).T / n, (1, 1, 1), 6
+
+
+def bcc(n):
+    at = cubic(n)[0]
+    return np.concatenate([at, at + 0.5 / n]), (1, 1, 1), 14
+
+
+@pytest.mark.parametrize("offset", [0, 1 / 3])
+@pytest.mark.parametrize(
+    ("lattice", "n"),
+    [
+        (square, 1),
+        (square, 2),
+        (square, 7),
+        (hexagonal, 2),
+        (hexagonal, 10),
+        (cubic, 1),
+        (cubic, 5),
+        (bcc, 1),
+        (bcc, 3),
+    ],
+)
+def test_lattices(adapter, lattice, n, offset):
+    """All cells alike, generators on the seam or not, where four or more cells meet in a point."""
+    points, edges, sides = lattice(n)
+    box = clvoro.Box((0,) * len(edges), edges, periodic=True)
+    d = adapter.diagram(box, points + offset * np.array(edges))
+    assert (np.diff(d.neighbour_starts) == sides).all()
+    assert (
+        np.abs(d.volumes * len(points) / box.measure - 1).max()
+        < 40 * np.finfo(adapter.dtype).eps * n
+    )
+    assert d.check()
+
+
+def test_clusters_need_wide_margins(adapter):
+    """A cell that reaches half a period on: images from farther away than a few spacings are needed."""
+    rng = np.random.default_rng(5)
+    for at in ((0.5, 0.5), (0.0, 0.98)):
+        points = np.concatenate([np.array(at) + 0.03 * rng.random((200, 2)), rng.random((2, 2))])
+        d = adapter.diagram(UNIT, points)
+        volumes = torus_voronoi(UNIT, UNIT.wrap(points))[1]
+        assert np.abs(d.volumes - volumes).max() < ROUNDING[adapter.dtype.name]
+        assert d.check()
+
+
+def test_cells_lie_around_their_generators(double):
+    d = double.diagram(UNIT, some_points(UNIT, 50))
+    owner = face_owners(d)
+    assert (np.abs(d.face_centroids - d.points[owner]) < 0.5).all()
+    assert (np.abs(d.vertices[d.cell_vertices] - d.points[owner]) < 0.5).all()
+    assert (d.vertices < 0).any()
+    assert (d.vertices > 1).any()
+    assert ((d.points >= 0) & (d.points < 1)).all()
+    # Each face lies half-way to its neighbour's image.
+    image = d.points[d.neighbours] + d.shifts * UNIT.extent
+    away = d.face_centroids - (image + d.points[owner]) / 2
+    assert np.abs(np.einsum("ij,ij->i", away, image - d.points[owner])).max() < 1e-14
+
+
+def test_points_are_wrapped(double):
+    points = some_points(UNIT, 40)
+    beyond = points + np.random.default_rng(1).integers(-3, 4, (40, 2))
+    one, two = double.diagram(UNIT, points), double.diagram(UNIT, beyond)
+    assert np.abs(one.points - two.points).max() < 1e-15 * 8
+    assert faces_of(one).keys() == faces_of(two).keys()
+    with pytest.raises(InputError, match="outside"):
+        double.diagram(CHANNEL, [[100.0, 0.0]])
+    on_seam = UNIT.wrap(np.array([[1.0, -1e-30], [0.0, 1 + 1e-16]]))
+    assert ((on_seam >= 0) & (on_seam < 1)).all()
+
+
+def test_plain_boxes_have_no_shifts(double):
+    d = double.diagram(clvoro.Box((0, 0), (1, 1)), some_points(UNIT, 10))
+    assert d.shifts.shape == (len(d.neighbours), 2)
+    assert d.shifts.dtype == np.int8
+    assert not d.shifts.any()
+
+
+def test_arguments(adapter):
+    assert clvoro.Box((0, 0), (1, 1), periodic=(False, True)).periodic == (False, True)
+    assert repr(UNIT) == "Box(lower=(0.0, 0.0), upper=(1.0, 1.0), periodic=(True, True))"
+    assert clvoro.Box((0, 0), (1, 1)) == clvoro.Box((0, 0), (1, 1), periodic=False) != UNIT
+    with pytest.raises(InputTypeError, match="periodic 1"):
+        clvoro.Box((0, 0), (1, 1), periodic=1)
+    with pytest.raises(InputError, match="3 directions, expected 2"):
+        clvoro.Box((0, 0), (1, 1), periodic=(True, True, False))
+    step = float(np.finfo(adapter.dtype).eps)
+    thin = clvoro.Box((0, 0), (1, 500 * step), periodic=True)
+    with pytest.raises(InputError, match="too thin"):
+        adapter.diagram(thin, [[0.5, 0]])
+    with pytest.raises(InputError, match="coincide"):
+        adapter.diagram(UNIT, [[0.5, 0.0], [0.25, 0.5], [0.5, 1.0]])
+
+
+# Runs.
+
+SPOT = sizing.Expression(
+    "0.05 + 0.3 * fmax(hypot(x - 0.05 - floor(x + 0.45), y - 0.9 - floor(y - 0.4)) - 0.1, 0)"
+)
+"""A refined spot around (0.05, 0.9), beyond two seams."""
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"method": "exact", "effort": "fast"},
+        {"method": "adaptive", "n_cells": 150, "start": "uniform"},
+        {"method": "coupled", "max_steps": 30},
+        {"method": "poisson", "max_steps": 5},
+        {"method": "weighted", "max_steps": 8},
+    ],
+    ids=lambda options: "-".join(map(str, options.values())) or "default",
+)
+def test_runs(adapter, options):
+    result = adapter.run(UNIT, SPOT, seed=3, **options)
+    assert result.check()
+    assert (np.abs(result.diagram.shifts).max(axis=0) == 1).all()
+    assert abs(result.diagram.volumes.sum() - 1) < 4 * np.finfo(adapter.dtype).eps * len(
+        result.points
+    )
+    if not options:
+        assert np.abs(result.error).mean() < 0.01
+        assert result.quality.mean() > 0.96
+
+
+def test_the_same_bits_from_run_to_run(adapter):
+    one, two = (adapter.run(UNIT, SPOT, seed=3, effort="fast") for _ in range(2))
+    for name in ("points", "error", "quality"):
+        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+
+
+def test_repair_across_seams(adapter):
+    """Diagrams repaired from step to step are those that are made anew."""
+    from clvoro.torus import Torus
+
+    stages = adapter._stages_for(UNIT)
+    engine, n = stages.engine, 800
+    rng = np.random.default_rng(11)
+    points = rng.random((n, 2))
+    torus, fresh = Torus(stages, UNIT), Torus(stages, UNIT)
+    x = engine.upload(UNIT.place(points, adapter.dtype))
+    t = torus.tessellate(x, n)
+    for _ in range(4):
+        points = points + 0.0003 * rng.standard_normal((n, 2))
+        x = engine.upload(UNIT.place(points, adapter.dtype))
+        t = torus._repaired(x, n, t)
+        assert t is not None
+        rows = [set(row) for row in np.split(*rows_of(t))]
+        volumes = t.volumes.get()
+        new = fresh.tessellate(x, n)
+        assert rows == [set(row) for row in np.split(*rows_of(new))]
+        assert np.abs(volumes - new.volumes.get()).max() * n < ROUNDING[adapter.dtype.name]
+
+
+def rows_of(t):
+    starts = t.starts.get()
+    return t.neighbours.get()[: starts[-1]], starts[1:-1]
+
+
+def test_a_repair_that_covers_twice_is_refused(double):
+    """Volumes tell a torus that is covered twice from one that is covered once."""
+    from clvoro.torus import Torus
+
+    stages = double._stages_for(UNIT)
+    x = stages.engine.upload(UNIT.place(some_points(UNIT, 500), double.dtype))
+    torus = Torus(stages, UNIT)
+    t = torus.tessellate(x, 500)
+    assert torus._repaired(x, 500, t) is not None
+    torus._edges = torus._edges / 2**0.5
+    assert torus._repaired(x, 500, torus.tessellate(x, 500)) is None
+
+
+def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
+    """The generators' rows are the same whether or not their images get cells, also in lattices a rounding off."""
+    from clvoro.torus import Torus
+
+    eps = np.finfo(adapter.dtype).eps
+    for box, lattice in ((UNIT, square(12)[0]), (CUBE, bcc(4)[0])):
+        stages, n = adapter._stages_for(box), len(lattice)
+        for noise in (0, eps, 1e3 * eps):
+            moved = lattice + noise * np.random.default_rng(2).standard_normal(lattice.shape)
+            x = stages.engine.upload(box.place(moved, adapter.dtype))
+            found = []
+            for whole in (True, False):
+                t = Torus(stages, box).tessellate(x, n, whole=whole)
+                starts = t.starts.get()
+                i = np.repeat(np.arange(n), np.diff(starts))
+                j = t.neighbours.get()[: starts[-1]]
+                assert set(zip(i, j, strict=True)) == set(zip(j, i, strict=True))
+                found.append(t.volumes.get().copy())
+            assert np.abs(found[0] - found[1]).max() * n < 100 * n * eps
+
+
+def test_coarse_levels_with_too_few_cells_are_left_out(double):
+    from clvoro.plans import auto_levels
+
+    box = clvoro.Box((0, 0, 0), (4, 4, 0.3), periodic=True)
+    result = double.run(box, 0.07, effort="fast", max_steps=1)
+    assert auto_levels(len(result.points), 3) > result.settings["levels"] == 0
+    with pytest.raises(FewCellsError):
+        double.run(box, 0.07, levels=1, max_steps=1)
+
+
+def test_resume(double, tmp_path):
+    """On from a checkpoint to the same bits, repaired in 2D, from a margin that the run has come to in 3D."""
+    for box, size in ((UNIT, SPOT), (CUBE, sizing.Constant(0.17))):
+        steps = []
+
+        def stop(row, steps=steps):
+            steps.append(row["step"])
+            return len(steps) == 6
+
+        options = {"seed": 2, "effort": "fast"}
+        whole = double.run(box, size, **options)
+        file = tmp_path / f"{box.dim}.checkpoint"
+        double.run(box, size, callback=stop, checkpoint=file, **options)
+        resumed = double.run(box, size, resume=file, **options)
+        assert resumed.points.tobytes() == whole.points.tobytes()
+        with pytest.raises(InputError, match="domain"):
+            double.run(clvoro.Box(box.lower, box.upper), size, resume=file, **options)
+
+
+@pytest.mark.parametrize("box", [CUBE, SLAB], ids=["cube", "slab"])
+def test_runs_3d(double, box):
+    size = sizing.Constant(0.16)
+    for options in ({"effort": "fast"}, {"method": "exact"}, {"method": "coupled", "max_steps": 4}):
+        result = double.run(box, size, seed=5, **options)
+        assert result.check()
+        assert abs(result.diagram.volumes.sum() - box.measure) < 1e-12
+    assert (np.abs(result.diagram.shifts).max(axis=0) == box.periodic).all()
+
+
+@pytest.mark.parametrize(("lattice", "n"), [(hexagonal, 10), (bcc, 5)])
+def test_a_lattice_stays(double, lattice, n):
+    """All forces vanish by symmetry, at the seams as elsewhere: nobody moves but for rounding."""
+    points, edges, _ = lattice(n)
+    box = clvoro.Box((0,) * len(edges), edges, periodic=True)
+    size = (box.measure / len(points)) ** (1 / box.dim)
+    for method in ("coupled", "weighted"):
+        result = double.run(box, size, points, method=method, max_steps=5, tol=0)
+        moved = result.points - box.wrap(points)
+        assert np.abs(moved - np.rint(moved / box.extent) * box.extent).max() < 1e-12
+
+
+def test_refinement_across_seams(double):
+    """The middles of a hexagonal lattice's edges make the lattice of half the spacing."""
+    points, edges, _ = hexagonal(6)
+    box = clvoro.Box((0, 0), edges, periodic=True)
+    size = (box.measure / 144) ** 0.5
+    result = double.run(box, size, points, levels=1, max_steps=0)
+    assert len(result.points) == 144
+    assert (np.diff(result.diagram.neighbour_starts) == 6).all()
+    assert np.abs(result.diagram.volumes * 144 / box.measure - 1).max() < 1e-12
+
+
+def test_too_few_cells_for_a_run(double):
+    with pytest.raises(FewCellsError, match="half a period"):
+        double.run(UNIT, 0.5, method="coupled")
