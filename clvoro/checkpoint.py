@@ -280,8 +280,8 @@ class Saved:
                     [array, np.zeros((state["spare"], *array.shape[1:]), array.dtype)]
                 )
             t[name] = engine.upload(array, array.dtype)
-        if isinstance(domain, Polygon) or any(domain.periodic):
-            # Trimmed or folded from another diagram, which is not kept: made anew, it has the same bits.
+        if isinstance(domain, Polygon):
+            # Trimmed from another diagram, which is not kept: made anew, it has the same bits.
             mesh.tessellation = mesh.tessellator.tessellate(mesh.points, mesh.n)
         else:
             mesh.tessellation = Tessellation(n=mesh.n, points=mesh.points, **t)
