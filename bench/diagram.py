@@ -1,10 +1,13 @@
 """The tessellation alone: time of each stage, cold and warm-started, uniform and graded.
 
     python bench/diagram.py [--dim 3] [--sizes 1e4,1e5,1e6,4e6] [--sets uniform,cubed,radial,hexagonal]
-                            [--scipy] [--repeat 5] [--device NAME] [--dtype float32] [--json]
+                            [--scipy] [--repeat 5] [--processor-time] [--device NAME]
+                            [--dtype float32] [--json]
 
-With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000, and "bcc", the
-body-centred cubic lattice, jittered likewise. Areas and moments are then part of "clip", and a
+With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000 around an empty
+ball, "core", the same with the ball filled, and "bcc", the body-centred cubic lattice, jittered
+likewise. Cells at the empty ball are cones to its centre, each near hundreds of others; "core" is
+what grading alone costs. Areas and moments are then part of "clip", and a
 warm row bins the moved generators and clips by the neighbours of the diagram before first.
 
 Point sets in the unit square, random with a fixed seed: "uniform"; "cubed", uniform with x -> x^3
@@ -24,6 +27,9 @@ graph; and the same with "order", which is a diagram of points in any order. Wit
 SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up to
 `--scipy-up-to` cells; "x SciPy" compares it with the last of the rates. The table ends with the
 rates of graded sets over the uniform one and with the slope of time against count.
+
+With `--processor-time` seconds are those that this process has had of the processors, over the
+device's compute units (SciPy: over one): what a CPU would take if no other work ran on it.
 """
 
 from __future__ import annotations
@@ -40,6 +46,7 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, markdown, names, parser
 
 import clvoro
+from clvoro._hooks import watching
 from clvoro._primitives import Gather
 from clvoro._program import Engine
 from clvoro.bins import Bins
@@ -107,6 +114,17 @@ def radial_3d(n: int, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate(kept)[:n]
 
 
+def core_3d(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Points as of `radial_3d`, and of their density at r = R / 1000 within."""
+    p, least = radial_3d(n, rng), math.sqrt(0.75) / RATIO_3D
+    # Of the density c / r^3 there are 4 pi c log(3/2) up to 3/2 R / 1000, and 4 pi c / 3 in the ball.
+    near = int((np.linalg.norm(p - 0.5, axis=1) < 1.5 * least).sum() / (3 * math.log(1.5)))
+    v = rng.standard_normal((near, 3))
+    r = least * rng.random(near) ** (1 / 3)
+    inner = 0.5 + (r / np.linalg.norm(v, axis=1))[:, None] * v
+    return rng.permutation(np.concatenate([inner, p]))[:n]
+
+
 def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
     """Jittered body-centred cubic lattice in random order, of about n points."""
     k = max(1, round((n / 2) ** (1 / 3)))
@@ -117,7 +135,7 @@ def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
-SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, bcc_3d)}
+SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, core_3d, bcc_3d)}
 
 
 KERNELS = {
@@ -128,16 +146,19 @@ KERNELS = {
 """How the names of the kernels begin that make up a column."""
 
 
-def median_time(queue: Any, repeat: int, function: Callable[[], object]) -> float:
+Clock = Callable[[], float]
+
+
+def median_time(queue: Any, repeat: int, function: Callable[[], object], clock: Clock) -> float:
     """Median seconds of `function`, from an idle queue to an idle queue, after a first call."""
     times = []
     for k in range(repeat + 1):
         queue.finish()
-        start = time.perf_counter()
+        start = clock()
         function()
         queue.finish()
         if k:
-            times.append(time.perf_counter() - start)
+            times.append(clock() - start)
     return statistics.median(times)
 
 
@@ -162,11 +183,14 @@ class Tessellator:
     def bin(self) -> None:
         """Bin the ordered generators."""
         self.binned = self.bins.build(self.box, self.points, self.n)
-        self.reach = self.binned.reach.copy()
+        self.reach = None
 
     def diagram(self) -> Any:
         """Tessellate from nothing, with the radii to begin with as the binning has left them."""
-        self.binned.reach[:] = self.reach
+        if self.reach is None:
+            self.reach = self.binned.reach.copy()
+        else:
+            self.binned.reach[:] = self.reach
         self.t = self.cells.tessellate(self.box, self.points, self.n, self.binned)
         return self.t
 
@@ -205,19 +229,41 @@ class Tessellator:
         self.t = t
 
 
-def kernel_times(queue: Any, repeat: int, function: Callable[[], object]) -> dict[str, float]:
-    """Median device times of the kernels of "diagram"."""
+def kernel_times(
+    queue: Any, repeat: int, function: Callable[[], object], clock: Clock | None
+) -> dict[str, float]:
+    """Median times of the kernels of "diagram": the device's own, or by `clock`, one by one."""
     function()
     times: dict[str, list[float]] = {name: [] for name in KERNELS}
     for _ in range(repeat):
-        with Profile(queue) as profile:
-            function()
+        costs = (
+            device_times(queue, function) if clock is None else own_times(queue, function, clock)
+        )
         for name, seen in times.items():
-            costs = (
-                c for (_, kernel), c in profile.costs.items() if kernel.startswith(KERNELS[name])
-            )
-            seen.append(sum(cost.seconds for cost in costs))
+            seen.append(sum(s for kernel, s in costs if kernel.startswith(KERNELS[name])))
     return {name: statistics.median(seen) for name, seen in times.items()}
+
+
+def device_times(queue: Any, function: Callable[[], object]) -> list[tuple[str, float]]:
+    with Profile(queue) as profile:
+        function()
+    return [(kernel, cost.seconds) for (_, kernel), cost in profile.costs.items()]
+
+
+def own_times(queue: Any, function: Callable[[], object], clock: Clock) -> list[tuple[str, float]]:
+    costs = []
+    queue.finish()
+    before = clock()
+
+    def watch(event: Any, _stage: str, name: str, *_: object, **__: object) -> None:
+        nonlocal before
+        event.wait()
+        costs.append((name, clock() - before))
+        before = clock()
+
+    with watching(queue, watch):
+        function()
+    return costs
 
 
 def sets_of(options: argparse.Namespace) -> dict[str, Callable[..., np.ndarray]]:
@@ -230,22 +276,25 @@ def measure(
     """Return the records of one set: cold and warm."""
     rng = np.random.default_rng(SEED + n)
     points = sets_of(options)[name](n, rng).astype(adapter.dtype)
-    repeat = options.repeat
+    repeat, clock, kernel_clock = options.repeat, time.perf_counter, None
+    if options.processor_time:
+        units = adapter.ctx.devices[0].max_compute_units
+        clock = kernel_clock = lambda: time.process_time() / units
     plain = Tessellator(Engine(adapter.ctx, adapter.queue, options.dim, adapter.dtype), points)
     queue = plain.engine.queue
-    order = median_time(queue, repeat, plain.order)
-    bins = median_time(queue, repeat, plain.bin)
-    cold = median_time(queue, repeat, plain.diagram)
+    order = median_time(queue, repeat, plain.order, clock)
+    bins = median_time(queue, repeat, plain.bin, clock)
+    cold = median_time(queue, repeat, plain.diagram, clock)
     plain.prepare_warm(rng)
-    warm = median_time(queue, repeat, plain.diagram_warm)
+    warm = median_time(queue, repeat, plain.diagram_warm, clock)
     del plain
 
     queue = profiled_queue(adapter.ctx)
     timed = Tessellator(Engine(adapter.ctx, queue, options.dim, adapter.dtype), points)
     timed.bin()
-    cold_kernels = kernel_times(queue, repeat, timed.diagram)
+    cold_kernels = kernel_times(queue, repeat, timed.diagram, kernel_clock)
     timed.prepare_warm(rng)
-    warm_kernels = kernel_times(queue, repeat, timed.diagram_warm)
+    warm_kernels = kernel_times(queue, repeat, timed.diagram_warm, kernel_clock)
     del timed
 
     n = len(points)
@@ -261,17 +310,18 @@ def measure(
             record |= {"order": order, "whole_rate": n / (order + binning + seconds)}
         records.append(record)
     if options.scipy and n <= options.scipy_up_to:
-        records[0]["scipy"] = scipy_time(points)
+        records[0]["scipy"] = scipy_time(points, options.processor_time)
         records[0]["over_scipy"] = records[0]["scipy"] * records[0]["whole_rate"] / n
     return records
 
 
-def scipy_time(points: np.ndarray) -> float:
+def scipy_time(points: np.ndarray, processor_time: bool) -> float:
     from scipy.spatial import Voronoi
 
-    start = time.perf_counter()
+    clock = time.process_time if processor_time else time.perf_counter
+    start = clock()
     Voronoi(points)
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def shown(figure: str, scale: float, form: str) -> Callable[[dict[str, Any]], str]:
@@ -327,6 +377,7 @@ def main() -> None:
     )
     options_of.add_argument("--repeat", type=int, default=5)
     options_of.add_argument("--scipy", action="store_true")
+    options_of.add_argument("--processor-time", action="store_true")
     options_of.add_argument("--scipy-up-to", type=float, default=1e6, metavar="N")
     options = options_of.parse_args()
     known = sets_of(options)

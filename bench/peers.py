@@ -1,14 +1,17 @@
 """Against peers, in the same run: diagrams by SciPy and Voro++, graded meshes by Gmsh.
 
     python bench/peers.py [--sizes 1e5,1e6] [--sets uniform,cubed] [--factors 1,0.5]
-                          [--skip diagrams|meshes] [--device NAME] [--dtype float32] [--json]
+                          [--dim 3] [--skip diagrams|meshes] [--device NAME] [--dtype float32]
+                          [--json]
 
 Diagrams: random points in the unit square (the sets of `diagram.py`), in random order; clvoro's
 time is from NumPy points to a diagram on the device with areas, centroids, faces and graph, and
 the second one with all arrays fetched. SciPy gives vertices and regions, no areas. Voro++
 (Debian: voro++-dev; its packaged version is three-dimensional and serial, so it runs on a slab
 one cell thick) computes cell, volume and neighbours; a small C++ program is compiled for it with
-g++ -O3. Best of two runs each, of one for SciPy.
+g++ -O3. Best of two runs each, of one for SciPy. With `--dim 3` the sets are those of the unit
+cube ("core" has sizes 1 : 1000), Voro++ does the same there with blocks of five generators, and
+there are no meshes.
 
 Meshes: the size field F3 of `convergence.py` times a factor; cells are the Voronoi cells of the
 vertices, and their error and quality are measured by clvoro in the same way for all, with one
@@ -51,15 +54,17 @@ from _common import (
     test_field,
 )
 from diagram import BOX as SQUARE
-from diagram import SEED, SETS
+from diagram import CUBE, SEED, SETS, SETS_3D
 
 import clvoro
 
+UNIT = {2: SQUARE, 3: CUBE}
 EDGE = 1.0746
 """Distance of neighbours in the lattice of regular hexagons of area 1."""
 
 VOROPP = r"""
 #include <chrono>
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <vector>
@@ -67,15 +72,18 @@ VOROPP = r"""
 int main(int, char **arguments)
 {
     const long n = atol(arguments[2]);
-    std::vector<double> points(2 * n);
+    std::vector<double> points(DIM * n);
     FILE *file = fopen(arguments[1], "rb");
-    if (!file || fread(points.data(), sizeof(double), 2 * n, file) != size_t(2 * n)) return 1;
+    if (!file || fread(points.data(), sizeof(double), DIM * n, file) != size_t(DIM * n)) return 1;
     fclose(file);
     const auto start = std::chrono::steady_clock::now();
-    const double thick = 1 / sqrt(double(n));
-    const int side = int(sqrt(n / 5.0)) + 1;
-    voro::container box(0, 1, 0, 1, -thick / 2, thick / 2, side, side, 1, false, false, false, 8);
-    for (long i = 0; i < n; ++i) box.put(int(i), points[2 * i], points[2 * i + 1], 0);
+    const double thick = DIM == 3 ? 1 : 1 / sqrt(double(n));
+    const int side = int(pow(n / 5.0, 1.0 / DIM)) + 1;
+    voro::container box(0, 1, 0, 1, 0, thick, side, side, DIM == 3 ? side : 1, false, false, false, 8);
+    for (long i = 0; i < n; ++i) {
+        const double *x = points.data() + DIM * i;
+        box.put(int(i), x[0], x[1], DIM == 3 ? x[DIM - 1] : thick / 2);
+    }
     voro::voronoicell_neighbor cell;
     std::vector<int> neighbours;
     double volume = 0;
@@ -110,7 +118,7 @@ def best_of(repeat: int, function: Callable[[], object]) -> float:
 
 def diagram_clvoro(adapter: clvoro.Adapter, points: np.ndarray) -> float:
     def run() -> None:
-        adapter.diagram(SQUARE, points)
+        adapter.diagram(UNIT[points.shape[1]], points)
         adapter.queue.finish()
 
     run()
@@ -119,9 +127,9 @@ def diagram_clvoro(adapter: clvoro.Adapter, points: np.ndarray) -> float:
 
 def diagram_fetched(adapter: clvoro.Adapter, points: np.ndarray) -> float:
     def run() -> None:
-        diagram = adapter.diagram(SQUARE, points)
-        for name in ("volumes", "centroids", "neighbours", "face_measures", "vertices",
-                     "cell_vertices"):  # fmt: skip
+        diagram = adapter.diagram(UNIT[points.shape[1]], points)
+        corners = "cell_vertices" if points.shape[1] == 2 else "face_vertices"
+        for name in ("volumes", "centroids", "neighbours", "face_measures", "vertices", corners):
             getattr(diagram, name)
 
     run()
@@ -141,8 +149,8 @@ def diagram_voropp(_: clvoro.Adapter, points: np.ndarray) -> float:
         source, program, data = (Path(folder, name) for name in ("peer.cc", "peer", "points"))
         source.write_text(VOROPP)
         built = subprocess.run(
-            ["g++", "-O3", "-march=native", "-I/usr/include/voro++", source, "-o", program,
-             "-lvoro++"], capture_output=True, check=False,
+            ["g++", "-O3", "-march=native", f"-DDIM={points.shape[1]}", "-I/usr/include/voro++",
+             source, "-o", program, "-lvoro++"], capture_output=True, check=False,
         )  # fmt: skip
         if built.returncode:
             raise MissingPeerError("voro++-dev (Debian, Ubuntu)")
@@ -154,7 +162,7 @@ def diagram_voropp(_: clvoro.Adapter, points: np.ndarray) -> float:
             )
             taken, area, _ = map(float, run.stdout.split())
             if abs(area - 1) > 1e-6:
-                raise RuntimeError(f"Voro++'s cells have the area {area}, expected 1")
+                raise RuntimeError(f"Voro++'s cells measure {area}, expected 1")
             seconds.append(taken)
     return min(seconds)
 
@@ -163,7 +171,7 @@ DIAGRAMS = {
     "clvoro": diagram_clvoro,
     "clvoro, arrays fetched": diagram_fetched,
     "SciPy": diagram_scipy,
-    "Voro++ (slab, serial)": diagram_voropp,
+    "Voro++ (serial)": diagram_voropp,
 }
 
 
@@ -267,10 +275,13 @@ def compare_diagrams(adapter: clvoro.Adapter, options: argparse.Namespace) -> No
     report = Report(options.json, DIAGRAM_COLUMNS)
     for name in options.sets:
         for n in options.sizes:
-            points = SETS[name](n, np.random.default_rng(SEED + n))
+            sets = SETS if options.dim == 2 else SETS_3D
+            points = sets[name](n, np.random.default_rng(SEED + n))
             ours = 0.0
             for peer, run in DIAGRAMS.items():
                 if peer.startswith("Voro++") and name != "uniform" and n > options.slow_up_to:
+                    continue
+                if peer == "SciPy" and options.dim == 3 and n > options.slow_up_to:
                     continue
                 try:
                     seconds = run(adapter, points)
@@ -307,20 +318,25 @@ def compare_meshes(adapter: clvoro.Adapter, options: argparse.Namespace) -> None
 def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[10**5, 10**6])
-    options_of.add_argument("--sets", type=names, default=["uniform", "cubed"])
+    options_of.add_argument("--dim", type=int, choices=(2, 3), default=2)
+    options_of.add_argument("--sets", type=names, help="default uniform,cubed; in 3D uniform,core")
     options_of.add_argument(
         "--factors", type=lambda text: [float(f) for f in names(text)], default=[1.0, 0.5, 0.25]
     )
     options_of.add_argument("--skip", choices=("diagrams", "meshes"))
     options_of.add_argument(
         "--slow-up-to", type=float, default=1e5, metavar="N",
-        help="largest graded set for Voro++, whose uniform bins collapse on it (1e5)",
+        help="largest graded set for Voro++, whose uniform bins collapse on it, and largest set in "
+        "3D for SciPy (1e5)",
     )  # fmt: skip
     options = options_of.parse_args()
+    options.sets = options.sets or (
+        ["uniform", "cubed"] if options.dim == 2 else ["uniform", "core"]
+    )
     adapter = make_adapter(options)
     if options.skip != "diagrams":
         compare_diagrams(adapter, options)
-    if options.skip != "meshes":
+    if options.skip != "meshes" and options.dim == 2:
         compare_meshes(adapter, options)
 
 
