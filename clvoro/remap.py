@@ -13,6 +13,8 @@ from ._program import Engine
 from .bins import Bins
 from .device import create_context
 from .errors import ClvoroError, InputError, InputTypeError
+from .overlap import transfer_polygons
+from .polygon import Polygon
 from .results import Diagram, Result
 from .transfer import Content, Graph, Transfer
 
@@ -38,7 +40,7 @@ def transfer_values(
     if source.domain != target.domain:
         raise InputError(
             f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
-            "both meshes with one Box"
+            "both meshes with one domain"
         )
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
@@ -48,9 +50,13 @@ def transfer_values(
         return np.zeros((len(target), 0))
     # Numbers around 1, by powers of two: nothing is rounded, and no product leaves the range.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(columns).max(axis=0), 1e-300))))
-    with adapter._alone() if adapter is not None else nullcontext():
-        ctx = _default_context() if adapter is None else adapter.ctx
-        means, low, high = _transferred(ctx, source, target, columns / scale, order, bool(limited))
+    task = source, target, columns / scale, order, bool(limited)
+    if isinstance(source.domain, Polygon):
+        means, low, high = _transferred_on_host(*task)
+    else:
+        with adapter._alone() if adapter is not None else nullcontext():
+            ctx = _default_context() if adapter is None else adapter.ctx
+            means, low, high = _transferred(ctx, *task)
     bounded = order == 1 or bool(limited)
     kept = _keep_mass(columns / scale, source.volumes, means, target.volumes, low, high, bounded)
     return (kept * scale).reshape(len(target), *given.shape[1:])
@@ -130,15 +136,30 @@ def _transferred(
     else:
         content = Content(values, values, values, centroids)
     got = stage.transfer(box, old, binned, content, new, sequence)
-    slack = 64 * np.finfo(np.float32).eps * got.volumes ** (1 - 1 / box.dim)
-    defect = np.abs(got.found - got.volumes) - DEFECT * got.volumes - slack
+    _demand_whole(got.found, got.volumes, box.dim)
+    return got.means.astype(float), got.low.astype(float), got.high.astype(float)
+
+
+def _transferred_on_host(
+    source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `_transferred` does, in a polygonal domain."""
+    means, low, high, found = transfer_polygons(source, target, columns, order, limited)
+    unit = source.domain.frame[1] ** 2
+    _demand_whole(found / unit, target.volumes / unit, 2)
+    return means, low, high
+
+
+def _demand_whole(found: np.ndarray, volumes: np.ndarray, dim: int) -> None:
+    """Raise ClvoroError unless the parts of each cell, `found` together, are all of it; in the device's unit."""
+    slack = 64 * np.finfo(np.float32).eps * volumes ** (1 - 1 / dim)
+    defect = np.abs(found - volumes) - DEFECT * volumes - slack
     worst = int(defect.argmax())
     if not defect[worst] <= 0:
         raise ClvoroError(
-            f"the parts of new cell {worst} have {got.found[worst] / got.volumes[worst]:.6g} of its volume, expected "
+            f"the parts of new cell {worst} have {found[worst] / volumes[worst]:.6g} of its volume, expected "
             "1: one of the meshes is not the Voronoi diagram of its points; ask their diagram.check()"
         )
-    return got.means.astype(float), got.low.astype(float), got.high.astype(float)
 
 
 def _upload(engine: Engine, diagram: Diagram) -> Graph:

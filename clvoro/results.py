@@ -157,6 +157,7 @@ class Diagram:
             wherever a cell has d neighbours in different directions, and values may leave the bounds of the old ones.
         adapter : Adapter, optional
             Whose device does the work; by default that of `create_context()`. In float64 where the device has it.
+            Between meshes of a polygonal domain, whose cells need not be convex, the host does it.
 
         Returns
         -------

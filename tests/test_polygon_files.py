@@ -510,3 +510,86 @@ def test_a_piece_with_one_cell_has_no_inner_cells(ctx) -> None:
     alone = mesh(ctx, Polygon(SQUARE), 1)
     assert summary(alone)["inner_mean_error"] is None
     assert "inner" not in boundary_line(alone)
+
+
+# Transfer.
+
+
+@pytest.fixture(scope="module")
+def pair(ctx):
+    """Two diagrams of one domain, with islands in cells and cells in parts."""
+    adapter = clvoro.Adapter(ctx)
+    return [adapter.diagram(bay(), scattered(bay(), n, seed)) for n, seed in ((60, 1), (45, 5))]
+
+
+def test_parts_are_those_of_the_cells(pair) -> None:
+    old, new = pair
+    before, after = cells_of(old), cells_of(new)
+    got = old.transfer(np.eye(60), new)
+    expected = np.array([[new_.intersection(old_).area for old_ in before] for new_ in after])
+    # Areas of sums of products of numbers up to 4; the mass that rounding leaves over is divided among all.
+    assert np.abs(got * new.volumes[:, None] - expected).max() < 1e-13
+    assert (expected > 0).sum() > 60
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_transfer_is_conservative_and_exact(ctx, name: str) -> None:
+    domain = DOMAINS[name]()
+    adapter = clvoro.Adapter(ctx)
+    old, new = (adapter.diagram(domain, scattered(domain, n, n)) for n in (300, 170))
+
+    def linear(d):
+        return 1 + 2 * d.centroids[:, 0] - 3 * d.centroids[:, 1]
+
+    rough = np.random.default_rng(7).standard_normal(300)
+    for order, limited in ((1, True), (2, True), (2, False)):
+        got = old.transfer(
+            np.column_stack([rough, linear(old), np.full(300, np.pi)]), new, order, limited=limited
+        )
+        assert got.shape == (170, 3)
+        for values, column in zip((rough, linear(old)), got.T, strict=False):
+            mass = np.abs(old.volumes * values).sum()
+            assert abs(new.volumes @ column - old.volumes @ values) < 1e-12 * mass
+        assert np.abs(got[:, 2] - np.pi).max() < 1e-14
+        if limited:
+            assert (got[:, 2] == np.pi).all()
+            assert got[:, 0].min() >= rough.min()
+            assert got[:, 0].max() <= rough.max()
+    # Exact where every old cell beneath has neighbours in two directions: nearly everywhere.
+    error = np.abs(got[:, 1] - linear(new))
+    assert np.median(error) < 1e-14
+    assert name == "comb" or error.max() < 1e-13
+
+
+def test_transfer_onto_itself_changes_nothing(pair) -> None:
+    values = np.random.default_rng(3).random(60)
+    assert np.abs(pair[0].transfer(values, pair[0]) - values).max() < 1e-13
+
+
+def test_transfer_between_domains_is_refused(pair, ctx) -> None:
+    other = clvoro.Adapter(ctx).diagram(Polygon(SQUARE), SQUARE * 0.5 + 0.2)
+    with pytest.raises(InputError, match="expected the same domain"):
+        pair[0].transfer(np.zeros(60), other)
+
+
+def test_slopes_are_those_of_the_device(ctx) -> None:
+    from clvoro.overlap import fit_slopes
+
+    # In a box, described as a polygon.
+    box, points = clvoro.Box((0, 0), (1, 1)), np.random.default_rng(9).random((80, 2))
+    values = np.random.default_rng(10).standard_normal((80, 1))
+    adapter = clvoro.Adapter(ctx)
+    new = np.random.default_rng(11).random((70, 2))
+    for limited in (True, False):
+        flat, ring_ = (
+            adapter.diagram(domain, points).transfer(
+                values, adapter.diagram(domain, new), 2, limited=limited
+            )
+            for domain in (box, Polygon(SQUARE))
+        )
+        # Where the fit is ill-conditioned, as between neighbours nearly in a row, rounding grows.
+        assert np.abs(flat - ring_).max() < 1e-10
+    slopes, least, most = fit_slopes(adapter.diagram(Polygon(SQUARE), points), values, True)
+    assert (least <= values).all()
+    assert (most >= values).all()
+    assert np.abs(slopes).max() > 0
