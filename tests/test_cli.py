@@ -176,7 +176,7 @@ def pressing_run(number):
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
         (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "no folder can be made"),
         (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
-        (["cases", "papre"], cli.BAD_INPUT, "airfoil, paper, sphere, surface"),
+        (["cases", "papre"], cli.BAD_INPUT, "airfoil, channel, lake, paper, sphere, surface"),
     ],
 )
 def test_errors_are_one_message(here, capsys, arguments, code, named):
@@ -233,6 +233,8 @@ def test_cases_are_listed_and_printed(here, capsys):
     assert call("cases") == cli.OK
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
         "airfoil",
+        "channel",
+        "lake",
         "paper",
         "sphere",
         "surface",
