@@ -92,10 +92,11 @@ kernel void place_children(const int size, global const int *starts, global cons
                                          DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
 #ifdef POLYGON
             /* Around a corner of the boundary the middle of the common face is in sight of both; where cells meet on
-               both sides of an obstacle, each face but the first brings its own middle, too. */
+               both sides of an obstacle, each face but the longest (of two equally long, the first) brings its own. */
             bool met = false;
-            for (int m = starts[i]; m < k && !met; ++m)
-                met = neighbours[m] == j && has_middle(i, j, face_measures[m], volumes[i]);
+            for (int m = starts[i]; m < starts[i + 1] && !met; ++m)
+                met = neighbours[m] == j && m != k &&
+                      (face_measures[m] > face_measures[k] || (face_measures[m] == face_measures[k] && m < k));
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {child[0], child[1]};
             if (met || leaves_at(x, y, DOMAIN) <= 1) {

@@ -155,3 +155,24 @@ def test_bad_sizes_are_named_inside_only() -> None:
     assert count_cells(field, clvoro.Polygon(SQUARE, [HOLE])) == pytest.approx(1100, rel=1e-3)
     with pytest.raises(InputError, match="is -1 at"):
         count_cells(field, clvoro.Polygon(SQUARE))
+
+
+def test_cells_that_meet_twice_bring_two_middles(ctx) -> None:
+    """The common face of two cells is cut by an obstacle, beside which both generators see their middle."""
+    from clvoro.tessellator import Tessellator
+
+    outer = np.array([(-3.0, -2), (3, -2), (3, 2), (-3, 2)])
+    obstacle = np.array([(1.0, -0.1), (1.2, -0.1), (1.2, 0.1), (1, 0.1)])
+    domain = clvoro.Polygon(outer, [obstacle])
+    stages = clvoro.Adapter(ctx)._stages_for(domain)
+    upload = stages.engine.upload
+    points = upload(domain.place(np.array([(0.0, -1), (0, 1)]), np.dtype(float)))
+    t = Tessellator(stages, domain).tessellate(points, 2, exact=True)
+    origin, scale = domain.frame
+    finer = stages.refinement.refine(domain, t, upload([0.5, 0.5])).get() * scale + origin
+    assert (
+        len(finer) == len(np.unique(finer, axis=0)) == 6
+    )  # the parents, two middles, one before each's longest wall
+    assert domain.contains(finer).all()
+    for middle in ((0.0, 0), (2.1, 0)):
+        assert np.hypot(*(finer - middle).T).min() < 1e-12
