@@ -1,4 +1,4 @@
-"""The tessellation: every cell clipped by its neighbours and walls, its faces, volume and centroid (`cells.cl`)."""
+"""The tessellation: each cell cut by neighbours and walls, its faces and moments (`cells.cl`; `hulls.cl` on CPUs)."""
 
 from __future__ import annotations
 
@@ -133,10 +133,6 @@ class Cells:
             engine, d = self.engine, self.engine.dim
             # A planar graph has at most 3 n - 6 edges, and every cell at most one face on each wall it touches.
             m = 7 * n + 8
-            self.rows.counts, self.rows.places = (
-                engine.empty(n, np.int32),
-                engine.empty(n, np.int32),
-            )
             # Two graphs in turn: the previous one stays valid, to be repaired. Measures are those of the present.
             self._graphs = [
                 {"starts": engine.empty(n + 1, np.int32), "neighbours": engine.empty(m, np.int32)}
@@ -196,7 +192,7 @@ class Cells:
         if self.row_capacity > ROW_CAPACITY and n * self.row_capacity > rows.slots.size:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
-        self._reserve_rows(n)
+        self.reserve_rows(n)
         self._reserve(n)
         while True:
             self.clear_flags()
@@ -294,8 +290,17 @@ class Cells:
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
-    def _reserve_rows(self, n: int) -> None:
+    def clear(self) -> None:
+        """Let go of the lists of faces, which hold nothing between two diagrams."""
+        none = self.engine.empty(1, np.int32)
+        self.rows = FaceRows(none, none, self.engine.empty(1, np.uint32), none, self.rows.flags)
+
+    def reserve_rows(self, n: int) -> None:
         """Make room for `n` rows of faces of the present capacity."""
+        if n > self.rows.counts.size:
+            self.rows.counts, self.rows.places = (
+                self.engine.empty(n, np.int32), self.engine.empty(n, np.int32)
+            )  # fmt: skip
         entries = n * self.row_capacity
         if entries >= 2**31:
             raise MemoryLimitError(
@@ -317,7 +322,7 @@ class Cells:
                 "are not supported: remove or perturb some"
             )
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
-        self._reserve_rows(n)
+        self.reserve_rows(n)
 
     def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"
