@@ -1,6 +1,6 @@
 #define CLIP_SHARPLY 1
 #include "common/join.h"
-#include "common/polyhedron.h"
+#include "common/clip.h"
 
 /* The corners of a diagram's cells in 3D, and which of them are surely one vertex. Each cell is clipped once more, by its
    neighbours alone. Its vertices, the corners, are numbered cell by cell: corner u. Two corners are one vertex where the

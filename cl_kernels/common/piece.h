@@ -10,7 +10,7 @@
 #if DIM == 2
 #include "common/polygon.h"
 #else
-#include "common/polyhedron.h"
+#include "common/clip.h"
 #endif
 
 #define PIECE_WHOLE 0  /* nothing was cut off */

@@ -1,0 +1,290 @@
+/* The clip of a polyhedron by the half-space nearer to its generator than to a neighbour. A clip takes out the triangles of
+   the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new face. Only that structure,
+   never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
+#include "common/noise.h"
+#include "common/polyhedron.h"
+
+#define CLIP_MISSED 0    /* the bisector does not cut the cell */
+#define CLIP_CUT 1       /* it does */
+#define CLIP_FULL 2      /* it does, and there are too many faces */
+#define CLIP_COLLAPSED 3 /* rounding leaves nothing, or much on the wrong side */
+#define CLIP_COINCIDE 4  /* another generator is at the place of the cell's own */
+
+inline REAL4 cross_product(REAL4 a, REAL4 b)
+{
+    return (REAL4)(difference_of_products(a.s1, b.s2, a.s2, b.s1), difference_of_products(a.s2, b.s0, a.s0, b.s2),
+                   difference_of_products(a.s0, b.s1, a.s1, b.s0), 0);
+}
+
+/* The bisector with generator q instead of which that between p and q may be taken: where these two are near each other
+   beside their distance from the cell's own, the planes of both are nearly parallel, and their difference is not. */
+inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
+{
+    if (label_p < 0 || label_q < 0)
+        return q;
+    const REAL4 w = (REAL4)(points[3 * label_q] - points[3 * label_p], points[3 * label_q + 1] - points[3 * label_p + 1],
+                            points[3 * label_q + 2] - points[3 * label_p + 2], 0);
+    const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
+    if (w2 > R(2e-3) * p.s3) /* level is half a square */
+        return q;
+    return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + w2 / 2);
+}
+
+/* The point in which three planes meet, from the planes alone. */
+inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
+{
+    const REAL4 p = cell->planes[a];
+    const REAL4 q = better_row(cell->planes[b], p, cell->labels[b], cell->labels[a], points);
+    const REAL4 r0 = cell->planes[c];
+    REAL4 r = better_row(r0, p, cell->labels[c], cell->labels[a], points);
+    if (r.s3 == r0.s3 && r.s0 == r0.s0)
+        r = better_row(r0, cell->planes[b], cell->labels[c], cell->labels[b], points);
+    const REAL4 qr = cross_product(q, r), rp = cross_product(r, p), pq = cross_product(p, q);
+    const REAL inverse = 1 / (p.s0 * qr.s0 + p.s1 * qr.s1 + p.s2 * qr.s2);
+    return (qr * p.s3 + rp * q.s3 + pq * r.s3) * inverse;
+}
+
+/* Make what lies beyond one disc: grown from the farthest vertex by a triangle at a time, the farthest first, and where
+   that does not reach all that lies farther beyond than `doubt`, through the nearest that do not. The distances of
+   vertices that do not belong where rounding has put them are changed. False if something stays out of reach. */
+inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
+{
+    REAL *s = (REAL *)cell->beyond;
+    bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* of the disc: vertices, faces */
+    int added = 0, left = 0; /* left: vertices certainly beyond, and not in the disc yet */
+    for (int v = 0; v < cell->n; ++v) {
+        inside[v] = false;
+        added = s[v] > s[added] ? v : added;
+        left += s[v] > doubt;
+    }
+    for (int f = 0; f < FACE_CAPACITY; ++f)
+        on[f] = false;
+    while (added >= 0) {
+        const INDEX4 f = cell->faces[added];
+        inside[added] = on[f.s0] = on[f.s1] = on[f.s2] = true;
+        left -= s[added] > doubt;
+        const REAL least = left > 0 ? -64 * doubt : depth;
+        added = -1;
+        for (int v = 0; v < cell->n; ++v) {
+            if (inside[v] || !(s[v] > least) || (added >= 0 && !(s[v] > s[added])))
+                continue;
+            const INDEX4 g = cell->faces[v];
+            const bool ab = inside[cell->at[g.s1 * FACE_CAPACITY + g.s0]];
+            const bool bc = inside[cell->at[g.s2 * FACE_CAPACITY + g.s1]];
+            const bool ca = inside[cell->at[g.s0 * FACE_CAPACITY + g.s2]];
+            const int shared = ab + bc + ca;
+            if (shared == 2 || (shared == 1 && !on[ab ? g.s2 : (bc ? g.s0 : g.s1)]))
+                added = v;
+        }
+    }
+    for (int v = 0; v < cell->n; ++v) {
+        if (inside[v] && !(s[v] > depth))
+            s[v] = 2 * depth;
+        if (!inside[v] && s[v] > depth)
+            s[v] = 0;
+    }
+    return left == 0;
+}
+
+/* The edges over which a bisector leaves the cell. */
+typedef struct {
+    int gone;                                              /* vertices beyond the bisector */
+    int n;                                                 /* edges */
+    ulong dead[FACE_WORDS];                                /* faces all of which is beyond */
+    INDEX vertices[VERTEX_CAPACITY + 1];                   /* those beyond, ascending */
+    INDEX before[FACE_CAPACITY + 4], after[FACE_CAPACITY + 4]; /* faces of an edge, along the rim */
+    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];   /* its ends, kept and not */
+} rim_t;
+
+/* Find the rim; false if it is not one simple cycle. */
+inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
+{
+    const REAL *s = (const REAL *)cell->beyond;
+    int gone = 0, n = 0;
+    SHORT_LOOP
+    for (int v = 0; v < cell->n; ++v) {
+        rim->vertices[gone] = v;
+        gone += s[v] > depth;
+    }
+    rim->gone = gone;
+    ulong touched[FACE_WORDS], around[FACE_WORDS];
+    for (int w = 0; w < FACE_WORDS; ++w)
+        touched[w] = around[w] = 0;
+    SHORT_LOOP
+    for (int k = 0; k < gone; ++k) {
+        const int v = rim->vertices[k];
+        const INDEX4 f = cell->faces[v];
+        const int a = f.s0, b = f.s1, c = f.s2;
+        add_face(touched, a);
+        add_face(touched, b);
+        add_face(touched, c);
+        const int ab = cell->at[b * FACE_CAPACITY + a];
+        rim->before[n] = a;
+        rim->after[n] = b;
+        rim->in[n] = ab;
+        rim->out[n] = v;
+        n += !(s[ab] > depth);
+        const int bc = cell->at[c * FACE_CAPACITY + b];
+        rim->before[n] = b;
+        rim->after[n] = c;
+        rim->in[n] = bc;
+        rim->out[n] = v;
+        n += !(s[bc] > depth);
+        const int ca = cell->at[a * FACE_CAPACITY + c];
+        rim->before[n] = c;
+        rim->after[n] = a;
+        rim->in[n] = ca;
+        rim->out[n] = v;
+        n += !(s[ca] > depth);
+        if (n > FACE_CAPACITY)
+            return false;
+    }
+    rim->n = n;
+    SHORT_LOOP
+    for (int k = 0; k < n; ++k)
+        add_face(around, rim->before[k]);
+    int faces = 0, dead = 0;
+    for (int w = 0; w < FACE_WORDS; ++w) {
+        rim->dead[w] = touched[w] & ~around[w];
+        faces += (int)popcount(around[w]);
+        dead += (int)popcount(rim->dead[w]);
+    }
+    /* Simple cycles, and Euler's formula for a disc: enough up to six triangles. More may be a ring and a disc. */
+    if (faces != n || n != gone + 2 - 2 * dead)
+        return false;
+    if (gone > 6) {
+        INDEX next[FACE_CAPACITY];
+        SHORT_LOOP
+        for (int k = 0; k < n; ++k)
+            next[rim->before[k]] = rim->after[k];
+        int face = next[rim->before[0]], steps = 1;
+        while (face != rim->before[0]) {
+            face = next[face];
+            ++steps;
+        }
+        return steps == n;
+    }
+    return true;
+}
+
+/* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbours that are seen are known to have a face. */
+#ifndef CLIP_SHARPLY
+#define CLIP_SHARPLY 0
+#endif
+
+/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before` the
+   neighbour may be a face of the cell already. */
+inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
+{
+    const REAL level = d2 / 2;
+    const int blocks = (cell->n + 7) / 8;
+    REAL8 far = -level;
+    for (int b = 0; b < blocks; ++b) {
+        const REAL8 s = fma(cell->x[b], d.s0, fma(cell->y[b], d.s1, fma(cell->z[b], d.s2, -level)));
+        cell->beyond[b] = s;
+        far = s > far ? s : far;
+    }
+    const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
+    const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
+    const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
+    if (!(farthest > (CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
+        return CLIP_MISSED;
+    const REAL distance = sqrt(d2);
+    const REAL depth = CLIP_SHARPLY ? 0 : distance * noise_length(distance);
+    if (!(farthest > depth))
+        return CLIP_MISSED;
+    if (seen_before)
+        for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1))
+            if (cell->labels[f] == label)
+                return CLIP_MISSED;
+
+    rim_t rim;
+    if (!find_rim(cell, depth, &rim)) {
+        if (rim.gone == cell->n)
+            return CLIP_COLLAPSED;
+        const REAL doubt = 64 * distance * (noise_length(distance) + REAL_EPS * sqrt(cell->reach2));
+        if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
+            return CLIP_COLLAPSED;
+    }
+    for (int w = 0; w < FACE_WORDS; ++w)
+        cell->alive[w] &= ~rim.dead[w];
+    const int face = first_spare(cell->alive);
+    if (face == FACE_CAPACITY)
+        return CLIP_FULL;
+    add_face(cell->alive, face);
+    cell->labels[face] = label;
+    cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
+
+    /* New vertices. Interpolation rounds by eps of the edge's length; where that may be much beside the distance of the
+       generators (while the cell is not closed yet, or near-duplicates), planes are intersected instead. */
+    REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
+    REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
+    const REAL *s = (const REAL *)cell->beyond;
+    SHORT_LOOP
+    for (int k = 0; k < rim.n; ++k) {
+        const int in = rim.in[k], out = rim.out[k];
+        const REAL s_in = s[in] < 0 ? s[in] : 0;
+        const REAL t = s_in / (s_in - s[out]);
+        nx[k] = x[in] + t * (x[out] - x[in]);
+        ny[k] = y[in] + t * (y[out] - y[in]);
+        nz[k] = z[in] + t * (z[out] - z[in]);
+    }
+    if (cell->reach2 > 16 * d2) {
+        const REAL reach = distance * sqrt(cell->reach2);
+        for (int k = 0; k < rim.n; ++k) {
+            const int in = rim.in[k], out = rim.out[k];
+            const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
+            /* But for planes that are nearly parallel to the edge: there only interpolation stays on it. */
+            const REAL slack = 1 + reach / (s[out] - s[in]);
+            const REAL off = fabs(v.s0 - nx[k]) + fabs(v.s1 - ny[k]) + fabs(v.s2 - nz[k]);
+            const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
+            if (slack < 1024 && off < 1024 * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
+                nx[k] = v.s0;
+                ny[k] = v.s1;
+                nz[k] = v.s2;
+            }
+        }
+    }
+    /* They take the places of those that are gone, then go behind the last; places left over are filled from the end. */
+    SHORT_LOOP
+    for (int k = 0; k < rim.n; ++k) {
+        const int v = k < rim.gone ? rim.vertices[k] : cell->n++;
+        x[v] = nx[k];
+        y[v] = ny[k];
+        z[v] = nz[k];
+        cell->faces[v] = (INDEX4)(rim.before[k], rim.after[k], face, 0);
+        link_vertex(cell, v);
+    }
+    SHORT_LOOP
+    for (int k = rim.gone - 1; k >= rim.n; --k) {
+        const int v = rim.vertices[k], last = --cell->n;
+        if (v != last) {
+            x[v] = x[last];
+            y[v] = y[last];
+            z[v] = z[last];
+            cell->faces[v] = cell->faces[last];
+            link_vertex(cell, v);
+        }
+        x[last] = y[last] = z[last] = 0;
+    }
+    find_reach(cell);
+    return CLIP_CUT;
+}
+
+/* Clip by the generators in row i of a graph; one of CLIP_*, or CLIP_COINCIDE. */
+inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbours,
+                       global const REAL *points)
+{
+    const int end = starts[i + 1];
+    for (int k = starts[i]; k < end; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
+        const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
+        const int what = d2 == 0 ? CLIP_COINCIDE : clip_cell(cell, d, d2, j, false, points);
+        if (what >= CLIP_FULL)
+            return what;
+    }
+    return CLIP_CUT;
+}
