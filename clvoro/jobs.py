@@ -20,6 +20,7 @@ from .io import check_writable, save, write_history
 from .polygon import Polygon
 from .profile import Profile
 from .results import Result
+from .sequence import frames_line, run_frames
 from .summary import boundary_line, measures_line, summary
 
 _REPEATED = (
@@ -108,7 +109,15 @@ class Job:
                     self._write(adapter, size, results, where)
                 raise
             self._write(adapter, size, results, where)
+            frames = []
+            if self.case.frames > 1 and not self.interrupted:
+                *_, last = results.values()
+                frames = run_frames(
+                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report
+                )
         self._summarise(results, where, profiles)
+        if frames and not self.quiet and not self.as_json:
+            print(frames_line(frames))
         return self.interrupted
 
     def _run_one(

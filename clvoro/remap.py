@@ -42,6 +42,11 @@ def transfer_values(
             f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
             "both meshes with one domain"
         )
+    if any(source.domain.periodic):
+        raise InputError(
+            f"the meshes are of {source.domain}, and values are not carried over in periodic boxes yet, expected a "
+            "domain with walls"
+        )
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
     given = _checked(values, len(source))

@@ -10,6 +10,8 @@ import clvoro
 from clvoro import sizing
 from clvoro.errors import InputError, InputTypeError
 from clvoro.faces import face_owners
+from clvoro.io.vtu_read import load_vtu
+from clvoro.quality import measure_mesh
 from clvoro.torus import FewCellsError
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
@@ -414,3 +416,99 @@ def test_refinement_across_seams(double):
 def test_too_few_cells_for_a_run(double):
     with pytest.raises(FewCellsError, match="half a period"):
         double.run(UNIT, 0.5, method="coupled")
+
+
+# Files, pictures, cases.
+
+
+@pytest.mark.parametrize("box", [UNIT, CHANNEL, SLAB], ids=["unit", "channel", "slab"])
+@pytest.mark.parametrize("kind", ["npz", "vtu"])
+def test_files(double, tmp_path, box, kind):
+    points = some_points(box, 500 if box.dim == 3 else 60)
+    result = double.run(box, 0.3, points, method="lloyd", max_steps=0)
+    path = tmp_path / f"mesh.{kind}"
+    result.save(path)
+    read = clvoro.load(path) if kind == "npz" else load_vtu(path)
+    assert read.diagram.domain == box
+    assert read.check()
+    assert faces_of(read.diagram).keys() == faces_of(result.diagram).keys()
+    assert (read.points == result.points).all()
+
+
+def test_one_cell_that_borders_on_itself(double):
+    diagram = double.diagram(CUBE, [[0.1, 0.2, 0.3]])
+    measures = measure_mesh(diagram)
+    assert (diagram.neighbours == 0).all()
+    assert np.abs(measures.skewness).max() < 1e-15
+    assert measures.inner.all()
+    assert (measures.volume_ratio == 1).all()
+
+
+def test_a_wrong_shift_is_found(double):
+    d = double.diagram(UNIT, some_points(UNIT, 30))
+    names = [n for n in d._NAMES if not n.startswith("face_vert")]
+    arrays = {name: getattr(d, name).copy() for name in names}
+    k = int(np.flatnonzero(d.shifts[:, 0])[0])
+    arrays["shifts"][k, 0] *= -1
+    report = clvoro.results.Diagram(UNIT, arrays).check()
+    assert not report
+    assert "graph symmetric" in str(report)
+
+
+def test_what_knows_no_seams_refuses(double, tmp_path):
+    result = double.run(UNIT, 0.2, method="lloyd", max_steps=1)
+    with pytest.raises(InputError, match="periodic"):
+        result.transfer(result.size, result)
+    with pytest.raises(InputError, match="cyclic"):
+        result.save(tmp_path / "polyMesh")
+
+
+def test_pictures_are_filled_up_to_the_seams(double):
+    """Images of cells cover the window; each place is in one polygon."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.path import Path
+
+    result = double.run(UNIT, 0.2, method="lloyd", max_steps=1)
+    figure = result.plot("quality")
+    (cells,) = (c for c in figure.axes[0].collections if isinstance(c, PolyCollection))
+    places = np.random.default_rng(4).random((300, 2))
+    covered = sum(Path(p.vertices).contains_points(places).astype(int) for p in cells.get_paths())
+    assert (covered == 1).all()
+    assert len(cells.get_paths()) > len(result.points)
+
+
+def test_a_case_with_frames(tmp_path):
+    from clvoro.cases import Case, load_case
+    from clvoro.cli import main
+
+    assert load_case("spots").domain == UNIT
+    assert load_case("spots").frames > 1
+    text = """
+    [domain]
+    lower = [0, 0]
+    upper = [1, 1]
+    periodic = [true, true]
+    [size]
+    kind = "expression"
+    expression = "0.1 + 0.1 * cos(6.283185307179586 * (x - {t}))"
+    [run]
+    effort = "fast"
+    [sequence]
+    frames = 3
+    """.replace("0.1 + 0.1", "0.12 + 0.03")
+    (tmp_path / "wave.toml").write_text(text)
+    out = tmp_path / "out"
+    assert main(["run", str(tmp_path / "wave.toml"), "--out", str(out), "--quiet"]) == 0
+    table = np.genfromtxt(out / "frames.csv", delimiter=",", names=True)
+    assert table["time"].tolist() == pytest.approx([0, 1 / 3, 2 / 3])
+    assert (table["mean_error"] < 0.02).all()
+    for frame in range(3):
+        mesh = load_vtu(out / "frames" / f"mesh-{frame:03d}.vtu")
+        shift = (mesh.points[:, 0] - frame / 3) * 2 * np.pi
+        assert np.abs(mesh.size / (0.12 + 0.03 * np.cos(shift)) - 1).max() < 0.1
+    assert (out / "pictures" / "frames.png").stat().st_size > 10_000
+    again = Case.from_toml((out / "case.toml").read_text(), "wave")
+    assert again.domain == UNIT
+    assert again.frames == 3
+    with pytest.raises(InputError, match="periodic"):
+        Case.from_toml(text.replace("[true, true]", "1"), "wave")

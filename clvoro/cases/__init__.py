@@ -44,6 +44,8 @@ class Case:
         Files that the case names are looked for here, then among those of the built-in cases.
     place : dict
         The keys of the file's `[domain]` table; empty for a box that is not from a file.
+    frames : int
+        Meshes that the size field's motion is followed by, the first included; see `clvoro.sequence`.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Case:
     run: dict[str, Any] = field(default_factory=dict)
     folder: Path = Path()
     place: dict[str, Any] = field(default_factory=dict)
+    frames: int = 1
 
     @classmethod
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
@@ -88,6 +91,7 @@ class Case:
             run=run,
             folder=folder,
             place=checked["domain"],
+            frames=checked.get("sequence", {}).get("frames", 1),
         )
 
     @property
@@ -102,9 +106,9 @@ class Case:
         run = {key: value for key, value in self.run.items() if key not in dropped}
         return replace(self, run=schema.RUN({**run, **changes}, f"{self.name}: run"))
 
-    def size_field(self) -> Any:
-        """Build the size field (an object of `clvoro.sizing`)."""
-        return build_size(self.size, self.folder, self.domain)
+    def size_field(self, time: float = 0.0) -> Any:
+        """Build the size field (an object of `clvoro.sizing`), with `time` in the place of {t} in expressions."""
+        return build_size(_at(self.size, time), self.folder, self.domain)
 
     def run_arguments(self) -> dict[str, Any]:
         """Return what the case sets of `Adapter.run`'s arguments, method and dtype apart."""
@@ -119,10 +123,10 @@ class Case:
         return {
             "name": self.name,
             "title": self.title,
-            "domain": self.place
-            or {"lower": list(self.domain.lower), "upper": list(self.domain.upper)},
+            "domain": self.place or _corners(self.domain),
             "size": self.size,
             "run": {key: self.run[key] for key in _RUN_ORDER if key in self.run},
+            **({"sequence": {"frames": self.frames}} if self.frames > 1 else {}),
         }
 
     def write(self, folder: Path, header: tuple[str, ...] = ()) -> Path:
@@ -149,6 +153,22 @@ class Case:
         with atomic_file(path) as file:
             file.write(toml.write(moved.table(), header).encode())
         return path
+
+
+def _corners(domain: Domain) -> dict[str, Any]:
+    """Return the table of a box."""
+    table: dict[str, Any] = {"lower": list(domain.lower), "upper": list(domain.upper)}
+    return {**table, "periodic": list(domain.periodic)} if any(domain.periodic) else table
+
+
+def _at(node: Any, time: float) -> Any:
+    """Return a tree of tables with `time` in the place of {t} in its expressions."""
+    if isinstance(node, Mapping):
+        return {
+            key: value.replace("{t}", f"({time!r})") if key == "expression" else _at(value, time)
+            for key, value in node.items()
+        }
+    return [_at(item, time) for item in node] if isinstance(node, list) else node
 
 
 def builtin_cases() -> Mapping[str, str]:

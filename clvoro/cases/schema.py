@@ -292,9 +292,18 @@ def ring(value: object, place: str) -> Any:
     return [vector(2)(v, f"{place}[{i}]") for i, v in enumerate(value)]
 
 
+def directions(value: object, place: str) -> bool | list[bool]:
+    """Check a truth value, or one for each direction."""
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, list) or not all(isinstance(v, bool) for v in value):
+        raise refuse(place, value, "true, false or one of them for each direction")
+    return value
+
+
 _DOMAINS = Kinds(
     {
-        "box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {}),
+        "box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {"periodic": directions}),
         "polygon": Table(
             {}, {"file": text, "outer": ring, "holes": list_of(ring)}, choice=("file", "outer")
         ),
@@ -337,4 +346,9 @@ RUN = Table(
     },
 )
 
-CASE = Table({"domain": domain, "size": size}, {"name": text, "title": text, "run": RUN})
+SEQUENCE = Table({"frames": whole(1)}, {})
+
+CASE = Table(
+    {"domain": domain, "size": size},
+    {"name": text, "title": text, "run": RUN, "sequence": SEQUENCE},
+)

@@ -73,9 +73,15 @@ def poly_mesh(diagram: Diagram, patches: Mapping[str, Iterable[int]] | None = No
     Raises
     ------
     InputError
-        If there are no such edges; or for a cell with an island in it, as no face of OpenFOAM's has a hole.
+        If there are no such edges; for a cell with an island in it, as no face of OpenFOAM's has a hole; or for a
+        periodic box.
     """
     box = diagram.domain
+    if any(box.periodic):
+        raise InputError(
+            f"the mesh is of {box}, whose seams OpenFOAM would need as cyclic patches, which are not written, expected "
+            "a domain with walls; save it as .vtu or .npz"
+        )
     names, groups = wall_groups(box) if patches is None else _named(box, patches)
     faces = _by_group(faces_once(diagram), groups)
     counts = np.bincount(groups[-1 - faces.neighbour[faces.inner :]], minlength=len(names))

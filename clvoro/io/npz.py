@@ -195,6 +195,9 @@ def _check_domain(arrays: Mapping[str, np.ndarray], domain: Domain) -> None:
     neighbours = arrays["diagram.neighbours"]
     if neighbours.size and neighbours.min() < -wall_count(domain):
         raise FileError("diagram.neighbours points to what does not exist")
+    shifts = arrays.get("diagram.shifts")
+    if shifts is not None and shifts.size and not (shifts.min() >= -1 and shifts.max() <= 1):
+        raise FileError("diagram.shifts has others than -1, 0 and 1")
     if isinstance(domain, Polygon):
         starts = arrays["diagram.face_vertex_starts"]
         if not np.array_equal(starts, 2 * np.arange(len(neighbours) + 1)):

@@ -15,7 +15,6 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..domain import Domain
 from ..faces import face_corners, face_owners
 from ..outlines import count_sides
 from ..polygon import Polygon
@@ -32,7 +31,7 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
 
     Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces_of_cell`),
     `label` (the cell's row in the result), and the vector `generator`, from the origin to the cell's generator.
-    A polygonal domain goes along as field data.
+    A polygonal or periodic domain goes along as field data. In a periodic box cells are not cut at the seams.
     """
     diagram = result.diagram
     n = len(diagram)
@@ -46,8 +45,7 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
     cells = [appended.add(name, array) for name, array in topology.items()]
     data = [appended.add(name, values) for name, values in cell_data(result).items()]
     field = [
-        appended.add(name, array, tuples=True)
-        for name, array in _domain_data(diagram.domain).items()
+        appended.add(name, array, tuples=True) for name, array in _domain_data(diagram).items()
     ]
     compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
     head = f"""<?xml version="1.0"?>
@@ -76,8 +74,22 @@ _"""
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-def _domain_data(domain: Domain) -> dict[str, np.ndarray]:
-    """Return what describes a domain that its cells' bounding box does not."""
+def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return what describes a domain, and its graph, that the cells' corners do not."""
+    domain = diagram.domain
+    if any(domain.periodic):
+        starts = face_corners(diagram)[0]
+        written = np.cumsum(np.diff(starts) > 0) - 1  # in 3D a face without a loop is left out
+        seam = np.flatnonzero(diagram.shifts.any(axis=1) & (np.diff(starts) > 0))
+        if domain.dim == 2:
+            written = np.arange(len(diagram.neighbours))
+        return {
+            "box_corners": in_space(np.array([domain.lower, domain.upper])),
+            "box_periodic": np.array(domain.periodic, np.uint8),
+            "seam_faces": written[seam].astype(np.int32),
+            "seam_neighbours": diagram.neighbours[seam],
+            "seam_shifts": in_space(diagram.shifts[seam]).astype(np.int32),
+        }
     if not isinstance(domain, Polygon):
         return {}
     return {

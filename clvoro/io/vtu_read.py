@@ -39,8 +39,8 @@ class _FileError(Exception):
 def load_vtu(path: str | PathLike[str]) -> Result:
     """Read the cells and what is known of them from a `.vtu` file that `Result.save` wrote.
 
-    The domain is the polygon that the file describes, or else the vertices' bounding box. The graph is made anew from
-    the corners that cells share; volumes, sizes, errors and quality are the file's. The history is empty.
+    The domain is the polygon or periodic box that the file describes, or else the vertices' bounding box. The graph is
+    made anew from the corners that cells share; volumes, sizes, errors and quality are the file's. The history is empty.
 
     Raises
     ------
@@ -185,6 +185,9 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         raise _FileError("its vertices lie on a line")
     polygon = _polygon(arrays) if dim == 2 else None
     domain = Box(tuple(lower), tuple(upper)) if polygon is None else polygon
+    periodic = "FieldData.box_periodic" in arrays
+    if periodic:
+        domain = _periodic_box(arrays, dim)
     x = np.ascontiguousarray(vertices[:, :dim])
     points = arrays["CellData.generator"][:, :dim].astype(float)
     owner = np.repeat(np.arange(len(kinds)), np.diff(cell_starts))
@@ -201,9 +204,11 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         flat, starts = corners, face_starts
         face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     neighbours = _neighbours(owner, face, flat, starts, x, domain)
+    across = _seam(arrays, neighbours, dim, len(kinds)) if periodic else {}
     known = {
         "points": points, "volumes": arrays["CellData.volume"].astype(float),
         "neighbour_starts": cell_starts, "neighbours": neighbours, "vertices": x,
+        **across,
     }  # fmt: skip
     if polygon is not None:
         rows = np.bincount(owner, minlength=len(kinds))
@@ -222,6 +227,30 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         points=points, diagram=diagram, **values, history=np.zeros(0, HISTORY_DTYPE),
         converged=False, stop_reason="read from a .vtu file",
     )  # fmt: skip
+
+
+def _periodic_box(arrays: dict[str, np.ndarray], dim: int) -> Box:
+    """Return the periodic box that the file has."""
+    corners = arrays["FieldData.box_corners"].reshape(2, 3)[:, :dim].astype(float)
+    axes = arrays["FieldData.box_periodic"]
+    if axes.shape != (dim,):
+        raise _FileError("box_periodic has another number of directions")
+    return Box(*corners.tolist(), periodic=[bool(a) for a in axes])
+
+
+def _seam(
+    arrays: dict[str, np.ndarray], neighbours: np.ndarray, dim: int, n: int
+) -> dict[str, np.ndarray]:
+    """Put in the neighbours across the seams, whose faces share no corners, and return the shifts."""
+    faces = _indices(arrays["FieldData.seam_faces"], len(neighbours), "seam_faces")
+    others = _indices(arrays["FieldData.seam_neighbours"], n, "seam_neighbours")
+    steps = arrays["FieldData.seam_shifts"].reshape(-1, 3)[:, :dim]
+    if not len(faces) == len(others) == len(steps) or (np.abs(steps.astype(float)) > 1).any():
+        raise _FileError("its seams do not fit its cells")
+    neighbours[faces] = others
+    shifts = np.zeros((len(neighbours), dim), np.int8)
+    shifts[faces] = steps
+    return {"shifts": shifts}
 
 
 def _polygon(arrays: dict[str, np.ndarray]) -> Polygon | None:
@@ -317,6 +346,8 @@ def _neighbours(
     if isinstance(domain, Polygon):
         result[alone] = -1 - domain.nearest_edge(middle)[0]
         return result
-    gaps = np.stack([middle - domain.lower, domain.upper - middle], axis=2).reshape(len(alone), -1)
+    gaps = np.stack([middle - domain.lower, domain.upper - middle], axis=2)
+    gaps[:, np.array(domain.periodic)] = np.inf  # these are seams
+    gaps = gaps.reshape(len(alone), -1)
     result[alone] = -1 - gaps.argmin(axis=1)
     return result

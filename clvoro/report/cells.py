@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -79,13 +80,13 @@ def plot_cells(
         if ax is None:
             height = grid_height(lower, upper, 1, 1, 0.55, 0.25 * (title is not None))
             ax = interactive_figure(WIDTH, height).add_subplot()
-        shown = _cells_in(diagram, lower, upper)
+        shown, offsets = _cells_in(diagram, lower, upper)
         values = scheme.values(result)
         low, high = scheme.limits(values) if limits is None else limits
-        cells = draw_cells(ax, diagram, shown, values, scheme, (low, high))
+        cells = draw_cells(ax, diagram, shown, offsets, values, scheme, (low, high))
         frame_part(ax, diagram.domain, lower, upper)
         if edges:
-            draw_edges(ax, diagram, shown, np.subtract(upper, lower))
+            draw_edges(ax, diagram, shown, offsets, np.subtract(upper, lower))
         if title is not None:
             ax.set_title(title)
         if key:
@@ -97,13 +98,16 @@ def draw_cells(
     ax: Any,
     diagram: Diagram,
     shown: np.ndarray,
+    offsets: np.ndarray,
     values: np.ndarray,
     scheme: Colouring,
     limits: tuple[float, float],
 ) -> PolyCollection:
-    """Add the filled polygons of the cells `shown` (indices) to `ax`."""
+    """Add the filled polygons of the cells `shown` (indices), moved by `offsets`, to `ax`."""
     starts, corners = diagram.cell_vertex_starts, diagram.vertices[diagram.cell_vertices]
-    polygons = [corners[starts[i] : starts[i + 1]] for i in shown]
+    polygons = [
+        corners[starts[i] : starts[i + 1]] + by for i, by in zip(shown, offsets, strict=True)
+    ]
     cells = PolyCollection(
         polygons,
         array=values[shown],
@@ -118,18 +122,31 @@ def draw_cells(
     return cells
 
 
-def draw_edges(ax: Any, diagram: Diagram, shown: np.ndarray, extent: np.ndarray) -> None:
+def draw_edges(
+    ax: Any, diagram: Diagram, shown: np.ndarray, offsets: np.ndarray, extent: np.ndarray
+) -> None:
     """Add each face once, as a line whose width follows the size of the cells beside it."""
     neighbours, owner = diagram.neighbours, face_owners(diagram)
-    inside = np.zeros(len(diagram), bool)
-    inside[shown] = True
+    if not len(shown):
+        return
     # A wall has no thickness of its own: there the cell counts twice.
     beyond = np.where(neighbours >= 0, neighbours, owner)
     lengths = np.sqrt(diagram.volumes)
     thin, colours = edge_style(ax, np.minimum(lengths[owner], lengths[beyond]), extent)
-    once = np.flatnonzero((neighbours < owner) & inside[owner] & (thin > 0.06))
+    # A seam has faces on both sides.
+    wanted = ((neighbours < owner) | diagram.shifts.any(axis=1)) & (thin > 0.06)
+    order = np.argsort(shown, kind="stable")
+    first, last = (np.searchsorted(shown[order], owner, side) for side in ("left", "right"))
+    counts = np.where(wanted, last - first, 0)  # images of the face's cell that are shown
+    once = np.repeat(np.arange(len(owner)), counts)
+    image = order[
+        np.repeat(first, counts)
+        + np.arange(len(once))
+        - np.repeat(np.cumsum(counts) - counts, counts)
+    ]
+    ends = diagram.vertices[face_ends(diagram)[once]] + offsets[image][:, None, :]
     lines = LineCollection(
-        list(diagram.vertices[face_ends(diagram)[once]]),
+        list(ends),
         colors=colours[once],
         linewidths=thin[once],
         capstyle="round",
@@ -312,10 +329,22 @@ def _add_classes(
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), **options)
 
 
-def _cells_in(diagram: Diagram, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the indices of the cells that reach into the window."""
+def _cells_in(
+    diagram: Diagram, lower: np.ndarray, upper: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (k,) of the cells, or of their images, that reach into the window, and offsets (k, 2)."""
     starts = diagram.cell_vertex_starts[:-1]
     corners = diagram.vertices[diagram.cell_vertices]
     low = np.minimum.reduceat(corners, starts, axis=0)
     high = np.maximum.reduceat(corners, starts, axis=0)
-    return np.flatnonzero(((high >= lower) & (low <= upper)).all(axis=1))
+    cells, offsets = [], []
+    for step in product(*((-1, 0, 1) if p else (0,) for p in diagram.domain.periodic)):
+        by = step * diagram.domain.extent
+        # An image has to come in; the rounding of a cell that ends at the seam is not enough.
+        slack = 1e-9 * diagram.domain.extent * any(step)
+        seen = np.flatnonzero(
+            ((high + by >= lower + slack) & (low + by <= upper - slack)).all(axis=1)
+        )
+        cells.append(seen)
+        offsets.append(np.broadcast_to(by, (len(seen), 2)))
+    return np.concatenate(cells), np.concatenate(offsets)

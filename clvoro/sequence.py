@@ -1,0 +1,119 @@
+"""Frames of a case whose size field moves: each mesh adapted from the one before it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .io import save
+from .io.atomic import atomic_file
+from .results import Result
+
+if TYPE_CHECKING:
+    from .cases import Case
+
+_KEPT = ("n_cells", "max_steps", "tol", "alpha", "k", "seed", "effort", "error_target")
+"""Settings of a run that its later frames keep."""
+COLUMNS = (
+    "frame",
+    "time",
+    "cells",
+    "steps",
+    "mean_error",
+    "max_error",
+    "mean_quality",
+    "min_quality",
+    "seconds",
+)
+PICTURED = 6
+
+
+def run_frames(
+    case: Case, adapter: Any, first: Result, out: Path, stop: Callable[[], bool], pictures: bool
+) -> list[dict[str, Any]]:
+    """Adapt `first`, the mesh of frame 0, to the later ones in turn, and write them into `out`.
+
+    Frame k of n has the time k / n. Written are ``frames/mesh-KKK.vtu``, ``frames.csv`` with `COLUMNS`, and with
+    `pictures` ``pictures/frames.png``. It ends early where `stop` returns True.
+
+    Returns
+    -------
+    list of dict
+        One per frame, the first included.
+    """
+    folder = out / "frames"
+    folder.mkdir(parents=True, exist_ok=True)
+    arguments = {k: v for k, v in case.run_arguments().items() if k in _KEPT}
+    if case.methods[-1] is not None:
+        arguments["method"] = case.methods[-1]
+    result, rows, shown = first, [], {}
+    wanted = np.unique(np.linspace(0, case.frames - 1, min(PICTURED, case.frames)).round())
+    for frame in range(case.frames):
+        time = frame / case.frames
+        if frame:
+            if stop():
+                break
+            result = adapter.run(
+                case.domain, case.size_field(time), points=result.points,
+                callback=lambda _: stop(), **arguments,
+            )  # fmt: skip
+        save(result, folder / f"mesh-{frame:03d}.vtu")
+        rows.append(_row(frame, time, result))
+        if pictures and frame in wanted:
+            shown[time] = result
+    with atomic_file(out / "frames.csv") as file:
+        lines = [",".join(COLUMNS), *(",".join(f"{row[c]:.6g}" for c in COLUMNS) for row in rows)]
+        file.write(("\n".join(lines) + "\n").encode())
+    if shown and case.domain.dim == 2:
+        _draw(shown, out / "pictures" / "frames.png")
+    return rows
+
+
+def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
+    error, history = np.abs(result.error), result.history
+    return {
+        "frame": frame, "time": time, "cells": len(error), "steps": int(history["step"][-1]),
+        "mean_error": error.mean(), "max_error": error.max(),
+        "mean_quality": result.quality.mean(), "min_quality": result.quality.min(),
+        "seconds": float(history["seconds"][-1]),
+    }  # fmt: skip
+
+
+def _draw(shown: Mapping[float, Result], path: Path) -> None:
+    """Draw frames side by side, coloured by target size."""
+    from .report import plot_cells
+    from .report.style import WIDTH, grid_height, new_figure, styled
+
+    results = list(shown.values())
+    domain = results[0].diagram.domain
+    columns = min(3, len(results))
+    lines = -(-len(results) // columns)
+    sizes = np.concatenate([r.size for r in results])
+    limits = (float(sizes.min()), float(sizes.max()))
+    with styled():
+        figure = new_figure(
+            WIDTH, grid_height(domain.lower, domain.upper, lines, columns, 0.1, 0.3)
+        )
+        axes = figure.subplots(lines, columns, squeeze=False).ravel()
+        for ax, (time, result) in zip(axes, shown.items(), strict=False):
+            title = f"t = {time:.2f}, {len(result.points)} cells"
+            plot_cells(result, "size", ax, limits=limits, key=False, title=title)
+        for ax in axes[len(results) :]:
+            ax.set_axis_off()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            figure.savefig(file, format="png", dpi=170)
+
+
+def frames_line(rows: list[dict[str, Any]]) -> str:
+    """Return in a line how the frames behind the first went."""
+    later = rows[1:] or rows
+    worst = max(row["mean_error"] for row in later)
+    return (
+        f"{len(rows)} frames: {min(r['steps'] for r in later)} to {max(r['steps'] for r in later)} steps each, "
+        f"mean |e| up to {worst:.4f}, mean Q down to {min(r['mean_quality'] for r in later):.4f}, "
+        f"{sum(r['seconds'] for r in later):.1f} seconds in all"
+    )
