@@ -90,6 +90,39 @@ def gradation(adapter: clvoro.Adapter) -> None:
         adapter.run(box, size, points=points(9, dim), method="weighted", max_steps=1)
 
 
+def polygon(adapter: clvoro.Adapter) -> None:
+    """Trimmed cells: a concave domain with a hole that many cells meet, and one that lies in a single cell."""
+    angle = np.arange(24) * (2 * np.pi / 24)
+    ring = np.stack([np.cos(angle), np.sin(angle)], 1)
+    outer = [(0, 0), (2, 0), (2, 1.5), (1.2, 0.9), (1, 1.5), (0, 1.5)]
+    for radius in (0.25, 0.003):
+        domain = clvoro.Polygon(outer, [0.5 + radius * ring])
+        for n in (2, 50):
+            x = points(40 * n) * (2, 1.5)
+            diagram = adapter.diagram(domain, x[domain.contains(x)][:n])
+            assert abs(diagram.volumes.sum() - domain.measure) < 1e-3 * domain.measure
+            assert len(diagram.vertices) > 3
+    adapter.run(domain, 0.25, method="exact", effort="fast", max_steps=12, seed=911)
+    layers = clvoro.Layers(0.05, count=2, edges=[0])
+    adapter.run(domain, 0.25, layers=layers, effort="fast", max_steps=6, seed=911)
+
+
+def periodic(adapter: clvoro.Adapter) -> None:
+    """Boxes that close upon themselves in some directions."""
+    near = lattice(5, 3) + 0.05 * (points(125, 3) - 0.5)
+    for x, which in (
+        (points(60), (True, True)),
+        (points(60), (True, False)),
+        (near, (True, False, False)),
+    ):
+        dim = len(which)
+        diagram = adapter.diagram(clvoro.Box((0,) * dim, (1,) * dim, periodic=which), x)
+        assert abs(diagram.volumes.sum() - 1) < 1e-4
+        assert len(diagram.vertices) > 3
+    square = clvoro.Box((0, 0), (1, 1), periodic=True)
+    adapter.run(square, 0.13, effort="fast", levels=0, max_steps=4, seed=911)
+
+
 def copy(adapter: clvoro.Adapter) -> None:
     """What a profile measures the bandwidth by, on little memory."""
     source, target = (stages_of(adapter).engine.zeros(256, np.uint8) for _ in range(2))
@@ -186,6 +219,8 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "transfer": transfer,
     "gradation": gradation,
     "copy": copy,
+    "polygon": polygon,
+    "periodic": periodic,
     "coupled": method("coupled", max_steps=2),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
