@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ._program import Engine
+from .bins import MAX_LEVELS
 from .cells import Cells
 
 
@@ -14,6 +15,11 @@ class FoldedCells(Cells):
         self._folds = {f"FOLD_{a}": periods[f"PERIOD_{a}"] for a in range(2)}
         super().__init__(engine)
 
+    def _build(self, cell_capacity: int, row_capacity: int) -> None:
+        self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
+        # Nothing is searched for here.
+        self._kernels = self.engine.kernels("cells", {**self.defines, "MAX_DEPTH": MAX_LEVELS})
+
     @property
     def defines(self) -> dict[str, object]:
         """The capacities and the periods, as kernels that work on the rows must be built with."""
@@ -21,5 +27,5 @@ class FoldedCells(Cells):
 
     def reserve(self, n: int) -> None:
         """Make room for `n` cells."""
-        self._reserve_rows(n)
+        self.reserve_rows(n)
         self._reserve(n)

@@ -40,7 +40,8 @@ def load_vtu(path: str | PathLike[str]) -> Result:
     """Read the cells and what is known of them from a `.vtu` file that `Result.save` wrote.
 
     The domain is the polygon or periodic box that the file describes, or else the vertices' bounding box. The graph is
-    made anew from the corners that cells share; volumes, sizes, errors and quality are the file's. The history is empty.
+    made anew from the corners that cells share; volumes, sizes, errors and quality are those of the file, the history
+    is empty.
 
     Raises
     ------
