@@ -109,10 +109,7 @@ class Cells:
         self._capacity = 0
         self._turn = 0
         self._n = 0
-        none = engine.empty(1, np.int32)
-        self.rows = FaceRows(
-            none, none, engine.empty(1, np.uint32), none, engine.empty(3, np.int32)
-        )
+        self.rows = self._no_rows(engine.empty(3, np.int32))
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -292,8 +289,12 @@ class Cells:
 
     def clear(self) -> None:
         """Let go of the lists of faces, which hold nothing between two diagrams."""
-        none = self.engine.empty(1, np.int32)
-        self.rows = FaceRows(none, none, self.engine.empty(1, np.uint32), none, self.rows.flags)
+        self.rows = self._no_rows(self.rows.flags)
+
+    def _no_rows(self, flags: cla.Array) -> FaceRows:
+        """Return lists for one cell."""
+        slots, counts, places = (self.engine.empty(1, np.int32) for _ in range(3))
+        return FaceRows(slots, counts, self.engine.empty(1, np.uint32), places, flags)
 
     def reserve_rows(self, n: int) -> None:
         """Make room for `n` rows of faces of the present capacity."""

@@ -62,10 +62,10 @@ def wrapped_rows(engine, points):
     """Return the counts of faces after wrapping alone, 0 where a cell is left, and the rows."""
     n, x = len(points), engine.upload(points)
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
-    cells._reserve_rows(n)
+    cells.reserve_rows(n)
     cells._reserve(n)
     engine.run_each(
-        cells._wrap, -(-n // LANES), np.int32(n), binned.points, binned.items, binned.reach,
+        cells._wrap, -(-n // LANES), np.int32(n), np.int32(n), binned.points, binned.items, binned.reach,
         binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
         engine.real.type(FIRST_REACH), cells.rows.slots, cells.rows.counts, cells.rows.places,
         group=WRAP_GROUP,
