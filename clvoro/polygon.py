@@ -298,11 +298,18 @@ class Polygon(Domain):
         """Return a place (2,) inside of a piece, off its boundary."""
         return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])
 
-    def nearest_edge(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return for each of `points` (n, 2) an edge that is nearest, (n,) int, and the nearest point on it (n, 2)."""
+    def nearest_edge(
+        self, points: np.ndarray, within: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return for each of `points` (n, 2) an edge that is nearest, (n,) int, and the nearest point on it (n, 2).
+
+        Looking no farther than `within` is faster; where there is no edge, its number is -1.
+        """
         points = np.asarray(points, dtype=float)
-        edge = np.empty(len(points), np.int64)
-        rows, edges = self._edges.query_nearest(shapely.points(points), all_matches=False)
+        edge = np.full(len(points), -1)
+        rows, edges = self._edges.query_nearest(
+            shapely.points(points), max_distance=within, all_matches=False
+        )
         edge[rows] = edges
         return edge, project(points, self.vertices[edge], self.vertices[self.next_vertex[edge]])
 

@@ -204,3 +204,73 @@ def test_device_and_host_agree(ctx, dtype: str) -> None:
 def test_what_is_refused(options: dict, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
         sizing.FeatureSize(**{"domain": clvoro.Polygon(SQUARE), **options})
+
+
+# --- other fields in polygons --------------------------------------------------------------------
+
+
+def test_graded_fields_ask_inside_only() -> None:
+    """A jump becomes a ramp, and what the field says outside is never heard."""
+    domain = clvoro.Polygon(ragged(60), [ragged(20, 5, (0.05, 0.0), 0.2)])
+
+    def jump(x: np.ndarray) -> np.ndarray:
+        assert domain.contains(x).all()
+        return np.where(x[:, 0] < 0.3, 0.02, 0.4)
+
+    graded = sizing.Graded(jump, slope=0.4, resolution=801)
+    graded.raster(domain)
+    x = inner(domain)
+    h = graded(x)
+    # From no place on the left is it nearer than straight across; the scheme is off by a spacing's growth.
+    exact = np.minimum(np.where(x[:, 0] < 0.3, 0.02, 0.02 + 0.4 * (x[:, 0] - 0.3)), 0.4)
+    spacing = domain.extent.max() / 800
+    assert (h >= exact - 2 * 0.4 * spacing).all()
+    assert h.max() < 0.4
+
+
+def test_rasters_that_do_not_cover_the_domain_are_named(ctx) -> None:
+    values = np.full((5, 7), 0.1)
+    lower, upper = (0, 0), (4, 2.5)
+    domain = clvoro.Polygon(SQUARE)  # up to y = 3
+    field = sizing.Raster(values, lower, upper, outside="error")
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(float))
+    with pytest.raises(
+        InputError, match=r"does not cover the domain: nothing is known at \(4, 3\)"
+    ):
+        sizing.Sizing(engine, domain, sizing.minimum(field, 0.5))
+    with pytest.raises(InputError, match=r"nothing is known at \(1, 2.6\)"):
+        field(np.array([(1, 1), (1, 2.6)]))
+    with pytest.raises(InputError, match="outside='no'"):
+        sizing.Raster(values, lower, upper, outside="no")
+    low = clvoro.Polygon(SQUARE * [1, 2.5 / 3])
+    sizing.Sizing(engine, low, field)
+    sizing.Sizing(engine, clvoro.Box(lower, upper), field)
+    assert sizing.Raster(values, lower, upper)(np.array([(9.0, 9)])) == 0.1
+
+
+def test_graded_fields_reach_narrow_places() -> None:
+    """A canal thinner than the spacing of the nodes."""
+    canal = [
+        (0, 0),
+        (1, 0),
+        (1, 0.503),
+        (2, 0.503),
+        (2, 0),
+        (3, 0),
+        (3, 1),
+        (2, 1),
+        (2, 0.504),
+        (1, 0.504),
+        (1, 1),
+        (0, 1),
+    ]
+    domain = clvoro.Polygon(canal)
+    graded = sizing.Graded(
+        sizing.Expression("x > 1 && x < 2 ? 0.01 : 0.3"), slope=0.2, resolution=151
+    )
+    graded.raster(domain)
+    h = graded(np.array([(1.5, 0.5035), (0.5, 0.5035), (0.5, 0.9)]))
+    # Off by the growth over a spacing of 0.02, and some way across the corner.
+    assert h == pytest.approx(
+        [0.01, 0.01 + 0.2 * 0.5, 0.01 + 0.2 * math.hypot(0.5, 0.3965)], abs=2 * 0.2 * 0.02
+    )

@@ -43,7 +43,7 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     if kind == "raster":
         values = load_array(folder / node["file"], "size.file")
         corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
-        return sizing.Raster(values, *corners, **_given(node, "at", "missing"))
+        return sizing.Raster(values, *corners, **_given(node, "at", "missing", "outside"))
     if kind in ("hessian", "gradient"):
         values = load_array(folder / node["file"], "size.file")
         corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
@@ -63,8 +63,7 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         return sizing.FeatureSize(domain, **options)
     if kind == "graded":
         options = _given(node, "growth", "slope", "resolution")
-        box = domain if isinstance(domain, Box) else Box(domain.lower, domain.upper)
-        return sizing.Graded(inner(node["field"]), box=box, **options)
+        return sizing.Graded(inner(node["field"]), box=domain, **options)
     if kind == "min":
         return sizing.minimum(*map(inner, node["fields"]))
     if kind == "max":

@@ -223,7 +223,7 @@ _SIZE = Kinds(
         "expression": Table({"expression": text}, {}),
         "raster": Table(
             {"file": text},
-            _COVERED,
+            {**_COVERED, "outside": one_of("nearest", "error")},
         ),
         "hessian": Table(
             {"file": text},

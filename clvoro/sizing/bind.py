@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
     from .._program import Engine
-    from ..domain import Box
+    from ..domain import Domain
     from .field import Field
 
 
@@ -28,12 +28,12 @@ class Binder:
         The device sees x' = (x - origin) / scale and h' = h / scale.
     real : numpy.dtype
         Precision in which the device reads the numbers.
-    domain : Box
+    domain : Domain
     engine : Engine or None
         Where a field that has to be computed first is computed; None for the default device.
     """
 
-    def __init__(self, domain: Box, real: np.dtype, engine: Engine | None = None):
+    def __init__(self, domain: Domain, real: np.dtype, engine: Engine | None = None):
         self.dim, self.domain, self.engine = domain.dim, domain, engine
         self.origin, self.scale = domain.frame
         self.real = np.dtype(real)
@@ -74,7 +74,7 @@ class Binder:
 
 
 def bind(
-    field: Field, domain: Box, real: DTypeLike = np.float64, engine: Engine | None = None
+    field: Field, domain: Domain, real: DTypeLike = np.float64, engine: Engine | None = None
 ) -> tuple[str, np.ndarray]:
     """Return `field` as OpenCL for the normalised coordinates of `domain`.
 
@@ -84,7 +84,7 @@ def bind(
     Parameters
     ----------
     field : Field
-    domain : Box
+    domain : Domain
     real : dtype
         The engine's precision.
     engine : Engine, optional

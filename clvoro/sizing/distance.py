@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..domain import Box
+from ..domain import Box, Domain
 from ..errors import InputError, InputTypeError
 from ..polygon import Polygon as PolygonalDomain
 from .field import Field, positive, slope_of
@@ -98,7 +98,7 @@ class Distance(Field):
         parts = parts or [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))]
         self._begin, self._end, self._radius = (np.concatenate(p) for p in zip(*parts, strict=True))
 
-    def landmarks(self, domain: Box) -> np.ndarray:
+    def landmarks(self, domain: Domain) -> np.ndarray:
         """Return points on the shapes, 1/64 of the domain's shorter side apart or so."""
         spacing = domain.extent.min() / 64
         found = [s.landmarks(spacing, _LANDMARKS) for s in self.surfaces]

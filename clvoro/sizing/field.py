@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
-    from ..domain import Box
+    from ..domain import Domain
     from .bind import Binder
 
 
@@ -82,7 +82,7 @@ class Field:
         """Return the field with `change` applied to each of the fields that it combines, if any."""
         return self
 
-    def landmarks(self, domain: Box) -> np.ndarray:
+    def landmarks(self, domain: Domain) -> np.ndarray:
         """Return points (m, d) at which h is likely to be least, for those who must see it.
 
         They may lie outside `domain`, whose size tells how dense they should be. By default none.
@@ -211,7 +211,7 @@ class Scaled(Field):
     def with_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
         return Scaled(change(self.field), self.factor)
 
-    def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
+    def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return self.field.landmarks(domain)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
@@ -256,7 +256,7 @@ class Combined(Field):
     def with_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
         return Combined(self.operation, *map(change, self.fields))
 
-    def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
+    def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return np.concatenate([f.landmarks(domain) for f in self.fields])
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:

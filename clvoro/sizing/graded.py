@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..domain import Box
+from ..domain import Domain
 from ..errors import InputError, InputTypeError
 from ..polygon import Polygon
 from .field import Field, as_field, slope_of
@@ -44,8 +44,9 @@ class Graded(Field):
         ln(growth), as for `Distance`.
     slope : float, optional
         The bound of |grad h| itself, in place of `growth`. 0 gives the least size everywhere.
-    box : Box, optional
-        What the grid covers; by default the domain. Outside, the nearest value holds on.
+    box : Box or Polygon, optional
+        What the grid covers; by default the domain. Outside, the nearest value holds on. In a polygon `field` is
+        asked for inside only; sizes also grow straight across what the polygon leaves out.
     resolution : int or sequence of d ints, optional
         Number of nodes along the box's longest side, or along each. By default as many as put the
         nodes one smallest size apart (the least of field on a coarse grid and at what it names), at
@@ -75,21 +76,23 @@ class Graded(Field):
         growth: float | None = None,
         *,
         slope: float | None = None,
-        box: Box | None = None,
+        box: Domain | None = None,
         resolution: int | Sequence[int] | None = None,
     ):
         self.field = as_field(field)
         self.slope = slope_of("Graded", growth, slope)
-        if box is not None and not isinstance(box, Box):
-            raise InputTypeError(f"Graded box is {type(box).__name__}, expected a clvoro.Box")
+        if box is not None and not isinstance(box, Domain):
+            raise InputTypeError(
+                f"Graded box is {type(box).__name__}, expected a clvoro.Box or clvoro.Polygon"
+            )
         if box is not None:
             self.field.check_dim(box.dim)
         self.box, self.dim = box, self.field.dim if box is None else box.dim
         self.resolution = None if resolution is None else _checked(resolution, self.dim)
         self._rasters: dict[tuple, Raster] = {}
-        self._latest: Box | None = box
+        self._latest: Domain | None = box
 
-    def raster(self, domain: Box | None = None, engine: Engine | None = None) -> Raster:
+    def raster(self, domain: Domain | None = None, engine: Engine | None = None) -> Raster:
         """Return the field as a `Raster` over its box, or else over `domain`, computing it if need be.
 
         Raises
@@ -117,7 +120,7 @@ class Graded(Field):
         super().check_dim(dim)
         self.field.check_dim(dim)
 
-    def landmarks(self, domain: Box) -> np.ndarray:  # noqa: D102
+    def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return self.raster(domain).landmarks(domain)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
@@ -126,17 +129,11 @@ class Graded(Field):
     def _emit(self, binder: Binder) -> str:
         return self.raster(binder.domain, binder.engine)._emit(binder)
 
-    def _compute(self, box: Box, engine: Engine) -> Raster:
+    def _compute(self, box: Domain, engine: Engine) -> Raster:
         from ..gradation import Gradation
         from .stage import Sizing
 
-        stage = Sizing(engine, box, self.field)
-        # In a polygon a function need not be defined everywhere in the box around it.
-        within = isinstance(box, Polygon) and not self.field.on_device
-
-        def evaluate(points: np.ndarray) -> np.ndarray:
-            return stage(box.nearest(points) if within else points)
-
+        evaluate = Sizing(engine, box, self.field)
         marks = self.field.landmarks(box)
         marks = marks[box.contains(marks)]
         at_marks = evaluate(marks) if len(marks) else np.zeros(0)
@@ -147,7 +144,10 @@ class Graded(Field):
             flat = np.arange(first, min(first + _BATCH, len(values)))
             places = np.unravel_index(flat, counts, order="F")
             nodes = np.column_stack([axis[i] for axis, i in zip(axes, places, strict=True)])
-            values[flat] = evaluate(nodes)
+            values[flat] = self._at_nodes(box, evaluate, nodes, axes)
+        # Where nobody may ask: more than can be reached from anywhere else.
+        far = np.isinf(values)
+        values[far] = values[~far].max(initial=0) + self.slope * box.extent.sum()
         self._seed(values, counts, axes, marks, at_marks)
         scale = box.frame[1]
         on_device = engine.upload(values / scale)
@@ -158,7 +158,37 @@ class Graded(Field):
         limited = np.minimum(on_device.get().astype(float) * scale, values)
         return Raster(limited.reshape(counts[::-1]), box.lower, box.upper)
 
-    def _counts(self, box: Box, evaluate: object, at_marks: np.ndarray) -> np.ndarray:
+    def _at_nodes(
+        self,
+        box: Domain,
+        evaluate: Callable[[np.ndarray], np.ndarray],
+        nodes: np.ndarray,
+        axes: list[np.ndarray],
+    ) -> np.ndarray:
+        """Return the field at nodes (n, d); infinite at those outside the domain.
+
+        One that is a spacing away at most gets what the nearest place inside allows it: so no strait is lost between
+        the nodes.
+        """
+        if not isinstance(box, Polygon):
+            return evaluate(nodes)
+        values = np.full(len(nodes), math.inf)
+        inside = box.contains(nodes)
+        out = np.flatnonzero(~inside)
+        spacing = float(np.hypot(*(axis[1] - axis[0] for axis in axes)))
+        edge, nearest = box.nearest_edge(nodes[out], within=spacing)
+        near = edge >= 0
+        places = np.concatenate([nodes[inside], nearest[near]])
+        if len(places):
+            h = evaluate(places)
+            away = np.hypot(*(nearest - nodes[out])[near].T)
+            values[inside] = h[: np.count_nonzero(inside)]
+            values[out[near]] = h[np.count_nonzero(inside) :] + self.slope * away
+        return values
+
+    def _counts(
+        self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray
+    ) -> np.ndarray:
         """Return the number of nodes along each axis."""
         if isinstance(self.resolution, tuple):
             return np.array(self.resolution)
@@ -169,7 +199,10 @@ class Graded(Field):
         counts = _along(box, coarse)
         grid = _axes(box, counts)
         probes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, box.dim)
-        least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))  # type: ignore[operator]
+        if isinstance(box, Polygon):
+            inner = np.array([box.inner_point(piece) for piece in range(box.n_pieces)])
+            probes = np.concatenate([probes[box.contains(probes)], inner])
+        least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))
         finest = (box.measure / _MOST) ** (1 / box.dim)
         spacing = min(max(least, finest), coarse)
         while np.prod(_along(box, spacing), dtype=float) > _MOST:
@@ -199,7 +232,7 @@ class Graded(Field):
         return f"Graded({self.field!r}, slope={self.slope:g})"
 
 
-def _axes(box: Box, counts: np.ndarray) -> list[np.ndarray]:
+def _axes(box: Domain, counts: np.ndarray) -> list[np.ndarray]:
     """Return the coordinates of the nodes along each axis."""
     return [
         np.linspace(low, high, n)
@@ -207,7 +240,7 @@ def _axes(box: Box, counts: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _along(box: Box, spacing: float) -> np.ndarray:
+def _along(box: Domain, spacing: float) -> np.ndarray:
     """Return how many nodes put them at most `spacing` apart on each axis, at least two."""
     return np.maximum(np.ceil(box.extent / spacing * (1 - 1e-12)).astype(np.int64), 1) + 1
 

@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
+from ..polygon import Polygon
 from .field import Field
 from .filling import filled, scattered_values
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..domain import Box
+    from ..domain import Domain
     from .bind import Binder
+
+_ROUNDINGS = 16  # of a coordinate, by which a place may lie beyond a raster
 
 
 class Raster(Field):
@@ -38,9 +41,9 @@ class Raster(Field):
     missing : "error" or "nearest"
         Whether values that are missing (NaN, or under a NumPy mask) are refused, or filled with the
         nearest one that is there.
-
-    Outside the box, and with "centres" within half a pixel of its sides, the value of the nearest
-    edge holds on.
+    outside : "nearest" or "error"
+        Whether a domain that reaches beyond the box is served with the value of the nearest edge of the array, or
+        refused with the place. (With "centres", the nearest value holds within half a pixel of the sides anyway.)
 
     Raises
     ------
@@ -56,7 +59,11 @@ class Raster(Field):
         upper: ArrayLike,
         at: str = "nodes",
         missing: str = "error",
+        outside: str = "nearest",
     ):
+        if outside not in ("nearest", "error"):
+            raise InputError(f"Raster got outside={outside!r}, expected 'nearest' or 'error'")
+        self.outside = outside
         low, high = check_corners("Raster", np.shape(values), lower, upper, at)
         counts = np.array(np.shape(values)[::-1])
         spacing = (high - low) / np.maximum(counts - (at == "nodes"), 1)
@@ -76,7 +83,7 @@ class Raster(Field):
         pixel = (self.upper - self.lower) / self._counts
         return 1.0 / pixel, self.lower + 0.5 * pixel
 
-    def landmarks(self, domain: Box) -> np.ndarray:
+    def landmarks(self, domain: Domain) -> np.ndarray:
         """Return the places of the least value in each of at most 64 tiles per axis."""
         low, where = self.values, np.arange(self.values.size).reshape(self.values.shape)
         for axis, count in enumerate(low.shape):
@@ -96,7 +103,22 @@ class Raster(Field):
         points = origin + np.divide(index, gain, out=np.zeros(index.shape), where=gain > 0)
         return np.clip(points, self.lower, self.upper)
 
+    def _refuse_outside(self, points: np.ndarray) -> None:
+        """Raise if one of `points` (n, d) lies beyond the box, but for roundings of it, and that is not wanted."""
+        if self.outside == "nearest":
+            return
+        far = max(np.abs(self.lower).max(), np.abs(self.upper).max())
+        slack = _ROUNDINGS * float(np.finfo(float).eps) * far
+        out = ((points < self.lower - slack) | (points > self.upper + slack)).any(axis=1)
+        if out.any():
+            where = ", ".join(f"{c:.6g}" for c in points[np.argmax(out)])
+            raise InputError(
+                f"{self!r} does not cover the domain: nothing is known at ({where}); give a larger raster, a "
+                "smaller domain, or outside='nearest'"
+            )
+
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        self._refuse_outside(points)
         gain, origin = self._index_map()
         t = np.clip((points - origin) * gain, 0, self._counts - 1)
         first = np.minimum(t.astype(int), np.maximum(self._counts - 2, 0))
@@ -109,6 +131,10 @@ class Raster(Field):
         return total
 
     def _emit(self, binder: Binder) -> str:
+        # A box holds a domain if it holds its corners.
+        domain = binder.domain
+        corners = domain.vertices if isinstance(domain, Polygon) else [domain.lower, domain.upper]
+        self._refuse_outside(np.array(corners))
         gain, origin = self._index_map()
         shift = -binder.normalise(origin) * (gain * binder.scale)
         at = binder.store(gain * binder.scale, shift, self.values / binder.scale)

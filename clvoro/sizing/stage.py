@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from .._program import Engine
-    from ..domain import Box
+    from ..domain import Domain
 
 _NONE_BAD = np.iinfo(np.int32).max
 
@@ -37,7 +37,7 @@ class Sizing:
     Parameters
     ----------
     engine : Engine
-    domain : Box
+    domain : Domain
     field : Field, number or callable
         A callable is evaluated on the host, and so is the combination of a callable with other
         fields: each evaluation then moves the points to the host and the sizes back.
@@ -57,7 +57,7 @@ class Sizing:
     """
 
     def __init__(
-        self, engine: Engine, domain: Box, field: object, gradient_step: float | None = None
+        self, engine: Engine, domain: Domain, field: object, gradient_step: float | None = None
     ):
         self.engine, self.domain, self.field = engine, domain, as_field(field)
         self.field.check_dim(domain.dim)
@@ -89,7 +89,7 @@ class Sizing:
         """The device's precision."""
         return self.engine.real
 
-    def landmarks(self, domain: Box) -> np.ndarray:
+    def landmarks(self, domain: Domain) -> np.ndarray:
         """Return the field's landmarks (see `Field.landmarks`)."""
         return self.field.landmarks(domain)
 
