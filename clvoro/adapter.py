@@ -346,7 +346,8 @@ class Adapter:
             levels = min(levels, most, most if saved is None else saved.levels)
         self._tried = levels
         if host is None and saved is None:
-            n = max(1, round((target - len(rows)) / 2 ** (domain.dim * levels)))
+            least = free.n_pieces if levels else 1
+            n = max(least, round((target - len(rows)) / 2 ** (domain.dim * levels)))
             if options["start"] == "uniform":
                 host = sample_uniform(free, n, options["seed"], self.dtype)
             else:

@@ -48,6 +48,11 @@ class Domain(ABC):
         return np.subtract(self.upper, self.lower)
 
     @property
+    def n_pieces(self) -> int:
+        """Number of pieces, none of which is without generators."""
+        return 1
+
+    @property
     @abstractmethod
     def measure(self) -> float:
         """Area or volume."""
