@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from .check_polygon import check_cells, check_edges, check_outlines, hidden
 from .errors import ClvoroError
 from .faces import face_keys
-from .outlines import SIDE_TURN, count_sides
+from .outlines import SIDE_TURN, count_sides, next_faces
 from .polygon import Polygon
 from .rebuilt import Doubts, Rebuilt
 from .walls import surface, wall_count, wall_distance
@@ -459,12 +459,16 @@ def _quality_2d(d: Diagram, perimeter: np.ndarray, q: np.ndarray, eps: float) ->
     Where rounding decides how many sides the boundary is, as many are taken as suit the quality `q` best.
     """
     few, many = (count_sides(d, SIDE_TURN * (1 + k * eps)) for k in (64, -64))
-    # So does it where a cell is a whole piece of the domain: in which corner the count begins.
-    alone = (
-        np.bincount(np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts)), d.neighbours >= 0)
-        == 0
-    )
-    few, many = np.maximum(few, 3), np.maximum(many + (alone & isinstance(d.domain, Polygon)), 3)
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
+    on_wall = d.neighbours < 0
+    if isinstance(d.domain, Polygon):
+        # So does the corner in which the count begins, where a cell is a whole piece of the domain. Where parts of a
+        # cell come together amid an edge, turning is summed up anew, which may make a side more or less.
+        alone = np.bincount(owner, ~on_wall, len(d)) == 0
+        meets = on_wall & (d.neighbours[next_faces(d)] == d.neighbours)
+        joints = np.bincount(owner, meets, len(d)).astype(int)
+        few, many = few - joints, many + joints + alone
+    few, many = np.maximum(few, 3), np.maximum(many, 3)
     quality = np.zeros(len(q))
     for more in range(int((many - few).max(initial=0)) + 1):
         sides = np.minimum(few + more, many)
