@@ -1,4 +1,3 @@
-#include "common/bins.h"
 #include "common/boundary.h"
 
 /* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex diagram.
@@ -12,23 +11,6 @@ inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 {
     const REAL2 d = (REAL2)(points[2 * i], points[2 * i + 1]) - y;
     return dot(d, d);
-}
-
-/* Per vertex: a generator somewhere near it, the first in the vertex' bin or behind it. */
-kernel void guess_owners(const int size, global const REAL2 *vertices, global const int *items, global const int2 *bins,
-                         global const FRAME *grid_frames, global const int4 *grid_shapes, const int n, global int *owners)
-{
-    WORK_ITEM(v);
-    int grid = 0;
-    while (true) {
-        const int b = bin_in_grid((global const REAL *)(vertices + v), grid_frames[grid], grid_shapes[grid]);
-        const int child = bins[b].s1;
-        if (bins[b + 1].s1 == child) {
-            owners[v] = items[min(bins[b].s0, n - 1)];
-            return;
-        }
-        grid = child;
-    }
 }
 
 /* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is nearer.

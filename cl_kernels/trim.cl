@@ -232,16 +232,19 @@ inline int other_side(const segments_t *s, int k, int i, int u)
 
 /* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a generator
    outside the domain, and so the cells tile the domain. Where edges cross a face closer to each other than rounding, they do
-   not. `n` generators are in the domain. */
+   not. And is anything left for the generator, beside those that are as near to the boundary as it is? `n` generators are in the domain. */
 kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global const int *touched, global const int *slots,
-                           global const int *starts, global const int *neighbours, global int *flags)
+                           global const int *roots, global const int *starts, global const int *neighbours, global int *flags)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;
     const int i = touched[u];
     bool fits = true;
+    REAL area = 0;
     for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
         const int j = s.labels[k];
+        if (roots[s.places[k]] == i)
+            area += difference_of_products(s.p[k].s0, s.q[k].s1, s.p[k].s1, s.q[k].s0);
         if (j < 0 || is_empty(&s, k))
             continue;
         if (j >= n)
@@ -260,7 +263,7 @@ kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global con
             found = s.labels[k] == j;
         fits &= found;
     }
-    if (!fits)
+    if (!fits || !(area > 0))
         atomic_or(flags, FLAG_LOST);
 }
 

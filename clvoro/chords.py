@@ -9,7 +9,6 @@ import pyopencl.array as cla
 
 from ._primitives import Room, Scan
 from ._program import Engine
-from .bins import BinnedPoints
 from .cells import Tessellation
 from .errors import InputError
 from .polygon import Polygon
@@ -96,13 +95,6 @@ class Boundary:
         self.owners = engine.zeros(self.edges, np.int32)
         self._known = 0  # cells that owners are among
         self._flags = engine.empty(1, np.int32)
-
-    def guess(self, binned: BinnedPoints, n: int) -> None:
-        """Find generators near the vertices, among the `n` that are `binned`."""
-        self.engine.run_each(
-            self._kernels.guess_owners, self.edges, self.vertices, binned.items, binned.bins,
-            binned.grid_frames, binned.grid_shapes, np.int32(n), self.owners,
-        )  # fmt: skip
 
     def cut(self, t: Tessellation, generators: int) -> Chords | np.ndarray:
         """Walk along all edges through the cells of `t`.

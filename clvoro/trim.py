@@ -87,7 +87,7 @@ class Trim:
         engine.run_each(k.write_segments, u, *cells, loops, pieces, starts, *parts)
         segments = (starts, *parts)
         engine.run_each(
-            k.check_segments, u, np.int32(n), *segments, chords.touched, chords.slots,
+            k.check_segments, u, np.int32(n), *segments, chords.touched, chords.slots, roots,
             convex.starts, convex.neighbours, self._flags,
         )  # fmt: skip
         self._demand(int(self._flags.get()[0]))

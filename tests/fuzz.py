@@ -1,9 +1,10 @@
 """Throw everything at clvoro: `python -m tests.fuzz --minutes 10`.
 
 Each input is made from one seed: generators in the plane and in space (clusters down to one ulp, lattices, circles,
-lines, walls, corners, one to three points, scales 1e-300 to 1e300), size fields, options, and files with bits changed.
-It must end in a mesh that passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError that says what
-is wrong). Whatever else happens is printed with its seed and saved; `python -m tests.fuzz --repeat SEED` does it again.
+lines, walls, corners, one to three points, scales 1e-300 to 1e300), polygons, size fields, options, and files with
+bits changed. It must end in a mesh that passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError that
+says what is wrong). Whatever else happens is printed with its seed and saved; `python -m tests.fuzz --repeat SEED` does
+it again.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 import clvoro
 from clvoro import sizing
@@ -26,6 +28,8 @@ from clvoro.cases import load_case
 from clvoro.cases.fields import load_array
 from clvoro.checkpoint import Saved
 from clvoro.io.vtu_read import load_vtu
+from tests import shores
+from tests.reference_polygon import faults
 
 SLOWEST = 180
 """Seconds after which an input counts as one that hangs."""
@@ -235,6 +239,93 @@ def try_solid(rng: np.random.Generator) -> str:
     return "mesh"
 
 
+def some_polygon(rng: np.random.Generator) -> clvoro.Polygon:
+    """Stars, combs, slits, blocks of a lattice, with holes and in pieces, coasts; turned, stretched, far away."""
+    kind = rng.integers(0, 7)
+    seed = int(rng.integers(2**31))
+    if kind == 0:
+        shape = shapely.Polygon(shores.star(int(rng.integers(3, 60)), seed, (0.5, 0.5), 0.5))
+    elif kind == 1:
+        depth, gap = rng.uniform(0.05, 0.97, 2)
+        shape = shapely.Polygon(shores.comb(int(rng.integers(1, 40)), depth, gap))
+    elif kind == 2:
+        make = shores.slit if rng.random() < 0.5 else shores.spit
+        shape = shapely.Polygon(make(10 ** rng.uniform(-12, -1)))
+    elif kind == 3:
+        shape = shores.blocks(rng, int(rng.integers(2, 9)))
+    elif kind == 4:
+        shape = shapely.Polygon(shores.coast(2 ** int(rng.integers(4, 10)), seed))
+    else:
+        made = shores.POLYGONS if kind == 5 else shores.TOUCHING
+        shape = made[str(rng.choice(list(made)))]().geometry
+    low = np.array(shape.bounds[:2])
+    extent = np.array(shape.bounds[2:]) - low
+    for _ in range(rng.integers(0, 4) if rng.random() < 0.4 else 0):
+        centre, radius = low + rng.uniform(0.1, 0.9, 2) * extent, 10 ** rng.uniform(-6, -0.5)
+        shape = shape.difference(
+            shapely.Polygon(shores.star(int(rng.integers(3, 9)), seed, centre, radius))
+        )
+    if rng.random() < 0.3:
+        a = rng.choice([np.pi / 4, np.pi / 6, rng.uniform(0, 6)])
+        turn = np.array([(np.cos(a), np.sin(a)), (-np.sin(a), np.cos(a))])
+        shape = shapely.transform(shape, lambda x: x @ turn)
+    if rng.random() < 0.3:
+        scale = (
+            10.0 ** rng.uniform(-2, 2, 2) if rng.random() < 0.5 else 10.0 ** rng.uniform(-30, 30)
+        )
+        shift = rng.choice([0, 1, 1e4]) * rng.uniform(-1, 1, 2)
+        shape = shapely.transform(shape, lambda x: (x + shift) * scale)
+    return clvoro.Polygon.from_shapely(shape)
+
+
+def placed_in_polygon(rng: np.random.Generator, domain: clvoro.Polygon) -> np.ndarray:
+    """Points of the unit square's kinds, on the boundary and off it."""
+    low, extent = np.array(domain.lower), domain.extent
+    kind = rng.random()
+    if kind < 0.3:
+        x = shores.lattice(int(rng.integers(1, 20)), rng.choice(["centres", "corners", "hexagons"]))
+    elif kind < 0.5:
+        v = domain.vertices
+        t = rng.choice([0, 0.25, 0.5, rng.random()], (len(v), 1))
+        x = (v + t * (v[domain.next_vertex] - v) - low) / extent
+        x = np.concatenate([x, rng.random((rng.integers(0, 30), 2))])
+    else:
+        x = some_points(rng)
+    if rng.random() < 0.2:
+        x = x + 10.0 ** rng.uniform(-17, -5) * rng.standard_normal(x.shape)
+    x = low + x * extent
+    inside = x[domain.contains(x)] if rng.random() < 0.98 else x
+    return np.unique(inside, axis=0) if len(inside) else domain.inner_point(0)[None]
+
+
+def try_polygon(rng: np.random.Generator) -> str:
+    domain = some_polygon(rng)
+    real = str(rng.choice(["float64", "float64", "float32"]))
+    points = placed_in_polygon(rng, domain)
+    # Boxes show what becomes of generators that coincide.
+    first = np.unique(domain.place(points, np.dtype(real)), axis=0, return_index=True)[1]
+    diagram = adapter(real).diagram(domain, points[np.sort(first)])
+    found = faults(diagram, real)
+    if found:
+        raise Wrong("; ".join(found))
+    return "mesh"
+
+
+def try_polygon_run(rng: np.random.Generator) -> str:
+    domain = some_polygon(rng)
+    size = float(np.sqrt(domain.measure / 10 ** rng.uniform(0, 2.6)))
+    real = str(rng.choice(["float64", "float64", "float32"]))
+    method = str(rng.choice(["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted"]))
+    steps = int(rng.integers(0, 15))
+    result = adapter(real).run(
+        domain, size, method=method, max_steps=steps, effort="fast", seed=int(rng.integers(99))
+    )
+    found = faults(result.diagram, real)
+    if found or not domain.contains(result.points).all():
+        raise Wrong("; ".join([*found, f"{np.sum(~domain.contains(result.points))} outside"]))
+    return "mesh"
+
+
 def some_size_3d(rng: np.random.Generator, box: clvoro.Box):
     """A size field of up to a hundred cells or so; sometimes an absurd one."""
     with np.errstate(all="ignore"):
@@ -373,6 +464,8 @@ WORK = {
     "file": (try_file, 0.16),
     "solid": (try_solid, 0.13),
     "solid-run": (try_solid_run, 0.05),
+    "polygon": (try_polygon, 0.2),
+    "polygon-run": (try_polygon_run, 0.05),
 }
 
 
