@@ -119,6 +119,12 @@ class Room:
             array = self._arrays[name] = self._engine.empty(room, dtype)
         return array[:size]
 
+    def clear(self, *names: object) -> None:
+        """Let go of all arrays, or of those whose names begin with one of `names`."""
+        gone = [n for n in self._arrays if not names or n[0] in names]
+        for name in gone:
+            del self._arrays[name]
+
     def zeros(self, *name: object, size: int, dtype: object = None) -> cla.Array:
         """Return the same, filled with zeros."""
         return self(*name, size=size, dtype=dtype).fill(0)

@@ -91,6 +91,13 @@ class Bins:
             grown[: old.size] = old
         return grown
 
+    def clear(self) -> None:
+        """Let go of all buffers."""
+        for name in list(vars(self)):
+            if isinstance(getattr(self, name), cla.Array):
+                delattr(self, name)
+        self._capacity = (0, 0)
+
     def build(self, box: Box, points: cla.Array, n: int) -> BinnedPoints:
         """Sort the first `n` of `points` (n, d; normalised coordinates, within `box`) into bins.
 

@@ -25,6 +25,12 @@ def whole_groups(size: int) -> int:
     return max(1, -(-size // GROUP)) * GROUP
 
 
+_WHILE_MADE = (
+    "mate", "choice", "root", "numbers", "standing", "bounds", "loose columns", "loose", "inverse sums",
+)  # fmt: skip
+"""Arrays that are of no use once a level is made, beside those of the graph between its two passes."""
+
+
 @dataclass(frozen=True)
 class Graph:
     """A weighted graph on the device, one row per cell.
@@ -134,6 +140,10 @@ class Coarsening:
             middle, (level, 1), lambda groups: (groups / n) ** (1 / dim), pairs=False
         )
         return inverse, self._compose(first, second, level), coarse
+
+    def clear(self, levels: int) -> None:
+        """Let go of what is needed only while `levels` levels are made."""
+        self._room.clear(*_WHILE_MADE, *((level, 0) for level in range(levels)))
 
     def pairs(self, graph: Graph, level: int) -> PairInverse:
         """Return the smoother's blocks alone, for the coarsest graph."""

@@ -188,6 +188,9 @@ class Loop:
 
     def refine(self) -> None:
         """Go to the next finer level."""
+        # The finer level needs another solver, and memory.
+        self.mesh.stages.release("poisson")
+        self.mesh.stages.projection.clear()
         finer = self.mesh.refine()
         self.inserted += finer.n - self.mesh.n
         # Together: an interruption between them would refine once too often.

@@ -35,10 +35,15 @@ from .trim import Trim
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-PEAK = {2: (98, 122), 3: (186, 340)}
+PEAK = {2: (71, 78), 3: (204, 248)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
 OUTPUT = {2: (34, 26), 3: (13, 813)}
 """The same while the finished diagram is read, corners, loops and all."""
+_DERIVED = (
+    "h", "error", "quality", "energy", "reach", "source", "changed", "potential", "lloyd_speed",
+    "correction_speed", "lloyd", "correction",
+)  # fmt: skip
+"""Arrays of a mesh that follow from its generators."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
 )  # fmt: skip
@@ -191,48 +196,53 @@ class Mesh:
         self.next_label = n
         if labels is None:
             labels = self.engine.upload(np.arange(n), np.int32)
-        self.adopt(
-            points, labels, self.engine.zeros(points.shape), self.engine.zeros(n, np.uint64),
-            self.engine.zeros(n),
-        )  # fmt: skip
+        rows = {
+            "points": points, "labels": labels, "velocity": self.engine.zeros(points.shape),
+            "signatures": self.engine.zeros(n, np.uint64), "ever": self.engine.zeros(n),
+        }  # fmt: skip
+        del points, labels
+        self.adopt(rows)
 
     def _spacing(self, points: np.ndarray) -> np.ndarray:
         """Return the size that cells are to have at `points` (k, d) on this level, (k,)."""
         return self.coarsening * np.asarray(self.sizing(points))
 
-    def adopt(
-        self,
-        points: cla.Array,
-        labels: cla.Array,
-        velocity: cla.Array,
-        signatures: cla.Array,
-        ever: cla.Array,
-    ) -> None:
+    def adopt(self, rows: dict[str, cla.Array]) -> None:
         """Take other generators for the present ones, sort them by bin so that neighbours are near in memory.
+
+        `rows` has their points, velocity (n, d), labels, signatures and ever (n,), and is used up: by then nobody else
+        should hold on to these arrays.
 
         Raises
         ------
         SizeFieldError
             If the size of one is not positive and finite.
         """
-        engine, stages = self.engine, self.stages
-        first = not hasattr(self, "tessellation")
-        n = len(points)
-        items = stages.bins.build(self.domain, points, n).items[:n].copy()
-        kept = {
-            "points": points, "labels": labels, "velocity": velocity, "signatures": signatures,
-            "ever": ever,
-        }  # fmt: skip
-        new = {name: stages.gather.rows(items, array) for name, array in kept.items()}
-        for name in ("h", "error", "quality", "energy", "reach", "source", "changed"):
-            new[name] = engine.empty(n)
-        for name in ("potential", "lloyd_speed", "correction_speed"):
-            new[name] = engine.zeros(n)
-        for name in ("lloyd", "correction"):
-            new[name] = engine.zeros(points.shape)
-        # At one stroke: whoever interrupts the run finds arrays that fit each other.
-        self.__dict__.update(new, n=n, tessellation=None)
+        stages, first = self.stages, not hasattr(self, "tessellation")
+        n = len(rows["points"])
+        items = stages.bins.build(self.domain, rows["points"], n).items[:n].copy()
+        # One after the other, so that each is let go of when it has been sorted.
+        new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
+        # At one stroke: whoever interrupts the run finds arrays that fit each other, or none, which `update` makes.
+        self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, "tessellation": None})
+        del new
         self.update(first)
+        # The next diagrams are repaired from this one, most likely.
+        stages.bins.clear()
+        self._clear_rows()
+
+    def _clear_rows(self) -> None:
+        """Let go of what takes memory while a diagram is made."""
+        if isinstance(self.stages.cells, Cells):
+            self.stages.cells.clear()
+
+    def _make_room(self) -> None:
+        """Make the arrays that there are not, of what follows from the generators."""
+        n, shape = self.n, self.points.shape
+        for name in _DERIVED:
+            if getattr(self, name) is None:
+                flat = name not in ("lloyd", "correction")
+                setattr(self, name, self.engine.zeros(n if flat else shape))
 
     @property
     def t(self) -> Tessellation:
@@ -251,6 +261,7 @@ class Mesh:
             If the size of one is not positive and finite.
         """
         stages = self.stages
+        self._make_room()
         self.tessellation = self.tessellator.tessellate(self.points, self.n, self.tessellation)
         self.sizing.evaluate(self.points, self.n, self.h)
         if self.coarsening != 1:
@@ -317,16 +328,27 @@ class Mesh:
         """
         w = self.weigh()
         total = self.missing(w) if n_cells is None else float(n_cells - self.n)
+        # The largest of what is not needed meanwhile.
+        self.stages.projection.clear()
+        self._clear_rows()
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(
             self.free, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,
             climb, theta, self.fixed,
         )  # fmt: skip
+        del rows
         if new is None:
             return 0, 0
         self.next_label += new.inserted
-        self.adopt(new.points, new.labels, new.velocity, new.signatures, new.ever)
-        return new.inserted, new.deleted
+        inserted, deleted = new.inserted, new.deleted
+        rows = {
+            name: getattr(new, name)
+            for name in ("points", "labels", "velocity", "signatures", "ever")
+        }
+        del new, w
+        self.stages.population.clear()
+        self.adopt(rows)
+        return inserted, deleted
 
     def assess(self) -> dict[str, Summary]:
         """Summarise the mesh: the scalars that the host sees of a step."""

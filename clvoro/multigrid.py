@@ -157,6 +157,7 @@ class Multigrid:
                 break
             self._levels.append(_Level(graph, pairs, groups, *vectors))
             graph = coarse
+        self._coarsening.clear(len(self._levels))
         self._programme = None
 
     def renew(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:

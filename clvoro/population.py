@@ -62,6 +62,10 @@ class PopulationControl:
             },
         )
 
+    def clear(self) -> None:
+        """Let go of all buffers."""
+        self._room.clear()
+
     def reorganise(
         self,
         domain: Domain,
@@ -127,13 +131,13 @@ class PopulationControl:
         """Return charge and walls (n, 2), and the strain averaged over one ring and over two (n, 4)."""
         engine, k, n = self.engine, self._kernels, t.n
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
-        raw, once, twice = (self._room("strain", rings, size=4 * n) for rings in range(3))
+        raw, once = (self._room("strain", turn, size=4 * n) for turn in range(2))
         engine.run_each(
             k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines
         )
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
-        engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, twice)
-        return kinds, once, twice
+        engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, raw)
+        return kinds, once, raw
 
     def _nucleate(
         self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int

@@ -42,6 +42,11 @@ class Projection:
         self._m = -1
         self._ahead = 8
 
+    def clear(self) -> None:
+        """Let go of all buffers that grow with the mesh."""
+        self._vectors.clear()
+        self._m, self._rows, self._columns = -1, None, None
+
     def _kernels_in(self, store: np.dtype) -> SimpleNamespace:
         if store not in self._kernels:
             name = "double" if store == np.float64 else "float"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from weakref import ReferenceType, ref
 
 import numpy as np
 import pyopencl.array as cla
@@ -29,7 +30,8 @@ class Repair:
         self._scan = Scan(engine)
         self._kernels: dict[tuple[object, ...], SimpleNamespace] = {}
         self._n = -1
-        self._last: Tessellation | None = None
+        # Weakly: the diagram of another mesh need not be kept in memory for this.
+        self._last: ReferenceType[Tessellation] | None = None
 
     def follow(
         self, cells: Cells, box: Box, points: cla.Array, previous: Tessellation
@@ -48,8 +50,9 @@ class Repair:
             self._marks, self._listed = engine.empty(n, np.int32), engine.empty(n, np.int32)
             self._sums, self._fits = engine.empty(n + 1, np.int32), engine.empty(n, np.int32)
             self._last = None
-        if previous is not self._last:
+        if self._last is None or self._last() is not previous:
             self._fits.fill(0)
+        cells.reserve_rows(n)
         corners = box.device_corners(engine.real)
         old = (previous.starts, previous.neighbours)
         cells.clear_flags()
@@ -61,8 +64,9 @@ class Repair:
             self._scan.exclusive(self._marks, self._sums, n)
             count = int(self._sums[n].get())
             if count == 0:
-                self._last = cells.complete(box, points, previous)
-                return self._last
+                t = cells.complete(box, points, previous)
+                self._last = None if t is None else ref(t)
+                return t
             if base + count > MAX_SHARE * n:
                 return None
             engine.run_each(k.list_marked, n, self._marks, self._sums, self._listed)
