@@ -100,8 +100,14 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
             open |= !on_chord;
             lost |= !on_chord && s.label < 0; /* at a wall of the box, which is far outside */
         } while (!is_complete(&cursor, begin) && ++count < most);
-        if (lost || count == most)
+        if (lost || count == most) {
+            /* What follows would not find to an end either. */
             atomic_or(flags, FLAG_LOST);
+            for (int place = first; place < list_starts[u + 1] + u + 1; ++place)
+                loop_pieces[place] = -1;
+            counts[u] = 0;
+            return;
+        }
         const int shell = c.shells[c.edges[begin]];
         const bool is_outer = open || shell < 0;
         /* A hole within the cell whose piece goes on beyond it: the cell's faces lie in the domain, if no chord leaves it. */

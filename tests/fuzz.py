@@ -2,9 +2,9 @@
 
 Each input is made from one seed: generators in the plane and in space (clusters down to one ulp, lattices, circles,
 lines, walls, corners, one to three points, scales 1e-300 to 1e300), polygons, size fields, options, and files with
-bits changed. It must end in a mesh that passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError that
-says what is wrong). Whatever else happens is printed with its seed and saved; `python -m tests.fuzz --repeat SEED` does
-it again.
+bits changed. It must end in a mesh that passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError
+that says what is wrong). Whatever else happens is printed with its seed and saved; `python -m tests.fuzz --repeat
+SEED` does it again.
 """
 
 from __future__ import annotations
