@@ -107,6 +107,24 @@ def polygon(adapter: clvoro.Adapter) -> None:
     adapter.run(domain, 0.25, layers=layers, effort="fast", max_steps=6, seed=911)
 
 
+def comb(adapter: clvoro.Adapter) -> None:
+    """Pieces of cells that change hands, islands in lakes within a cell, edges on faces."""
+    teeth = [
+        (k + side, 1 - 0.8 * (side in (0.4, 0.6)))
+        for k in range(4)
+        for side in (0.1, 0.4, 0.6, 0.9)
+    ]
+    domain = clvoro.Polygon([(-1, 0), (4.5, 0), *np.array(teeth)[::-1]])
+    diagram = adapter.diagram(domain, domain.nearest(points(12) * (4, 0.3)))
+    assert abs(diagram.volumes.sum() - domain.measure) < 1e-4
+    square = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+    lake = clvoro.Polygon.from_pieces([[square, square * 0.5 + 0.25], [square * 0.25 + 0.375]])
+    for each in (np.array([(0.5, 0.5), (0.1, 0.1)]), lattice(8, 2)):
+        diagram = adapter.diagram(lake, each[lake.contains(each)])
+        assert abs(diagram.volumes.sum() - lake.measure) < 1e-4
+        assert len(diagram.vertices) > 3
+
+
 def periodic(adapter: clvoro.Adapter) -> None:
     """Boxes that close upon themselves in some directions."""
     near = lattice(5, 3) + 0.05 * (points(125, 3) - 0.5)
@@ -220,6 +238,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "gradation": gradation,
     "copy": copy,
     "polygon": polygon,
+    "comb": comb,
     "periodic": periodic,
     "coupled": method("coupled", max_steps=2),
     "lloyd": method("lloyd", max_steps=1),
