@@ -112,6 +112,7 @@ class FaceLoops:
                     k.find_opposites, v, views.owners, views.corner_faces, views.starts, views.view_labels,
                     views.turn_starts, views.turns, opposites, chains,
                 )  # fmt: skip
+                views.corner_faces = engine.empty(1, np.int32)  # the largest of what has served
             cl.enqueue_copy(engine.queue, joined.data, views.labels.data)
             done.fill(0)
             proposals = engine.empty(len(views.turns), np.int32).fill(-1)
@@ -124,6 +125,7 @@ class FaceLoops:
                 corners.name_vertices(views, joined)
                 chosen = self._chosen(k, views)
             if what & PUT:
+                del reduced
                 opposites, chains = self._put(k, views, opposites, chains, proposals)
                 reduced = engine.empty(len(views.turns), np.int32)
         raise ClvoroError(
