@@ -16,6 +16,7 @@ from typing import Protocol
 
 from .krylov import Solution
 from .mesh import Mesh
+from .pieces import balance_pieces
 
 
 class Method(Protocol):
@@ -65,6 +66,7 @@ class PublishedMethod:
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         laplacian = poisson.assemble(t.starts, t.neighbours, t.face_measures, mesh.points)
         poisson.compatible(mesh.error, t.volumes, mesh.source)
+        balance_pieces(mesh, t.volumes)
         solution = poisson.solve(
             laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
         )
@@ -112,6 +114,7 @@ class WeightedMethod:
             t.starts, t.neighbours, t.face_measures, mesh.points, w.density
         )
         poisson.compatible(w.excess, w.weight, mesh.source)
+        balance_pieces(mesh, w.weight)
         # Generators get new labels, in an array of their own, whenever their order changes.
         solution = poisson.solve(
             laplacian, mesh.source, mesh.potential, tolerance=self.tolerance, numbering=mesh.labels,

@@ -294,6 +294,16 @@ class Polygon(Domain):
         found[rows] = pieces
         return found
 
+    def nearest_piece(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) the piece that holds it or is nearest, (n,) int."""
+        found = self.piece_of(points)
+        rest = np.flatnonzero(found < 0)
+        if rest.size:  # off by a rounding
+            edge, _ = self.nearest_edge(points[rest])
+            ring = np.searchsorted(self.ring_starts, edge, side="right") - 1
+            found[rest] = self.piece_of_ring[ring]
+        return found
+
     def inner_point(self, piece: int) -> np.ndarray:
         """Return a place (2,) inside of a piece, off its boundary."""
         return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])

@@ -176,3 +176,16 @@ def test_cells_that_meet_twice_bring_two_middles(ctx) -> None:
     assert domain.contains(finer).all()
     for middle in ((0.0, 0), (2.1, 0)):
         assert np.hypot(*(finer - middle).T).min() < 1e-12
+
+
+@pytest.mark.parametrize("method", ["coupled", "adaptive"])
+def test_pieces_are_meshed_each_with_its_own_balance(ctx, method: str) -> None:
+    """The Poisson equation of a graph in two parts has a solution only if each part's sources sum up to 0."""
+    corner = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+    domain = clvoro.Polygon.from_pieces([[corner], [corner * 2 + np.array([3, 0])]])
+    options = {"method": method, "max_steps": 60} if method == "coupled" else {"effort": "fast"}
+    result = clvoro.Adapter(ctx).run(domain, 0.1, seed=1, **options)
+    assert result.check().ok
+    assert np.isin(result.history["iterations"], np.arange(1, 100)).any()
+    # A tenth of the cells' size at most: what rounding the number of cells of a piece leaves is a twentieth.
+    assert np.abs(result.error).mean() < 0.1
