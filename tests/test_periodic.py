@@ -351,6 +351,12 @@ def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
             assert np.abs(found[0] - found[1]).max() * n < 100 * n * eps
 
 
+def test_faces_that_one_side_does_not_see_are_dropped(adapter):
+    from tests.oclgrind_work import drop_faces
+
+    drop_faces(adapter)
+
+
 def test_coarse_levels_with_too_few_cells_are_left_out(double):
     from clvoro.plans import auto_levels
 
