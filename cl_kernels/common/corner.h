@@ -4,11 +4,12 @@
    seam.cl), in which a neighbour is the nearest image of its generator; 0 along an axis with walls. */
 #ifdef FOLD_0
 #define FOLD(a) ((a) == 0 ? R(FOLD_0) : R(FOLD_1))
-inline REAL fold(REAL d, REAL period)
+inline REAL fold_period(REAL d, REAL period)
 {
-    return period > 0 ? d - period * rint(d * (1 / period)) : d;
+    /* Faster than rint, which PoCL calls. */
+    return d > period / 2 ? d - period : (d < -period / 2 ? d + period : d);
 }
-#define BETWEEN(a, from, to) fold((to) - (from), FOLD(a))
+#define BETWEEN(a, from, to) (FOLD(a) > 0 ? fold_period((to) - (from), FOLD(a)) : (to) - (from))
 #else
 #define FOLD(a) 0
 #define BETWEEN(a, from, to) ((to) - (from))

@@ -20,7 +20,8 @@
 
 inline REAL nearest_image(REAL d, REAL period)
 {
-    return period > 0 ? d - period * rint(d * (1 / period)) : d;
+    const REAL half_period = period / 2;
+    return period > 0 ? (d > half_period ? d - period : (d < -half_period ? d + period : d)) : d;
 }
 
 /* The image in [0, period), on the grid of eps. */
