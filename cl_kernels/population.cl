@@ -302,11 +302,19 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
 #endif
 
 /* Per generator i: the excess of its cell, in the sense of `sign`, as a site to split (sign > 0) or to delete. Cells of few
-   faces go, those of many are split, if their excess is alike. Above 4 all are alike. */
-kernel void score_excess(const int size, global const int *starts, global const REAL *excess, const REAL sign,
-                         global ulong *keys)
+   faces go, those of many are split, if their excess is alike. Above 4 all are alike. A cell without neighbours stays: it
+   is the last of its piece of the domain. */
+kernel void score_excess(const int size, global const int *starts, global const int *neighbours,
+                         global const REAL *excess, const REAL sign, global ulong *keys)
 {
     WORK_ITEM(i);
+    bool alone = sign < 0;
+    for (int k = starts[i]; k < starts[i + 1] && alone; ++k)
+        alone = neighbours[k] < 0;
+    if (alone) {
+        keys[i] = 0;
+        return;
+    }
     const REAL faces = starts[i + 1] - starts[i];
     const REAL magnitude = 2 + sign * (excess[i] + FACE_WEIGHT * (faces - REGULAR_FACES));
     keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), i) : 0;

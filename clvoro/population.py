@@ -203,7 +203,7 @@ class PopulationControl:
         engine, k, n = self.engine, self._kernels, t.n
         sign = engine.real.type(math.copysign(1, rest))
         keys = self._room("keys", size=n, dtype=np.uint64)
-        engine.run_each(k.score_excess, n, t.starts, excess, sign, keys)
+        engine.run_each(k.score_excess, n, t.starts, t.neighbours, excess, sign, keys)
         self._exempt(t, keys, around=False)
         engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, EXCESS_RINGS), keys)
         chosen = self._choose(t, keys, EXCESS_RINGS)
