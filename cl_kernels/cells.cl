@@ -149,7 +149,9 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
         inner = w;
         w = fmin(need, 2 * w);
     }
-    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+    /* A search that is to be repeated begins with a guess as before: from 0 it would never widen. */
+    if (flag == 0 && cell.reach2 > 0)
+        reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
     store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
     places[i] = i;
 }

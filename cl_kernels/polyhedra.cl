@@ -74,7 +74,9 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
         return;
     }
 
-    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+    /* A search that is to be repeated begins with a guess as before: from 0 it would never widen. */
+    if (flag == 0 && cell.reach2 > 0)
+        reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
 
     /* A vertex of every face. */
     INDEX start[FACE_CAPACITY];

@@ -281,3 +281,15 @@ def test_degenerate_sets(adapter64, places):
     points = np.where(a[:, 2:] == 0, points, np.nextafter(points, points + a[:, 2:]))
     points = np.clip(points, BOX.lower, BOX.upper)
     check_invariants(adapter64.diagram(BOX, points), np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_search_that_is_repeated_widens(ctx, seed):
+    """Among generators that coincide in single precision cells shrink to a point, while others need more capacity."""
+    rng = np.random.default_rng(seed)
+    around = rng.uniform(0, 1, (40, 2))
+    cluster = 0.3 + rng.normal(size=(300, 2)) * 10.0 ** -rng.uniform(6, 8)
+    with pytest.raises(clvoro.ClvoroError, match="coincide|too close"):
+        clvoro.Adapter(ctx, "float32").diagram(
+            clvoro.Box((0, 0), (1, 1)), np.concatenate([around, cluster])
+        )
