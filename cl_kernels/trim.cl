@@ -380,16 +380,18 @@ kernel void copy_whole(const int size, global const int *starts, global const in
                        global const REAL *face_measures, global const REAL2 *face_centroids, SEGMENT_ARGS,
                        global const int *slots, global const int *roots, global const int *marks,
                        global const int *new_starts, global int *new_neighbours, global REAL *new_measures,
-                       global REAL2 *new_centroids)
+                       global REAL2 *new_centroids, global REAL2 *outlines)
 {
     WORK_ITEM(i);
     if (slots[i] != UNTOUCHED)
         return;
     const segments_t s = SEGMENTS;
     const int shift = new_starts[i] - starts[i];
+    const bool marked = marks[i];
+    outlines[i] = (REAL2)(starts[i + 1] - starts[i], 6);
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         int j = neighbours[k];
-        if (marks[i] && j >= 0 && slots[j] != UNTOUCHED) {
+        if (marked && j >= 0 && slots[j] != UNTOUCHED) {
             const int u = slots[j];
             for (int m = s.starts[u]; m < s.starts[u + 1]; ++m)
                 if (s.labels[m] == i && s.from[m] < 0 && s.to[m] < 0)
@@ -514,11 +516,4 @@ kernel void name_places(const int size, global const int *list_starts, global in
     WORK_ITEM(u);
     for (int place = list_starts[u] + u; place < list_starts[u + 1] + u + 1; ++place)
         place_cells[place] = u;
-}
-
-/* Per generator of the domain: the outline of a cell that the boundary does not pass through. */
-kernel void draw_whole(const int size, global const int *starts, global REAL2 *outlines)
-{
-    WORK_ITEM(i);
-    outlines[i] = (REAL2)(starts[i + 1] - starts[i], 6);
 }

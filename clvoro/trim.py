@@ -164,15 +164,14 @@ class Trim:
         neighbours = room("neighbours", size=m, dtype=np.int32)
         measures, centroids = room("measures", size=m), room("centroids", size=2 * m)
         face_segments = room("face_segments", size=m, dtype=np.int32)
+        outlines = room("outlines", size=2 * n)
         engine.run_each(
             k.copy_whole, n, convex.starts, convex.neighbours, convex.face_measures,
             convex.face_centroids, *segments, chords.slots, roots, marks, starts, neighbours, measures,
-            centroids,
+            centroids, outlines,
         )  # fmt: skip
         place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
         engine.run_each(k.name_places, u, chords.list_starts, place_cells)
-        outlines = room("outlines", size=2 * n)
-        engine.run_each(k.draw_whole, n, convex.starts, outlines)
         engine.run_each(
             k.write_trimmed, u, *segments, convex.points, *owners, orphans, np.int32(orphan_count),
             place_cells, starts, neighbours, measures, centroids, face_segments, convex.volumes,

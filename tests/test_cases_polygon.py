@@ -149,7 +149,9 @@ def test_the_channel_leaves_its_section_out() -> None:
     assert case.domain.measure == pytest.approx(3.5 * 1.2 - section.measure, rel=1e-12)
     size = case.size_field()
     assert size(np.array([(-1.0, 0.6), (2.5, -0.6)])) == pytest.approx(0.006)
-    assert size(section.vertices).max() <= 0.004
+    # Around the section sizes come from the layers.
+    (layer,) = case.run_arguments()["layers"]
+    assert layer.edges == tuple(range(4, 4 + len(section.vertices)))
     assert size(np.array([(-1.0, 0.0)])) == pytest.approx(0.06)
 
 
@@ -159,3 +161,39 @@ def test_cases_run(ctx) -> None:
     result = adapter.run(case.domain, 8 * case.size_field(), effort="fast", seed=1)
     assert result.check().ok
     assert result.diagram.volumes.sum() == pytest.approx(case.domain.measure, rel=1e-12)
+
+
+LAYERED = """
+[domain]
+outer = [[0, 0], [2, 0], [2, 1], [0, 1]]
+holes = [{ kind = "circle", centre = [1, 0.5], radius = 0.2, n_points = 16 }]
+
+[size]
+kind = "constant"
+value = 0.1
+
+[[layers]]
+height = 0.02
+count = 2
+rings = [1]
+
+[[layers]]
+height = 0.03
+edges = [0]
+"""
+
+
+def test_layers_of_a_case(tmp_path):
+    case = Case.from_toml(LAYERED, "layered")
+    around, below = case.run_arguments()["layers"]
+    assert around == clvoro.Layers(0.02, count=2, edges=range(4, 20))
+    assert below == clvoro.Layers(0.03, edges=[0])
+    again = load_case(case.write(tmp_path))
+    assert again.run_arguments()["layers"] == [around, below]
+    with pytest.raises(InputError, match=r"rings has \[2\], expected 0 to 1"):
+        Case.from_toml(LAYERED.replace("rings = [1]", "rings = [2]"), "layered").run_arguments()
+    boxed = LAYERED.split("[size]")[1]
+    with pytest.raises(InputError, match="polygonal domain"):
+        Case.from_toml(
+            f"[domain]\nlower = [0, 0]\nupper = [2, 1]\n[size]{boxed}", "boxed"
+        ).run_arguments()

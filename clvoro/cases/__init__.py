@@ -14,7 +14,7 @@ from ..domain import Domain
 from ..errors import InputError
 from ..io.atomic import atomic_file
 from . import schema, toml
-from .domains import build_domain
+from .domains import build_domain, build_layers
 from .fields import build_size, load_array, named_files
 from .files import FOLDER, locate
 from .naca import naca4
@@ -44,6 +44,8 @@ class Case:
         Files that the case names are looked for here, then among those of the built-in cases.
     place : dict
         The keys of the file's `[domain]` table; empty for a box that is not from a file.
+    layers : tuple of dict
+        The tables of the file's `[[layers]]`.
     frames : int
         Meshes that the size field's motion is followed by, the first included; see `clvoro.sequence`.
     """
@@ -56,6 +58,7 @@ class Case:
     folder: Path = Path()
     place: dict[str, Any] = field(default_factory=dict)
     frames: int = 1
+    layers: tuple[dict[str, Any], ...] = ()
 
     @classmethod
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
@@ -92,6 +95,7 @@ class Case:
             folder=folder,
             place=checked["domain"],
             frames=checked.get("sequence", {}).get("frames", 1),
+            layers=tuple(checked.get("layers", ())),
         )
 
     @property
@@ -116,6 +120,8 @@ class Case:
         arguments = {key: value for key, value in self.run.items() if key not in apart}
         if "points" in arguments:
             arguments["points"] = load_array(self.folder / arguments["points"], "run.points")
+        if self.layers:
+            arguments["layers"] = [build_layers(table, self.domain) for table in self.layers]
         return arguments
 
     def table(self) -> dict[str, Any]:
@@ -126,6 +132,7 @@ class Case:
             "domain": self.place or _corners(self.domain),
             "size": self.size,
             "run": {key: self.run[key] for key in _RUN_ORDER if key in self.run},
+            **({"layers": list(self.layers)} if self.layers else {}),
             **({"sequence": {"frames": self.frames}} if self.frames > 1 else {}),
         }
 

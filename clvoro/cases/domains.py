@@ -10,6 +10,7 @@ import numpy as np
 
 from ..domain import Box, Domain
 from ..errors import InputError
+from ..layers import Layers
 from ..polygon import Polygon
 from .files import locate
 from .naca import naca4
@@ -49,3 +50,18 @@ def _ring(node: Any) -> np.ndarray:
         return naca4(**rest)
     turn = np.linspace(0, 2 * np.pi, rest.get("n_points", 64), endpoint=False)
     return np.array(rest["centre"]) + rest["radius"] * np.column_stack([np.cos(turn), np.sin(turn)])
+
+
+def build_layers(node: Mapping[str, Any], domain: Domain) -> Layers:
+    """Return the layers that `node` describes, a table that `schema.LAYERS` has passed, along walls of `domain`."""
+    rest = {key: value for key, value in node.items() if key != "rings"}
+    if "rings" not in node:
+        return Layers(**rest)
+    if not isinstance(domain, Polygon):
+        raise InputError("layers has rings, expected a polygonal domain, or edges")
+    starts = domain.ring_starts
+    missing = [ring for ring in node["rings"] if ring >= len(starts) - 1]
+    if missing:
+        raise InputError(f"layers.rings has {missing}, expected 0 to {len(starts) - 2}")
+    edges = [e for ring in node["rings"] for e in range(starts[ring], starts[ring + 1])]
+    return Layers(**{**rest, "edges": sorted({*rest.get("edges", ()), *edges})})

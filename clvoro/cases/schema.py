@@ -348,7 +348,19 @@ RUN = Table(
 
 SEQUENCE = Table({"frames": whole(1)}, {})
 
+LAYERS = Table(
+    {"height": positive},
+    {
+        "count": whole(1),
+        "growth": positive,
+        "spacing": positive,
+        "edges": list_of(whole(0)),
+        "rings": list_of(whole(0)),
+    },
+)
+"""Rows of generators along walls; rings stand for all their edges, 0 the first outer ring."""
+
 CASE = Table(
     {"domain": domain, "size": size},
-    {"name": text, "title": text, "run": RUN, "sequence": SEQUENCE},
+    {"name": text, "title": text, "run": RUN, "layers": list_of(LAYERS), "sequence": SEQUENCE},
 )
