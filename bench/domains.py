@@ -3,7 +3,7 @@
     python bench/domains.py [--effort default] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
 Writes `domains.png` into `bench/pictures` or `--out`, and prints what each mesh came to: a lake with an island,
-fine along the shore; a wing section in a channel, with layers around it; a box that is periodic in both directions,
+eight cells across its straits; a wing section in a channel, with layers around it; a box that is periodic in both directions,
 with refined spots across its seams.
 """
 
@@ -40,8 +40,8 @@ class Example:
 
 def shore() -> Example:
     domain = lake(900, rough=0.2)
-    size = sizing.Distance(domain.boundary(), h_min=0.018, growth=1.3, h_max=0.11)
-    return Example("Polygon(shore, [island])", domain, size)
+    size = sizing.FeatureSize(domain, cells_across=8, growth=1.25, h_min=0.016, h_max=0.11)
+    return Example("FeatureSize(Polygon(shore, [island]), 8)", domain, size)
 
 
 def channel() -> Example:
