@@ -176,7 +176,11 @@ def pressing_run(number):
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
         (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "no folder can be made"),
         (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
-        (["cases", "papre"], cli.BAD_INPUT, "airfoil, channel, lake, paper, sphere, surface"),
+        (
+            ["cases", "papre"],
+            cli.BAD_INPUT,
+            "airfoil, channel, lake, paper, sphere, spots, surface",
+        ),
     ],
 )
 def test_errors_are_one_message(here, capsys, arguments, code, named):
@@ -237,6 +241,7 @@ def test_cases_are_listed_and_printed(here, capsys):
         "lake",
         "paper",
         "sphere",
+        "spots",
         "surface",
     ]
     assert call("cases", "paper") == cli.OK

@@ -250,4 +250,4 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert [span["step"] for span in found["spans"]] == [0, 1, 2, 3, None]
     assert found["bandwidth"] > 0
     assert cli.main([*options, "--profile"]) == cli.OK
-    assert "cells.clip_cells" in capsys.readouterr().out
+    assert "cells.measure_cells" in capsys.readouterr().out
