@@ -50,6 +50,24 @@ def diagrams(adapter: clvoro.Adapter) -> None:
         assert len(diagram.vertices) > 3
 
 
+def hulls(adapter: clvoro.Adapter) -> None:
+    """Sets on which wrapping gives up: too many near, or too few; spread over scales; along walls and lines."""
+    square = clvoro.Box((0, 0), (1, 1))
+    spots = [0.4 + scale * (points(30) - 0.5) for scale in (1e-2, 1e-4, 1e-6)]
+    if adapter.dtype == np.float32:
+        spots.pop()
+    for each in (
+        np.vstack([points(450) * (0.05, 1), [[0.99, 0.7]]]),
+        np.vstack([*spots, points(9)]),
+        points(90) ** 3,
+        np.vstack([points(40) * (1, 1e-4), points(40)]),
+        np.stack([np.linspace(0.01, 0.99, 77), np.full(77, 0.3)], axis=1),
+        np.vstack([points(30), points(30) + 1e-4 * (points(30, seed=1) - 0.5)]),
+    ):
+        diagram = adapter.diagram(square, np.clip(each, 0, 1))
+        assert abs(diagram.volumes.sum() - 1) < 1e-4
+
+
 def lattice(side: int, dim: int) -> np.ndarray:
     line = (np.arange(side) + 0.5) / side
     return np.stack(np.meshgrid(*[line] * dim), axis=-1).reshape(-1, dim)
@@ -223,6 +241,7 @@ def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
         text = {
             "bounds": "kernel void bounds(global int *a) { a[get_global_id(0) + 1] = 1; }",
             "race": "kernel void race(global int *a) { a[0] = get_global_id(0); }",
+            "same": "kernel void same(global int *a) { a[0] = 1; }",
             "local_race": "kernel void local_race(global int *a) { local int s[16]; int i = get_local_id(0);"
             " s[i] = i; a[i] = s[15 - i]; }",
             "barrier_": "kernel void barrier_(global int *a)"
@@ -258,6 +277,7 @@ def _bound(kernel: cl.Kernel, buffer: cl.Buffer) -> cl.Kernel:
 
 WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "diagrams": diagrams,
+    "hulls": hulls,
     "solid": solid,
     "fields": fields,
     "multigrid": multigrid,
@@ -275,7 +295,10 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "exact": method("exact", levels=0, effort="fast", max_steps=75),
     "solid-run": method("exact", CUBE, SOLID, effort="fast", max_steps=14),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
-    **{f"broken-{k}": broken(k) for k in ("bounds", "race", "local_race", "barrier_", "private")},
+    **{
+        f"broken-{k}": broken(k)
+        for k in ("bounds", "race", "same", "local_race", "barrier_", "private")
+    },
 }
 
 

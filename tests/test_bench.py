@@ -29,12 +29,14 @@ def test_interpolation():
     assert adapted["l2"] < adapted["largest"] < uniform["largest"]
 
 
+@pytest.mark.slow
 def test_interpolation_fails_where_too_little_is_won():
     # A layer as wide as the square: nothing to adapt to.
     _, adapted = records("interpolation.py", "--sizes", "4e3", "--steepness", "2", code=1)
     assert adapted["l1_factor"] < 5
 
 
+@pytest.mark.slow
 def test_restart():
     cold, *moved = records("restart.py", "--moves", "2")
     assert cold["steps"] > 100

@@ -58,7 +58,10 @@ def call(*arguments):
 # The built-in cases.
 
 
-@pytest.mark.parametrize(("name", "least", "most"), [("sphere", 15e3, 4e4), ("surface", 2e4, 4e4)])
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [("sphere", 15e3, 4e4), pytest.param("surface", 2e4, 4e4, marks=pytest.mark.slow)],
+)
 def test_counts(ctx, name, least, most):
     case = load_case(name)
     field = Sizing(patch.make_engine(ctx, dim=3), case.domain, case.size_field())
@@ -81,7 +84,7 @@ def test_the_body_is_the_formula_it_names():
     assert case.size_field()(body.vertices) == pytest.approx(0.025)
 
 
-@pytest.mark.parametrize("name", ["sphere", "surface"])
+@pytest.mark.parametrize("name", ["sphere", pytest.param("surface", marks=pytest.mark.slow)])
 def test_run_writes_everything(here, capsys, name):
     assert call("run", name, "--cells", 300, "--effort", "fast", "--json") == cli.OK
     out = here / "out" / name

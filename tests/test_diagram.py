@@ -289,7 +289,7 @@ def test_a_search_that_is_repeated_widens(ctx, seed):
     rng = np.random.default_rng(seed)
     around = rng.uniform(0, 1, (40, 2))
     cluster = 0.3 + rng.normal(size=(300, 2)) * 10.0 ** -rng.uniform(6, 8)
-    with pytest.raises(clvoro.ClvoroError, match="coincide|too close"):
+    with pytest.raises(clvoro.ClvoroError, match=r"coincide|too close"):
         clvoro.Adapter(ctx, "float32").diagram(
             clvoro.Box((0, 0), (1, 1)), np.concatenate([around, cluster])
         )

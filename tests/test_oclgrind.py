@@ -25,6 +25,7 @@ ROOT = Path(__file__).parent.parent
 TRAPS = {
     "bounds": "Invalid write",
     "race": "Write-write data race at global",
+    "same": "Write-write data race at global",
     "local_race": "data race at local",
     "barrier_": "divergence detected",
 }
@@ -54,7 +55,13 @@ def simulate(name, *options):
         done = subprocess.run(
             [sys.executable, "-W", "ignore", "-m", "tests.oclgrind_work", name, *options],
             cwd=ROOT,
-            env={**os.environ, "OCLGRIND_DATA_RACES": "1", "OCLGRIND_LOG": str(log)},
+            # Writing the same is a race, too, by OpenCL's memory model: flags are raised by atomic_or.
+            env={
+                **os.environ,
+                "OCLGRIND_DATA_RACES": "1",
+                "OCLGRIND_UNIFORM_WRITES": "1",
+                "OCLGRIND_LOG": str(log),
+            },
             capture_output=True,
             text=True,
             timeout=1800,

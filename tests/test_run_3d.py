@@ -273,7 +273,7 @@ def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     check(result, SMALL)
 
 
-@pytest.mark.parametrize("levels", [0, 2])
+@pytest.mark.parametrize("levels", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_levels(adapter, levels):
     result = adapter.run(BOX, S1, levels=levels, effort="fast", seed=16)
     h = result.history
@@ -354,7 +354,13 @@ def test_callable_and_device_field_agree(adapter):
     assert host.points == pytest.approx(device.points, abs=1e-6)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=() if name in ("adaptive", "coupled") else pytest.mark.slow)
+        for name in METHODS
+    ],
+)
 def test_elongated_boxes(adapter, adapter32, method):
     """A box 20 times as long as it is flat, and a plate one cell thick."""
     plate = clvoro.Box((0, 0, 0), (1, 1, 0.02))
