@@ -54,6 +54,7 @@ def test_transfer():
     assert max(r["mass"] for r in rows) < 1e-12
 
 
+@pytest.mark.slow
 def test_fields(tmp_path):
     rows = records("fields.py", "--effort", "fast", "--out", str(tmp_path))
     assert len(rows) == 6
