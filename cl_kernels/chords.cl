@@ -137,7 +137,7 @@ kernel void walk_edges(const int size, const int generators, global const REAL2 
         const bool last = cell == target || steps > size + generators;
         const int next = last ? -1 : step_along(cell, owners[v], target, a, e, starts, neighbours, points, &t);
         if (cell >= generators) {
-            intruders[cell - generators] = 1;
+            atomic_or(intruders + cell - generators, 1);
             atomic_or(flags, FLAG_OUTSIDE);
         }
         if (cell != target && next < 0)

@@ -41,7 +41,7 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
     WORK_ITEM(i);
     cell_t cell;
     if (!make_cell(&cell, i, points, box_lower, box_upper, starts, neighbours)) {
-        full[0] = 1;
+        atomic_or(full, 1);
         return;
     }
     const int begin = starts[i], end = starts[i + 1];
@@ -205,5 +205,5 @@ kernel void spread_labels(const int size, global const int *same, global const i
         any = true;
     }
     if (any)
-        changed[0] = 1;
+        atomic_or(changed, 1);
 }

@@ -94,7 +94,7 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         jump *= count[a];
     }
     if ((parity & 1) != colour) {
-        wake[i] = 1;
+        atomic_or(wake + i, 1);
         return;
     }
     REAL least = lowest[i], around = least;
@@ -105,7 +105,7 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         jump *= tiles[a];
     }
     if (around > threshold) {
-        wake[i] = 1;
+        atomic_or(wake + i, 1);
         return;
     }
     /* Bits 2 a and 2 a + 1: the lower and the upper side across axis a has changed. */
@@ -148,9 +148,9 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
     jump = 1;
     for (int a = 0; a < DIM; ++a) {
         if ((changed >> (2 * a) & 1) && tile[a] > 0)
-            wake[i - jump] = 1;
+            atomic_or(wake + i - jump, 1);
         if ((changed >> (2 * a + 1) & 1) && tile[a] < tiles[a] - 1)
-            wake[i + jump] = 1;
+            atomic_or(wake + i + jump, 1);
         jump *= tiles[a];
     }
 }

@@ -56,8 +56,8 @@ inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, glo
 }
 
 /* Per generator i: marks[i] = 1, and its neighbours' at the face in question, where the neighbours from before no longer
-   enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; all who write one
-   write the same. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up. */
+   enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; many may
+   write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up. */
 kernel void check_rows(const int size, global const int *starts, global const int *neighbours,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *fits,
                        global int *marks)
@@ -69,7 +69,7 @@ kernel void check_rows(const int size, global const int *starts, global const in
     const int start = starts[i], n = starts[i + 1] - start;
     global const int *row = neighbours + start;
     if (n < 3 || n > CHECKED_FACES) {
-        marks[i] = 1;
+        atomic_or(marks + i, 1);
         return;
     }
     /* Face k, its direction, and the corners u before it and v behind it; face `before` lies before it. */
@@ -104,11 +104,11 @@ kernel void check_rows(const int size, global const int *starts, global const in
         if (!good) {
             bad = true;
             if (before >= 0)
-                marks[before] = 1;
+                atomic_or(marks + before, 1);
             if (face >= 0)
-                marks[face] = 1;
+                atomic_or(marks + face, 1);
             if (after >= 0)
-                marks[after] = 1;
+                atomic_or(marks + after, 1);
         }
         before = face;
         face = after;
@@ -116,7 +116,7 @@ kernel void check_rows(const int size, global const int *starts, global const in
         u = v;
     }
     if (bad || turns != 1 || least2 < sqrt(REAL_EPS) * reach2)
-        marks[i] = 1;
+        atomic_or(marks + i, 1);
     if (!known)
         fits[i] = fit;
 }
@@ -188,6 +188,12 @@ kernel void place_clipped(const int size, global const int *listed, const int ba
     marks[listed[w]] = fits[listed[w]] = 0;
 }
 
+inline void mark_both(int i, int j, global int *marks)
+{
+    atomic_or(marks + i, 1);
+    atomic_or(marks + j, 1);
+}
+
 /* Per listed generator: mark it and its neighbours where they do not fit together. Those who were not clipped have been
    checked against each other before. */
 kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
@@ -215,9 +221,9 @@ kernel void check_clipped(const int size, global const int *listed, global const
         const REAL2 d = face_direction(j, x, points);
         global const int *other = face_row(&rows, j, &m);
         bool exact;
-        fits[j] = 0;
+        atomic_and(fits + j, 0);
         if (!fits_neighbour(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper, &exact))
-            marks[i] = marks[j] = 1;
+            mark_both(i, j, marks);
     }
     /* Whom the row from before names is told as well: he may still name i. */
     const int end = old_starts[i + 1];
@@ -236,6 +242,6 @@ kernel void check_clipped(const int size, global const int *listed, global const
         for (int q = 0; q < m && !there; ++q)
             there = other[q] == i;
         if (there)
-            marks[i] = marks[j] = 1;
+            mark_both(i, j, marks);
     }
 }

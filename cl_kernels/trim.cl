@@ -328,7 +328,7 @@ kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touche
         orphans[piece] = 1;
         for (int k = s.starts[u]; k < s.starts[u + 1]; ++k)
             if (s.places[k] == piece && s.labels[k] >= 0 && slots[s.labels[k]] == UNTOUCHED)
-                marks[s.labels[k]] = 1;
+                atomic_or(marks + s.labels[k], 1);
     }
 }
 
