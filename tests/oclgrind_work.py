@@ -170,7 +170,7 @@ def comb(adapter: clvoro.Adapter) -> None:
 
 def periodic(adapter: clvoro.Adapter) -> None:
     """Boxes that close upon themselves in some directions."""
-    near = lattice(5, 3) + 0.05 * (points(125, 3) - 0.5)
+    near = lattice(4, 3) + 0.05 * (points(64, 3) - 0.5)
     for x, which in (
         (points(60), (True, True)),
         (points(60), (True, False)),
@@ -182,7 +182,9 @@ def periodic(adapter: clvoro.Adapter) -> None:
         assert len(diagram.vertices) > 3
     square = clvoro.Box((0, 0), (1, 1), periodic=True)
     adapter.run(square, 0.13, effort="fast", levels=0, max_steps=4, seed=911)
-    adapter.run(clvoro.Box((0,) * 3, (1,) * 3, periodic=True), 0.2, method="coupled", max_steps=2)
+    # The second diagram of a run in 3D begins with the rows of the first, unfolded.
+    rod = clvoro.Box((0, 0, 0), (1, 0.4, 0.4), periodic=(True, False, False))
+    adapter.run(rod, 0.17, method="coupled", max_steps=2)
     drop_faces(adapter)
 
 

@@ -13,6 +13,7 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pyopencl as cl
@@ -47,10 +48,33 @@ pytestmark = [
 ]
 
 
+POOL = ThreadPoolExecutor(2)
+"""The simulator has one thread for work as small as this."""
+
+
 @functools.cache
+def start(name, *options):
+    return POOL.submit(run, name, *options)
+
+
 def simulate(name, *options):
-    """Run a piece of work in the simulator; return its log and how often each kernel ran."""
-    log = ROOT / f".oclgrind-{os.getpid()}.log"
+    """Return the log of a piece of work in the simulator, and how often each kernel ran."""
+    return start(name, *options).result()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def started(request):
+    """Start all that is asked for ahead of the tests that wait for it."""
+    for item in request.session.items:
+        params = getattr(item, "callspec", None)
+        if item.path == request.path and params and "variant" in params.params:
+            start(params.params["name"], *VARIANTS[params.params["variant"]])
+    yield
+    POOL.shutdown(cancel_futures=True)
+
+
+def run(name, *options):
+    log = ROOT / f".oclgrind-{'-'.join((str(os.getpid()), name, *options))}.log"
     try:
         done = subprocess.run(
             [sys.executable, "-W", "ignore", "-m", "tests.oclgrind_work", name, *options],
