@@ -1,7 +1,11 @@
-"""Values of cells carried from one diagram of a polygon to another, on the host: cells need not be convex."""
+"""Values of cells carried from one diagram to another, on the host.
+
+Of polygons, where cells need not be convex, and of periodic boxes in 2D, where cells meet images of others.
+"""
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,7 +18,7 @@ _PAIRS = 1 << 20  # of cells that are intersected at a time
 _LEAST = 1e-300  # stands for 0 where it divides
 
 
-def transfer_polygons(
+def transfer_on_host(
     source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, ...]:
     """Return what comes into the cells of `target` of `columns` (n, width), means over those of `source`.
@@ -31,7 +35,8 @@ def transfer_polygons(
     least = most = columns
     if order == 2:
         slopes, least, most = fit_slopes(source, columns, limited)
-    old, new = outlines(source), outlines(target)
+    new = outlines(target)
+    old, image, away = _images(source, outlines(source), shapely.total_bounds(new))
     here, there = shapely.STRtree(old).query(new, predicate="intersects")
     by = np.lexsort((there, here))
     here, there = here[by], there[by]
@@ -42,8 +47,9 @@ def transfer_polygons(
         parts = shapely.intersection(new[i], old[j])
         area = shapely.area(parts)
         some = area > 0
-        i, j, area, parts = i[some], j[some], area[some], parts[some]
-        off = shapely.get_coordinates(shapely.centroid(parts)) - source.centroids[j]
+        i, k, area, parts = i[some], j[some], area[some], parts[some]
+        j = image[k]
+        off = shapely.get_coordinates(shapely.centroid(parts)) - source.centroids[j] - away[k]
         found += np.bincount(i, area, n)
         for c in range(width):
             value = columns[j, c] + (slopes[j, c] * off).sum(axis=1)
@@ -51,6 +57,25 @@ def transfer_polygons(
         np.minimum.at(low, i, least[j])
         np.maximum.at(high, i, most[j])
     return mass / np.maximum(found, _LEAST)[:, None], low, high, found
+
+
+def _images(
+    diagram: Diagram, cells: np.ndarray, bounds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `cells` (n,) with their images within `bounds`: shapes (k,), whose image each is, and how far away (k, 2)."""
+    n, periodic = len(cells), diagram.domain.periodic
+    shapes, rows, away = [cells], [np.arange(n)], [np.zeros((n, 2))]
+    boxes = shapely.bounds(cells)
+    for step in product(*((-1, 0, 1) if p else (0,) for p in periodic)):
+        if not any(step):
+            continue
+        shift = np.array(step) * diagram.domain.extent
+        low, high = boxes[:, :2] + shift, boxes[:, 2:] + shift
+        near = np.flatnonzero(((high > bounds[:2]) & (low < bounds[2:])).all(axis=1))
+        shapes.append(shapely.transform(cells[near], lambda xy, shift=shift: xy + shift))
+        rows.append(near)
+        away.append(np.tile(shift, (len(near), 1)))
+    return np.concatenate(shapes), np.concatenate(rows), np.concatenate(away)
 
 
 def outlines(diagram: Diagram) -> np.ndarray:
@@ -113,7 +138,7 @@ def fit_slopes(
     owner = np.repeat(np.arange(n), np.diff(diagram.neighbour_starts))
     inner = diagram.neighbours >= 0
     i, j = owner[inner], diagram.neighbours[inner]
-    d = diagram.centroids[j] - diagram.centroids[i]
+    d = diagram.centroids[j] + diagram.shifts[inner] * diagram.domain.extent - diagram.centroids[i]
     weight = 1 / np.maximum((d**2).sum(axis=1), _LEAST)
     normal = np.zeros((n, 2, 2))
     for a in range(2):

@@ -13,7 +13,7 @@ from ._program import Engine
 from .bins import Bins
 from .device import create_context
 from .errors import ClvoroError, InputError, InputTypeError
-from .overlap import transfer_polygons
+from .overlap import transfer_on_host
 from .polygon import Polygon
 from .results import Diagram, Result
 from .transfer import Content, Graph, Transfer
@@ -42,10 +42,11 @@ def transfer_values(
             f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
             "both meshes with one domain"
         )
-    if any(source.domain.periodic):
+    on_host = isinstance(source.domain, Polygon) or any(source.domain.periodic)
+    if on_host and source.domain.dim == 3:
         raise InputError(
-            f"the meshes are of {source.domain}, and values are not carried over in periodic boxes yet, expected a "
-            "domain with walls"
+            f"the meshes are of {source.domain}, and values are not carried over in periodic boxes in 3D yet, expected "
+            "a domain with walls"
         )
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
@@ -56,7 +57,7 @@ def transfer_values(
     # Numbers around 1, by powers of two: nothing is rounded, and no product leaves the range.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(columns).max(axis=0), 1e-300))))
     task = source, target, columns / scale, order, bool(limited)
-    if isinstance(source.domain, Polygon):
+    if on_host:
         means, low, high = _transferred_on_host(*task)
     else:
         with adapter._alone() if adapter is not None else nullcontext():
@@ -149,7 +150,7 @@ def _transferred_on_host(
     source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what `_transferred` does, in a polygonal domain."""
-    means, low, high, found = transfer_polygons(source, target, columns, order, limited)
+    means, low, high, found = transfer_on_host(source, target, columns, order, limited)
     unit = source.domain.frame[1] ** 2
     _demand_whole(found / unit, target.volumes / unit, 2)
     return means, low, high

@@ -171,8 +171,8 @@ class Diagram:
         Raises
         ------
         InputError, InputTypeError
-            If the meshes have different domains or a periodic one, `values` has another shape or is not finite (a mean
-            with a NaN is none), or `order` is neither 1 nor 2.
+            If the meshes have different domains or a periodic one in 3D, `values` has another shape or is not finite (a
+            mean with a NaN is none), or `order` is neither 1 nor 2.
         ClvoroError
             If one of the meshes is not the Voronoi diagram of its points.
         """
