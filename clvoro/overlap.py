@@ -62,7 +62,7 @@ def transfer_on_host(
 def _images(
     diagram: Diagram, cells: np.ndarray, bounds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `cells` (n,) and images of them within `bounds`: shapes (k,), of which cell each is, how far away (k, 2)."""
+    """Return `cells` (n,) and images of them within `bounds`: shapes (k,), of which cell, how far away (k, 2)."""
     n, periodic = len(cells), diagram.domain.periodic
     shapes, rows, away = [cells], [np.arange(n)], [np.zeros((n, 2))]
     boxes = shapely.bounds(cells)
