@@ -1,4 +1,5 @@
 #include "common/bins.h"
+#include "common/sort.h"
 
 /* Generators are counted into bins, level by level, then placed by a counting sort. The order in which atomics arrive
    only decides ranks within a bin, and the last pass sorts each bin by generator index: the result is deterministic. */
@@ -105,7 +106,7 @@ kernel void place_items(const int size, global const int *keys, global const int
     items[bins[keys[i]].s0 + ranks[i]] = i;
 }
 
-/* Per bin: sort its items by generator index (Shell's sort: a leaf holds a handful, but duplicates may pile up). */
+/* Per bin: sort its items by generator index: a leaf holds a handful, but duplicates may pile up. */
 kernel void sort_bins(const int size, global const int2 *bins, global const int *bin_grid,
                       global const int4 *grid_shapes, global int *items)
 {
@@ -115,17 +116,7 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
         return;
     const int count = bins[b + 1].s0 - bins[b].s0;
     global int *list = items + bins[b].s0;
-    int gap = 1;
-    while (gap < count / 9)
-        gap = 3 * gap + 1;
-    for (; gap > 0; gap /= 3)
-        for (int k = gap; k < count; ++k) {
-            const int item = list[k];
-            int at = k;
-            for (; at >= gap && list[at - gap] > item; at -= gap)
-                list[at] = list[at - gap];
-            list[at] = item;
-        }
+    sort_list(list, count);
 }
 
 /* Per place p: the generator's position, and the edge of the leaf that it lies in. */

@@ -1,4 +1,5 @@
 #include "common/boundary.h"
+#include "common/sort.h"
 
 /* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex diagram.
    Each crossing of an edge with a face is computed once, for both cells beside it, so that trimmed cells tile the domain. */
@@ -204,17 +205,5 @@ kernel void place_chords(const int size, global const int *chord_cells, global c
 kernel void sort_chords(const int size, global const int *starts, global int *listed)
 {
     WORK_ITEM(u);
-    global int *list = listed + starts[u];
-    const int count = starts[u + 1] - starts[u];
-    int gap = 1;
-    while (gap < count / 9)
-        gap = 3 * gap + 1;
-    for (; gap > 0; gap /= 3)
-        for (int k = gap; k < count; ++k) {
-            const int item = list[k];
-            int at = k;
-            for (; at >= gap && list[at - gap] > item; at -= gap)
-                list[at] = list[at - gap];
-            list[at] = item;
-        }
+    sort_list(listed + starts[u], starts[u + 1] - starts[u]);
 }

@@ -8,15 +8,14 @@ of a search tree over all generators.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from .check_polygon import check_cells, check_edges, check_outlines, hidden
-from .errors import ClvoroError
 from .faces import face_keys
+from .findings import Check, MisfitError, Report
 from .outlines import SIDE_TURN, count_sides, next_faces
 from .polygon import Polygon
 from .rebuilt import Doubts, Rebuilt
@@ -30,131 +29,18 @@ ROUNDINGS = 256
 off by more, where the faces that meet there say so: see `Rebuilt.doubts`."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong.
-
-    Attributes
-    ----------
-    name : str
-        Of the property that does not hold, such as ``"volumes sum"``.
-    message : str
-        What was found, what was expected, and where it is worst.
-    count : int
-        In how many places.
-    """
-
-    name: str
-    message: str
-    count: int = 1
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.message}"
-
-
-@dataclass(frozen=True)
-class Report:
-    """What a check has found; true if that is nothing.
-
-    Attributes
-    ----------
-    findings : tuple of Finding
-    checked : tuple of str
-        Names of the properties that were looked at. The check stops early where arrays do not fit each other.
-    cells, faces : int
-    precision : str
-        The precision in which the mesh was made, told by its numbers; tolerances follow it.
-    """
-
-    findings: tuple[Finding, ...]
-    checked: tuple[str, ...]
-    cells: int
-    faces: int
-    precision: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether nothing is wrong."""
-        return not self.findings
-
-    def __bool__(self) -> bool:
-        return self.ok
-
-    def __str__(self) -> str:
-        head = f"{self.cells} cells, {self.faces} faces, {self.precision}"
-        if self.ok:
-            return f"{head}: {len(self.checked)} properties hold"
-        return "\n".join([f"{head}: {len(self.findings)} of {len(self.checked)} properties do not hold",
-                          *(f"  {finding}" for finding in self.findings)])  # fmt: skip
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {"ok": self.ok, **asdict(self)}
-
-    def demand(self) -> None:
-        """Raise if something is wrong.
-
-        Raises
-        ------
-        CheckError
-        """
-        if self.findings:
-            raise CheckError(str(self))
-
-
-class CheckError(ClvoroError):
-    """A mesh is not what it claims to be."""
-
-
-class _MisfitError(Exception):
-    """Arrays do not fit each other: what builds on them cannot be looked at."""
-
-
-class _Check:
-    """Collects findings about one diagram."""
-
-    def __init__(self, diagram: Diagram) -> None:
-        self.diagram = diagram
-        self.findings: list[Finding] = []
-        self.checked: list[str] = []
-
-    def note(
-        self, name: str, wrong: np.ndarray, say: Callable[[int], str], stop: bool = False
-    ) -> None:
-        """Record whether `name` holds: `wrong` (k,) is true (or large) where it does not."""
-        self.checked.append(name)
-        places = np.flatnonzero(wrong)
-        if places.size:
-            worst = int(places[np.argmax(np.asarray(wrong)[places])])
-            more = f" ({places.size} such)" if places.size > 1 else ""
-            self.findings.append(Finding(name, say(worst) + more, int(places.size)))
-            if stop:
-                raise _MisfitError
-
-    def shape(self, name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str = "f") -> None:
-        """Record whether an array has its shape, and finite numbers."""
-        fits = array.shape == shape and array.dtype.kind in kinds
-        self.note(
-            "shapes", np.array([not fits]),
-            lambda _: f"{name} is {array.dtype} {array.shape}, expected {shape}", stop=True,
-        )  # fmt: skip
-        if array.dtype.kind == "f":
-            bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
-            self.note("finite", bad, lambda i: f"{name}[{i}] is {array[i]}", stop=True)
-
-
 def check_diagram(diagram: Diagram) -> Report:
     """Check a diagram in 2D or 3D; see `Diagram.check`."""
-    return _finish(_Check(diagram))
+    return _finish(Check(diagram))
 
 
 def check_result(result: Result) -> Report:
     """Check a result: its diagram, sizes, error (the paper's 3.1), quality (4.1) and history; see `Result.check`."""
-    check = _Check(result.diagram)
+    check = Check(result.diagram)
     return _finish(check, lambda: _check_result(check, result))
 
 
-def _finish(check: _Check, more: Callable[[], None] | None = None) -> Report:
+def _finish(check: Check, more: Callable[[], None] | None = None) -> Report:
     diagram, geometry = check.diagram, None
     try:
         _check_structure(check)
@@ -162,7 +48,7 @@ def _finish(check: _Check, more: Callable[[], None] | None = None) -> Report:
         _check_geometry(check, geometry)
         if more is not None:
             more()
-    except _MisfitError:
+    except MisfitError:
         pass
     names = tuple(dict.fromkeys(check.checked))
     real = "unknown precision" if geometry is None else geometry.real.name
@@ -170,7 +56,7 @@ def _finish(check: _Check, more: Callable[[], None] | None = None) -> Report:
     return Report(tuple(check.findings), names, len(diagram), faces, real)
 
 
-def _check_structure(check: _Check) -> None:
+def _check_structure(check: Check) -> None:
     """Check that the arrays fit each other, and that the graph is one."""
     d = check.diagram
     dim, n = d.domain.dim, len(d.points)
@@ -250,7 +136,7 @@ def _check_structure(check: _Check) -> None:
         check_outlines(check)
 
 
-def _check_shifts(check: _Check) -> None:
+def _check_shifts(check: Check) -> None:
     """Check that only faces in periodic directions lead to images, and none to walls there."""
     d = check.diagram
     periodic = np.array(d.domain.periodic)
@@ -270,7 +156,7 @@ def _check_shifts(check: _Check) -> None:
         )  # fmt: skip
 
 
-def _check_starts(check: _Check, name: str, starts: np.ndarray, total: int) -> None:
+def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> None:
     good = len(starts) > 0 and starts[0] == 0 and starts[-1] == total
     rises = np.diff(starts.astype(np.int64)) if len(starts) else np.zeros(0)
     check.note(
@@ -279,7 +165,7 @@ def _check_starts(check: _Check, name: str, starts: np.ndarray, total: int) -> N
     )  # fmt: skip
 
 
-def _check_geometry(check: _Check, g: Rebuilt) -> None:
+def _check_geometry(check: Check, g: Rebuilt) -> None:
     d = check.diagram
     n, dim, domain = len(d), d.domain.dim, d.domain
     slack = ROUNDINGS * g.unit
@@ -328,7 +214,7 @@ def _check_geometry(check: _Check, g: Rebuilt) -> None:
     _check_nearest(check, g, slack)
 
 
-def _check_faces(check: _Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
+def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
     """Check faces: closed around each cell, measured right, outward, on their walls, the same from both sides."""
     d = check.diagram
     dim, n = d.domain.dim, len(d)
@@ -393,7 +279,7 @@ def _check_faces(check: _Check, g: Rebuilt, slack: float, doubts: Doubts) -> Non
     )  # fmt: skip
 
 
-def _check_nearest(check: _Check, g: Rebuilt, slack: float) -> None:
+def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     """Check what makes it a Voronoi diagram: no generator is nearer to a cell's corner than the cell's own."""
     d = check.diagram
     corners = d.vertices[g.corners]
@@ -413,7 +299,7 @@ def _check_nearest(check: _Check, g: Rebuilt, slack: float) -> None:
     )  # fmt: skip
 
 
-def _check_result(check: _Check, result: Result) -> None:
+def _check_result(check: Check, result: Result) -> None:
     d = result.diagram
     n, dim = len(d), d.domain.dim
     for name in ("size", "error", "quality"):

@@ -12,12 +12,12 @@ from .outlines import face_ends, next_faces
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from .check import _Check
+    from .findings import Check
     from .rebuilt import Rebuilt
     from .results import Diagram
 
 
-def check_outlines(check: _Check) -> None:
+def check_outlines(check: Check) -> None:
     """Check that faces chain up to loops, and that the corners go along all of them, and bridges there and back."""
     d = check.diagram
     n, ends, following = len(d), face_ends(d), next_faces(d)
@@ -49,7 +49,7 @@ def check_outlines(check: _Check) -> None:
     )  # fmt: skip
 
 
-def check_edges(check: _Check, g: Rebuilt, slack: float) -> None:
+def check_edges(check: Check, g: Rebuilt, slack: float) -> None:
     """Check that the faces on each edge of the polygon cover it, one after the other."""
     d, domain = check.diagram, check.diagram.domain
     rows = np.flatnonzero(d.neighbours < 0)
@@ -79,7 +79,7 @@ def check_edges(check: _Check, g: Rebuilt, slack: float) -> None:
     )  # fmt: skip
 
 
-def check_cells(check: _Check, g: Rebuilt, slack: float) -> None:
+def check_cells(check: Check, g: Rebuilt, slack: float) -> None:
     """Check that each cell holds its generator: its faces go around it once."""
     d = check.diagram
     begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)

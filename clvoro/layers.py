@@ -14,11 +14,13 @@ from ._arrays import check_integer, check_number
 from .domain import Box, Domain
 from .errors import InputError, InputTypeError
 from .polygon import Polygon
-from .sizing import Distance, Segment, as_field, minimum
+from .sizing import Distance, as_field, minimum
 from .sizing.field import Field
+from .sizing.shapes import Edges
 
 _SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin anew
 _NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
+_GROWTH = 1.2  # of sizes beyond layers that do not grow themselves
 _APART = 0.3  # of a width, between the last row and the generators that move
 _NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
 _OWN = 0.9  # of its distance from the wall: a generator that another wall is nearer to than this is not in its place
@@ -268,9 +270,9 @@ def bounded(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
     """Return the field that is nowhere larger than what grows from the layers into the domain."""
     field = as_field(size)
     for layer in layers:
-        segments = [Segment(a, b) for a, b in chosen_segments(domain, layer).tolist()]
-        slope = math.log(layer.growth) if layer.growth > 1 else math.log(1.2)
-        field = minimum(field, Distance(segments, h_min=layer.width, slope=slope))
+        walls = Edges(*np.moveaxis(chosen_segments(domain, layer), 1, 0))
+        slope = math.log(layer.growth if layer.growth > 1 else _GROWTH)
+        field = minimum(field, Distance(walls, h_min=layer.width, slope=slope))
     return field
 
 

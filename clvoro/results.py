@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .adapter import Adapter
-    from .check import Report
     from .domain import Domain
+    from .findings import Report
     from .quality import Measures
 
 HISTORY_DTYPE = np.dtype(

@@ -190,6 +190,15 @@ def test_layers_of_a_case(tmp_path):
     assert below == clvoro.Layers(0.03, edges=[0])
     again = load_case(case.write(tmp_path))
     assert again.run_arguments()["layers"] == [around, below]
+    # Edges are numbered as the rings are given: here that one runs around the hole counter-clockwise.
+    (_, beside) = Case.from_toml(
+        LAYERED.replace("edges = [0]", "edges = [4]"), "layered"
+    ).run_arguments()["layers"]
+    (edge,) = beside.edges
+    assert case.domain.edge_numbers[edge] == 4 != edge
+    assert case.domain.vertices[edge] == pytest.approx(
+        (1 + 0.2 * np.cos(np.pi / 8), 0.5 + 0.2 * np.sin(np.pi / 8))
+    )
     with pytest.raises(InputError, match=r"rings has \[2\], expected 0 to 1"):
         Case.from_toml(LAYERED.replace("rings = [1]", "rings = [2]"), "layered").run_arguments()
     boxed = LAYERED.split("[size]")[1]

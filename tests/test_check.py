@@ -9,7 +9,7 @@ from solids import solid_diagram, solid_result
 
 import clvoro
 from clvoro import cli
-from clvoro.check import CheckError
+from clvoro.findings import CheckError
 from clvoro.io.vtu_read import load_vtu
 from clvoro.results import Diagram
 

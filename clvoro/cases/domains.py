@@ -55,6 +55,8 @@ def _ring(node: Any) -> np.ndarray:
 def build_layers(node: Mapping[str, Any], domain: Domain) -> Layers:
     """Return the layers that `node` describes, a table that `schema.LAYERS` has passed, along walls of `domain`."""
     rest = {key: value for key, value in node.items() if key != "rings"}
+    if "edges" in rest and isinstance(domain, Polygon):
+        rest["edges"] = edges_of(domain, rest["edges"]).tolist()
     if "rings" not in node:
         return Layers(**rest)
     if not isinstance(domain, Polygon):
@@ -65,3 +67,14 @@ def build_layers(node: Mapping[str, Any], domain: Domain) -> Layers:
         raise InputError(f"layers.rings has {missing}, expected 0 to {len(starts) - 2}")
     edges = [e for ring in node["rings"] for e in range(starts[ring], starts[ring + 1])]
     return Layers(**{**rest, "edges": sorted({*rest.get("edges", ()), *edges})})
+
+
+def edges_of(domain: Polygon, numbers: list[int]) -> np.ndarray:
+    """Return the edges of `domain` whose `numbers` are those of the rings as the case gives them."""
+    unknown = np.setdiff1d(numbers, domain.edge_numbers)
+    if unknown.size:
+        raise InputError(
+            f"edges has {unknown[0]}, expected numbers of edges of the domain's rings, from 0 to "
+            f"{domain.edge_numbers.max()}"
+        )
+    return np.flatnonzero(np.isin(domain.edge_numbers, numbers))

@@ -14,6 +14,7 @@ from ..domain import Box, Domain
 from ..errors import InputError
 from ..io.arrays import read_array
 from ..polygon import Polygon
+from .domains import edges_of
 from .files import locate
 from .naca import naca4
 
@@ -115,13 +116,7 @@ def _boundary(domain: Domain, edges: list[int] | None) -> Any:
         raise InputError(f"edges of a boundary need a polygon as domain, not {domain}")
     if isinstance(domain, Box) or edges is None:
         return domain
-    unknown = np.setdiff1d(edges, domain.edge_numbers)
-    if unknown.size:
-        raise InputError(
-            f"edges has {unknown[0]}, expected numbers of edges of the domain's rings, from 0 to "
-            f"{domain.edge_numbers.max()}"
-        )
-    return domain.boundary(np.flatnonzero(np.isin(domain.edge_numbers, edges)))
+    return domain.boundary(edges_of(domain, edges))
 
 
 def load_array(path: Path, place: str) -> np.ndarray:
