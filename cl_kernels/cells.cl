@@ -1,6 +1,7 @@
 #include "common/bins.h"
 #include "common/corner.h"
 #include "common/face_rows.h"
+#include "common/moments.h"
 
 #ifndef MAX_DEPTH
 #error "build with -DMAX_DEPTH=levels that the bins may have"
@@ -265,7 +266,7 @@ kernel void measure_cells(const int size, global const int *places, global const
         if (place < 0 || ((keep[place * KEEP_WORDS + k / 32] >> (k % 32)) & 1u))
             faces[n++] = row[k];
     const int start = starts[i];
-    REAL area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
+    moments_t moments = {0, 0, 0, 0, 0, 0};
     if (n >= 3) {
         const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
         REAL2 v = origin;
@@ -273,15 +274,7 @@ kernel void measure_cells(const int size, global const int *places, global const
             const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
             const REAL2 e = w - v;
             const REAL2 sum = v + w;
-            /* The triangle x_i, v, w: area cross / 2, centroid (v + w) / 3, second moments
-               area (v v + w w + (v + w) (v + w)) / 12. */
-            const REAL cross = difference_of_products(v.s0, w.s1, v.s1, w.s0);
-            area += cross;
-            cx += cross * sum.s0;
-            cy += cross * sum.s1;
-            xx += cross * (v.s0 * v.s0 + w.s0 * w.s0 + sum.s0 * sum.s0);
-            xy += cross * (v.s0 * v.s1 + w.s0 * w.s1 + sum.s0 * sum.s1);
-            yy += cross * (v.s1 * v.s1 + w.s1 * w.s1 + sum.s1 * sum.s1);
+            add_triangle(&moments, v, w);
             neighbours[start + k] = faces[k];
             face_measures[start + k] = sqrt(dot(e, e));
             face_centroids[2 * (start + k)] = sum.s0 / 2;
@@ -289,19 +282,7 @@ kernel void measure_cells(const int size, global const int *places, global const
             v = w;
         }
     }
-    volumes[i] = area / 2;
-    if (area > 0) {
-        cx /= 3 * area;
-        cy /= 3 * area;
-        xx = xx / (12 * area) - cx * cx;
-        xy = xy / (12 * area) - cx * cy;
-        yy = yy / (12 * area) - cy * cy;
-    }
-    offsets[2 * i] = cx;
-    offsets[2 * i + 1] = cy;
-    covariances[3 * i] = xx;
-    covariances[3 * i + 1] = xy;
-    covariances[3 * i + 2] = yy;
+    write_moments(&moments, i, volumes, offsets, covariances);
 }
 
 /* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has them, if

@@ -1,4 +1,6 @@
-#include "common/outline.h"
+#include "common/moments.h"
+#include "common/segments.h"
+#include "common/sides.h"
 #include "common/trimmed.h"
 
 /* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a cell, what
@@ -8,8 +10,6 @@
 
 #define FLAG_LOST 1   /* as in chords.cl */
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
-#define UNTOUCHED 0x7fffffff
-#define ISLAND -2 /* the end of a chord that belongs to a hole within its cell */
 #define ON_BOUNDARY (4 * REAL_EPS)
 
 #define CONVEX_ARGS                                                                                                  \
@@ -169,18 +169,6 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         atomic_or(flags, FLAG_ORPHANS);
 }
 
-/* Segments of all touched cells, cell by cell, piece by piece, loop by loop; see segment_t. */
-typedef struct {
-    global const int *starts, *labels, *from, *to, *places;
-    global const REAL2 *p, *q;
-} segments_t;
-
-#define SEGMENT_ARGS                                                                                                 \
-    global const int *segment_starts, global const int *segment_labels, global const int *segment_from,              \
-        global const int *segment_to, global const int *segment_places, global const REAL2 *segment_p,               \
-        global const REAL2 *segment_q
-#define SEGMENTS {segment_starts, segment_labels, segment_from, segment_to, segment_places, segment_p, segment_q}
-
 /* Per touched cell u: its segments, behind segment_starts[u]; `places` tells the loop's piece. */
 kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const int *loop_chords,
                            global const int *loop_pieces, global const int *segment_starts, global int *labels,
@@ -214,26 +202,6 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
                 } while (!is_complete(&cursor, begin) && at < segment_starts[u + 1]);
             }
     }
-}
-
-inline bool is_empty(const segments_t *s, int k)
-{
-    return s->labels[k] < 0 ? s->from[k] < 0 : s->from[k] == s->to[k];
-}
-
-/* The segment of cell j, number u of those that the boundary passes through, that is segment k of cell i from the other side;
-   -1 if there is none. */
-inline int other_side(const segments_t *s, int k, int i, int u)
-{
-    for (int m = s->starts[u]; m < s->starts[u + 1]; ++m) {
-        if (s->labels[m] != i || is_empty(s, m))
-            continue;
-        const bool ends_meet = s->from[k] < 0 ? s->to[m] < 0 : s->to[m] == s->from[k];
-        const bool begins_meet = s->to[k] < 0 ? s->from[m] < 0 : s->from[m] == s->to[k];
-        if (ends_meet && begins_meet)
-            return m;
-    }
-    return -1;
 }
 
 /* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a generator
@@ -271,13 +239,6 @@ kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global con
     }
     if (!fits || !(area > 0))
         atomic_or(flags, FLAG_LOST);
-}
-
-/* The generator that the piece on the other side of segment k of cell i goes to, -1 if it is not known yet. */
-inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
-{
-    const int j = s->labels[k], u = slots[j];
-    return u == UNTOUCHED ? j : roots[s->places[other_side(s, k, i, u)]];
 }
 
 /* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is known.
@@ -340,19 +301,6 @@ kernel void list_orphans(const int size, global const int *ranks, global int *or
         orphans[ranks[place]] = place;
 }
 
-/* Is segment k of cell i, in a piece that goes to `root`, a face of the cell of `root`? *other is what it names. */
-inline bool is_face(const segments_t *s, int k, int i, int root, global const int *slots, global const int *roots,
-                    int *other)
-{
-    const int label = s->labels[k];
-    if (is_empty(s, k)) {
-        *other = -1;
-        return false;
-    }
-    *other = label < 0 ? label : other_root(s, k, i, slots, roots);
-    return *other != root;
-}
-
 /* Per generator of the domain: faces of its cell, if the boundary does not pass through it. */
 kernel void count_whole(const int size, global const int *starts, global const int *slots, global int *counts)
 {
@@ -403,68 +351,15 @@ kernel void copy_whole(const int size, global const int *starts, global const in
     }
 }
 
-/* What is summed over the segments of a cell: as in measure_cells. */
-typedef struct {
-    REAL area, cx, cy, xx, xy, yy;
-} moments_t;
-
-inline void add_triangle(moments_t *m, REAL2 v, REAL2 w)
-{
-    const REAL2 sum = v + w;
-    const REAL cross = difference_of_products(v.s0, w.s1, v.s1, w.s0);
-    m->area += cross;
-    m->cx += cross * sum.s0;
-    m->cy += cross * sum.s1;
-    m->xx += cross * (v.s0 * v.s0 + w.s0 * w.s0 + sum.s0 * sum.s0);
-    m->xy += cross * (v.s0 * v.s1 + w.s0 * w.s1 + sum.s0 * sum.s1);
-    m->yy += cross * (v.s1 * v.s1 + w.s1 * w.s1 + sum.s1 * sum.s1);
-}
-
-/* The boundary of a cell, run by run of chords: how many sides it has there, a side turning by less than 30 degrees, and how many
-   neighbours a hexagonal lattice would have there: 6 - sum of 2 + turning / 60 degrees over the runs. */
-typedef struct {
-    REAL2 ahead; /* along the chord before, 0 at the start of a run */
-    REAL turned, sides, missing;
-} outline_t;
-
-#define SIDE_TURN R(0.5235987755982988)
-
-inline void add_side(outline_t *o, REAL2 e, bool chord)
-{
-    if (!chord) {
-        o->ahead = 0;
-        o->sides += 1;
-        return;
-    }
-    const bool goes_on = o->ahead.s0 != 0 || o->ahead.s1 != 0;
-    const REAL turn = goes_on ? atan2(o->ahead.s0 * e.s1 - o->ahead.s1 * e.s0, dot(o->ahead, e)) : 0;
-    o->turned = goes_on ? o->turned + turn : 0;
-    if (!goes_on || fabs(o->turned) > SIDE_TURN) {
-        o->sides += 1;
-        o->turned = 0;
-    }
-    o->missing += (goes_on ? 0 : 2) + turn / R(1.0471975511965976);
-    o->ahead = e;
-}
-
-/* A segment between two pieces of the cell: a run that ends there goes on in the other piece, straight on. */
-inline void join_runs(outline_t *o)
-{
-    const bool goes_on = o->ahead.s0 != 0 || o->ahead.s1 != 0;
-    o->sides -= goes_on;
-    o->missing -= 2 * goes_on;
-    o->ahead = 0;
-}
-
 /* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that have
-   changed cells, in order; segments_of[place] is the touched cell that they lie in.
+   changed cells, in order; place_cells[place] is the touched cell that they lie in.
 
    outlines[i] = (sides, neighbours that a hexagonal lattice would have here) */
 kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *points, global const int *touched,
                           global const int *slots, global const int *roots, global const int *orphans, const int orphan_count,
                           global const int *place_cells, global const int *new_starts, global int *new_neighbours,
                           global REAL *new_measures, global REAL2 *new_centroids, global int *face_segments,
-                          global REAL *volumes, global REAL2 *offsets, global REAL *covariances, global REAL2 *outlines,
+                          global REAL *volumes, global REAL *offsets, global REAL *covariances, global REAL2 *outlines,
                           global const REAL2 *tangents)
 {
     WORK_ITEM(u);
@@ -501,12 +396,7 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
             ++at;
         }
     }
-    volumes[i] = m.area / 2;
-    const REAL cx = m.cx / (3 * m.area), cy = m.cy / (3 * m.area);
-    offsets[i] = (REAL2)(cx, cy);
-    covariances[3 * i] = m.xx / (12 * m.area) - cx * cx;
-    covariances[3 * i + 1] = m.xy / (12 * m.area) - cx * cy;
-    covariances[3 * i + 2] = m.yy / (12 * m.area) - cy * cy;
+    write_moments(&m, i, volumes, offsets, covariances);
     outlines[i] = (REAL2)(o.sides, 6 - o.missing);
 }
 
