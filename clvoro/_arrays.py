@@ -9,10 +9,10 @@ import numpy as np
 from .errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
-    from .domain import Box
+    from .domain import Domain
 
 
-def check_points(points: object, domain: Box) -> np.ndarray:
+def check_points(points: object, domain: Domain) -> np.ndarray:
     """Return `points` as a float64 array (n, d) inside `domain`.
 
     Raises
@@ -89,3 +89,30 @@ def check_number(
         bound = f"> {above:g}" if above > -np.inf else f">= {least:g}"
         raise InputError(f"{name} is {value!r}, expected a finite number {bound}")
     return number
+
+
+def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    """Refuse `value` if it is none of `choices`."""
+    if value not in choices:
+        raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
+
+
+class Naming:
+    """Says which of the caller's points coincide, when the device has found that some do."""
+
+    def __init__(self, points: np.ndarray, domain: Domain, real: np.dtype) -> None:
+        self.points, self.domain, self.real = points, domain, real
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if not isinstance(error, InputError):
+            return
+        pair = coincident_pair(self.domain.place(self.points, self.real))
+        if pair is not None:
+            other = "" if self.real == np.float64 else " or use dtype='float64'"
+            raise InputError(
+                f"points[{pair[0]}] and points[{pair[1]}] coincide in {self.real}, expected distinct "
+                f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
+            ) from error

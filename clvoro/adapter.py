@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from . import device
-from ._arrays import check_integer, check_number, check_points, coincident_pair
+from ._arrays import Naming, check_choice, check_integer, check_number, check_points
 from ._program import Engine
 from .checkpoint import Checkpointer, Saved, describe
 from .domain import Domain
@@ -161,7 +161,7 @@ class Adapter:
         check_memory(engine, n)
         binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
-        with _Naming(host, domain, self.dtype):
+        with Naming(host, domain, self.dtype):
             tessellator = Tessellator(stages, domain)
             t = tessellator.tessellate(sorted_points, n, exact=True)
         return fetch_diagram(engine, domain, t, labels, unfolded=tessellator.unfolded)
@@ -358,7 +358,7 @@ class Adapter:
             host = np.concatenate([rows, apart_from(host, rows, free)])
         mesh, near = None, False
         if host is not None and (saved is None or (planned and levels == 0)):
-            with _Naming(host, domain, self.dtype):
+            with Naming(host, domain, self.dtype):
                 unsorted = engine.upload(domain.place(host, self.dtype))
                 mesh = Mesh(
                     stages,
@@ -422,30 +422,3 @@ class Adapter:
             )
         check_memory(engine, 0 if host is None else len(host) * 2.0 ** (dim * min(count, 99)))
         return count
-
-
-def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    """Refuse `value` if it is none of `choices`."""
-    if value not in choices:
-        raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
-
-
-class _Naming:
-    """Says which of the caller's points coincide, when the device has found that some do."""
-
-    def __init__(self, points: np.ndarray, domain: Domain, real: np.dtype) -> None:
-        self.points, self.domain, self.real = points, domain, real
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if not isinstance(error, InputError):
-            return
-        pair = coincident_pair(self.domain.place(self.points, self.real))
-        if pair is not None:
-            other = "" if self.real == np.float64 else " or use dtype='float64'"
-            raise InputError(
-                f"points[{pair[0]}] and points[{pair[1]}] coincide in {self.real}, expected distinct "
-                f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
-            ) from error
