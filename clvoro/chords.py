@@ -79,7 +79,8 @@ class Boundary:
 
     def __init__(self, engine: Engine, domain: Polygon) -> None:
         self.engine = engine
-        self._scan, self._room = Scan(engine), Room(engine)
+        # Counts change a little from step to step.
+        self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
         self._kernels = engine.kernels("chords")
         origin, scale = domain.frame
         self.edges = len(domain.vertices)

@@ -46,7 +46,8 @@ class Trim:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._scan, self._room = Scan(engine), Room(engine)
+        # Counts change a little from step to step.
+        self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
         self._kernels = engine.kernels("trim")
         self._flags = engine.empty(1, np.int32)
 
