@@ -12,30 +12,22 @@ import numpy as np
 import pyopencl as cl
 
 from . import device
-from ._arrays import Naming, check_choice, check_integer, check_number, check_points
+from ._arrays import Naming, check_number, check_points
 from ._program import Engine
 from .checkpoint import Checkpointer, Saved, describe
 from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
-from .layers import Layers, apart_from, bounded, free_domain, place_layers
+from .layers import Layers
 from .loop import Loop
-from .mesh import Mesh, Stages, check_memory
-from .methods import PUBLISHED, Relaxation, make_method
-from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
-from .precision import check_precision
+from .mesh import Stages, check_memory
+from .preparation import Options, Preparation, check_options
 from .results import Diagram, Result
-from .sizing import Sizing, as_field
-from .start import count_cells, sample_density, sample_uniform
 from .tessellator import Tessellator
 from .torus import FewCellsError
 
-METHODS = ("adaptive", "exact", *PUBLISHED)
-STARTS = ("density", "uniform")
-GRADIENT_STEP = 0.2
-"""Step over h in which the exact projection sees the gradient of the size field."""
-STEPS = 100
-"""Steps of a method that repeats one kind of step, unless the caller says otherwise."""
+MOST_LEVELS = 99
+"""Coarser levels: no mesh has as many."""
 
 
 class Adapter:
@@ -69,7 +61,6 @@ class Adapter:
         self._stages: dict[tuple[object, ...], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
-        self._tried = 0
         self._watch: Callable[[np.void], None] | None = None
 
     @contextmanager
@@ -259,26 +250,15 @@ class Adapter:
         SolverError
             If a linear solve breaks down.
         """
-        check_choice("method", method, METHODS)
-        check_choice("start", start, STARTS)
-        check_choice("effort", effort, tuple(EFFORTS))
-        options = {
-            "method": method, "start": start, "effort": effort, "levels": levels,
-            "seed": check_integer("seed", seed, 0),
-            "tol": check_number("tol", tol, least=0),
-            "k": check_number("k", k, above=0),
-            "alpha": None if alpha is None else check_number("alpha", alpha, above=0),
-            "max_steps": None if max_steps is None else check_integer("max_steps", max_steps, 0),
-            "n_cells": None if n_cells is None else check_integer("n_cells", n_cells, 1),
-            "error_target": None if error_target is None
-            else check_number("error_target", error_target, above=0),
-        }  # fmt: skip
+        options = check_options(
+            method=method, start=start, effort=effort, levels=levels, seed=seed, tol=tol, k=k, alpha=alpha,
+            max_steps=max_steps, n_cells=n_cells, error_target=error_target, layers=layers,
+        )  # fmt: skip
         if callback is not None and not callable(callback):
             raise InputTypeError(
                 f"callback is {callback!r} of type {type(callback).__name__}, expected a function "
                 "of a row of the history"
             )
-        options["layers"] = (layers,) if isinstance(layers, Layers) else tuple(layers)
         every = check_number("checkpoint_every", checkpoint_every, least=0)
         files = checkpoint, every, resume
         with self._alone():
@@ -289,136 +269,68 @@ class Adapter:
         domain: Domain,
         size: object,
         points: np.ndarray | None,
-        options: dict[str, Any],
-        *rest: Any,
-    ) -> Result:
-        """Run with as many coarse levels as a periodic box allows for: one more would have too few cells around it."""
-        most = 99
-        while True:
-            try:
-                return self._try(domain, size, points, options, *rest, most)
-            except FewCellsError:
-                if options["levels"] != "auto" or self._tried == 0:
-                    raise
-                most = self._tried - 1
-
-    def _try(
-        self,
-        domain: Domain,
-        size: object,
-        points: np.ndarray | None,
-        options: dict[str, Any],
+        options: Options,
         callback: Callable[[np.void], object] | None,
         checkpoint: str | PathLike[str] | None,
         every: float,
         resume: str | PathLike[str] | None,
-        most: int,
     ) -> Result:
-        """Build mesh and plan, and carry the plan out, with at most `most` levels; the options are checked."""
+        """Prepare a run and carry it out, with fewer coarse levels where a periodic box has too few cells around it."""
         stages = self._stages_for(domain)
-        engine, method, n_cells = stages.engine, options["method"], options["n_cells"]
-        planned = method not in PUBLISHED
         host = None if points is None else check_points(points, domain)
-        made_by = describe(domain, options, self.dtype, host)
+        made_by = describe(domain, vars(options), self.dtype, host)
         saved = None if resume is None else Saved(resume)
         if saved is not None:
             saved.fit(made_by)
-        if host is not None and not planned and n_cells not in (None, len(host)):
-            raise InputError(
-                f"n_cells is {n_cells}, but {len(host)} points are given, and method {method!r} "
-                "keeps their number; leave n_cells out, or use method='adaptive'"
-            )
-        rows, free = np.empty((0, domain.dim)), domain
-        if options["layers"]:
-            rows, free = (
-                place_layers(domain, options["layers"]),
-                free_domain(domain, options["layers"]),
-            )
-            size = bounded(size, domain, options["layers"])
-        sizing = Sizing(engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
-        given = host is not None and not planned
-        asked = float(len(host)) if given else count_cells(sizing, free) + len(rows)
-        target = n_cells if n_cells is not None else max(1, round(asked))
-        check_memory(engine, max(target, 0 if host is None else len(host)))
-        factor = (asked / target) ** (1 / domain.dim) if planned and n_cells is not None else 1.0
-        levels = self._levels(options["levels"], engine, target, host) if planned else 0
-        if options["levels"] == "auto":
-            levels = min(levels, most, most if saved is None else saved.levels)
-        self._tried = levels
-        if host is None and saved is None:
-            least = free.n_pieces if levels else 1
-            n = max(least, round((target - len(rows)) / 2 ** (domain.dim * levels)))
-            if options["start"] == "uniform":
-                host = sample_uniform(free, n, options["seed"], self.dtype)
-            else:
-                host = sample_density(sizing, free, n, options["seed"], self.dtype)
-        if host is not None:
-            check_precision(sizing, domain, host, factor)
-        if host is not None and len(rows):
-            host = np.concatenate([rows, apart_from(host, rows, free)])
-        mesh, near = None, False
-        if host is not None and (saved is None or (planned and levels == 0)):
-            with Naming(host, domain, self.dtype):
-                unsorted = engine.upload(domain.place(host, self.dtype))
-                mesh = Mesh(
-                    stages,
-                    domain,
-                    sizing,
-                    unsorted,
-                    coarsening=factor * 2.0**levels,
-                    free=free,
-                    fixed=len(rows),
+        most = MOST_LEVELS if saved is None else saved.levels
+        while True:
+            prepared = Preparation(stages, domain, size, host, options, most)
+            try:
+                loop = self._begin(prepared, made_by, saved, checkpoint, every, callback)
+                return loop.run(
+                    options.n_cells if options.planned else None,
+                    float(prepared.target),
+                    self._settings(prepared),
                 )
-            near = points is not None and planned and levels == 0
-            near = near and self._near(mesh, n_cells, options["effort"])
-        plan: list[Action]
-        if planned:
-            plan = plan_adaptive(
-                domain.dim, options["effort"], levels, method == "exact", options["error_target"],
-                warm=points is not None, near=near,
-            )  # fmt: skip
-        else:
-            relaxation = Relaxation(options["alpha"], options["k"])
-            steps = STEPS if options["max_steps"] is None else options["max_steps"]
-            plan = plan_steps(make_method(method, relaxation), steps)
-        tol = None if planned else options["tol"]
+            except FewCellsError:
+                if options.levels != "auto" or prepared.levels == 0:
+                    raise
+                most = prepared.levels - 1
+
+    @staticmethod
+    def _begin(
+        prepared: Preparation,
+        made_by: dict,
+        saved: Saved | None,
+        checkpoint: str | PathLike[str] | None,
+        every: float,
+        callback: Callable[[np.void], object] | None,
+    ) -> Loop:
+        """Return the loop at its beginning, or where it was when it was saved."""
+        options, mesh = prepared.options, None
+        if saved is None or prepared.may_be_near:
+            mesh = prepared.mesh()
+        plan = prepared.plan(mesh)
         writer = None if checkpoint is None else Checkpointer(checkpoint, every, made_by, plan)
         if saved is not None:
-            mesh = saved.restore(stages, domain, sizing, plan, free, len(rows))
+            mesh = saved.restore(
+                prepared.stages, prepared.domain, prepared.sizing, plan, prepared.free, len(prepared.rows)
+            )  # fmt: skip
         assert mesh is not None
-        loop = Loop(mesh, plan, levels, options["max_steps"], tol, callback)
+        tol = None if options.planned else options.tol
+        loop = Loop(mesh, plan, prepared.levels, options.max_steps, tol, callback)
         loop.checkpoint = writer
         if saved is not None:
             saved.set(loop)
-        settings = {**options, "levels": levels, "dtype": self.dtype.name}
-        settings["layers"] = [repr(layer) for layer in options["layers"]]
-        if points is not None:
-            settings["start"] = "points"
-        return loop.run(n_cells if planned else None, float(target), settings)
+        return loop
 
-    @staticmethod
-    def _near(mesh: Mesh, n_cells: int | None, effort: str) -> bool:
-        """Tell whether a mesh that was given needs no more than correction."""
-        missing = mesh.missing() if n_cells is None else float(n_cells - mesh.n)
-        s, n = mesh.assess(), mesh.n
-        return is_near(
-            mesh.engine.dim, effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
-        )
-
-    @staticmethod
-    def _levels(levels: int | str, engine: Engine, target: int, host: np.ndarray | None) -> int:
-        """Return the number of coarser levels that lead to `target` cells, from points `host` or from a sample."""
-        dim = engine.dim
-        if levels == "auto":
-            if host is None:
-                return auto_levels(target, dim)
-            return max(0, round(np.log2(target / len(host)) / dim))
-        count = check_integer("levels", levels, 0)
-        most = int(np.log2(max(target, 1)) / dim)
-        if host is None and count > most:
-            raise InputError(
-                f"levels is {levels}, expected at most {most} for {target} cells, or 'auto': each "
-                f"level has {2**dim} times fewer"
-            )
-        check_memory(engine, 0 if host is None else len(host) * 2.0 ** (dim * min(count, 99)))
-        return count
+    def _settings(self, prepared: Preparation) -> dict[str, Any]:
+        """Return what the result says of how it was made."""
+        options = prepared.options
+        return {
+            **vars(options),
+            "start": options.start if prepared.points is None else "points",
+            "levels": prepared.levels,
+            "dtype": self.dtype.name,
+            "layers": [repr(layer) for layer in options.layers],
+        }

@@ -6,7 +6,6 @@ import reference
 
 import clvoro
 from clvoro import sizing
-from clvoro.adapter import METHODS
 from clvoro.errors import (
     ClvoroError,
     InputError,
@@ -14,6 +13,7 @@ from clvoro.errors import (
     MemoryLimitError,
     SizeFieldError,
 )
+from clvoro.preparation import METHODS
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)

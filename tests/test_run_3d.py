@@ -6,8 +6,8 @@ import reference3d
 
 import clvoro
 from clvoro import sizing
-from clvoro.adapter import METHODS
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
+from clvoro.preparation import METHODS
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 1))
 S1 = sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.04, slope=0.3)

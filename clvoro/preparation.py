@@ -1,0 +1,242 @@
+"""What a run begins with: options that are checked, its size field and number of cells, generators, mesh and plan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._arrays import Naming, check_choice, check_integer, check_number
+from .domain import Domain
+from .errors import InputError
+from .layers import Layers, apart_from, bounded, free_domain, place_layers
+from .mesh import Mesh, Stages, check_memory
+from .methods import PUBLISHED, Relaxation, make_method
+from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
+from .precision import check_precision
+from .sizing import Sizing, as_field
+from .start import count_cells, sample_density, sample_uniform
+
+METHODS = ("adaptive", "exact", *PUBLISHED)
+STARTS = ("density", "uniform")
+GRADIENT_STEP = 0.2
+"""Step over h in which the exact projection sees the gradient of the size field."""
+STEPS = 100
+"""Steps of a method that repeats one kind of step, unless the caller says otherwise."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `Adapter.run` was asked for; see there."""
+
+    method: str
+    start: str
+    effort: str
+    levels: int | str
+    seed: int
+    tol: float
+    k: float
+    alpha: float | None
+    max_steps: int | None
+    n_cells: int | None
+    error_target: float | None
+    layers: tuple[Layers, ...]
+
+    @property
+    def planned(self) -> bool:
+        """Whether a plan leads from coarse to fine, and not one kind of step is repeated."""
+        return self.method not in PUBLISHED
+
+
+def check_options(
+    method: str,
+    start: str,
+    effort: str,
+    levels: int | str,
+    seed: int,
+    tol: float,
+    k: float,
+    alpha: float | None,
+    max_steps: int | None,
+    n_cells: int | None,
+    error_target: float | None,
+    layers: Layers | Sequence[Layers],
+) -> Options:
+    """Return the options of a run, if they are as they should be; `levels` awaits the number of cells.
+
+    Raises
+    ------
+    InputError, InputTypeError
+    """
+    check_choice("method", method, METHODS)
+    check_choice("start", start, STARTS)
+    check_choice("effort", effort, tuple(EFFORTS))
+    return Options(
+        method=method,
+        start=start,
+        effort=effort,
+        levels=levels,
+        seed=check_integer("seed", seed, 0),
+        tol=check_number("tol", tol, least=0),
+        k=check_number("k", k, above=0),
+        alpha=None if alpha is None else check_number("alpha", alpha, above=0),
+        max_steps=None if max_steps is None else check_integer("max_steps", max_steps, 0),
+        n_cells=None if n_cells is None else check_integer("n_cells", n_cells, 1),
+        error_target=None if error_target is None else check_number("error_target", error_target, above=0),
+        layers=(layers,) if isinstance(layers, Layers) else tuple(layers),
+    )  # fmt: skip
+
+
+class Preparation:
+    """From options to a mesh and a plan.
+
+    Parameters
+    ----------
+    stages : Stages
+    domain : Domain
+    size : number, callable or clvoro.sizing field
+    points : (n, d) array, optional
+        The caller's generators, checked.
+    options : Options
+    most_levels : int
+        Most coarser levels, where their number is left to this.
+
+    Attributes
+    ----------
+    rows : (m, d) ndarray
+        Generators of layers, which stay where they are.
+    free : Domain
+        What the layers leave.
+    sizing : Sizing
+    target : int
+        Cells of the finest level.
+    factor : float
+        On the size field, so that it asks for `target` cells.
+    levels : int
+        Coarser levels that a plan begins with.
+
+    Raises
+    ------
+    InputError, InputTypeError, SizeFieldError, MemoryLimitError
+    """
+
+    def __init__(
+        self,
+        stages: Stages,
+        domain: Domain,
+        size: object,
+        points: np.ndarray | None,
+        options: Options,
+        most_levels: int,
+    ) -> None:
+        self.stages, self.domain, self.points, self.options = stages, domain, points, options
+        n_cells, d = options.n_cells, domain.dim
+        given = points is not None and not options.planned
+        if points is not None and given and n_cells not in (None, len(points)):
+            raise InputError(
+                f"n_cells is {n_cells}, but {len(points)} points are given, and method {options.method!r} "
+                "keeps their number; leave n_cells out, or use method='adaptive'"
+            )
+        self.rows, self.free = np.empty((0, d)), domain
+        if options.layers:
+            self.rows, self.free = (
+                place_layers(domain, options.layers),
+                free_domain(domain, options.layers),
+            )
+            size = bounded(size, domain, options.layers)
+        self.sizing = Sizing(stages.engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
+        if points is not None and given:
+            asked = float(len(points))
+        else:
+            asked = count_cells(self.sizing, self.free) + len(self.rows)
+        self.target = n_cells if n_cells is not None else max(1, round(asked))
+        check_memory(stages.engine, max(self.target, 0 if points is None else len(points)))
+        scaled = options.planned and n_cells is not None
+        self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
+        self.levels = 0
+        if options.planned:
+            self.levels = self._count_levels()
+            if options.levels == "auto":
+                self.levels = min(self.levels, most_levels)
+
+    def _count_levels(self) -> int:
+        """Return the number of coarser levels that lead to the cells, from the caller's points or from a sample."""
+        d, levels, points = self.domain.dim, self.options.levels, self.points
+        if levels == "auto":
+            if points is None:
+                return auto_levels(self.target, d)
+            return max(0, round(np.log2(self.target / len(points)) / d))
+        count = check_integer("levels", levels, 0)
+        most = int(np.log2(max(self.target, 1)) / d)
+        if points is None and count > most:
+            raise InputError(
+                f"levels is {levels}, expected at most {most} for {self.target} cells, or 'auto': each "
+                f"level has {2**d} times fewer"
+            )
+        begun = 0 if points is None else len(points) * 2.0 ** (d * min(count, 99))
+        check_memory(self.stages.engine, begun)
+        return count
+
+    def generators(self) -> np.ndarray:
+        """Return the first ones, (n, d): the caller's or a random sample of the coarsest level, after those of layers.
+
+        Warns
+        -----
+        PrecisionWarning
+            If their positions cannot tell sizes as small as those asked for.
+        """
+        options, real = self.options, self.stages.engine.real
+        host = self.points
+        if host is None:
+            least = self.free.n_pieces if self.levels else 1
+            cells = (self.target - len(self.rows)) / 2 ** (self.domain.dim * self.levels)
+            n = max(least, round(cells))
+            if options.start == "uniform":
+                host = sample_uniform(self.free, n, options.seed, real)
+            else:
+                host = sample_density(self.sizing, self.free, n, options.seed, real)
+        check_precision(self.sizing, self.domain, host, self.factor)
+        if len(self.rows):
+            host = np.concatenate([self.rows, apart_from(host, self.rows, self.free)])
+        return host
+
+    def mesh(self) -> Mesh:
+        """Return the mesh of the first generators."""
+        host, real = self.generators(), self.stages.engine.real
+        with Naming(host, self.domain, real):
+            return Mesh(
+                self.stages,
+                self.domain,
+                self.sizing,
+                self.stages.engine.upload(self.domain.place(host, real)),
+                coarsening=self.factor * 2.0**self.levels,
+                free=self.free,
+                fixed=len(self.rows),
+            )
+
+    @property
+    def may_be_near(self) -> bool:
+        """Whether the caller's points may be a mesh that only needs correction."""
+        return self.points is not None and self.options.planned and self.levels == 0
+
+    def plan(self, mesh: Mesh | None) -> list[Action]:
+        """Return what is to be done. `mesh` (of `mesh`, as it begins) is looked at only if it `may_be_near`."""
+        options = self.options
+        if not options.planned:
+            relaxation = Relaxation(options.alpha, options.k)
+            steps = STEPS if options.max_steps is None else options.max_steps
+            return plan_steps(make_method(options.method, relaxation), steps)
+        near = self.may_be_near and mesh is not None and self._is_near(mesh)
+        return plan_adaptive(
+            self.domain.dim, options.effort, self.levels, options.method == "exact", options.error_target,
+            warm=self.points is not None, near=near,
+        )  # fmt: skip
+
+    def _is_near(self, mesh: Mesh) -> bool:
+        n, n_cells = mesh.n, self.options.n_cells
+        missing = mesh.missing() if n_cells is None else float(n_cells - n)
+        s = mesh.assess()
+        return is_near(
+            self.domain.dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
+        )  # fmt: skip
