@@ -49,6 +49,20 @@ kernel void scan_chunks(const int size, global const int *values, const int firs
         out[n] = total;
 }
 
+/* The same in one pass, by one work-item. */
+kernel void scan_few(const int size, global const int *values, const int first, global int *out, const int n)
+{
+    WORK_ITEM(only);
+    (void)only;
+    int total = 0;
+    for (int i = 0; i < n; ++i) {
+        const int value = values[first + i];
+        out[i] = total;
+        total += value;
+    }
+    out[n] = total;
+}
+
 /* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier, with Knuth's exact difference, which
    has no branch), so that float32 totals of millions of terms stay exact to a few ulp. */
 typedef struct {
@@ -111,41 +125,52 @@ inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
 }
 #endif
 
-/* Block-wise: partials[group] = summary of the group's items. */
-kernel void summarise_blocks(global const REAL *values, const int n, global summary_t *partials)
+/* Block-wise: partials[groups * a + group] = summary of the group's items of array a, of the first `count` of eight. */
+kernel void summarise_blocks(global const REAL *a0, global const REAL *a1, global const REAL *a2, global const REAL *a3,
+                             global const REAL *a4, global const REAL *a5, global const REAL *a6, global const REAL *a7,
+                             const int count, const int n, global summary_t *partials)
 {
-    summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
-#if GROUP_SIZE == 1
-    add_run(&mine, values, block_begin(n), block_end(n));
-    partials[get_group_id(0)] = mine;
-#else
+#if GROUP_SIZE > 1
     local summary_t shares[GROUP_SIZE];
-    const int t = get_local_id(0);
-    for (BLOCK_LOOP(i, n))
-        add_value(&mine, values[i]);
-    shares[t] = mine;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (t == 0) {
-        for (int s = 1; s < GROUP_SIZE; ++s)
-            merge_summary(&mine, shares[s]);
-        partials[get_group_id(0)] = mine;
-    }
 #endif
+    for (int a = 0; a < count; ++a) {
+        global const REAL *values = a < 4 ? (a < 2 ? (a < 1 ? a0 : a1) : (a < 3 ? a2 : a3))
+                                          : (a < 6 ? (a < 5 ? a4 : a5) : (a < 7 ? a6 : a7));
+        global summary_t *out = partials + get_num_groups(0) * a + get_group_id(0);
+        summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
+#if GROUP_SIZE == 1
+        add_run(&mine, values, block_begin(n), block_end(n));
+        *out = mine;
+#else
+        const int t = get_local_id(0);
+        for (BLOCK_LOOP(i, n))
+            add_value(&mine, values[i]);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        shares[t] = mine;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (t == 0) {
+            for (int s = 1; s < GROUP_SIZE; ++s)
+                merge_summary(&mine, shares[s]);
+            *out = mine;
+        }
+#endif
+    }
 }
 
-/* One work-item: out[4 slot ...] = sum, sum of magnitudes, least, largest. */
-kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int slot,
+/* One work-item per array: out[4 slots[a] ...] = sum, sum of magnitudes, least, largest. */
+kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int8 slots,
                            global REAL *out)
 {
-    WORK_ITEM(only);
-    (void)only;
-    summary_t all = partials[0];
+    WORK_ITEM(a);
+    const int slot_of[8] = {slots.s0, slots.s1, slots.s2, slots.s3, slots.s4, slots.s5, slots.s6, slots.s7};
+    summary_t all = partials[groups * a];
     for (int g = 1; g < groups; ++g)
-        merge_summary(&all, partials[g]);
-    out[4 * slot] = all.sum + all.sum_low;
-    out[4 * slot + 1] = all.magnitude + all.magnitude_low;
-    out[4 * slot + 2] = all.least;
-    out[4 * slot + 3] = all.largest;
+        merge_summary(&all, partials[groups * a + g]);
+    global REAL *put = out + 4 * slot_of[a];
+    put[0] = all.sum + all.sum_low;
+    put[1] = all.magnitude + all.magnitude_low;
+    put[2] = all.least;
+    put[3] = all.largest;
 }
 
 /* Row p of `out` is row items[p] of `rows`; a row is `words` 32-bit words, whatever they mean. */

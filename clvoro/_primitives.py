@@ -6,7 +6,7 @@ loops of `primitives.cl` take 0.5 ms, and 1.7 s to compile at the first use.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,9 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ._program import Engine
+
+AT_ONCE = 8
+"""Arrays that are summarised by one launch, at most."""
 
 
 class Scan:
@@ -23,6 +26,8 @@ class Scan:
         self.engine = engine
         cpu = bool(engine.queue.device.type & cl.device_type.CPU)
         self.width = engine.queue.device.max_compute_units * 4 if cpu else 4096
+        # On a CPU one work-item is through with so many before three launches are.
+        self._few = 8192 if cpu else 0
         self._kernels = engine.kernels("primitives")
         self._sums = engine.empty(self.width + 1, np.int32)
 
@@ -33,6 +38,9 @@ class Scan:
         """
         k, engine = self._kernels, self.engine
         begin, count = np.int32(first), np.int32(n)
+        if n <= self._few:
+            engine.run_each(k.scan_few, 1, values, begin, out, count, group=1)
+            return
         engine.run_each(k.chunk_sums, self.width, values, begin, self._sums, count, group=1)
         engine.run_each(k.scan_sums, 1, self._sums, np.int32(self.width), group=1)
         engine.run_each(k.scan_chunks, self.width, values, begin, self._sums, out, count, group=1)
@@ -66,16 +74,24 @@ class Summaries:
         self.engine = engine
         self.slots = {name: slot for slot, name in enumerate(names)}
         self._kernels = engine.kernels("primitives")
-        self._partials = engine.empty(6 * engine.groups)
+        self._partials = engine.empty(6 * engine.groups * AT_ONCE)
         self.values = engine.zeros((len(names), 4))
 
     def collect(self, name: str, array: cla.Array, n: int) -> None:
         """Summarise the first `n` of `array` into the slot `name`."""
+        self.collect_all({name: array}, n)
+
+    def collect_all(self, arrays: Mapping[str, cla.Array], n: int) -> None:
+        """Summarise the first `n` of each of `AT_ONCE` arrays at most into the slot of its name."""
         k, engine = self._kernels, self.engine
-        engine.run_blocks(k.summarise_blocks, array, np.int32(n), self._partials)
+        given, count = list(arrays.values()), np.int32(len(arrays))
+        spare = given[:1] * (AT_ONCE - len(given))
+        slots = np.zeros(AT_ONCE, np.int32)
+        slots[: len(given)] = [self.slots[name] for name in arrays]
+        engine.run_blocks(k.summarise_blocks, *given, *spare, count, np.int32(n), self._partials)
         engine.run_each(
-            k.combine_blocks, 1, self._partials, np.int32(engine.groups),
-            np.int32(self.slots[name]), self.values, group=1,
+            k.combine_blocks, len(given), self._partials, np.int32(engine.groups), slots,
+            self.values, group=1,
         )  # fmt: skip
 
     def read_one(self, name: str) -> Summary:
@@ -110,6 +126,8 @@ class Room:
     def __init__(self, engine: Engine, spare: float = 0.0) -> None:
         self._engine, self._spare = engine, spare
         self._arrays: dict[tuple, cla.Array] = {}
+        # The part of each that was handed out last: to cut one costs as much as a launch.
+        self._parts: dict[tuple, cla.Array] = {}
 
     def __call__(self, *name: object, size: int, dtype: object = None) -> cla.Array:
         """Return the first `size` items of the array called `name`; their content is arbitrary."""
@@ -117,13 +135,18 @@ class Room:
         if array is None or len(array) < size:
             room = max(size + int(self._spare * size), 1)
             array = self._arrays[name] = self._engine.empty(room, dtype)
-        return array[:size]
+            self._parts.pop(name, None)
+        part = self._parts.get(name)
+        if part is None or len(part) != size:
+            part = self._parts[name] = array[:size]
+        return part
 
     def clear(self, *names: object) -> None:
         """Let go of all arrays, or of those whose names begin with one of `names`."""
         gone = [n for n in self._arrays if not names or n[0] in names]
         for name in gone:
             del self._arrays[name]
+            self._parts.pop(name, None)
 
     def zeros(self, *name: object, size: int, dtype: object = None) -> cla.Array:
         """Return the same, filled with zeros."""

@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,9 +34,13 @@ def kernel_folder() -> Path:
     return inside if inside.is_dir() else Path(__file__).parent.parent / "cl_kernels"
 
 
-def source_text(name: str, _seen: set[str] | None = None) -> str:
-    """Return the text of `cl_kernels/<name>` with every include pasted in once."""
-    seen = set() if _seen is None else _seen
+@cache
+def source_text(name: str) -> str:
+    """Return the text of `cl_kernels/<name>` with every include pasted in once; files are read once."""
+    return _paste(name, set())
+
+
+def _paste(name: str, seen: set[str]) -> str:
     lines = [f'#line 1 "{name}"']
     for number, line in enumerate((kernel_folder() / name).read_text().splitlines(), start=1):
         match = _INCLUDE.match(line)
@@ -43,10 +48,31 @@ def source_text(name: str, _seen: set[str] | None = None) -> str:
             lines.append(line)
         elif match[1] not in seen:
             seen.add(match[1])
-            lines += [source_text(match[1], seen), f'#line {number + 1} "{name}"']
+            lines += [_paste(match[1], seen), f'#line {number + 1} "{name}"']
         else:
             lines.append("")
     return "\n".join(lines)
+
+
+class Kernels(SimpleNamespace):
+    """Kernels of a program as attributes, made when first asked for: to make one costs as much as ten launches.
+
+    Each has arguments of its own, and knows its `stage`, for a profile.
+    """
+
+    def __init__(self, program: cl.Program, stage: str) -> None:
+        super().__init__(_program=program, _stage=stage)
+
+    def __getattr__(self, name: str) -> cl.Kernel:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            kernel = cl.Kernel(self._program, name)
+        except cl.LogicError as error:
+            raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
+        kernel.stage = self._stage  # type: ignore[attr-defined]
+        setattr(self, name, kernel)
+        return kernel
 
 
 def build_program(
@@ -117,11 +143,8 @@ class Engine:
 
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
-    ) -> SimpleNamespace:
-        """Build `cl_kernels/<stage>.cl` and return its kernels as attributes, each with arguments of its own.
-
-        Each kernel knows its `stage`, for a profile.
-        """
+    ) -> Kernels:
+        """Build `cl_kernels/<stage>.cl` and return its kernels."""
         real = "double" if self.real == np.float64 else "float"
         # What a source does not name would only have it built anew for every domain.
         text = source_text(f"{stage}.cl")
@@ -129,11 +152,7 @@ class Engine:
         full = {
             "DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size, **named, **(defines or {}),
         }  # fmt: skip
-        program = build_program(self.ctx, f"{stage}.cl", full, prelude)
-        kernels = program.all_kernels()
-        for kernel in kernels:
-            kernel.stage = stage  # type: ignore[attr-defined]
-        return SimpleNamespace(**{k.function_name: k for k in kernels})
+        return Kernels(build_program(self.ctx, f"{stage}.cl", full, prelude), stage)
 
     def run(
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None

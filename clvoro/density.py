@@ -70,6 +70,5 @@ class Density:
         """Take the mean of ``w.excess``, weighted by ``w.weight``, away from it."""
         n = self._n
         self.engine.run_each(self._kernels.weigh_excess, n, w.weight, w.excess, self._weighed)
-        self._sums.collect("weighed", self._weighed, n)
-        self._sums.collect("weight", w.weight, n)
+        self._sums.collect_all({"weighed": self._weighed, "weight": w.weight}, n)
         self.engine.run_each(self._kernels.remove_mean, n, self._sums.values, w.excess)

@@ -353,13 +353,11 @@ class Mesh:
     def assess(self) -> dict[str, Summary]:
         """Summarise the mesh: the scalars that the host sees of a step."""
         s, n = self.summaries, self.n
-        s.collect("error", self.error, n)
-        s.collect("quality", self.quality, n)
-        s.collect("energy", self.energy, n)
-        s.collect("lloyd", self.lloyd_speed, n)
-        s.collect("correction", self.correction_speed, n)
-        s.collect("changed", self.changed, n)
-        s.collect("ever", self.ever, n)
+        arrays = {
+            "error": self.error, "quality": self.quality, "energy": self.energy, "lloyd": self.lloyd_speed,
+            "correction": self.correction_speed, "changed": self.changed, "ever": self.ever,
+        }  # fmt: skip
+        s.collect_all(arrays, n)
         return s.read()
 
     def refined_count(self) -> int:

@@ -24,7 +24,7 @@ def scan(ctx):
     return Scan(patch.make_engine(ctx))
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 1000, 100003])
+@pytest.mark.parametrize("n", [0, 1, 2, 7, 8, 9, 1000, 8192, 8193, 100003])
 @pytest.mark.parametrize("first", [0, 5])
 def test_scan(scan, n, first):
     values = np.random.default_rng(n + 31).integers(-50, 90, n + first + 3).astype(np.int32)
@@ -62,6 +62,19 @@ def test_summaries(engine, n):
     assert (b.least, b.largest) == (values.min(), values.max())
     assert b.peak == np.abs(values).max()
     assert (a.sum, a.magnitude, a.least) == (-b.sum, b.magnitude, -b.largest)
+
+
+@pytest.mark.parametrize("count", [2, 7, 8])
+def test_summaries_together_are_those_alone(engine, count):
+    n, rng = 3001, np.random.default_rng(count)
+    arrays = {str(k): engine.upload(rng.normal(k, 1 + k, n + k)) for k in range(count)}
+    together, alone = Summaries(engine, "76543210"), Summaries(engine, "01234567")
+    together.collect_all(arrays, n)
+    for name, array in arrays.items():
+        alone.collect(name, array, n)
+    found, expected = together.read(), alone.read()
+    assert {name: found[name] for name in arrays} == {name: expected[name] for name in arrays}
+    assert len({expected[name].sum for name in arrays}) == count
 
 
 def test_summaries_are_compensated(engine):

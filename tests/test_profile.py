@@ -133,9 +133,9 @@ def test_calls_and_bytes_of_known_launches(engine):
 def test_times_are_those_of_the_events(engine):
     x = engine.zeros(200_000)
     kernel = engine.kernels("primitives").summarise_blocks
-    partials = engine.empty(6 * engine.groups)
+    args = *[x] * 8, np.int32(1), np.int32(len(x)), engine.empty(6 * engine.groups)
     with Profile(engine.queue) as taken:
-        events = [engine.run_blocks(kernel, x, np.int32(len(x)), partials) for _ in range(9)]
+        events = [engine.run_blocks(kernel, *args) for _ in range(9)]
     seconds = sum(1e-9 * (e.profile.end - e.profile.start) for e in events)
     assert seconds > 0
     assert taken.of("primitives") == pytest.approx(seconds, rel=1e-12)
@@ -144,11 +144,11 @@ def test_times_are_those_of_the_events(engine):
 def test_few_events_are_kept(engine, monkeypatch):
     monkeypatch.setattr(profile, "PENDING", 10)
     x, kernel = engine.zeros(64), engine.kernels("primitives").summarise_blocks
-    partials = engine.empty(6 * engine.groups)
+    args = *[x] * 8, np.int32(1), np.int32(64), engine.empty(6 * engine.groups)
     most = 0
     with Profile(engine.queue) as taken:
         for _ in range(57):
-            engine.run_blocks(kernel, x, np.int32(64), partials)
+            engine.run_blocks(kernel, *args)
             most = max(most, len(taken._pending))
     assert 0 < most < 10
     assert taken._pending == []
