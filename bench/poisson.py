@@ -1,22 +1,27 @@
 """Poisson solve on Voronoi graphs: iterations, set-up and solve time, against pyamg and SciPy.
 
-    python bench/poisson.py [N ...] [--mesh random|adapted] [--device NAME] [--dtype float32] [--json]
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python bench/poisson.py [--sizes 1e3,1e4,1e5,1e6]
+                        [--mesh random|adapted] [--device NAME] [--dtype float32] [--json]
 
 Right side: white noise of mean zero; relative residual 1e-8 (1e-5 in float32). Times are the best of `--repeat`
 solves on a running process (kernels built), the peers' the best of one or two. Peers run where installed, up to
 `--peers-up-to` cells; direct solves up to a tenth of that.
+
+With `--processor-time` seconds are those that this process has had of the processors, ours over the device's compute
+units: what the wall clock shows on a machine without other work.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
+from _common import Report, counts, heading, make_adapter, parser
 
 import clvoro
 from clvoro._program import Engine
@@ -27,19 +32,11 @@ try:
 except ImportError:
     pyamg = None
 
-
-def context(name):
-    """Return the context of the first device whose (or whose platform's) name contains `name`."""
-    if name is None:
-        return clvoro.create_context()
-    for platform in cl.get_platforms():
-        for device in platform.get_devices():
-            if name.lower() in f"{platform.name} {device.name}".lower():
-                return cl.Context([device])
-    raise SystemExit(f"no OpenCL device whose name contains {name!r}; see `clvoro devices`")
+Outcome = tuple[int, float, float, float]
+"""Iterations, relative residual, seconds of set-up and of the solve."""
 
 
-def morton_order(points):
+def morton_order(points: np.ndarray) -> np.ndarray:
     """Order of points in [0, 1]^2 along a Morton curve."""
     key = np.zeros(len(points), np.int64)
     boxes = np.minimum((points * 2**15).astype(np.int64), 2**15 - 1)
@@ -48,7 +45,7 @@ def morton_order(points):
     return np.argsort(key, kind="stable")
 
 
-def make_graph(adapter, n, mesh):
+def make_graph(adapter: clvoro.Adapter, n: int, mesh: str) -> clvoro.Diagram:
     """Diagram of `n` cells in the unit box, generators in Morton order."""
     box = clvoro.Box((0.0, 0.0), (1.0, 1.0))
     rng = np.random.default_rng(n)
@@ -63,17 +60,26 @@ def make_graph(adapter, n, mesh):
     return adapter.diagram(box, points[morton_order(points)])
 
 
-def best(repeat, function):
-    """Least of `repeat` times of `function`, and its last result."""
+def best(repeat: int, clock: Callable[[], float], function: Callable[[], Any]) -> tuple[float, Any]:
+    """Least of `repeat` times of `function` by `clock`, and its last result."""
     times = []
     for _ in range(repeat):
-        start = time.perf_counter()
+        start = clock()
         result = function()
-        times.append(time.perf_counter() - start)
+        times.append(clock() - start)
     return min(times), result
 
 
-def ours(engine, diagram, b, method, tolerance, repeat):
+def ours(
+    engine: Engine,
+    diagram: clvoro.Diagram,
+    b: np.ndarray,
+    method: str,
+    tolerance: float,
+    repeat: int,
+    clock: Callable[[], float],
+    cores: int,
+) -> Outcome:
     poisson = Poisson(engine)
     arrays = (
         engine.upload(diagram.neighbour_starts, np.int32),
@@ -97,13 +103,13 @@ def ours(engine, diagram, b, method, tolerance, repeat):
         )
 
     set_up()
-    seconds_set_up, laplacian = best(repeat, set_up)
+    seconds_set_up, laplacian = best(repeat, clock, set_up)
     solve()
-    seconds, solution = best(repeat, solve)
-    return solution.iterations, solution.residual, seconds_set_up, seconds
+    seconds, solution = best(repeat, clock, solve)
+    return solution.iterations, solution.residual, seconds_set_up / cores, seconds / cores
 
 
-def matrix(diagram):
+def matrix(diagram: clvoro.Diagram) -> sp.csr_matrix:
     """Return A = -Laplacian as a SciPy matrix."""
     n = len(diagram)
     rows = np.repeat(np.arange(n), np.diff(diagram.neighbour_starts))
@@ -115,75 +121,82 @@ def matrix(diagram):
     return sp.csr_matrix(sp.diags(np.asarray(W.sum(axis=1)).ravel()) - W)
 
 
-def with_pyamg(A, b, tolerance, repeat):
+def with_pyamg(
+    A: sp.csr_matrix, b: np.ndarray, tolerance: float, repeat: int, clock: Callable[[], float]
+) -> Outcome:
     # One addition to the diagonal makes the matrix definite, as pyamg needs it, and leaves x_0 = 0.
     A = A.copy()
     A[0, 0] *= 2
-    set_up, ml = best(repeat, lambda: pyamg.smoothed_aggregation_solver(A))
+    set_up, ml = best(repeat, clock, lambda: pyamg.smoothed_aggregation_solver(A))
     residuals = []
 
     def solve():
         residuals.clear()
         return ml.solve(b, tol=tolerance, accel="cg", residuals=residuals, maxiter=300)
 
-    seconds, x = best(repeat, solve)
+    seconds, x = best(repeat, clock, solve)
     residual = np.linalg.norm(b - A @ x) / np.linalg.norm(b)
     return len(residuals) - 1, residual, set_up, seconds
 
 
-def with_scipy(A, b):
-    set_up, lu = best(1, lambda: sla.splu(sp.csc_matrix(A[1:, 1:])))
+def with_scipy(A: sp.csr_matrix, b: np.ndarray, clock: Callable[[], float]) -> Outcome:
+    set_up, lu = best(1, clock, lambda: sla.splu(sp.csc_matrix(A[1:, 1:])))
     x = np.zeros(len(b))
-    seconds, x[1:] = best(1, lambda: lu.solve(b[1:]))
+    seconds, x[1:] = best(1, clock, lambda: lu.solve(b[1:]))
     return 1, np.linalg.norm(b - A @ x) / np.linalg.norm(b), set_up, seconds
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("cells", nargs="*", type=float, default=[1e3, 1e4, 1e5, 1e6])
-    parser.add_argument("--mesh", choices=["random", "adapted"], default="random")
-    parser.add_argument("--device", help="part of the device's or platform's name")
-    parser.add_argument("--dtype", choices=["float64", "float32"], default="float64")
-    parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--peers-up-to", type=float, default=1e6, metavar="N")
-    parser.add_argument("--jacobi-up-to", type=float, default=1e5, metavar="N")
-    parser.add_argument("--json", action="store_true", help="one JSON object per line")
-    options = parser.parse_args()
+COLUMNS = {
+    "cells": lambda r: f"{r['cells']:,}",
+    "method": lambda r: r["method"],
+    "iterations": lambda r: r["iterations"],
+    "residual": lambda r: f"{r['residual']:.1e}",
+    "set-up s": lambda r: f"{r['set_up']:.3f}",
+    "solve s": lambda r: f"{r['solve']:.3f}",
+    "sum s": lambda r: f"{r['set_up'] + r['solve']:.3f}",
+    "over ours": lambda r: f"{r['ratio']:.1f}",
+}
 
-    ctx = context(options.device)
-    adapter = clvoro.Adapter(ctx)
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(options.dtype))
+
+def main() -> None:
+    options_of = parser(__doc__)
+    options_of.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5,1e6"))
+    options_of.add_argument("--mesh", choices=["random", "adapted"], default="random")
+    options_of.add_argument("--repeat", type=int, default=3)
+    options_of.add_argument("--peers-up-to", type=float, default=1e6, metavar="N")
+    options_of.add_argument("--jacobi-up-to", type=float, default=1e5, metavar="N")
+    options_of.add_argument("--processor-time", action="store_true")
+    options = options_of.parse_args()
+
+    adapter = make_adapter(options)
+    engine = Engine(adapter.ctx, cl.CommandQueue(adapter.ctx), 2, adapter.dtype)
     tolerance = 1e-8 if options.dtype == "float64" else 1e-5
-    if not options.json:
-        print(f"{ctx.devices[0].name.strip()}, {options.dtype}, {options.mesh} mesh")
-        print(f"{'N':>9} {'method':<10} {'its':>6} {'residual':>9} {'set-up s':>9} {'solve s':>9} "
-              f"{'sum s':>9} {'times ours':>10}")  # fmt: skip
-    for n in map(int, options.cells):
+    clock, cores = time.perf_counter, 1
+    if options.processor_time:
+        clock, cores = time.process_time, adapter.ctx.devices[0].max_compute_units
+    report = Report(options.json, COLUMNS)
+    for n in options.sizes:
         diagram = make_graph(adapter, n, options.mesh)
         b = np.random.default_rng(n + 1).standard_normal(len(diagram))
         b -= b.mean()
         rows = {}
         for method in ["multigrid"] + ["jacobi"] * (n <= options.jacobi_up_to):
-            rows[method] = ours(engine, diagram, b, method, tolerance, options.repeat)
+            rows[method] = ours(engine, diagram, b, method, tolerance, options.repeat, clock, cores)
         if n <= options.peers_up_to:
             A = matrix(diagram)
             if pyamg is not None:
-                rows["pyamg"] = with_pyamg(A, b, tolerance, 1 if n > 2e5 else 2)
+                rows["pyamg"] = with_pyamg(A, b, tolerance, 1 if n > 2e5 else 2, clock)
             if n <= options.peers_up_to / 10:
-                rows["SciPy LU"] = with_scipy(A, b)
+                rows["SciPy LU"] = with_scipy(A, b, clock)
         total = sum(rows["multigrid"][2:])
         for method, (iterations, residual, set_up, solve) in rows.items():
-            ratio = (set_up + solve) / total
-            if options.json:
-                print(json.dumps({
-                    "cells": len(diagram), "mesh": options.mesh, "dtype": options.dtype,
-                    "method": method, "iterations": iterations, "residual": residual,
-                    "set_up": set_up, "solve": solve, "ratio": ratio,
-                }))  # fmt: skip
-            else:
-                print(f"{len(diagram):>9} {method:<10} {iterations:>6} {residual:>9.1e} "
-                      f"{set_up:>9.4f} {solve:>9.4f} {set_up + solve:>9.4f} {ratio:>10.2f}",
-                      flush=True)  # fmt: skip
+            record = {
+                "cells": len(diagram), "mesh": options.mesh, "dtype": options.dtype, "method": method,
+                "iterations": iterations, "residual": float(residual), "set_up": set_up, "solve": solve,
+                "ratio": (set_up + solve) / total,
+            }  # fmt: skip
+            report.add(record, f"{n:,} {method}")
+    report.finish(heading(adapter, f"Poisson on {options.mesh} meshes"))
 
 
 if __name__ == "__main__":
