@@ -20,6 +20,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._workspace import Workspace
 from .errors import BuildError
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
@@ -132,6 +133,8 @@ class Engine:
 
     item_group: int = field(init=False)
     """Work-items per group of a kernel that does one item each."""
+    workspace: Workspace = field(init=False, repr=False, compare=False)
+    """Memory that stages use in turn; see `scratch`."""
 
     def __post_init__(self) -> None:
         device = self.queue.device
@@ -140,6 +143,7 @@ class Engine:
         object.__setattr__(self, "groups", min(512, units * (4 if cpu else 8)))
         object.__setattr__(self, "group_size", 1 if cpu else 128)
         object.__setattr__(self, "item_group", 64)
+        object.__setattr__(self, "workspace", Workspace(self.queue))
 
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
@@ -182,6 +186,12 @@ class Engine:
     def empty(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
         """Return an uninitialised device array; `dtype` defaults to the engine's precision."""
         return cla.empty(self.queue, shape, self.real if dtype is None else dtype)
+
+    def scratch(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
+        """Return the same, but of the workspace, valid to the end of its frame; outside of one, an array of its own."""
+        dtype = np.dtype(self.real if dtype is None else dtype)
+        taken = self.workspace.take(shape, dtype)
+        return self.empty(shape, dtype) if taken is None else taken
 
     def zeros(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
         """Return a device array of zeros."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Scan
@@ -75,7 +76,7 @@ class Tessellation:
 
 @dataclass
 class FaceRows:
-    """Lists of faces while a diagram is made, on the device; see `common/face_rows.h`.
+    """Lists of faces while a diagram is made, on the device and of the workspace; see `common/face_rows.h`.
 
     Attributes
     ----------
@@ -86,8 +87,8 @@ class FaceRows:
         Bits of the faces that both cells see.
     places : (n,) int32
         Slot of each row, or -1 if it is as before.
-    flags : (3,) int32
-        What went wrong, the first generator concerned, and whether any cell is doubtful.
+    flags : (4,) int32
+        What went wrong, the first generator concerned, whether any cell is doubtful, and the faces of all rows.
     """
 
     slots: cla.Array
@@ -100,16 +101,14 @@ class FaceRows:
 class Cells:
     """Tessellate a box.
 
-    Buffers are reused: of a `Tessellation` the next call leaves only the graph as it is, the one after that nothing.
+    Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._capacity = 0
-        self._turn = 0
-        self._n = 0
-        self.rows = self._no_rows(engine.empty(3, np.int32))
+        self._capacity = self._room = self._n = self._enlarged_for = 0
+        self._flags = engine.empty(4, np.int32)
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -126,35 +125,38 @@ class Cells:
         return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity}
 
     def _reserve(self, n: int) -> None:
+        """Make room for the diagrams of `n` generators, but for their faces."""
+        engine, d = self.engine, self.engine.dim
         if n > self._capacity:
-            engine, d = self.engine, self.engine.dim
-            # A planar graph has at most 3 n - 6 edges, and every cell at most one face on each wall it touches.
-            m = 7 * n + 8
-            # Two graphs in turn: the previous one stays valid, to be repaired. Measures are those of the present.
-            self._graphs = [
-                {"starts": engine.empty(n + 1, np.int32), "neighbours": engine.empty(m, np.int32)}
-                for _ in range(2)
-            ]
-            self._measures = {
-                "face_measures": engine.empty(m),
-                "face_centroids": engine.empty((m, d)),
+            self._of_cells = {
+                "starts": engine.empty(n + 1, np.int32),
                 "volumes": engine.empty(n),
                 "offsets": engine.empty((n, d)),
                 "covariances": engine.empty((n, d * (d + 1) // 2)),
             }
-            self._capacity = n
-            self._n = -1
+            self._capacity, self._room, self._n = n, 0, -1
         if n != self._n:
-            # Cut the buffers to n cells (the faces' keep their spare room: their number is only known on the device).
-            lengths = {"starts": n + 1, "volumes": n, "offsets": n, "covariances": n}
-            self._views = [
-                {
-                    name: a[: lengths[name]] if name in lengths else a
-                    for name, a in {**graph, **self._measures}.items()
-                }
-                for graph in self._graphs
-            ]
+            self._views = {
+                name: array[: n + 1] if name == "starts" else array[:n]
+                for name, array in self._of_cells.items()
+            }
             self._n = n
+
+    def _reserve_faces(self, n: int, m: int) -> None:
+        """Make room for the `m` faces of `n` cells.
+
+        Cells and walls are the nodes of a planar graph, which has at most 3 (n + 4) - 6 edges: two faces each, or one
+        at a wall. Rounding may add some, where many generators lie on a circle.
+        """
+        most = max(m, 6 * n + 12)
+        if most > self._room:
+            engine, d = self.engine, self.engine.dim
+            self._of_faces = {
+                "neighbours": engine.empty(most, np.int32),
+                "face_measures": engine.empty(most),
+                "face_centroids": engine.empty((most, d)),
+            }
+            self._room = most
 
     def tessellate(
         self,
@@ -184,15 +186,20 @@ class Cells:
         ClvoroError
             If a cell has more than `LARGEST_ROW` faces, or a little more.
         """
-        engine, rows = self.engine, self.rows
-        total, n = n, n if wanted is None else wanted
-        if self.row_capacity > ROW_CAPACITY and n * self.row_capacity > rows.slots.size:
+        with self.engine.workspace.frame():
+            return self._tessellate(box, points, n, binned, exact, n if wanted is None else wanted)
+
+    def _tessellate(
+        self, box: Box, points: cla.Array, total: int, binned: BinnedPoints, exact: bool, n: int
+    ) -> Tessellation:
+        """Tessellate by `total` generators, of which the cells of the first `n` are wanted."""
+        engine = self.engine
+        if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
-        self.reserve_rows(n)
         self._reserve(n)
         while True:
-            self.clear_flags()
+            rows = self.take_rows(n)
             corners = box.device_corners(engine.real)
             search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
             if self._wrap is not None:
@@ -207,113 +214,121 @@ class Cells:
                 rows.places, rows.flags,
             )  # fmt: skip
             # Every row is new: there are none from before.
-            flags, generator = self._match(box, points, n, rows.places, rows.places, exact)
+            old = rows.places, rows.places
+            flags, generator, m, starts = self._match(rows, box, points, n, *old, exact)
             if not flags & FULL:
                 break
             self._enlarge(n)
-        if not flags & ~DOUBT:
-            t = self._measure(box, points, n, rows.places, rows.places)
-            if flags & DOUBT:
-                flags, generator = self._check(box, t, exact)
         if flags & ~DOUBT:
+            self._refuse(flags, generator)
+        t, flags, generator = self._measure(rows, box, points, n, *old, starts, m, flags, exact)
+        if t is None:
             self._refuse(flags, generator)
         return t
 
-    def complete(self, box: Box, points: cla.Array, previous: Tessellation) -> Tessellation | None:
-        """Return the diagram of `points` whose `rows` are those of `previous` or, where that has a place, new ones.
+    def complete(
+        self, rows: FaceRows, box: Box, points: cla.Array, previous: Tessellation
+    ) -> Tessellation | None:
+        """Return the diagram of `points` whose rows are those of `previous` or, where `rows` has a place, new ones.
 
         None if they do not make a diagram.
         """
-        n, starts, neighbours = previous.n, previous.starts, previous.neighbours
-        flags = self._match(box, points, n, starts, neighbours, exact=False)[0]
+        n, old = previous.n, (previous.starts, previous.neighbours)
+        flags, _, m, starts = self._match(rows, box, points, n, *old, exact=False)
         if flags & ~DOUBT:
             return None
-        t = self._measure(box, points, n, starts, neighbours)
-        return None if flags & DOUBT and self._check(box, t, exact=False)[0] & ~DOUBT else t
+        return self._measure(rows, box, points, n, *old, starts, m, flags, exact=False)[0]
 
-    def clear_flags(self) -> None:
-        """Nothing has gone wrong yet."""
-        self.rows.flags.set(np.array([0, 2**31 - 1, 0], np.int32))
-
-    def _flags(self) -> tuple[int, int]:
-        """Read what has gone wrong, with `DOUBT` where any cell is doubtful, and the first generator concerned."""
-        wrong, generator, doubtful = (int(v) for v in self.rows.flags.get())
-        return wrong | (DOUBT if doubtful else 0), generator
+    def _read_flags(self) -> tuple[int, int, int]:
+        """Read what has gone wrong, with `DOUBT` where any cell is doubtful, the first generator concerned, and m."""
+        wrong, generator, doubtful, m = (int(v) for v in self._flags.get())
+        return wrong | (DOUBT if doubtful else 0), generator, m
 
     def _match(
         self,
+        rows: FaceRows,
         box: Box,
         points: cla.Array,
         n: int,
-        starts: cla.Array,
-        neighbours: cla.Array,
+        old_starts: cla.Array,
+        old_neighbours: cla.Array,
         exact: bool,
-    ) -> tuple[int, int]:
-        """Make the rows symmetric, count their faces; return the flags, and the first generator concerned."""
-        rows, counts = self.rows, self._views[self._turn]["starts"]
-        self.engine.run_each(
-            self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, starts, neighbours,
-            points, *box.device_corners(self.engine.real), np.int32(starts is not rows.places),
-            self._share(exact), rows.keep, counts, rows.flags,
+    ) -> tuple[int, int, int, cla.Array]:
+        """Make the rows symmetric; return the flags, the first generator concerned, the faces and where rows start."""
+        engine, starts = self.engine, self.engine.scratch(n + 1, np.int32)
+        engine.run_each(
+            self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, old_starts,
+            old_neighbours, points, *box.device_corners(engine.real),
+            np.int32(old_starts is not rows.places), self._share(exact), rows.keep, starts,
+            rows.flags,
         )  # fmt: skip
-        return self._flags()
+        self._scan.exclusive(starts, starts, n)
+        # The host reads all at once.
+        word = starts.dtype.itemsize
+        cl.enqueue_copy(
+            engine.queue, rows.flags.data, starts.data, byte_count=word, src_offset=n * word,
+            dst_offset=3 * word,
+        )  # fmt: skip
+        return *self._read_flags(), starts
 
     def _measure(
-        self, box: Box, points: cla.Array, n: int, starts: cla.Array, neighbours: cla.Array
-    ) -> Tessellation:
-        """Write graph and measures of the rows."""
-        rows, new = self.rows, self._views[self._turn]
-        self._scan.exclusive(new["starts"], new["starts"], n)
-        self.engine.run_each(
-            self._kernels.measure_cells, n, rows.places, rows.slots, rows.counts, starts, neighbours,
-            rows.keep, new["starts"], points, *box.device_corners(self.engine.real),
-            new["neighbours"], new["face_measures"], new["face_centroids"], new["volumes"],
-            new["offsets"], new["covariances"],
+        self,
+        rows: FaceRows,
+        box: Box,
+        points: cla.Array,
+        n: int,
+        old_starts: cla.Array,
+        old_neighbours: cla.Array,
+        starts: cla.Array,
+        m: int,
+        flags: int,
+        exact: bool,
+    ) -> tuple[Tessellation | None, int, int]:
+        """Write graph and measures of the rows; None if its doubtful cells do not fit. Return the flags, too."""
+        engine, corners = self.engine, box.device_corners(self.engine.real)
+        self._reserve_faces(n, m)
+        new, faces = self._views, self._of_faces
+        # The previous graph is read meanwhile, and stays if this call is broken off.
+        neighbours = engine.scratch(m, np.int32)
+        engine.run_each(
+            self._kernels.measure_cells, n, rows.places, rows.slots, rows.counts, old_starts,
+            old_neighbours, rows.keep, starts, points, *corners, neighbours,
+            faces["face_measures"], faces["face_centroids"], new["volumes"], new["offsets"],
+            new["covariances"],
         )  # fmt: skip
-        # Only now: a call that was broken off leaves the previous diagram as it is.
-        self._turn = 1 - self._turn
-        return Tessellation(n=n, points=points, **new)
-
-    def _check(self, box: Box, t: Tessellation, exact: bool) -> tuple[int, int]:
-        """Check the doubtful cells of `t`; return the flags, and the first generator concerned."""
-        rows = self.rows
-        self.engine.run_each(
-            self._kernels.check_doubtful, t.n, rows.places, rows.counts, t.starts, t.neighbours,
-            t.volumes, t.points, *box.device_corners(self.engine.real),
-            self._share(exact), rows.flags,
-        )  # fmt: skip
-        return self._flags()
+        generator = 0
+        if flags & DOUBT:
+            engine.run_each(
+                self._kernels.check_doubtful, n, rows.places, rows.counts, starts, neighbours,
+                new["volumes"], points, *corners, self._share(exact), rows.flags,
+            )  # fmt: skip
+            flags, generator, _ = self._read_flags()
+            if flags & ~DOUBT:
+                return None, flags, generator
+        engine.run_each(
+            self._kernels.put_graph, n, starts, neighbours, new["starts"], faces["neighbours"]
+        )
+        return Tessellation(n=n, points=points, **new, **faces), flags, generator
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
-    def clear(self) -> None:
-        """Let go of the lists of faces, which hold nothing between two diagrams."""
-        self.rows = self._no_rows(self.rows.flags)
-
-    def _no_rows(self, flags: cla.Array) -> FaceRows:
-        """Return lists for one cell."""
-        slots, counts, places = (self.engine.empty(1, np.int32) for _ in range(3))
-        return FaceRows(slots, counts, self.engine.empty(1, np.uint32), places, flags)
-
-    def reserve_rows(self, n: int) -> None:
-        """Make room for `n` rows of faces of the present capacity."""
-        if n > self.rows.counts.size:
-            self.rows.counts, self.rows.places = (
-                self.engine.empty(n, np.int32), self.engine.empty(n, np.int32)
-            )  # fmt: skip
-        entries = n * self.row_capacity
+    def take_rows(self, n: int, slots: int | None = None) -> FaceRows:
+        """Return `n` rows of faces of the present capacity, of which `slots` (by default all) may be new; no flags."""
+        engine, slots = self.engine, n if slots is None else slots
+        entries = slots * self.row_capacity
         if entries >= 2**31:
             raise MemoryLimitError(
                 f"{n} cells of up to {self.row_capacity} faces need {entries:.3g} entries, expected "
                 "fewer than 2^31, which 32-bit indices can tell apart; use fewer cells, or perturb "
                 "generators that lie on a common circle"
             )
-        if entries > self.rows.slots.size:
-            self.rows.slots = self.engine.empty(entries, np.int32)
-        words = n * ((self.row_capacity + 31) // 32)
-        if words > self.rows.keep.size:
-            self.rows.keep = self.engine.empty(words, np.uint32)
+        self._flags.set(np.array([0, 2**31 - 1, 0, 0], np.int32))
+        return FaceRows(
+            engine.scratch(entries, np.int32), engine.scratch(slots, np.int32),
+            engine.scratch(slots * ((self.row_capacity + 31) // 32), np.uint32),
+            engine.scratch(n, np.int32), self._flags,
+        )  # fmt: skip
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for `n` cells."""
@@ -323,9 +338,9 @@ class Cells:
                 "are not supported: remove or perturb some"
             )
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
-        self.reserve_rows(n)
+        self._enlarged_for = n
 
-    def _refuse(self, flags: int, generator: int) -> None:
+    def _refuse(self, flags: int, generator: int) -> NoReturn:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"
         raise InputError(
             f"generator {generator} {what} in {self.engine.real}; expected distinct generators: "

@@ -27,5 +27,4 @@ class FoldedCells(Cells):
 
     def reserve(self, n: int) -> None:
         """Make room for `n` cells."""
-        self.reserve_rows(n)
         self._reserve(n)

@@ -89,6 +89,8 @@ class Stages:
     def release(self, *names: str) -> None:
         """Let go of stages (by default all) and their buffers; those that are used again are made again."""
         gone = [self.__dict__.pop(name, None) for name in names or Stages._CLASSES]
+        if not names:
+            self.engine.workspace.clear()
         if any(stage is not None for stage in gone):
             del gone
             gc.collect()  # stages and the launches that they keep refer to each other
@@ -229,12 +231,7 @@ class Mesh:
         self.update(first)
         # The next diagrams are repaired from this one, most likely.
         stages.bins.clear()
-        self._clear_rows()
-
-    def _clear_rows(self) -> None:
-        """Let go of what takes memory while a diagram is made."""
-        if isinstance(self.stages.cells, Cells):
-            self.stages.cells.clear()
+        self.engine.workspace.clear()
 
     def _make_room(self) -> None:
         """Make the arrays that there are not, of what follows from the generators."""
@@ -330,7 +327,7 @@ class Mesh:
         total = self.missing(w) if n_cells is None else float(n_cells - self.n)
         # The largest of what is not needed meanwhile.
         self.stages.projection.clear()
-        self._clear_rows()
+        self.engine.workspace.clear()
         rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
         new = self.stages.population.reorganise(
             self.free, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,

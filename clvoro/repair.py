@@ -40,47 +40,53 @@ class Repair:
 
         Returns None where too much has changed, or generators coincide: the diagram is then to be made anew.
         """
-        engine, n, rows = self.engine, previous.n, cells.rows
+        with self.engine.workspace.frame():
+            t = self._follow(cells, box, points, previous)
+        self._last = None if t is None else ref(t)
+        return t
+
+    def _follow(
+        self, cells: Cells, box: Box, points: cla.Array, previous: Tessellation
+    ) -> Tessellation | None:
+        engine, n = self.engine, previous.n
         key = tuple(cells.defines.values())
         if key not in self._kernels:
             self._kernels[key] = engine.kernels("repair", cells.defines)
         k = self._kernels[key]
         if n != self._n:
-            self._n = n
-            self._marks, self._listed = engine.empty(n, np.int32), engine.empty(n, np.int32)
-            self._sums, self._fits = engine.empty(n + 1, np.int32), engine.empty(n, np.int32)
+            self._n, self._fits = n, engine.empty(n, np.int32)
             self._last = None
         if self._last is None or self._last() is not previous:
             self._fits.fill(0)
-        cells.reserve_rows(n)
+        most = int(MAX_SHARE * n)
+        rows = cells.take_rows(n, most)
+        marks, listed = engine.scratch(n, np.int32), engine.scratch(most, np.int32)
+        sums = engine.scratch(n + 1, np.int32)
         corners = box.device_corners(engine.real)
         old = (previous.starts, previous.neighbours)
-        cells.clear_flags()
-        self._marks.fill(0)
+        marks.fill(0)
         rows.places.fill(-1)
-        engine.run_each(k.check_rows, n, *old, points, *corners, self._fits, self._marks)
+        engine.run_each(k.check_rows, n, *old, points, *corners, self._fits, marks)
         base = 0
         for _ in range(MAX_ROUNDS):
-            self._scan.exclusive(self._marks, self._sums, n)
-            count = int(self._sums[n].get())
+            self._scan.exclusive(marks, sums, n)
+            count = int(sums[n].get())
             if count == 0:
-                t = cells.complete(box, points, previous)
-                self._last = None if t is None else ref(t)
-                return t
-            if base + count > MAX_SHARE * n:
+                return cells.complete(rows, box, points, previous)
+            if base + count > most:
                 return None
-            engine.run_each(k.list_marked, n, self._marks, self._sums, self._listed)
+            engine.run_each(k.list_marked, n, marks, sums, listed)
             engine.run_each(
-                k.clip_marked, count, self._listed, np.int32(base), rows.places, rows.slots,
+                k.clip_marked, count, listed, np.int32(base), rows.places, rows.slots,
                 rows.counts, *old, points, *corners, rows.flags,
             )  # fmt: skip
             engine.run_each(
-                k.place_clipped, count, self._listed, np.int32(base), rows.places, self._marks,
+                k.place_clipped, count, listed, np.int32(base), rows.places, marks,
                 self._fits,
             )  # fmt: skip
             engine.run_each(
-                k.check_clipped, count, self._listed, rows.places, rows.slots, rows.counts, *old,
-                points, *corners, self._marks, self._fits,
+                k.check_clipped, count, listed, rows.places, rows.slots, rows.counts, *old,
+                points, *corners, marks, self._fits,
             )  # fmt: skip
             base += count
         return None

@@ -264,7 +264,7 @@ def test_enlarged_capacity_is_for_those_that_need_it(adapter64):
     tessellate(POINTS["graded"])
     assert cells.row_capacity == ROW_CAPACITY
     with pytest.raises(clvoro.ClvoroError, match="32-bit"):
-        cells.reserve_rows(2**31 // ROW_CAPACITY + 1)
+        cells.take_rows(2**31 // ROW_CAPACITY + 1)
 
 
 @settings(max_examples=60, deadline=None)

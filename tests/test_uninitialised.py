@@ -1,7 +1,8 @@
 """No kernel reads what none has written: results are the same to the bit, whatever fresh memory holds.
 
-Oclgrind's check for uninitialised reads does not look at global memory, so new buffers are filled here with one pattern
-of bytes or another: NaN and -1, large numbers, zeros. Whoever reads them gives it away.
+Oclgrind's check for uninitialised reads does not look at global memory, so new buffers, and what is taken of the
+workspace, are filled here with one pattern of bytes or another: NaN and -1, large numbers, zeros. Whoever reads them
+gives it away, as does who reads an array of the workspace whose frame is over, once another has its place.
 """
 
 import numpy as np
@@ -18,18 +19,20 @@ PATTERNS = (0xFF, 0x00, 0x4B)
 @pytest.fixture
 def filled(monkeypatch):
     """Set the byte that fresh device memory is full of."""
-    plain = Engine.empty
+    ways = {"empty": Engine.empty, "scratch": Engine.scratch}
 
     def fill_with(byte):
-        def empty(self, shape, dtype=None):
-            array = plain(self, shape, dtype)
-            if array.nbytes:
-                array.set(
-                    np.full(array.nbytes, byte, np.uint8).view(array.dtype).reshape(array.shape)
-                )
-            return array
+        for name, plain in ways.items():
 
-        monkeypatch.setattr(Engine, "empty", empty)
+            def filled(self, shape, dtype=None, plain=plain):
+                array = plain(self, shape, dtype)
+                if array.nbytes:
+                    array.set(
+                        np.full(array.nbytes, byte, np.uint8).view(array.dtype).reshape(array.shape)
+                    )
+                return array
+
+            monkeypatch.setattr(Engine, name, filled)
 
     return fill_with
 

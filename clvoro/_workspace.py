@@ -1,0 +1,85 @@
+"""Device memory that stages use in turn.
+
+Much of what a stage works on is of no use to anybody once it is done: lists of candidate faces, the vectors of a linear
+solve, the marks of insertions. Such arrays are taken from one stretch of memory for the time of a frame,
+
+    with engine.workspace.frame():
+        marks = engine.scratch(n, np.int32)
+
+as local variables are from the stack of a program: frames nest, and at the end of one all that was taken within it is
+given back, to be taken by the next. The queue is in order, so that commands which still use it are done by then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+
+class Workspace:
+    """A stack of device arrays.
+
+    The memory grows while a frame needs more than any before and is then kept, in one piece: what is repeated step by
+    step allocates nothing.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+    """
+
+    def __init__(self, queue: cl.CommandQueue) -> None:
+        self._queue = queue
+        # Sub-buffers have to begin at multiples of this; a cache line at least keeps arrays apart.
+        self._unit = max(64, queue.device.mem_base_addr_align // 8)
+        self._depth = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Let go of all memory, outside of any frame; within one, nothing is done."""
+        if self._depth:
+            return
+        self._pieces: list[cl.Buffer] = []
+        self._views: dict[tuple[int, int, int], cl.Buffer] = {}
+        self._piece = self._used = self._taken = self._most = 0
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Give back at the end what is taken meanwhile."""
+        if self._depth == 0 and len(self._pieces) > 1:
+            # One piece in the place of those that it took to find out how much is needed.
+            self._pieces, self._views = [], {}
+            self._add(self._most)
+        before = self._piece, self._used, self._taken
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            self._piece, self._used, self._taken = before
+
+    def take(self, shape: int | tuple[int, ...], dtype: np.dtype) -> cla.Array | None:
+        """Return an array whose content is arbitrary, valid to the end of the frame; None outside of any."""
+        if self._depth == 0:
+            return None
+        size = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
+        size = -(-size // self._unit) * self._unit
+        while self._piece < len(self._pieces):
+            if self._used + size <= self._pieces[self._piece].size:
+                break
+            self._piece, self._used = self._piece + 1, 0
+        else:
+            self._add(size)
+        key = self._piece, self._used, size
+        if key not in self._views:
+            self._views[key] = self._pieces[self._piece].get_sub_region(self._used, size)
+        self._used += size
+        self._taken += size
+        self._most = max(self._most, self._taken)
+        return cla.Array(self._queue, shape, dtype, data=self._views[key])
+
+    def _add(self, size: int) -> None:
+        self._pieces.append(cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size))

@@ -1,0 +1,114 @@
+"""Memory that stages use in turn: arrays of a frame do not overlap, those of the next take their place."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clvoro._program import Engine
+
+
+@pytest.fixture
+def engine(ctx):
+    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Sizes of the buffers that have been made."""
+    sizes, plain = [], cl.Buffer
+
+    class Counted(plain):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            sizes.append(self.size)
+
+    monkeypatch.setattr(cl, "Buffer", Counted)
+    return sizes
+
+
+SHAPES = [(5, np.int32), ((100, 2), None), (1, np.uint8), (0, None), (7000, np.float32), (3, None)]
+
+
+def take(engine):
+    """Take arrays of all kinds and fill each with a number of its own."""
+    arrays = [engine.scratch(*shape) for shape in SHAPES]
+    for k, array in enumerate(arrays):
+        if array.size:
+            array.fill(k + 1)
+    return arrays
+
+
+def check(arrays):
+    for k, (array, (shape, dtype)) in enumerate(zip(arrays, SHAPES, strict=True)):
+        assert array.shape == (shape if isinstance(shape, tuple) else (shape,))
+        assert array.dtype == (np.float64 if dtype is None else dtype)
+        assert (array.get() == k + 1).all()
+
+
+def test_arrays_of_open_frames_do_not_overlap(engine):
+    """Also those of a frame within another, when the memory grows meanwhile, and once it is in one piece."""
+    for _ in range(3):
+        with engine.workspace.frame():
+            outer = take(engine)
+            for _ in range(2):
+                with engine.workspace.frame():
+                    check([a for a, _ in zip(take(engine), outer, strict=True)])
+            check(outer)
+            again = take(engine)
+            check(outer)
+            check(again)
+
+
+def test_frames_take_the_same_memory_in_turn(engine, made):
+    """Without allocations from the third on: the first finds out how much it takes, the second makes one piece."""
+    for turn in range(5):
+        if turn == 2:
+            before = len(made)
+        with engine.workspace.frame():
+            take(engine)
+            for _ in range(3):
+                with engine.workspace.frame():
+                    take(engine)
+    assert len(made) == before
+    once = sum(
+        np.prod(shape, dtype=int) * np.dtype(dtype or float).itemsize for shape, dtype in SHAPES
+    )
+    # Two of each at a time; pieces begin at multiples of a unit.
+    unit = max(64, engine.queue.device.mem_base_addr_align // 8)
+    assert 2 * once <= made[-1] <= 2 * once + 2 * len(SHAPES) * unit
+
+
+def test_a_frame_that_fails_gives_back_what_it_took(engine, made):
+    def fail():
+        with engine.workspace.frame():
+            take(engine)
+            raise ZeroDivisionError
+
+    for _ in range(4):
+        with pytest.raises(ZeroDivisionError):
+            fail()
+        count = len(made)
+    with engine.workspace.frame():
+        check(take(engine))
+    assert len(made) == count
+
+
+def test_outside_of_frames_arrays_have_memory_of_their_own(engine):
+    arrays = take(engine)
+    with engine.workspace.frame():
+        take(engine)
+    take(engine)
+    check(arrays)
+
+
+def test_clearing_lets_go_of_the_memory_but_not_within_a_frame(engine, made):
+    with engine.workspace.frame():
+        outer = take(engine)
+        engine.workspace.clear()
+        check(take(engine))
+        check(outer)
+    engine.workspace.clear()
+    before = len(made)
+    with engine.workspace.frame():
+        check(take(engine))
+    assert len(made) > before
