@@ -70,3 +70,15 @@ def test_a_table_is_markdown():
     lines = [line for line in done.stdout.splitlines() if line.startswith("|")]
     assert len(lines) == 5
     assert len({line.count("|") for line in lines}) == 1
+
+
+@pytest.mark.slow
+def test_scaling(tmp_path):
+    pytest.importorskip("matplotlib")
+    rows = records(
+        "scaling.py", "--sizes", "500,1e3", "--run-sizes", "500,1e3", "--out", str(tmp_path)
+    )
+    names = {r["curve"] for r in rows}
+    assert {"diagram", "next diagram", "3D diagram", "Poisson", "fast run", "default run"} <= names
+    assert all(len(r["cells"]) == len(r["seconds"]) == 2 and r["slope"] is None for r in rows)
+    assert (tmp_path / "scaling.png").read_bytes()[:4] == b"\x89PNG"
