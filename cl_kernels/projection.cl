@@ -137,22 +137,19 @@ kernel void descend(int k, int n, int most, REAL tolerance, global const int *st
     const int first = get_global_id(0) == 0;
     global REAL *now = record + 4 * k;
     global const REAL *last = now - 4;
-    if (k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0)) {
-        if (first) now[RECORD_RUNNING] = 0;
-        return;
-    }
+    const int over = k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0);
     const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
     const REAL start = k > 0 ? record[RECORD_NORM] : norm;
-    const int running = k < most && norm > tolerance * tolerance * start && norm <= REAL_MAX && gamma > 0;
-    if (first) {
+    const int running = !over && k < most && norm > tolerance * tolerance * start && norm <= REAL_MAX && gamma > 0;
+    if (first) now[RECORD_RUNNING] = running;
+    if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
-        now[RECORD_RUNNING] = running;
     }
-    if (!running) return;
+    const int end = running ? n : 0;
     const STORE beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
     Sum curvature = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
+    for (BLOCK_LOOP(i, end)) {
         const STORE zi = z[i], pi = zi + beta * p[i];
         STORE sum[DIM];
         EACH_AXIS(a)
@@ -184,13 +181,13 @@ kernel void update(int k, int n, global const int *starts, global const int *nei
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
-    if (now[RECORD_RUNNING] == 0) return;
+    const int running = now[RECORD_RUNNING] != 0;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch);
-    if (get_global_id(0) == 0) now[RECORD_CURVATURE] = curvature;
-    if (!(curvature > 0)) return;
+    if (running && get_global_id(0) == 0) now[RECORD_CURVATURE] = curvature;
+    const int end = running && curvature > 0 ? n : 0;
     const STORE alpha = now[RECORD_GAMMA] / curvature;
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
+    for (BLOCK_LOOP(i, end)) {
         /* One sum per axis: a single one would have to wait for itself twice as long. */
         STORE sum[DIM], q = eps[i] * p[i];
         EACH_AXIS(a) {

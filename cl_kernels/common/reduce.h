@@ -1,5 +1,8 @@
 /* Sums and maxima that repeat bit by bit: every group writes one partial value per quantity, and whoever needs the
-   total adds the partial values of all groups in their order. Include after blocks.h and real.h. */
+   total adds the partial values of all groups in their order. Include after blocks.h and real.h.
+
+   All hold barriers. A kernel must not return before one, not even all of its work-items alike: PoCL then runs astray with
+   groups of more than one. What is not to be done becomes a loop of no turns. */
 
 /* Running sum of one work-item; compensated (Kahan) in single precision, where a CPU's work-item adds up many thousands. */
 typedef struct {
