@@ -1,6 +1,7 @@
 #include "common/bins.h"
 #include "common/corner.h"
 #include "common/face_rows.h"
+#include "common/graph.h"
 #include "common/moments.h"
 
 #ifndef MAX_DEPTH
@@ -283,19 +284,6 @@ kernel void measure_cells(const int size, global const int *places, global const
         }
     }
     write_moments(&moments, i, volumes, offsets, covariances);
-}
-
-/* Per generator i: its row of the new graph in the place of that of the previous one. */
-kernel void put_graph(const int size, global const int *new_starts, global const int *new_neighbours,
-                      global int *starts, global int *neighbours)
-{
-    WORK_ITEM(i);
-    const int end = new_starts[i + 1];
-    starts[i + 1] = end;
-    if (i == 0)
-        starts[0] = 0;
-    for (int k = new_starts[i]; k < end; ++k)
-        neighbours[k] = new_neighbours[k];
 }
 
 /* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has them, if

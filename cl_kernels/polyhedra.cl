@@ -1,3 +1,4 @@
+#include "common/graph.h"
 #include "common/search.h"
 
 #define UNFINISHED INT_MIN /* count of a cell that was full: to be clipped again with more room */

@@ -20,7 +20,7 @@ import numpy as np
 
 from .cells import Tessellation
 from .errors import InputError
-from .mesh import Mesh, Stages
+from .mesh import SUMMARIES, Mesh, Stages
 from .plans import Action, Step
 from .polygon import Polygon
 from .results import HISTORY_DTYPE, Displacements
@@ -30,11 +30,8 @@ if TYPE_CHECKING:
     from .loop import Loop
     from .sizing import Sizing
 
-FORMAT, VERSION = "clvoro-checkpoint", 1
-_MESH = (
-    "points", "labels", "velocity", "signatures", "ever", "changed", "h", "potential", "lloyd",
-    "correction", "lloyd_speed", "correction_speed",
-)  # fmt: skip
+FORMAT, VERSION = "clvoro-checkpoint", 2
+_MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
 _PER_FACE = ("neighbours", "face_measures", "face_centroids")
 _DIAGRAM = (
     "starts", "neighbours", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
@@ -115,6 +112,7 @@ class Checkpointer:
         arrays: dict[str, np.ndarray] = {
             f"mesh.{name}": getattr(mesh, name).get() for name in _MESH
         }
+        arrays["summaries"] = mesh.summaries.values.get()
         starts = t.starts.get()
         m = int(starts[-1])
         for name in _DIAGRAM:
@@ -193,12 +191,13 @@ class Saved:
         n, m = len(a["mesh.points"]), len(a["diagram.neighbours"])
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
             **{f"mesh.{name}": ((n,), real) for name in _MESH},
-            **{f"mesh.{name}": ((n, d), real) for name in ("points", "velocity", "lloyd", "correction")},
+            **{f"mesh.{name}": ((n, d), real) for name in ("points", "velocity")},
             "mesh.labels": ((n,), np.int32), "mesh.signatures": ((n,), np.uint64),
             "diagram.starts": ((n + 1,), np.int32), "diagram.neighbours": ((m,), np.int32),
             "diagram.face_measures": ((m,), real), "diagram.face_centroids": ((m, d), real),
             "diagram.volumes": ((n,), real), "diagram.offsets": ((n, d), real),
             "diagram.covariances": ((n, d * (d + 1) // 2), real),
+            "summaries": ((len(SUMMARIES), 4), real),
             "history": ((len(a["history"]),), HISTORY_DTYPE),
         }  # fmt: skip
         for name, (shape, dtype) in shapes.items():
@@ -289,6 +288,7 @@ class Saved:
         if mesh.tessellator.torus is not None:
             mesh.tessellator.torus.margin = self.margin
         mesh._evaluate_metric()
+        mesh.summaries.values.set(a["summaries"])
         levels = {
             k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")
         }

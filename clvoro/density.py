@@ -13,8 +13,8 @@ from .cells import Tessellation
 
 
 @dataclass(frozen=True)
-class Weighting:
-    """What the size field asks of each cell, on the device.
+class Excess:
+    """How much each cell is too large or too small for the size field, on the device.
 
     Attributes
     ----------
@@ -24,51 +24,76 @@ class Weighting:
         V rho: how many generators the cell should hold.
     excess : (n,) real
         log(V rho) = d log(L / h): the cell is too large by this share of its volume.
+    """
+
+    density: cla.Array
+    weight: cla.Array
+    excess: cla.Array
+
+
+@dataclass(frozen=True)
+class Weighting(Excess):
+    """That, and what the size field asks of each generator, on the device.
+
+    Attributes
+    ----------
     gradient : (n, d) real
         grad log h, fitted to the neighbours' h.
     lloyd : (n, d) real
         Displacement to the centroid weighted by h^-(d + 2).
     """
 
-    density: cla.Array
-    weight: cla.Array
-    excess: cla.Array
     gradient: cla.Array
     lloyd: cla.Array
 
 
 class Density:
-    """The kernels of `density.cl`. Buffers are reused: a `Weighting` lives until the next call."""
+    """The kernels of `density.cl`. What they return is of the workspace."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("density")
         self._sums = Summaries(engine, ("weighed", "weight"))
-        self._n = -1
 
-    def evaluate(self, t: Tessellation, h: cla.Array) -> Weighting:
-        """Return the weighting of `t` for sizes `h` (n,)."""
-        engine, k, n, d = self.engine, self._kernels, t.n, self.engine.dim
-        if n != self._n:
-            self._n = n
-            self._log_h, self._weighed = engine.empty(n), engine.empty(n)
-            self._weighting = Weighting(
-                *(engine.empty(n) for _ in range(3)), *(engine.empty((n, d)) for _ in range(2))
-            )
-        w = self._weighting
-        engine.run(
-            k.evaluate_density, -(-n // 4), np.int32(n), t.volumes, h, w.density, w.weight,
-            w.excess, self._log_h,
-        )  # fmt: skip
-        engine.run_each(
-            k.fit_gradient, n, t.starts, t.neighbours, t.points, self._log_h, w.gradient
-        )
-        engine.run_each(k.weight_offsets, n, t.offsets, t.covariances, w.gradient, w.lloyd)
+    def weigh(self, t: Tessellation, h: cla.Array) -> Excess:
+        """Return the excess of the cells of `t` over sizes `h` (n,)."""
+        w = Excess(*(self.engine.scratch(t.n) for _ in range(3)))
+        with self.engine.workspace.frame():
+            self._weigh(t, h, w)
         return w
 
-    def remove_mean(self, w: Weighting) -> None:
+    def _weigh(self, t: Tessellation, h: cla.Array, w: Excess) -> cla.Array:
+        """Write the excess; return log h (n,)."""
+        log_h = self.engine.scratch(t.n)
+        self.engine.run(
+            self._kernels.evaluate_density, -(-t.n // 4), np.int32(t.n), t.volumes, h, w.density,
+            w.weight, w.excess, log_h,
+        )  # fmt: skip
+        return log_h
+
+    def evaluate(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        lloyd: cla.Array | None = None,
+        gradient: cla.Array | None = None,
+    ) -> Weighting:
+        """Return the weighting of `t` for sizes `h` (n,), with `lloyd` and `gradient` (n, d) in given arrays if any."""
+        engine, k, shape = self.engine, self._kernels, (t.n, self.engine.dim)
+        lloyd = engine.scratch(shape) if lloyd is None else lloyd
+        gradient = engine.scratch(shape) if gradient is None else gradient
+        w = Weighting(*(engine.scratch(t.n) for _ in range(3)), gradient, lloyd)
+        with engine.workspace.frame():
+            log_h = self._weigh(t, h, w)
+            engine.run_each(k.fit_gradient, t.n, t.starts, t.neighbours, t.points, log_h, gradient)
+            engine.run_each(k.weight_offsets, t.n, t.offsets, t.covariances, gradient, lloyd)
+        return w
+
+    def remove_mean(self, w: Excess) -> None:
         """Take the mean of ``w.excess``, weighted by ``w.weight``, away from it."""
-        n = self._n
-        self.engine.run_each(self._kernels.weigh_excess, n, w.weight, w.excess, self._weighed)
-        self._sums.collect_all({"weighed": self._weighed, "weight": w.weight}, n)
-        self.engine.run_each(self._kernels.remove_mean, n, self._sums.values, w.excess)
+        engine, n = self.engine, len(w.excess)
+        with engine.workspace.frame():
+            weighed = engine.scratch(n)
+            engine.run_each(self._kernels.weigh_excess, n, w.weight, w.excess, weighed)
+            self._sums.collect_all({"weighed": weighed, "weight": w.weight}, n)
+            engine.run_each(self._kernels.remove_mean, n, self._sums.values, w.excess)

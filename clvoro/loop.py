@@ -123,10 +123,11 @@ class Loop:
 
     def step(self, action: Step) -> None:
         """Displace and move all generators, and tessellate anew."""
-        self.solution = action.method.displace(self.mesh)
-        if self.initial is None:
-            self.initial = self.displacements()
-        action.method.move(self.mesh)
+        with self.mesh.engine.workspace.frame():
+            self.solution = action.method.displace(self.mesh)
+            if self.initial is None:
+                self.initial = self.displacements()
+            action.method.move(self.mesh)
         self.mesh.update()
         if self.held is not None:
             self.mesh.match_size()
@@ -190,7 +191,7 @@ class Loop:
         """Go to the next finer level."""
         # The finer level needs another solver, and memory.
         self.mesh.stages.release("poisson")
-        self.mesh.stages.projection.clear()
+        self.mesh.engine.workspace.clear()
         finer = self.mesh.refine()
         self.inserted += finer.n - self.mesh.n
         # Together: an interruption between them would refine once too often.
@@ -244,8 +245,9 @@ class Loop:
         mesh = self.mesh
         final = None
         if self.steps:
-            self.last.displace(mesh)
-            final = self.displacements()
+            with mesh.engine.workspace.frame():
+                self.last.displace(mesh)
+                final = self.displacements()
         labels = np.sort(mesh.labels.get())
         size = mesh.values(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)

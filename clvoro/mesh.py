@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from ._primitives import Gather, Summaries, Summary
 from ._program import Engine
 from .bins import Bins
 from .cells import Cells, Tessellation
-from .density import Density, Weighting
+from .density import Density, Excess, Weighting
 from .domain import Domain
 from .errors import MemoryLimitError
 from .fetch import fetch_diagram
@@ -39,10 +40,7 @@ PEAK = {2: (71, 78), 3: (204, 248)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
 OUTPUT = {2: (34, 26), 3: (13, 950)}
 """The same while the finished diagram is read, corners, loops and all."""
-_DERIVED = (
-    "h", "error", "quality", "energy", "reach", "source", "changed", "potential", "lloyd_speed",
-    "correction_speed", "lloyd", "correction",
-)  # fmt: skip
+_DERIVED = ("h", "error", "quality", "reach", "potential")
 """Arrays of a mesh that follow from its generators."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
@@ -144,18 +142,20 @@ class Mesh:
         In an order of the device's own: along its bins.
     labels : (n,) int32
     tessellation : Tessellation
-    h, error, quality, energy, reach : (n,) real
+    h, error, quality, reach : (n,) real
         `reach` is the lesser of h and L, by which motion is limited.
-    source, potential : (n,) real
-        Right side of the latest Poisson solve, and its solution: the next one's start.
+    potential : (n,) real
+        Solution of the latest Poisson solve: the next one's start.
+    source : (n,) real
+        Its right side; this and what follows is of the workspace, made by `begin_step`.
     lloyd, correction : (n, d) real
         The two halves of the latest step. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
     velocity : (n, d) real
         The latest step as it was made.
     signatures : (n,) uint64
         Of the sets of neighbours; see `Metric.compare_neighbours`.
-    changed, ever : (n,) real
-        1 where the set of neighbours has changed in the latest step, on this level at all; else 0.
+    ever : (n,) real
+        1 where the set of neighbours has changed in a step on this level; else 0.
     """
 
     n: int
@@ -167,10 +167,8 @@ class Mesh:
     h: cla.Array
     error: cla.Array
     quality: cla.Array
-    energy: cla.Array
     reach: cla.Array
     source: cla.Array
-    changed: cla.Array
     potential: cla.Array
     lloyd: cla.Array
     correction: cla.Array
@@ -235,11 +233,21 @@ class Mesh:
 
     def _make_room(self) -> None:
         """Make the arrays that there are not, of what follows from the generators."""
-        n, shape = self.n, self.points.shape
         for name in _DERIVED:
             if getattr(self, name) is None:
-                flat = name not in ("lloyd", "correction")
-                setattr(self, name, self.engine.zeros(n if flat else shape))
+                setattr(self, name, self.engine.zeros(self.n))
+
+    def begin_step(self) -> None:
+        """Take room for what generators are displaced by, to the end of the workspace's frame."""
+        engine, n, shape = self.engine, self.n, self.points.shape
+        self.lloyd, self.correction = engine.scratch(shape), engine.scratch(shape)
+        self.lloyd_speed, self.correction_speed = engine.scratch(n), engine.scratch(n)
+        self.source = engine.scratch(n)
+
+    def note_speeds(self) -> None:
+        """Summarise how far generators are displaced."""
+        speeds = {"lloyd": self.lloyd_speed, "correction": self.correction_speed}
+        self.summaries.collect_all(speeds, self.n)
 
     @property
     def t(self) -> Tessellation:
@@ -263,50 +271,60 @@ class Mesh:
         self.sizing.evaluate(self.points, self.n, self.h)
         if self.coarsening != 1:
             stages.metric.scale_sizes(self.coarsening, self.h)
-        self._evaluate_metric()
-        stages.metric.compare_neighbours(
-            self.t, self.labels, first, self.signatures, self.changed, self.ever
-        )
+        with self.engine.workspace.frame():
+            changed = self.engine.scratch(self.n)
+            stages.metric.compare_neighbours(
+                self.t, self.labels, first, self.signatures, changed, self.ever
+            )
+            self._evaluate_metric({"changed": changed, "ever": self.ever})
         # Before anything is done with a bad size: the solver, say, would complain of something else.
         self.sizing.check(self.points, self.h, self.coarsening)
 
-    def _evaluate_metric(self) -> None:
+    def _evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
+        """Evaluate error and quality, and summarise them, and `others` by name."""
         if self.fixed:
             self.stages.metric.hold_sizes(self.labels, self.fixed, self.t.volumes, self.h)
-        self.stages.metric.evaluate(
-            self.t, self.h, self.error, self.quality, self.energy, self.reach
-        )
+        with self.engine.workspace.frame():
+            energy = self.engine.scratch(self.n)
+            self.stages.metric.evaluate(
+                self.t, self.h, self.error, self.quality, energy, self.reach
+            )
+            own = {"error": self.error, "quality": self.quality, "energy": energy}
+            self.summaries.collect_all({**own, **(others or {})}, self.n)
 
     def hold(self, displacement: cla.Array) -> None:
         """Set `displacement` (n, d) to zero for the generators that stay where they are."""
         if self.fixed:
             self.stages.motion.hold_generators(self.labels, self.fixed, displacement)
 
-    def weigh(self) -> Weighting:
-        """Evaluate density, excess and weighted centroids of the present cells; valid until the next call."""
-        return self.stages.density.evaluate(self.t, self.h)
+    def weigh(self, gradient: cla.Array | None = None) -> Weighting:
+        """Evaluate density, excess and, as `lloyd`, weighted centroids of the present cells: see `Density.evaluate`."""
+        return self.stages.density.evaluate(self.t, self.h, self.lloyd, gradient)
 
-    def _excess(self, w: Weighting) -> Summary:
+    def _excess(self, w: Excess) -> Summary:
         """Summarise the excess, log(V / h^d)."""
         self.summaries.collect("excess", w.excess, self.n)
         return self.summaries.read_one("excess")
 
-    def mean_log_error(self, w: Weighting) -> float:
+    def mean_log_error(self, w: Excess) -> float:
         """Mean of |log(L / h)|, by a weighting that has just been made."""
         return self._excess(w).magnitude / self.n / self.engine.dim
 
-    def missing(self, w: Weighting | None = None) -> float:
+    def missing(self, w: Excess | None = None) -> float:
         """Return how many generators the size field asks for beside those that there are (negative: too many).
 
         The sum of V rho, not that of log(V rho), which would be biased by how much the cells' sizes scatter.
         """
-        w = self.weigh() if w is None else w
-        self.summaries.collect("weight", w.weight, self.n)
+        with self.engine.workspace.frame():
+            w = self.stages.density.weigh(self.t, self.h) if w is None else w
+            self.summaries.collect("weight", w.weight, self.n)
         return self.summaries.read_one("weight").sum - self.n
 
     def match_size(self) -> None:
         """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""
-        factor = math.exp(self._excess(self.weigh()).sum / self.n / self.engine.dim)
+        with self.engine.workspace.frame():
+            w = self.stages.density.weigh(self.t, self.h)
+            factor = math.exp(self._excess(w).sum / self.n / self.engine.dim)
         self.coarsening *= factor
         metric = self.stages.metric
         metric.scale_sizes(factor, self.h)
@@ -323,17 +341,18 @@ class Mesh:
 
         The count goes to `n_cells` or, with None, to what the size field asks for.
         """
-        w = self.weigh()
-        total = self.missing(w) if n_cells is None else float(n_cells - self.n)
-        # The largest of what is not needed meanwhile.
-        self.stages.projection.clear()
+        # This takes more than a step does.
         self.engine.workspace.clear()
-        rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
-        new = self.stages.population.reorganise(
-            self.free, self.t, self.h, self.reach, w.excess, rows, total, self.next_label, nuclei,
-            climb, theta, self.fixed,
-        )  # fmt: skip
-        del rows
+        with self.engine.workspace.frame():
+            w = self.stages.density.weigh(self.t, self.h)
+            total = self.missing(w) if n_cells is None else float(n_cells - self.n)
+            rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
+            new = self.stages.population.reorganise(
+                self.free, self.t, self.h, self.reach, w.excess, rows, total, self.next_label,
+                nuclei, climb, theta, self.fixed,
+            )  # fmt: skip
+        del rows, w
+        self.engine.workspace.clear()
         if new is None:
             return 0, 0
         self.next_label += new.inserted
@@ -342,20 +361,14 @@ class Mesh:
             name: getattr(new, name)
             for name in ("points", "labels", "velocity", "signatures", "ever")
         }
-        del new, w
+        del new
         self.stages.population.clear()
         self.adopt(rows)
         return inserted, deleted
 
     def assess(self) -> dict[str, Summary]:
-        """Summarise the mesh: the scalars that the host sees of a step."""
-        s, n = self.summaries, self.n
-        arrays = {
-            "error": self.error, "quality": self.quality, "energy": self.energy, "lloyd": self.lloyd_speed,
-            "correction": self.correction_speed, "changed": self.changed, "ever": self.ever,
-        }  # fmt: skip
-        s.collect_all(arrays, n)
-        return s.read()
+        """Fetch the summaries of the mesh and of the latest step: the scalars that the host sees of it."""
+        return self.summaries.read()
 
     def refined_count(self) -> int:
         """Return how many generators `refine` would make."""

@@ -23,7 +23,10 @@ class Method(Protocol):
     """A way to move generators."""
 
     def displace(self, mesh: Mesh) -> Solution | None:
-        """Compute `mesh.lloyd` and `mesh.correction` (and their lengths over h) where the mesh is now."""
+        """Compute `mesh.lloyd` and `mesh.correction` (and their lengths over h) where the mesh is now.
+
+        They are valid to the end of the workspace's frame.
+        """
         ...
 
     def move(self, mesh: Mesh) -> None:
@@ -62,6 +65,7 @@ class PublishedMethod:
         """Evaluate both displacements, also one that the method does not use: reports show both."""
         stages, t, r = mesh.stages, mesh.t, self.relaxation
         motion, poisson = stages.motion, stages.poisson
+        mesh.begin_step()
         mesh.lloyd = t.offsets
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         laplacian = poisson.assemble(t.starts, t.neighbours, t.face_measures, mesh.points)
@@ -77,6 +81,7 @@ class PublishedMethod:
         motion.relax_globally(
             mesh.summaries, "correction", alpha, r.k, mesh.correction, mesh.correction_speed
         )
+        mesh.note_speeds()
         return solution
 
     def move(self, mesh: Mesh) -> None:
@@ -106,8 +111,9 @@ class WeightedMethod:
         """Evaluate the weighted Lloyd displacement and the correction."""
         stages, t = mesh.stages, mesh.t
         motion, poisson = stages.motion, stages.poisson
-        w = mesh.weigh()
-        mesh.lloyd = w.lloyd
+        mesh.begin_step()
+        # Nobody asks for the gradient afterwards.
+        w = mesh.weigh(gradient=mesh.correction)
         mesh.hold(mesh.lloyd)
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         laplacian = poisson.assemble(
@@ -122,6 +128,7 @@ class WeightedMethod:
         )  # fmt: skip
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         mesh.hold(mesh.correction)
+        mesh.note_speeds()
         return solution
 
     def move(self, mesh: Mesh) -> None:
@@ -185,6 +192,7 @@ class ProjectedMethod:
     def displace(self, mesh: Mesh) -> Solution:
         """Evaluate the descent, with momentum, and its projection."""
         stages, t = mesh.stages, mesh.t
+        mesh.begin_step()
         w = mesh.weigh()
         if self.aim and self.steps > 2:
             off = mesh.mean_log_error(w)
@@ -193,7 +201,6 @@ class ProjectedMethod:
         self.steps += 1
         if self.sampled_gradient:
             mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, mesh.source, w.gradient)
-        mesh.lloyd = w.lloyd
         if self.descent == "shape":
             stages.shape.descend(
                 t, mesh.reach, mesh.quality, mesh.lloyd, emphasis=self.emphasis, rate=self.rate
@@ -210,6 +217,7 @@ class ProjectedMethod:
             fixed=mesh.fixed,
         )  # fmt: skip
         stages.motion.measure_displacement(mesh.correction, mesh.h, mesh.correction_speed)
+        mesh.note_speeds()
         return solution
 
     def move(self, mesh: Mesh) -> None:

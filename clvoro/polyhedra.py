@@ -24,7 +24,7 @@ FACES_PER_CELL = 16.5
 class Polyhedra:
     """Tessellate a box in 3D.
 
-    Buffers are reused: of a `Tessellation` the next call leaves only the graph as it is, the one after that nothing.
+    Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -33,8 +33,7 @@ class Polyhedra:
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
         self._report = engine.empty(3, np.int32)
-        self._capacity = self._room = 0
-        self._turn = 0
+        self._capacity = self._room = self._n = 0
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
@@ -47,12 +46,8 @@ class Polyhedra:
         if n <= self._capacity:
             return
         engine = self.engine
-        self._row_places, self._row_counts = (engine.empty(n, np.int32) for _ in range(2))
-        # Two graphs in turn: the previous one stays valid, for a warm start. Measures are those of the present.
-        self._graphs: list[dict[str, cla.Array]] = [
-            {"starts": engine.empty(n + 1, np.int32)} for _ in range(2)
-        ]
         self._of_cells = {
+            "starts": engine.empty(n + 1, np.int32),
             "volumes": engine.empty(n),
             "offsets": engine.empty((n, 3)),
             "covariances": engine.empty((n, 6)),
@@ -60,31 +55,27 @@ class Polyhedra:
         self._of_faces: dict[str, cla.Array] = {}
         self._capacity = n
 
-    def _reserve_faces(self, m: int) -> None:
-        """Make room for `m` faces of a diagram at work, in no order yet."""
-        if m <= self._room:
-            return
+    def _take_faces(self, m: int) -> tuple[cla.Array, ...]:
+        """Return labels, measures and centroids of `m` faces of a diagram at work, in no order yet."""
         if m >= 2**31 // 3:
             raise MemoryLimitError(
                 f"the cells have {m:.3g} faces, expected fewer than {2**31 // 3:.3g}, which 32-bit "
                 "indices can tell apart; use fewer cells, or perturb generators that lie on a "
                 "common sphere"
             )
-        engine = self.engine
-        self._labels, self._measures = engine.empty(m, np.int32), engine.empty(m)
-        self._centroids, self._kept = engine.empty((m, 3)), engine.empty(m, np.uint8)
-        self._room = m
+        engine, self._room = self.engine, m
+        return engine.scratch(m, np.int32), engine.scratch(m), engine.scratch((m, 3))
 
-    def _set(self, n: int, m: int) -> dict[str, cla.Array]:
-        """Return the graph whose turn it is and the measures, cut to `n` cells, with room for `m` faces."""
-        engine, graph, faces = self.engine, self._graphs[self._turn], self._of_faces
-        if "neighbours" not in graph or len(graph["neighbours"]) < m:
-            graph["neighbours"] = engine.empty(m, np.int32)
-        if not faces or len(faces["face_measures"]) < m:
+    def _faces(self, m: int) -> dict[str, cla.Array]:
+        """Return room for the `m` faces of a diagram."""
+        engine, faces = self.engine, self._of_faces
+        if not faces or len(faces["neighbours"]) < m:
+            faces.clear()
+            m += m // 32  # their number changes a little from step to step
+            faces["neighbours"] = engine.empty(m, np.int32)
             faces["face_measures"] = engine.empty(m)
             faces["face_centroids"] = engine.empty((m, 3))
-        cells = {name: a[:n] for name, a in self._of_cells.items()}
-        return {**graph, **faces, **cells, "starts": graph["starts"][: n + 1]}
+        return faces
 
     def tessellate(
         self,
@@ -117,19 +108,35 @@ class Polyhedra:
         ClvoroError
             If a cell has more than `MOST_FACES` faces.
         """
-        engine, k = self.engine, self._kernels(FACE_CAPACITY)
         rows = n if rows is None else rows
         self._reserve_cells(rows)
-        self._reserve_faces(
-            max(self._room, round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64)
+        with self.engine.workspace.frame():
+            return self._tessellate(box, points, n, binned, previous, exact, rows)
+
+    def _tessellate(
+        self,
+        box: Box,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | None,
+        exact: bool,
+        rows: int,
+    ) -> Tessellation:
+        engine, k = self.engine, self._kernels(FACE_CAPACITY)
+        most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
+        labels, measures, centroids = self._take_faces(
+            most if rows != self._n else max(most, self._room)
         )
+        self._n = rows
+        row_places, row_counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
         lower, upper = box.device_corners(engine.real)
-        arrays = self._set(rows, self._room)
+        cells = {name: a[:rows] for name, a in self._of_cells.items() if name != "starts"}
         warm = previous is not None and previous.n == rows
         old = (
             (previous.starts, previous.neighbours)
             if previous is not None and warm
-            else (self._row_counts, self._row_counts)
+            else (row_counts, row_counts)
         )
         capacity, again = FACE_CAPACITY, False
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
@@ -138,9 +145,9 @@ class Polyhedra:
             engine.run_each(
                 self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items, binned.reach,
                 binned.bins, binned.grid_frames, binned.grid_shapes, points, lower, upper,
-                np.int32(warm), *old, np.int32(again), np.int32(self._room), share, self._row_places,
-                self._row_counts, self._labels, self._measures, self._centroids,
-                arrays["volumes"], arrays["offsets"], arrays["covariances"], self._report,
+                np.int32(warm), *old, np.int32(again), np.int32(self._room), share, row_places,
+                row_counts, labels, measures, centroids, cells["volumes"], cells["offsets"],
+                cells["covariances"], self._report,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
@@ -149,7 +156,7 @@ class Polyhedra:
                 self._refuse(flags, generator)
             if m > self._room:
                 # All anew: what did not fit was not kept.
-                self._reserve_faces(m + m // 32 + 64)
+                labels, measures, centroids = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
             elif flags & FULL:
@@ -164,23 +171,25 @@ class Polyhedra:
                 self._report.set(np.array([flags & (DOUBT | NARROW), 2**31 - 1, m], np.int32))
             else:
                 break
-        arrays = self._set(rows, m)
+        # The previous graph stays until all is done.
+        starts, neighbours = engine.scratch(rows + 1, np.int32), engine.scratch(m, np.int32)
+        kept = engine.scratch(m, np.uint8)
         engine.run_each(
-            k.match_faces, rows, self._row_places, self._row_counts, self._labels, self._measures,
-            arrays["volumes"], points, share, np.int32(flags & DOUBT), self._kept, arrays["starts"], self._report,
+            k.match_faces, rows, row_places, row_counts, labels, measures, cells["volumes"], points,
+            share, np.int32(flags & DOUBT), kept, starts, self._report,
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
         if flags & ~(DOUBT | NARROW):
             self._refuse(flags, generator)
-        self._scan.exclusive(arrays["starts"], arrays["starts"], rows)
+        self._scan.exclusive(starts, starts, rows)
+        faces, cells["starts"] = self._faces(m), self._of_cells["starts"][: rows + 1]
         engine.run_each(
-            k.place_faces, rows, self._row_places, self._row_counts, self._labels, self._measures,
-            self._centroids, self._kept, np.int32(flags & DOUBT), arrays["starts"],
-            arrays["neighbours"], arrays["face_measures"], arrays["face_centroids"],
+            k.place_faces, rows, row_places, row_counts, labels, measures, centroids, kept,
+            np.int32(flags & DOUBT), starts, neighbours, faces["face_measures"],
+            faces["face_centroids"],
         )  # fmt: skip
-        # Only now: a call that was broken off leaves the previous diagram as it is.
-        self._turn = 1 - self._turn
-        return Tessellation(n=rows, points=points, **arrays, narrow=bool(flags & NARROW))
+        engine.run_each(k.put_graph, rows, starts, neighbours, cells["starts"], faces["neighbours"])
+        return Tessellation(n=rows, points=points, **cells, **faces, narrow=bool(flags & NARROW))
 
     def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"

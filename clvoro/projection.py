@@ -38,14 +38,7 @@ class Projection:
         self._partial = engine.empty(_ROWS * engine.groups)
         self._record = engine.empty(4 * 64)
         self._kernels: dict[np.dtype, SimpleNamespace] = {}
-        self._vectors: dict[np.dtype, SimpleNamespace] = {}
-        self._m = -1
         self._ahead = 8
-
-    def clear(self) -> None:
-        """Let go of all buffers that grow with the mesh."""
-        self._vectors.clear()
-        self._m, self._rows, self._columns = -1, None, None
 
     def _kernels_in(self, store: np.dtype) -> SimpleNamespace:
         if store not in self._kernels:
@@ -54,21 +47,15 @@ class Projection:
         return self._kernels[store]
 
     def _reserve(self, n: int, m: int, store: np.dtype, most: int) -> SimpleNamespace:
-        """Return the iteration's vectors for `n` cells; make room for `m` faces and `most` iterations."""
+        """Return the iteration's arrays for `n` cells and `m` faces; make room for `most` iterations."""
         engine, d = self.engine, self.engine.dim
-        if m > self._m:
-            self._m = m
-            self._rows = engine.empty((m, d), np.float32)
-            self._columns = engine.empty((m, d), np.float32)
         if 4 * (most + 1) > len(self._record):
             self._record = engine.empty(4 * (most + 1))
-        v = self._vectors.get(store)
-        if v is None or len(v.r) < n:
-            v = self._vectors[store] = SimpleNamespace(
-                **{name: engine.empty((n, d), store) for name in ("own", "s", "u")},
-                **{name: engine.empty(n, store) for name in ("eps", "inverse", "r", "z", "p")},
-            )
-        return v
+        return SimpleNamespace(
+            **{name: engine.scratch((m, d), np.float32) for name in ("rows", "columns")},
+            **{name: engine.scratch((n, d), store) for name in ("own", "s", "u")},
+            **{name: engine.scratch(n, store) for name in ("eps", "inverse", "r", "z", "p")},
+        )
 
     def project(
         self,
@@ -117,6 +104,29 @@ class Projection:
         SolverError
             If a number is not finite.
         """
+        with self.engine.workspace.frame():
+            return self._project(
+                t, h, gradient, excess, displacement, correction, quality, eps, lenience, bound,
+                max_iterations, tolerance, labels, fixed,
+            )  # fmt: skip
+
+    def _project(
+        self,
+        t: Tessellation,
+        h: cla.Array,
+        gradient: cla.Array,
+        excess: cla.Array,
+        displacement: cla.Array,
+        correction: cla.Array,
+        quality: cla.Array,
+        eps: float,
+        lenience: float,
+        bound: float,
+        max_iterations: int,
+        tolerance: float,
+        labels: cla.Array | None,
+        fixed: int,
+    ) -> Solution:
         engine, n = self.engine, t.n
         real = engine.real.type
         store = np.dtype(np.float32) if tolerance >= SINGLE else engine.real
@@ -126,15 +136,15 @@ class Projection:
         engine.run_blocks(
             k.assemble, np.int32(n), *faces, t.face_measures, t.face_centroids, t.volumes,
             t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
-            real(bound), self._rows, self._columns, v.own, v.eps, v.inverse, v.r, v.z, v.p, v.s,
+            real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, v.p, v.s,
             v.u, partial, t.starts if labels is None else labels, np.int32(fixed),
         )  # fmt: skip
         descend = Launch(
             engine, k.descend, np.int32(0), np.int32(n), np.int32(max_iterations),
-            real(tolerance), *faces, self._columns, v.own, v.eps, v.z, v.p, v.s, partial, record,
+            real(tolerance), *faces, v.columns, v.own, v.eps, v.z, v.p, v.s, partial, record,
         )  # fmt: skip
         update = Launch(
-            engine, k.update, np.int32(0), np.int32(n), *faces, self._rows, v.own, v.eps,
+            engine, k.update, np.int32(0), np.int32(n), *faces, v.rows, v.own, v.eps,
             v.inverse, v.p, v.s, v.u, v.r, v.z, partial, record,
         )  # fmt: skip
         solution = self._iterate(descend, update, tolerance, max_iterations)

@@ -15,7 +15,6 @@ class Shape:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("shape")
-        self._n = -1
 
     def descend(
         self,
@@ -39,15 +38,13 @@ class Shape:
             Bound of the displacement over h.
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
-        if t.n != self._n:
-            self._n = t.n
-            self._tension, self._pressure = engine.empty(t.n), engine.empty(t.n)
-        engine.run(
-            k.load_cells, -(-t.n // 4), np.int32(t.n), t.starts, t.face_measures, t.volumes,
-            quality, real(emphasis), self._tension, self._pressure,
-        )  # fmt: skip
-        engine.run_each(
-            k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
-            t.points, self._tension, self._pressure, h, real(rate), real(longest), lloyd,
-            *t.outlines,
-        )  # fmt: skip
+        with engine.workspace.frame():
+            tension, pressure = engine.scratch(t.n), engine.scratch(t.n)
+            engine.run(
+                k.load_cells, -(-t.n // 4), np.int32(t.n), t.starts, t.face_measures, t.volumes,
+                quality, real(emphasis), tension, pressure,
+            )  # fmt: skip
+            engine.run_each(
+                k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
+                t.points, tension, pressure, h, real(rate), real(longest), lloyd, *t.outlines,
+            )  # fmt: skip

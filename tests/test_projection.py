@@ -38,17 +38,19 @@ class Assembled:
         given |= {"r": r} if r is not None else {}
         given |= {"displacement": displacement} if displacement is not None else {}
         given["quality"] = options.pop("quality", given["quality"])
+        taken, reserve = [], projection._reserve
+        projection._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
         projection.project(
             t, engine.upload(h), engine.upload(gradient), engine.upload(given["r"]),
             engine.upload(given["displacement"]), engine.empty((n, 2)),
             engine.upload(given["quality"]), max_iterations=0, tolerance=1e-12, **options,
         )  # fmt: skip
-        host, v = patch.fetch(t), projection._vectors[np.dtype(np.float64)]
+        host, (v,) = patch.fetch(t), taken
         self.eps, self.inverse, self.rhs = v.eps.get(), v.inverse.get(), v.r.get()
         inner = host.neighbours >= 0
         i, j = host.owners[inner], host.neighbours[inner]
         m = len(host.neighbours)
-        rows, columns = (a.get()[:m][inner] for a in (projection._rows, projection._columns))
+        rows, columns = (a.get()[:m][inner] for a in (v.rows, v.columns))
         diagonal = v.own.get()
         # In displacements over h, B = J h: B by rows, and its transpose by rows.
         self.B, self.C = np.zeros((n, n, 2)), np.zeros((n, n, 2))
