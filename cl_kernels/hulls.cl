@@ -315,6 +315,7 @@ kernel void wrap_cells(const int size, const int n, const int rows_wanted, globa
     for (int lane = 0; lane < LANES; ++lane)
         list.counts[lane] = 0;
     list.inverted = 0;
+    list.x[0] = list.y[0] = 0; /* hulls begin there where all lists are empty */
     /* Of the generators nearer than `done` all are in the list that can be neighbours; now those nearer than `r` are added. */
     double8 done2 = 0, r = vload8(0, rs), need = 0;
     long8 todo = vload8(0, wanted), doubt = 0, walled = 0;
