@@ -1,5 +1,6 @@
 /* Coarse graphs by matching, for multigrid: cells joined by a heavy weight become one. Rows of a graph are
-   columns[starts[i] .. starts[i + 1]) with weights > 0; an entry with weight 0 or naming its own row counts for nothing.
+   columns[starts[i] .. starts[i + 1]) with weights > 0; an entry with weight 0 or naming its own row counts for nothing, nor does
+   a negative one (a wall).
 
    Everything is decided by each cell or group for itself from the last kernel's result, so there is one outcome. */
 #include "common/real.h"
@@ -61,7 +62,7 @@ kernel void propose(
         REAL most = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (j == i || (mate[j] != NONE) != mated) continue;
+            if (j < 0 || j == i || (mate[j] != NONE) != mated) continue;
             const REAL p = preference(weights[k] * (inverse_sums[i] + inverse_sums[j]), i, j);
             if (p > most) {
                 most = p;
@@ -82,24 +83,27 @@ kernel void marry(int n, global const int *choice, global int *mate)
 }
 
 /* The lower one of two mates stands for their group. Who has found no mate joins that of its heaviest neighbour with one
-   (its choice now), and stands alone if there is none. root[i] = who stands for i's group, is_root[i] = whether i does. */
-kernel void join(int n, global const int *mate, global const int *choice, global int *root, global int *is_root)
+   (its choice now), and stands alone if there is none. is_root[i] = whether i stands for its group. */
+inline int root_of(int i, global const int *mate, global const int *choice)
+{
+    const int to = mate[i] != NONE ? i : choice[i];
+    return to == NONE ? i : min(to, mate[to]);
+}
+
+kernel void join(int n, global const int *mate, global const int *choice, global int *is_root)
 {
     const int i = get_global_id(0);
-    if (i >= n) return;
-    const int to = mate[i] != NONE ? i : choice[i];
-    const int r = to == NONE ? i : min(to, mate[to]);
-    root[i] = r;
-    is_root[i] = r == i;
+    if (i < n) is_root[i] = root_of(i, mate, choice) == i;
 }
 
 /* group[i] = number of i's group, members counted in the order of who stands for them; standing[g] = who stands for g. */
 kernel void number_groups(
-    int n, global const int *root, global const int *numbers, global int *group, global int *standing)
+    int n, global const int *mate, global const int *choice, global const int *numbers, global int *group,
+    global int *standing)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
-    const int r = root[i];
+    const int r = root_of(i, mate, choice);
     group[i] = numbers[r];
     if (r == i) standing[numbers[r]] = i;
 }
@@ -113,87 +117,117 @@ inline int is_first(int i, int k, global const int *starts, global const int *co
 }
 
 /* Members of a group: the two mates, then those who have joined the one, then the other. With `fill` they are listed at
-   members[member_starts[g]], else counted, with the lengths of their rows, which bound the group's. */
+   members[member_starts[g]], else counted. */
 kernel void list_members(
     int groups, int fill, global const int *starts, global const int *columns, global const int *mate,
-    global const int *choice, global const int *standing, global int *member_starts, global int *bounds,
-    global int *members)
+    global const int *choice, global const int *standing, global int *member_starts, global int *members)
 {
     const int g = get_global_id(0);
     if (g >= groups) return;
     const int pair[2] = {standing[g], mate[standing[g]]};
-    int at = fill ? member_starts[g] : 0, bound = 0;
+    int at = fill ? member_starts[g] : 0;
     for (int s = 0; s < 2; ++s) {
         if (pair[s] == NONE) continue;
         if (fill) members[at] = pair[s];
         ++at;
-        bound += starts[pair[s] + 1] - starts[pair[s]];
     }
     for (int s = 0; s < 2; ++s) {
         const int i = pair[s];
         if (i == NONE) continue;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (choice[j] != i || !is_first(i, k, starts, columns)) continue;
+            if (j < 0 || choice[j] != i || !is_first(i, k, starts, columns)) continue;
             if (fill) members[at] = j;
             ++at;
-            bound += starts[j + 1] - starts[j];
         }
     }
-    if (!fill) {
-        member_starts[g] = at;
-        bounds[g] = bound;
-    }
+    if (!fill) member_starts[g] = at;
 }
 
-/* Row of group g: the weights between its members and those of each other group added up. It is built at
-   loose_columns[bounds[g]], where there is room for all entries of its members, and its length left in lengths[g]. */
-kernel void merge_rows(
+/* Whether an entry before row entry `last` of the group's member number `until` leads to group h, too. */
+inline int is_known(
+    int h, int first, int until, int last, global const int *starts, global const int *columns,
+    global const REAL *weights, global const int *group, global const int *members)
+{
+    for (int s = first; s <= until; ++s) {
+        const int end = s == until ? last : starts[members[s] + 1];
+        for (int k = starts[members[s]]; k < end; ++k)
+            if (weights[k] > 0 && group[columns[k]] == h) return 1;
+    }
+    return 0;
+}
+
+/* lengths[g] = how many other groups the members of group g are tied to. The first of them are remembered; beyond, where a
+   cell has very many neighbours, it takes another look at the entries before. */
+#define REMEMBERED 32
+
+kernel void count_rows(
     int groups, global const int *starts, global const int *columns, global const REAL *weights,
-    global const int *group, global const int *member_starts, global const int *members, global const int *bounds,
-    global int *lengths, global int *loose_columns, global REAL *loose_weights)
+    global const int *group, global const int *member_starts, global const int *members, global int *lengths)
 {
     const int g = get_global_id(0);
     if (g >= groups) return;
-    const int begin = bounds[g];
+    int known[REMEMBERED], count = 0;
+    for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
+        const int i = members[s];
+        for (int k = starts[i]; k < starts[i + 1]; ++k) {
+            if (weights[k] <= 0) continue;
+            const int h = group[columns[k]];
+            if (h == g) continue;
+            int at = 0;
+            while (at < min(count, REMEMBERED) && known[at] != h) ++at;
+            if (at < min(count, REMEMBERED)) continue;
+            if (count < REMEMBERED)
+                known[count++] = h;
+            else if (!is_known(h, member_starts[g], s, k, starts, columns, weights, group, members))
+                ++count;
+        }
+    }
+    lengths[g] = count;
+}
+
+/* Row of group g: the weights between its members and those of each other group added up, times a factor. */
+kernel void merge_rows(
+    int groups, REAL factor, global const int *starts, global const int *columns, global const REAL *weights,
+    global const int *group, global const int *member_starts, global const int *members, global const int *row_starts,
+    global int *row_columns, global REAL *row_weights)
+{
+    const int g = get_global_id(0);
+    if (g >= groups) return;
+    const int begin = row_starts[g];
     int end = begin;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
         const int i = members[s];
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
-            const int h = group[columns[k]];
             const REAL w = weights[k];
-            if (h == g || w <= 0) continue;
+            if (w <= 0) continue;
+            const int h = group[columns[k]];
+            if (h == g) continue;
             int at = begin;
-            while (at < end && loose_columns[at] != h) ++at;
+            while (at < end && row_columns[at] != h) ++at;
             if (at == end) {
-                loose_columns[at] = h;
-                loose_weights[at] = w;
+                row_columns[at] = h;
+                row_weights[at] = w;
                 ++end;
             } else
-                loose_weights[at] += w;
+                row_weights[at] += w;
         }
     }
-    lengths[g] = end - begin;
+    for (int at = begin; at < end; ++at) row_weights[at] *= factor;
 }
 
-/* The rows one behind the other, times a factor. Of the two sums of a pair of groups, which differ by rounding, the lower
-   group's is taken, so that the graph is symmetric to the last bit. */
-kernel void pack_rows(
-    int groups, REAL factor, global const int *bounds, global const int *starts, global const int *loose_columns,
-    global const REAL *loose_weights, global int *columns, global REAL *weights)
+/* Of the two sums of a pair of groups, which differ by rounding, the lower group's is taken, so that the graph is symmetric
+   to the last bit: the upper groups' are written only, the lower ones' only read. */
+kernel void share_weights(int groups, global const int *starts, global const int *columns, global REAL *weights)
 {
     const int g = get_global_id(0);
     if (g >= groups) return;
-    const int shift = bounds[g] - starts[g];
     for (int k = starts[g]; k < starts[g + 1]; ++k) {
-        const int h = loose_columns[k + shift];
-        int l = k + shift;
-        if (h < g) {
-            l = bounds[h];
-            while (loose_columns[l] != g) ++l;
-        }
-        columns[k] = h;
-        weights[k] = factor * loose_weights[l];
+        const int h = columns[k];
+        if (h > g) continue;
+        int l = starts[h];
+        while (columns[l] != g) ++l;
+        weights[k] = weights[l];
     }
 }
 

@@ -5,7 +5,8 @@
 
    A work-group owns a block of the vectors and leaves one partial sum per quantity; in the next kernel all groups add the
    same partial sums, so the scalars never leave the device and no kernel of one work-item is needed.
-   Vectors are scaled by a power of two to max |b| ~ 1, lest squares of a small right side underflow.
+   Vectors are scaled by a power of two to max |b| ~ 1, lest squares of a small right side underflow. Those of the iteration are
+   in STORE, which may be single where REAL is double: memory traffic is the cost. Solution, right side and sums are in REAL.
 
    With `centre` the null space is the constants: whatever rounding puts into the mean of r is taken out one iteration later,
    or the residual could not fall below it.
@@ -43,17 +44,17 @@
         if (get_local_id(0) == 0) ROW(q)[get_group_id(0)] = put_; \
     }
 
-/* r = b - w, and what is needed to centre and scale it. */
-kernel void residual(int n, global const REAL *b, global const REAL *w, global REAL *r, global REAL *partial)
+/* What is needed to centre and scale r = b - w (b, where the start is `zero`). */
+kernel void residual(
+    int n, int zero, global const REAL *b, global const STORE *w, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum sum_b = SUM_ZERO, sum_r = SUM_ZERO;
     REAL max_b = 0;
     for (BLOCK_LOOP(i, n)) {
-        const REAL bi = b[i], ri = bi - w[i];
-        r[i] = ri;
+        const REAL bi = b[i];
         sum_add(&sum_b, bi);
-        sum_add(&sum_r, ri);
+        sum_add(&sum_r, zero ? bi : bi - w[i]);
         max_b = fmax(max_b, fabs(bi));
     }
     PUT(SUM_B, sum_b.value);
@@ -62,10 +63,11 @@ kernel void residual(int n, global const REAL *b, global const REAL *w, global R
     if (get_local_id(0) == 0) ROW(MAX_B)[get_group_id(0)] = max_b;
 }
 
-/* r = 2^e (r - mean r) if `centre`, else 2^e r; norms of r and of the right side treated alike; p = 0.
+/* r = 2^e (r - mean r) if `centre`, else 2^e r; norms of r and of the right side treated alike; p = 0, and x where it starts from `zero`.
    state[1] = 2^-e, state[2] = the part of the squared norm of b that was taken away. */
 kernel void begin(
-    int n, int centre, global const REAL *b, global REAL *r, global REAL *p, global REAL *partial, global REAL *state)
+    int n, int zero, int centre, global const REAL *b, global const STORE *w, global REAL *x, global STORE *r, global STORE *p,
+    global REAL *partial, global REAL *state)
 {
     local REAL scratch[GROUP_SIZE];
     const REAL mean_b = centre ? total_sum(ROW(SUM_B), scratch) / n : 0;
@@ -74,11 +76,13 @@ kernel void begin(
     const int exponent = max_b > 0 && max_b <= REAL_MAX ? clamp(-ilogb(max_b), -EXPONENT_LIMIT, EXPONENT_LIMIT) : 0;
     Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
-        const REAL bi = ldexp(b[i] - mean_b, exponent), ri = ldexp(r[i] - mean_r, exponent);
+        const REAL bi = ldexp(b[i] - mean_b, exponent);
+        const STORE ri = ldexp((zero ? b[i] : b[i] - w[i]) - mean_r, exponent);
         r[i] = ri;
         p[i] = 0;
+        if (zero) x[i] = 0;
         sum_add(&norm_b, bi * bi);
-        sum_add(&norm_r, ri * ri);
+        sum_add(&norm_r, (REAL)ri * ri);
         sum_add(&sum_r, ri);
     }
     PUT(NORM_B, norm_b.value);
@@ -110,79 +114,74 @@ kernel void sum_norms(global const REAL *partial, global REAL *state, const int 
 
 /* u = D^-1 r and gamma: Jacobi's method, for the first iteration. */
 kernel void jacobi(
-    int n, global const REAL *inverse_diagonal, global const REAL *r, global REAL *u, global REAL *partial)
+    int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
-        const REAL ui = inverse_diagonal[i] * r[i];
+        const STORE ui = inverse_diagonal[i] * r[i];
         u[i] = ui;
-        sum_add(&gamma, r[i] * ui);
+        sum_add(&gamma, (REAL)r[i] * ui);
     }
     PUT(GAMMA(0), gamma.value);
 }
 
 /* partial row q = (a, b). */
-kernel void dot_product(int n, int q, global const REAL *a, global const REAL *b, global REAL *partial)
+kernel void dot_product(int n, int q, global const STORE *a, global const STORE *b, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) sum_add(&sum, a[i] * b[i]);
+    for (BLOCK_LOOP(i, n)) sum_add(&sum, (REAL)a[i] * b[i]);
     PUT(q, sum.value);
 }
 
 /* p = u + beta p. From the iteration on that finds the residual at its target (or anything out of order, NaN included)
    record[k].running is 0 and nothing changes any more, so that the host may run ahead without changing the result. */
 kernel void direction(
-    int k, int n, REAL tolerance, global const REAL *u, global REAL *p, global const REAL *partial, global REAL *state,
+    int k, int n, REAL tolerance, global const STORE *u, global STORE *p, global const REAL *partial, global REAL *state,
     global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     const int first = get_global_id(0) == 0;
     global REAL *now = record + 4 * k;
     global const REAL *last = now - 4;
-    if (k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0)) {
-        if (first) now[RECORD_RUNNING] = 0;
-        return;
-    }
+    const int over = k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0);
     const REAL norm = total_sum(ROW(NORM_R(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
-    REAL target = state[0], beta = 0;
-    if (k > 0)
-        beta = gamma / last[RECORD_GAMMA];
-    else
-        target = tolerance * tolerance * total_sum(ROW(NORM_B), scratch);
-    const int running = norm > target && norm <= REAL_MAX && gamma > 0;
-    if (first) {
+    const REAL norm_b = total_sum(ROW(NORM_B), scratch);
+    const REAL target = k > 0 ? state[0] : tolerance * tolerance * norm_b;
+    const int running = !over && norm > target && norm <= REAL_MAX && gamma > 0;
+    if (first) now[RECORD_RUNNING] = running;
+    if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
-        now[RECORD_RUNNING] = running;
         if (k == 0) state[3] = target;
     }
     if (!running) return;
+    const REAL beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
     for (BLOCK_LOOP(i, n)) p[i] = u[i] + beta * p[i];
 }
 
 /* x += alpha p, r -= alpha q. */
 kernel void update(
-    int k, int n, int centre, global const REAL *p, global const REAL *q, global REAL *x, global REAL *r, global REAL *partial,
-    global REAL *state, global REAL *record)
+    int k, int n, int centre, global const STORE *p, global const STORE *q, global REAL *x, global STORE *r,
+    global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
-    if (now[RECORD_RUNNING] == 0) return;
+    const int running = now[RECORD_RUNNING] != 0;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
-    if (get_global_id(0) == 0) {
+    if (running && get_global_id(0) == 0) {
         now[RECORD_CURVATURE] = curvature;
         if (k == 0) state[0] = state[3];
     }
-    if (!(curvature > 0)) return;
+    const int end = running && curvature > 0 ? n : 0;
     const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
     Sum norm = SUM_ZERO, sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
-        const REAL ri = r[i] - mean - alpha * q[i];
+    for (BLOCK_LOOP(i, end)) {
+        const STORE ri = r[i] - mean - alpha * q[i];
         x[i] += alpha_x * p[i];
         r[i] = ri;
-        sum_add(&norm, ri * ri);
+        sum_add(&norm, (REAL)ri * ri);
         sum_add(&sum, ri);
     }
     PUT(NORM_R(k + 1), norm.value);
@@ -191,28 +190,28 @@ kernel void update(
 
 /* The same with u = D^-1 r and gamma for the next iteration. */
 kernel void update_jacobi(
-    int k, int n, int centre, global const REAL *inverse_diagonal, global const REAL *p, global const REAL *q,
-    global REAL *x, global REAL *r, global REAL *u, global REAL *partial, global REAL *state, global REAL *record)
+    int k, int n, int centre, global const STORE *inverse_diagonal, global const STORE *p, global const STORE *q,
+    global REAL *x, global STORE *r, global STORE *u, global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
-    if (now[RECORD_RUNNING] == 0) return;
+    const int running = now[RECORD_RUNNING] != 0;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
-    if (get_global_id(0) == 0) {
+    if (running && get_global_id(0) == 0) {
         now[RECORD_CURVATURE] = curvature;
         if (k == 0) state[0] = state[3];
     }
-    if (!(curvature > 0)) return;
+    const int end = running && curvature > 0 ? n : 0;
     const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
     Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) {
-        const REAL ri = r[i] - mean - alpha * q[i], ui = inverse_diagonal[i] * ri;
+    for (BLOCK_LOOP(i, end)) {
+        const STORE ri = r[i] - mean - alpha * q[i], ui = inverse_diagonal[i] * ri;
         x[i] += alpha_x * p[i];
         r[i] = ri;
         u[i] = ui;
-        sum_add(&norm, ri * ri);
+        sum_add(&norm, (REAL)ri * ri);
         sum_add(&sum, ri);
-        sum_add(&gamma, ri * ui);
+        sum_add(&gamma, (REAL)ri * ui);
     }
     PUT(NORM_R(k + 1), norm.value);
     PUT(SUM_R(k + 1), sum.value);

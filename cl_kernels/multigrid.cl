@@ -1,5 +1,5 @@
-/* One multigrid cycle on graphs of matched cells (coarsening.cl), in a precision of its own (REAL); the residual comes and
-   the correction goes in the caller's (SOURCE). One work-item per cell or group, one work-group for the coarsest level.
+/* One multigrid cycle on graphs of matched cells (coarsening.cl), in a precision of its own (REAL); where that is not the
+   caller's (SOURCE), the residual comes and the correction goes in that. One work-item per cell or group, one work-group for the coarsest level.
 
    Smoothing is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], as two damped pairwise-Jacobi steps. */
 #include "common/real.h"
@@ -91,7 +91,7 @@ kernel void eliminate(
             z[i * n + j] = i == j;
         }
         for (int k = starts[i]; k < starts[i + 1]; ++k)
-            if (columns[k] != i) w[i * n + columns[k]] += weights[k];
+            if (columns[k] >= 0 && columns[k] != i) w[i * n + columns[k]] += weights[k];
     }
     barrier(CLK_GLOBAL_MEM_FENCE);
     for (int p = 0; p < n; ++p) {

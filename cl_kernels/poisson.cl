@@ -2,11 +2,14 @@
 
        (A phi)_i = sum_j w_ij (phi_i - phi_j)        w_ij = rho_ij l_ij / |x_i - x_j|
 
-   One work-item per cell in `assemble`, a block of cells per group elsewhere. */
+   One work-item per cell in `assemble`, a block of cells per group elsewhere. Columns are the diagram's neighbours: walls are
+   negative, and have weight 0. Weights and the vectors of an iteration are in STORE, which may be single. */
 #include "common/domain.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
 #include "common/rows.h"
+
+#define REAL8 CLVORO_JOIN(REAL, 8)
 
 /* The measure that cell j has of its face with cell i, -1 if it has none; eight of its faces at a time on a CPU, as in
    row_difference. */
@@ -19,7 +22,7 @@ inline REAL measured_by(
 #if GROUP_SIZE == 1
     for (; k < end && k <= last; k += 8) {
         const int8 is_i = (vload8(0, neighbours + k) == i) & (k + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < end);
-        const REAL8 m = select((REAL8)(-1), vload8(0, face_measures + k), ROW_MASK(is_i));
+        const REAL8 m = select((REAL8)(-1), vload8(0, face_measures + k), MASK8(REAL)(is_i));
         const REAL4 m4 = fmax(m.lo, m.hi);
         const REAL2 m2 = fmax(m4.lo, m4.hi);
         measure = fmax(measure, fmax(m2.s0, m2.s1));
@@ -30,20 +33,17 @@ inline REAL measured_by(
     return measure;
 }
 
-/* Weights, diagonal and its inverse (0 where there is no neighbour). The two cells of a face have measured it each for
-   itself, with roundings of their own: both take the mean of the two, so that A is symmetric to the last bit. A face that
-   only one of them has seen is shorter than rounding, and gets the weight 0. A wall becomes the cell itself with
-   weight 0. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho is smooth. */
+/* Weights. The two cells of a face have measured it each for itself, with roundings of their own: both take the mean of the two,
+   so that A is symmetric to the last bit. A face that only one of them has seen is shorter than rounding, and gets the
+   weight 0, as do walls. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho is smooth. */
 kernel void assemble(
     int n, int weighted, global const int *starts, global const int *neighbours, global const REAL *face_measures,
-    global const REAL *points, global const REAL *density, global int *columns, global REAL *weights,
-    global REAL *diagonal, global REAL *inverse_diagonal)
+    global const REAL *points, global const REAL *density, global STORE *weights)
 {
     const int i = get_global_id(0);
     if (i >= n) return;
     const REAL root_i = weighted ? sqrt(density[i]) : R(1);
     const int last = starts[n] - 8;
-    REAL sum = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
         REAL weight = 0;
@@ -59,28 +59,47 @@ kernel void assemble(
                 if (weighted) weight *= root_i * sqrt(density[j]);
             }
         }
-        columns[k] = weight == 0 ? i : j;
         weights[k] = weight;
-        sum += weight;
     }
-    diagonal[i] = sum;
-    inverse_diagonal[i] = sum == 0 ? 0 : 1 / sum;
+}
+
+/* The inverse of each row's sum, 0 where there is no neighbour: Jacobi's preconditioner. */
+kernel void invert_diagonal(int n, global const int *starts, global const STORE *weights, global STORE *inverse)
+{
+    const int i = get_global_id(0);
+    if (i >= n) return;
+    REAL sum = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) sum += weights[k];
+    inverse[i] = sum == 0 ? 0 : 1 / sum;
 }
 
 /* y = A x, and row `q` of partial = (x, y). */
 kernel void apply(
-    int n, int q, global const int *starts, global const int *columns, global const REAL *weights, global const REAL *x,
-    global REAL *y, global REAL *partial)
+    int n, int q, global const int *starts, global const int *columns, global const STORE *weights, global const STORE *x,
+    global STORE *y, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum product = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
-        const REAL yi = row_difference(i, n, starts, columns, weights, x);
+        const STORE yi = row_difference(i, n, starts, columns, weights, x);
         y[i] = yi;
-        sum_add(&product, x[i] * yi);
+        sum_add(&product, (REAL)x[i] * yi);
     }
     const REAL put = group_sum(product.value, scratch);
     if (get_local_id(0) == 0) partial[q * get_num_groups(0) + get_group_id(0)] = put;
+}
+
+/* The same without the product, for an x in full precision: the residual of a start. */
+kernel void apply_full(
+    int n, global const int *starts, global const int *columns, global const STORE *weights, global const REAL *x,
+    global STORE *y)
+{
+    for (BLOCK_LOOP(i, n)) {
+        REAL sum = 0;
+        for (int k = starts[i]; k < starts[i + 1]; ++k)
+            if (columns[k] >= 0) sum += weights[k] * (x[i] - x[columns[k]]);
+        y[i] = sum;
+    }
 }
 
 /* The right side V_i (s_i - mean s), mean = sum V s / sum V, whose sum vanishes: partial sums, then the values. */

@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -144,6 +144,13 @@ class Engine:
         object.__setattr__(self, "group_size", 1 if cpu else 128)
         object.__setattr__(self, "item_group", 64)
         object.__setattr__(self, "workspace", Workspace(self.queue))
+
+    def single(self) -> Engine:
+        """Return the same engine in float32, with the same workspace."""
+        engine = replace(self, real=np.dtype(np.float32))
+        for name in ("groups", "group_size", "item_group", "workspace"):
+            object.__setattr__(engine, name, getattr(self, name))
+        return engine
 
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""

@@ -10,7 +10,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Room, Scan
-from ._program import Engine
+from ._program import Engine, Kernels
 
 ROUNDS = 3
 """Rounds of matching; the third still pairs off every fifth cell, a fourth would not pay."""
@@ -25,10 +25,8 @@ def whole_groups(size: int) -> int:
     return max(1, -(-size // GROUP)) * GROUP
 
 
-_WHILE_MADE = (
-    "mate", "choice", "root", "numbers", "standing", "bounds", "loose columns", "loose", "inverse sums",
-)  # fmt: skip
-"""Arrays that are of no use once a level is made, beside those of the graph between its two passes."""
+_IN_RANGE = 60
+"""Weights up to 2^60 and down to 2^-60 are in single precision as they are: so are their inverses."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Graph:
     ----------
     starts : (n + 1,) int32
     columns : (m,) int32
-        An entry that names its own row counts for nothing.
+        An entry that names its own row counts for nothing, nor does one of weight 0; a negative one has weight 0.
     weights : (m,) real
         Symmetric, >= 0.
     """
@@ -99,12 +97,20 @@ class Coarsening:
         Of the multigrid's precision.
     """
 
-    def __init__(self, engine: Engine, source: str) -> None:
+    def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernels = engine.kernels("coarsening", {"SOURCE": source})
+        self._converters: dict[np.dtype, Kernels] = {}
+        self._kernels = self._kernels_from(engine.real)
         self._scan = Scan(engine)
         self._room = Room(engine)
         self.exponent = 0
+
+    def _kernels_from(self, source: np.dtype) -> Kernels:
+        """Kernels that convert from another precision."""
+        if source not in self._converters:
+            name = "double" if source == np.float64 else "float"
+            self._converters[source] = self.engine.kernels("coarsening", {"SOURCE": name})
+        return self._converters[source]
 
     def _run(self, kernel: cl.Kernel, size: int, *args: object) -> None:
         self.engine.run(kernel, whole_groups(size), *args)
@@ -112,20 +118,24 @@ class Coarsening:
     def convert(self, graph: Graph, level: int, *, anew: bool = True) -> Graph:
         """Return `graph` with its weights in this engine's precision, times a power of two.
 
-        The largest becomes 1 at most, so that weights of any unit and their inverses are in range.
-        Without `anew` the power is the last call's.
+        The largest becomes 1 at most, so that weights of any unit and their inverses are in range;
+        where they are so already they stay as they are. Without `anew` the power is the last call's.
         """
-        m = len(graph.weights)
-        size, weights = np.int32(m), self._room(level, "weights", size=m)
+        m, source = len(graph.weights), graph.weights.dtype
+        kernels = self._kernels_from(source)
         if anew:
             items = self.engine.groups * self.engine.group_size
-            partial = self._room("largest", size=items, dtype=graph.weights.dtype)
+            partial = self._room("largest", source, size=items, dtype=source)
             rows = (np.int32(len(graph)), graph.starts)
-            self.engine.run_blocks(self._kernels.largest, *rows, graph.weights, partial)
+            self.engine.run_blocks(kernels.largest, *rows, graph.weights, partial)
             most = float(partial.get().max())
             self.exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
-        exponent = np.int32(self.exponent)
-        self._run(self._kernels.convert, m, size, exponent, graph.weights, weights)
+            if source == self.engine.real and abs(self.exponent) <= _IN_RANGE:
+                self.exponent = 0
+        if source == self.engine.real and self.exponent == 0:
+            return graph
+        weights = self._room(level, "weights", size=m)
+        self._run(kernels.convert, m, np.int32(m), np.int32(self.exponent), graph.weights, weights)
         return Graph(graph.starts, graph.columns, weights)
 
     def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Groups, Graph]:
@@ -135,22 +145,25 @@ class Coarsening:
         lengths (groups / cells)^(1/d): groups are that much farther apart than cells.
         """
         n, dim = len(graph), self.engine.dim
-        inverse, first, middle = self._match(graph, (level, 0), 1.0, pairs=True)
-        _, second, coarse = self._match(
-            middle, (level, 1), lambda groups: (groups / n) ** (1 / dim), pairs=False
-        )
-        return inverse, self._compose(first, second, level), coarse
+        with self.engine.workspace.frame():
+            inverse, first = self._group(graph, level)
+            middle = self._graph_of(graph, first, 1.0)
+            _, second = self._group(middle)
+            ratio = (len(second) / n) ** (1 / dim)
+            coarse = self._graph_of(middle, second, ratio, level)
+            return inverse, self._compose(first, second, level), coarse
 
-    def clear(self, levels: int) -> None:
-        """Let go of what is needed only while `levels` levels are made."""
-        self._room.clear(*_WHILE_MADE, *((level, 0) for level in range(levels)))
+    def clear(self) -> None:
+        """Let go of all buffers."""
+        self._room.clear()
 
     def pairs(self, graph: Graph, level: int) -> PairInverse:
         """Return the smoother's blocks alone, for the coarsest graph."""
-        n, room = len(graph), self._room
-        mate = room("mate", size=n, dtype=np.int32).fill(-1)
-        self._round(graph, self._sums(graph), mate, room("choice", size=n, dtype=np.int32))
-        return self._pair_inverse(graph, mate, level)
+        n, ints = len(graph), np.int32
+        with self.engine.workspace.frame():
+            mate, choice = (self.engine.scratch(n, ints) for _ in range(2))
+            self._round(graph, self._sums(graph), mate.fill(-1), choice)
+            return self._pair_inverse(graph, mate, level)
 
     def renew_pairs(self, graph: Graph, pairs: PairInverse) -> None:
         """Set the blocks of `pairs` for other weights of the same cells; the pairs stay."""
@@ -161,9 +174,9 @@ class Coarsening:
         )  # fmt: skip
 
     def _sums(self, graph: Graph) -> cla.Array:
-        """Inverse sums of the rows' weights."""
+        """Inverse sums of the rows' weights, in the workspace."""
         n = len(graph)
-        sums = self._room("inverse sums", size=n)
+        sums = self.engine.scratch(n)
         self._run(
             self._kernels.inverse_sums, n, np.int32(n), graph.starts, graph.columns, graph.weights,
             sums,
@@ -192,57 +205,54 @@ class Coarsening:
         )  # fmt: skip
         return pairs
 
-    def _match(self, graph: Graph, name: tuple, factor, *, pairs: bool):
-        """One pass: mates, groups, and the graph of the groups with its weights times `factor`."""
-        run, k, n, m = self._run, self._kernels, len(graph), len(graph.columns)
-        size, zero, one = np.int32(n), np.int32(0), np.int32(1)
+    def _group(self, graph: Graph, level: int | None = None) -> tuple[PairInverse | None, Groups]:
+        """One pass: groups of mates and who has joined them, in the workspace; the smoother's blocks of `level`."""
+        run, k, n, scratch = self._run, self._kernels, len(graph), self.engine.scratch
+        size, zero, one, ints = np.int32(n), np.int32(0), np.int32(1), np.int32
+        group, members, starts = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
+        with self.engine.workspace.frame():
+            mate, choice, numbers = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
+            mate.fill(-1)
+            inverse, sums = None, self._sums(graph)
+            for turn in range(ROUNDS):
+                self._round(graph, sums, mate, choice)
+                if turn == 0 and level is not None:
+                    inverse = self._pair_inverse(graph, mate, level)
+            rows = (graph.starts, graph.columns, graph.weights)
+            run(k.propose, n, size, one, *rows, sums, mate, choice)
+            run(k.join, n, size, mate, choice, numbers)
+            self._scan.exclusive(numbers, numbers, n)
+            count = int(numbers[n : n + 1].get()[0])
+            standing, number = scratch(count, ints), np.int32(count)
+            run(k.number_groups, n, size, mate, choice, numbers, group, standing)
+            listing = (graph.starts, graph.columns, mate, choice, standing, starts)
+            run(k.list_members, count, number, zero, *listing, members)
+            self._scan.exclusive(starts, starts, count)
+            run(k.list_members, count, number, one, *listing, members)
+        return inverse, Groups(group, starts[: count + 1], members)
 
-        def ints(*key: object, count: int) -> cla.Array:
-            return self._room(*key, size=count, dtype=np.int32)
+    def _graph_of(
+        self, graph: Graph, groups: Groups, factor: float, level: int | None = None
+    ) -> Graph:
+        """Return the graph of `groups`, weights times `factor`: kept for `level`, else in the workspace."""
+        run, k, count = self._run, self._kernels, len(groups)
 
-        mate, choice = ints("mate", count=n), ints("choice", count=n)
-        mate.fill(-1)
-        inverse, sums = None, self._sums(graph)
-        for turn in range(ROUNDS):
-            self._round(graph, sums, mate, choice)
-            if turn == 0 and pairs:
-                inverse = self._pair_inverse(graph, mate, name[0])
-        rows = (graph.starts, graph.columns, graph.weights)
-        run(k.propose, n, size, one, *rows, sums, mate, choice)
+        def array(name: str, size: int, dtype: object = None) -> cla.Array:
+            if level is None:
+                return self.engine.scratch(size, dtype)
+            return self._room(level, f"coarse {name}", size=size, dtype=dtype)
 
-        root, numbers = ints("root", count=n), ints("numbers", count=n + 1)
-        run(k.join, n, size, mate, choice, root, numbers)
-        self._scan.exclusive(numbers, numbers, n)
-        count = int(numbers[n : n + 1].get()[0])
-        groups = Groups(
-            ints(name, "group", count=n), ints(name, "starts", count=count + 1),
-            ints(name, "members", count=n),
-        )  # fmt: skip
-        standing, bounds = ints("standing", count=count), ints("bounds", count=count + 1)
-        number = np.int32(count)
-        run(k.number_groups, n, size, root, numbers, groups.group, standing)
-        listing = (graph.starts, graph.columns, mate, choice, standing, groups.starts, bounds)
-        run(k.list_members, count, number, zero, *listing, groups.members)
-        self._scan.exclusive(groups.starts, groups.starts, count)
-        self._scan.exclusive(bounds, bounds, count)
-        run(k.list_members, count, number, one, *listing, groups.members)
-
-        loose_columns, loose_weights = ints("loose columns", count=m), self._room("loose", size=m)
-        starts = ints(name, "row starts", count=count + 1)
-        run(
-            k.merge_rows, count, number, *rows, groups.group, groups.starts, groups.members, bounds,
-            starts, loose_columns, loose_weights,
-        )  # fmt: skip
+        lists = (groups.group, groups.starts, groups.members)
+        rows = (graph.starts, graph.columns, graph.weights, *lists)
+        number, starts = np.int32(count), array("starts", count + 1, np.int32)
+        run(k.count_rows, count, number, *rows, starts)
         self._scan.exclusive(starts, starts, count)
         entries = int(starts[count : count + 1].get()[0])
-        columns = ints(name, "columns", count=entries)
-        weights = self._room(name, "row weights", size=entries)
-        scale = self.engine.real.type(factor(count) if callable(factor) else factor)
-        run(
-            k.pack_rows, count, number, scale, bounds, starts, loose_columns, loose_weights,
-            columns, weights,
-        )  # fmt: skip
-        return inverse, groups, Graph(starts, columns, weights)
+        columns, weights = array("columns", entries, np.int32), array("weights", entries)
+        scale = self.engine.real.type(factor)
+        run(k.merge_rows, count, number, scale, *rows, starts, columns, weights)
+        run(k.share_weights, count, number, starts, columns, weights)
+        return Graph(starts, columns, weights)
 
     def _compose(self, inner: Groups, outer: Groups, level: int) -> Groups:
         run, k, room = self._run, self._kernels, self._room

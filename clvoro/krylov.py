@@ -10,10 +10,11 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ._program import Engine
+from ._program import Engine, Kernels
 from .errors import SolverError
 
 Apply = Callable[[cla.Array, cla.Array], object]
+Precondition = Callable[[cla.Array, cla.Array, cla.Array], object]
 
 # Rows of the array of partial sums, and columns of the record: as in cl_kernels/krylov.cl.
 CURVATURE, _GAMMA, _ROWS = 3, 6, 11
@@ -76,12 +77,17 @@ class ConjugateGradient:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernels = engine.kernels("krylov")
+        self._kernels: dict[np.dtype, Kernels] = {}
         self.partial = engine.zeros(_ROWS * engine.groups)
         """Partial sums; a fused operator leaves those of (x, A x) in row `CURVATURE`."""
         self._state = engine.zeros(6)
-        self._capacity = 0
         self._record_capacity = 0
+
+    def _kernels_in(self, store: np.dtype) -> Kernels:
+        if store not in self._kernels:
+            name = "double" if store == np.float64 else "float"
+            self._kernels[store] = self.engine.kernels("krylov", {"STORE": name})
+        return self._kernels[store]
 
     def solve(
         self,
@@ -89,7 +95,7 @@ class ConjugateGradient:
         rhs: cla.Array,
         x: cla.Array,
         *,
-        precondition: cla.Array | Apply,
+        precondition: cla.Array | Precondition,
         tolerance: float,
         max_iterations: int,
         fused: bool = False,
@@ -97,16 +103,19 @@ class ConjugateGradient:
         lookahead: int = 64,
         from_zero: bool = False,
         verify: bool = True,
+        store: np.dtype | None = None,
     ) -> Solution:
         """Solve A x = b from the start `x`, in place.
 
         Parameters
         ----------
         apply : callable (x, y)
-            Enqueues y = A x on the engine's queue. The operator must be symmetric.
+            Enqueues y = A x on the engine's queue; y is in `store`, and so is x but for the start and the solution.
+            The operator must be symmetric.
         rhs, x : (n,) real, device
-        precondition : (n,) real or callable (r, u)
-            The inverse of a diagonal, or what enqueues u = M^-1 r, M symmetric positive definite.
+        precondition : (n,) store or callable (r, u, spare)
+            The inverse of a diagonal, or what enqueues u = M^-1 r, M symmetric positive definite, all in `store`;
+            `spare` is a vector that it may use.
         tolerance : float
             Of the relative residual in the 2-norm.
         max_iterations : int
@@ -121,6 +130,8 @@ class ConjugateGradient:
             Start from zero, whatever `x` holds: saves an application of the operator.
         verify : bool
             Evaluate the true residual at the end; else trust the recurrence's that it is within the tolerance.
+        store : numpy.dtype, optional
+            Of the iteration's vectors: the engine's precision or, where few digits are asked for, float32.
 
         Returns
         -------
@@ -133,10 +144,33 @@ class ConjugateGradient:
         BreakdownError
             If the operator or preconditioner is not positive definite: a SolverError, too.
         """
+        with self.engine.workspace.frame():
+            return self._solve(
+                apply, rhs, x, precondition, tolerance, max_iterations, fused, centre, lookahead,
+                from_zero, verify, self.engine.real if store is None else np.dtype(store),
+            )  # fmt: skip
+
+    def _solve(
+        self,
+        apply: Apply,
+        rhs: cla.Array,
+        x: cla.Array,
+        precondition: cla.Array | Precondition,
+        tolerance: float,
+        max_iterations: int,
+        fused: bool,
+        centre: bool,
+        lookahead: int,
+        from_zero: bool,
+        verify: bool,
+        store: np.dtype,
+    ) -> Solution:
         n = len(rhs)
-        self._reserve(n, max_iterations)
-        kernels, launch = self._kernels, self.engine.run_blocks
-        r, u, p, q = (v[:n] for v in self._vectors)
+        if max_iterations > self._record_capacity:
+            self._record_capacity = max_iterations
+            self._record = self.engine.zeros(4 * max_iterations)
+        kernels, launch = self._kernels_in(store), self.engine.run_blocks
+        r, u, p, q = (self.engine.scratch(n, store) for _ in range(4))
         size, zero, mean = np.int32(n), np.int32(0), np.int32(centre)
         diagonal = isinstance(precondition, cla.Array)
         # The recurrence stops a little lower, so that the true residual is within the tolerance.
@@ -163,14 +197,12 @@ class ConjugateGradient:
 
         def measure(zero: bool = False) -> float:
             """Set r to the true residual and return its relative norm; negative: b is zero."""
-            if zero:
-                x.fill(0)
-                q.fill(0)
-            else:
+            if not zero:
                 apply(x, q)
-            launch(kernels.residual, size, rhs, q, r, self.partial)
+            anew = np.int32(zero)
+            launch(kernels.residual, size, anew, rhs, q, self.partial)
             launch(
-                kernels.begin, size, mean, rhs, r, p, self.partial, self._state
+                kernels.begin, size, anew, mean, rhs, q, x, r, p, self.partial, self._state
             )  # fmt: skip
             self.engine.run(
                 kernels.sum_norms, self.engine.group_size, self.partial, self._state,
@@ -190,7 +222,7 @@ class ConjugateGradient:
 
         def iterate(k: int) -> None:
             if not diagonal:
-                precondition(r, u)
+                precondition(r, u, q)
                 launch(kernels.dot_product, size, np.int32(_GAMMA + (k & 1)), r, u, self.partial)
             direction.set_first(k)
             direction()
@@ -276,14 +308,6 @@ class ConjugateGradient:
             "positive definite",
             [*history, residual],
         )
-
-    def _reserve(self, n: int, max_iterations: int) -> None:
-        if n > self._capacity:
-            self._capacity = n
-            self._vectors = [self.engine.empty(n) for _ in range(4)]
-        if max_iterations > self._record_capacity:
-            self._record_capacity = max_iterations
-            self._record = self.engine.zeros(4 * max_iterations)
 
 
 class Launch:

@@ -139,7 +139,7 @@ class Loop:
         if action.least and abs(self.missing()) <= action.least * self.mesh.n:
             return
         # What the solver holds is of no use for other generators, and the largest of what is not needed here.
-        self.mesh.stages.release("poisson")
+        self.mesh.stages.clear("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
         inserted, deleted = self.mesh.reorganise(nuclei, self.held, theta=action.theta)
         self.inserted += inserted
@@ -190,7 +190,7 @@ class Loop:
     def refine(self) -> None:
         """Go to the next finer level."""
         # The finer level needs another solver, and memory.
-        self.mesh.stages.release("poisson")
+        self.mesh.stages.clear("poisson")
         self.mesh.engine.workspace.clear()
         finer = self.mesh.refine()
         self.inserted += finer.n - self.mesh.n

@@ -36,7 +36,7 @@ from .trim import Trim
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-PEAK = {2: (71, 78), 3: (204, 248)}
+PEAK = {2: (49, 59), 3: (151, 102)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
 OUTPUT = {2: (34, 26), 3: (13, 950)}
 """The same while the finished diagram is read, corners, loops and all."""
@@ -84,11 +84,16 @@ class Stages:
         setattr(self, name, stage)
         return stage
 
-    def release(self, *names: str) -> None:
-        """Let go of stages (by default all) and their buffers; those that are used again are made again."""
-        gone = [self.__dict__.pop(name, None) for name in names or Stages._CLASSES]
-        if not names:
-            self.engine.workspace.clear()
+    def clear(self, *names: str) -> None:
+        """Let go of the buffers of those of these stages that there are; their kernels stay."""
+        for name in names:
+            if name in self.__dict__:
+                getattr(self, name).clear()
+
+    def release(self) -> None:
+        """Let go of all stages and their buffers; those that are used again are made again."""
+        gone = [self.__dict__.pop(name, None) for name in Stages._CLASSES]
+        self.engine.workspace.clear()
         if any(stage is not None for stage in gone):
             del gone
             gc.collect()  # stages and the launches that they keep refer to each other

@@ -68,12 +68,15 @@ class PublishedMethod:
         mesh.begin_step()
         mesh.lloyd = t.offsets
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        laplacian = poisson.assemble(t.starts, t.neighbours, t.face_measures, mesh.points)
         poisson.compatible(mesh.error, t.volumes, mesh.source)
         balance_pieces(mesh, t.volumes)
-        solution = poisson.solve(
-            laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
-        )
+        with mesh.engine.workspace.frame():
+            laplacian = poisson.assemble(
+                t.starts, t.neighbours, t.face_measures, mesh.points, tolerance=r.tolerance
+            )
+            solution = poisson.solve(
+                laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
+            )
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         mesh.hold(mesh.correction)
         mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
@@ -116,16 +119,18 @@ class WeightedMethod:
         w = mesh.weigh(gradient=mesh.correction)
         mesh.hold(mesh.lloyd)
         motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        laplacian = poisson.assemble(
-            t.starts, t.neighbours, t.face_measures, mesh.points, w.density
-        )
         poisson.compatible(w.excess, w.weight, mesh.source)
         balance_pieces(mesh, w.weight)
-        # Generators get new labels, in an array of their own, whenever their order changes.
-        solution = poisson.solve(
-            laplacian, mesh.source, mesh.potential, tolerance=self.tolerance, numbering=mesh.labels,
-            from_zero=True,
-        )  # fmt: skip
+        with mesh.engine.workspace.frame():
+            laplacian = poisson.assemble(
+                t.starts, t.neighbours, t.face_measures, mesh.points, w.density,
+                tolerance=self.tolerance,
+            )  # fmt: skip
+            # Generators get new labels, in an array of their own, whenever their order changes.
+            solution = poisson.solve(
+                laplacian, mesh.source, mesh.potential, tolerance=self.tolerance,
+                numbering=mesh.labels, from_zero=True,
+            )  # fmt: skip
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         mesh.hold(mesh.correction)
         mesh.note_speeds()

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from functools import cache
+from operator import is_not
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Room
-from ._program import Engine
+from ._program import Engine, Kernels
 from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, whole_groups
 
 _COARSEST = 64
@@ -21,7 +22,11 @@ _MOST_LEVELS = 30
 # below is left to the coarse levels.
 _LOWEST = 0.35
 _CENTRE, _RADIUS = (2 + _LOWEST) / 2, (2 - _LOWEST) / 2
-_DAMPING = (1 / (_CENTRE - _RADIUS * math.sqrt(0.5)), 1 / (_CENTRE + _RADIUS * math.sqrt(0.5)))
+_DAMPING = (
+    np.float32(1 / (_CENTRE - _RADIUS * math.sqrt(0.5))),
+    np.float32(1 / (_CENTRE + _RADIUS * math.sqrt(0.5))),
+)
+_NONE = np.float32(0)
 
 
 @dataclass(frozen=True)
@@ -29,9 +34,6 @@ class _Level:
     graph: Graph
     pairs: PairInverse
     groups: Groups | None
-    b: cla.Array
-    x: cla.Array
-    t: cla.Array
 
 
 class _SavedLevel:
@@ -83,12 +85,23 @@ def _cuts(starts: np.ndarray, rows: int, length: int) -> bool:
 
 
 class _Bound:
-    """A kernel with arguments of its own, set once."""
+    """A kernel with arguments of its own, which are set when they change only."""
 
-    def __init__(self, engine: Engine, kernel: cl.Kernel, size: int, *args: object) -> None:
-        self._kernel = kernel
-        self._queue, self._size = engine.queue, (whole_groups(size),)
-        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+    def __init__(self, engine: Engine, kernel: cl.Kernel) -> None:
+        self._queue, self._kernel = engine.queue, kernel
+        self._args: list[object] = []
+
+    def bind(self, size: int, args: Iterable[object]) -> _Bound:
+        """Set the arguments."""
+        given = [a.data if isinstance(a, cla.Array) else a for a in args]
+        if len(given) != len(self._args) or any(map(is_not, given, self._args)):
+            self._kernel.set_args(*given)
+            self._args, self._size = given, (whole_groups(size),)
+        return self
+
+    def release(self) -> None:
+        """Let go of the arguments."""
+        self._args = []
 
     def __call__(self) -> None:
         cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, (GROUP,))
@@ -100,7 +113,8 @@ class Multigrid:
     Groups of four to five cells that are tied together (see `Coarsening`), constant interpolation,
     coarse weights scaled by the ratio of lengths, pairwise-Jacobi Chebyshev smoothing of degree 2,
     elimination on the coarsest level of at most 64 groups. It works in float32, whatever the
-    engine's precision: half the memory to read, and the outer iteration sets the accuracy.
+    engine's precision: half the memory to read, and the outer iteration sets the accuracy. If that
+    one's vectors are in float32, too, the finest level works on them in place.
 
     With S the smoother's polynomial and C a level's coarse correction, a cycle is
     M^-1 = 2 S - S A S + (1 - S A) C (1 - A S), positive definite for whatever weights: S A has its
@@ -115,15 +129,21 @@ class Multigrid:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._single = Engine(engine.ctx, engine.queue, engine.dim, np.dtype(np.float32))
-        self._source = "double" if engine.real == np.float64 else "float"
-        self._coarsening = Coarsening(self._single, self._source)
-        self._kernels = self._single.kernels("multigrid", {"SOURCE": self._source})
-        self._pool: dict[tuple[int, int], SimpleNamespace] = {}
-        self._programme: tuple[cla.Array, cla.Array, list[_Bound]] | None = None
+        self._single = engine.single()
+        self._coarsening = Coarsening(self._single)
+        self._bound: dict[tuple, _Bound] = {}
+        self._programme: tuple[Sequence[object], list[_Bound]] | None = None
         self._room = Room(self._single)
         self._levels: list[_Level] = []
         self._factor: cla.Array | None = None
+
+    def clear(self) -> None:
+        """Let go of all levels."""
+        self._levels, self._factor, self._programme = [], None, None
+        for bound in self._bound.values():
+            bound.release()
+        self._coarsening.clear()
+        self._room.clear()
 
     @property
     def sizes(self) -> list[int]:
@@ -144,20 +164,18 @@ class Multigrid:
         self._levels, self._factor = [], None
         while True:
             depth, n = len(self._levels), len(graph)
-            vectors = [self._room(depth, name, size=n) for name in "bxt"]
             if n <= _COARSEST:
                 pairs = self._coarsening.pairs(graph, depth)
-                self._levels.append(_Level(graph, pairs, None, *vectors))
+                self._levels.append(_Level(graph, pairs, None))
                 self._eliminate(graph)
                 break
             pairs, groups, coarse = self._coarsening.coarsen(graph, depth)
             if len(groups) > 0.8 * n or depth == _MOST_LEVELS:
                 # Hardly a neighbour left: smoothing is all there is to do.
-                self._levels.append(_Level(graph, pairs, None, *vectors))
+                self._levels.append(_Level(graph, pairs, None))
                 break
-            self._levels.append(_Level(graph, pairs, groups, *vectors))
+            self._levels.append(_Level(graph, pairs, groups))
             graph = coarse
-        self._coarsening.clear(len(self._levels))
         self._programme = None
 
     def renew(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
@@ -225,8 +243,7 @@ class Multigrid:
             if depth > 0:
                 self._coarsening.renew_pairs(graph, pairs)
             groups = host.groups and Groups(*(single.upload(a, np.int32) for a in host.groups))
-            vectors = [self._room(depth, name, size=n) for name in "bxt"]
-            self._levels.append(_Level(graph, pairs, groups, *vectors))
+            self._levels.append(_Level(graph, pairs, groups))
         if "factor" in arrays:
             self._factor = single.upload(arrays["factor"], np.float32)
         self._programme = None
@@ -234,77 +251,107 @@ class Multigrid:
     def _eliminate(self, graph: Graph) -> None:
         n = len(graph)
         self._factor = self._room("factor", size=_factor_size(n))
-        kernel = self._kernels.eliminate
-        kernel.set_args(
-            np.int32(n), graph.starts.data, graph.columns.data, graph.weights.data,
-            self._factor.data,
+        kernel = self._kernels(np.dtype(np.float32)).eliminate
+        group = self._single.group_size
+        self._single.run(
+            kernel, group, np.int32(n), graph.starts, graph.columns, graph.weights, self._factor,
+            group=group,
         )  # fmt: skip
-        group = (self._single.group_size,)
-        cl.enqueue_nd_range_kernel(self.engine.queue, kernel, group, group)
 
-    def apply(self, r: cla.Array, u: cla.Array) -> None:
+    def apply(self, r: cla.Array, u: cla.Array, spare: cla.Array | None = None) -> None:
         """Enqueue u = M^-1 r: one cycle.
 
         Parameters
         ----------
-        r, u : (n,) real
+        r, u : (n,) real or float32
+        spare : (n,) of the same, optional
+            What is in it is lost.
         """
-        if self._programme is None or self._programme[0] is not r or self._programme[1] is not u:
-            self._programme = (r, u, self._compile(r, u))
-        for launch in self._programme[2]:
+        arrays = [a if a is None else a.base_data for a in (r, u, spare)]
+        programme = self._programme
+        if programme is None or any(map(is_not, programme[0], arrays)):
+            programme = self._programme = (arrays, self._compile(r, u, spare))
+        for launch in programme[1]:
             launch()
 
-    def _compile(self, r: cla.Array, u: cla.Array) -> list[_Bound]:
-        """One cycle as a list of kernels with their arguments set."""
+    def _vectors(self, depth: int) -> list[cla.Array]:
+        """Right side, solution and defect of a level."""
+        n = len(self._levels[depth].graph)
+        return [self._room(depth, name, size=n) for name in "bxt"]
+
+    def _compile(self, r: cla.Array, u: cla.Array, spare: cla.Array | None) -> list[_Bound]:
+        """One cycle as a list of kernels with their arguments set: down to the coarsest level, and up again."""
         launches: list[_Bound] = []
-        bound: dict[tuple, _Bound] = {}
-        early, late = (np.float32(d) for d in _DAMPING)
+        early, late = _DAMPING
+        inside = r.dtype == np.float32
+        vectors = [self._vectors(depth) for depth in range(1, len(self._levels))]
+        if inside and spare is not None:
+            vectors.insert(0, [r, u, spare])
+        else:
+            vectors.insert(0, self._vectors(0))
+            inside = False
 
         def bind(depth: int, name: str, size: int, *args: object, variant: int = 0) -> None:
-            key = (depth, name, variant)
-            if key not in bound:
-                kernel = getattr(self._kernels_of(depth, variant), name)
-                bound[key] = _Bound(self._single, kernel, size, np.int32(size), *args)
-            launches.append(bound[key])
+            key = (depth, name, variant, r.dtype)
+            if key not in self._bound:
+                kernel = getattr(self._kernels(r.dtype), name)
+                self._bound[key] = _Bound(self._single, kernel)
+            launches.append(self._bound[key].bind(size, (_integer(size), *args)))
 
-        def visit(depth: int) -> None:
-            """Set x of a level, from its b."""
-            level = self._levels[depth]
-            n, b, x, t = len(level.graph), level.b, level.x, level.t
-            blocks = (level.pairs.partner, level.pairs.own, level.pairs.both)
-            if depth == 0:
-                bind(0, "first_rounded", n, late, *blocks, r, b, x)
-            if level.groups is None and self._factor is not None:
+        def relax(depth: int, damping: np.float32, last: bool = False) -> None:
+            """One step of smoothing from the x that there is."""
+            level, (b, x, t), variant = self._levels[depth], vectors[depth], int(damping is late)
+            n, blocks = len(level.graph), _blocks(level)
+            bind(depth, "defect", n, *_rows(level), b, x, t)
+            if last and depth == 0 and not inside:
+                bind(depth, "correct_out", n, damping, *blocks, t, x, u)
+            else:
+                bind(depth, "correct", n, damping, *blocks, t, x, variant=variant)
+
+        deepest = len(self._levels) - 1
+        for depth, level in enumerate(self._levels):
+            n, (b, x, t) = len(level.graph), vectors[depth]
+            if depth == 0 and not inside:
+                bind(0, "first_rounded", n, late, *_blocks(level), r, b, x)
+            elif level.groups is not None or self._factor is None:
+                bind(depth, "first", n, late, *_blocks(level), b, x)
+            if depth == deepest and self._factor is not None:
                 bind(depth, "solve_down", n, self._factor, b, t)
                 bind(depth, "solve_up", n, self._factor, t, x)
-                if depth == 0:
-                    bind(0, "correct_out", n, np.float32(0), *blocks, b, x, u)
-                return
-            rows = (level.graph.starts, level.graph.columns, level.graph.weights)
-            if depth > 0:
-                bind(depth, "first", n, late, *blocks, b, x)
-            bind(depth, "defect", n, *rows, b, x, t)
-            bind(depth, "correct", n, early, *blocks, t, x)
+                if depth == 0 and not inside:
+                    bind(0, "correct_out", n, _NONE, *_blocks(level), b, x, u)
+                break
+            relax(depth, early)
             if level.groups is not None:
-                groups, coarse = level.groups, self._levels[depth + 1]
-                bind(depth, "defect", n, *rows, b, x, t)
-                lists = (groups.starts, groups.members)
-                bind(depth, "restrict_sum", len(groups), *lists, t, coarse.b)
-                visit(depth + 1)
-                bind(depth, "prolong", n, groups.group, coarse.x, x)
-            bind(depth, "defect", n, *rows, b, x, t)
-            bind(depth, "correct", n, early, *blocks, t, x)
-            bind(depth, "defect", n, *rows, b, x, t)
-            if depth == 0:
-                bind(0, "correct_out", n, late, *blocks, t, x, u)
-            else:
-                bind(depth, "correct", n, late, *blocks, t, x, variant=1)
-
-        visit(0)
+                bind(depth, "defect", n, *_rows(level), b, x, t)
+                lists, coarse_b = (level.groups.starts, level.groups.members), vectors[depth + 1][0]
+                bind(depth, "restrict_sum", len(level.groups), *lists, t, coarse_b)
+        for depth in range(deepest, -1, -1):
+            level = self._levels[depth]
+            if depth == deepest and self._factor is not None:
+                continue
+            if level.groups is not None:
+                (_, x, _), (_, e, _) = vectors[depth], vectors[depth + 1]
+                bind(depth, "prolong", len(level.graph), level.groups.group, e, x)
+            relax(depth, early)
+            relax(depth, late, last=True)
         return launches
 
-    def _kernels_of(self, depth: int, variant: int) -> SimpleNamespace:
-        """Kernels that keep their arguments for one level, made once."""
-        if (depth, variant) not in self._pool:
-            self._pool[depth, variant] = self._single.kernels("multigrid", {"SOURCE": self._source})
-        return self._pool[depth, variant]
+    def _kernels(self, source: np.dtype) -> Kernels:
+        """Kernels of their own arguments that take the residual in `source`."""
+        name = "double" if source == np.float64 else "float"
+        return self._single.kernels("multigrid", {"SOURCE": name})
+
+
+def _rows(level: _Level) -> tuple[cla.Array, ...]:
+    return level.graph.starts, level.graph.columns, level.graph.weights
+
+
+def _blocks(level: _Level) -> tuple[cla.Array, ...]:
+    return level.pairs.partner, level.pairs.own, level.pairs.both
+
+
+@cache
+def _integer(value: int) -> np.int32:
+    """Return the same object for the same value, by which arguments are compared."""
+    return np.int32(value)

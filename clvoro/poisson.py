@@ -9,15 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ._primitives import Room
-from ._program import Engine
+from ._program import Engine, Kernels
 from .errors import InputError
-from .krylov import CURVATURE, BreakdownError, ConjugateGradient, Launch, Solution
+from .krylov import (
+    CURVATURE,
+    BreakdownError,
+    ConjugateGradient,
+    Launch,
+    Precondition,
+    Solution,
+)
 from .multigrid import Multigrid
 
 _MOST_CYCLES = 200
-_ROUGH = 1e-3
-"""Tolerance from which on the recurrence is trusted with the residual: it loses digits only far down."""
+ROUGH = 1e-3
+"""Tolerance from which on the recurrence, whose vectors are then in single precision, is trusted with the residual.
+
+It loses digits only far down, and the solution itself is summed up in full precision.
+"""
 _MOST_LOST = 5
 """Iterations that a solve may take more than the first with the same multigrid; a set-up costs about nine."""
 _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
@@ -44,24 +53,17 @@ class Laplacian:
     ----------
     starts : (n + 1,) int32
     neighbours : (m,) int32
-        As the diagram's, but an entry that contributes nothing (a wall) names the cell itself.
-    weights : (m,) real
+        The diagram's: walls are negative.
+    weights : (m,) real or float32
         w_ij = rho_ij l_ij / d_ij; 0 at walls.
-    diagonal, inverse_diagonal : (n,) real
-        Row sums of the weights; the inverse of 0 is 0.
-    points : (n, d) real
-        The generators, for preconditioners.
     """
 
     starts: cla.Array
     neighbours: cla.Array
     weights: cla.Array
-    diagonal: cla.Array
-    inverse_diagonal: cla.Array
-    points: cla.Array
 
     def __len__(self) -> int:
-        return len(self.diagonal)
+        return len(self.starts) - 1
 
 
 class Poisson:
@@ -74,13 +76,24 @@ class Poisson:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernels = engine.kernels("poisson")
+        self._kernels: dict[np.dtype, Kernels] = {}
         self._krylov = ConjugateGradient(engine)
         self._multigrid: Multigrid | None = None
         self._prepared: Laplacian | None = None
         self._numbering: object = None
         self._at_best = self._latest = 0
-        self._room = Room(engine)
+
+    def clear(self) -> None:
+        """Let go of all buffers, and of what the next solve might take over from the last."""
+        self._prepared = self._numbering = None
+        if self._multigrid is not None:
+            self._multigrid.clear()
+
+    def _kernels_in(self, store: np.dtype) -> Kernels:
+        if store not in self._kernels:
+            name = "double" if store == np.float64 else "float"
+            self._kernels[store] = self.engine.kernels("poisson", {"STORE": name})
+        return self._kernels[store]
 
     def assemble(
         self,
@@ -89,6 +102,8 @@ class Poisson:
         face_measures: cla.Array,
         points: cla.Array,
         density: cla.Array | None = None,
+        *,
+        tolerance: float = 0.0,
     ) -> Laplacian:
         """Build (A phi)_i = sum_j w_ij (phi_i - phi_j), w_ij = rho_ij l_ij / |x_i - x_j|.
 
@@ -102,11 +117,13 @@ class Poisson:
             Generators.
         density : (n,) real, optional
             rho > 0; rho_ij is the geometric mean. Without it rho = 1.
+        tolerance : float
+            Of the solves to come. From `ROUGH` on, weights and the vectors of the iteration are in float32.
 
         Returns
         -------
         Laplacian
-            Its arrays are used again by the next call.
+            Its weights are of the workspace: they last as long as the present frame.
         """
         engine = self.engine
         n = len(starts) - 1
@@ -114,15 +131,23 @@ class Poisson:
         _check("face_measures", face_measures, neighbours.shape)
         if density is not None:
             _check("density", density, (n,))
-        m, room = len(neighbours), self._room
-        columns, weights = room("columns", size=m, dtype=np.int32), room("weights", size=m)
-        diagonal, inverse = room("diagonal", size=n), room("inverse", size=n)
+        store = np.dtype(np.float32) if tolerance >= ROUGH else engine.real
+        weights = engine.scratch(len(neighbours), store)
         engine.run(
-            self._kernels.assemble, n, np.int32(n), np.int32(density is not None), starts,
-            neighbours, face_measures, points, points if density is None else density, columns,
-            weights, diagonal, inverse,
+            self._kernels_in(store).assemble, n, np.int32(n), np.int32(density is not None), starts,
+            neighbours, face_measures, points, points if density is None else density, weights,
         )  # fmt: skip
-        return Laplacian(starts, columns, weights, diagonal, inverse, points)
+        return Laplacian(starts, neighbours, weights)
+
+    def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
+        """Return the inverses of the sums of weights (n,), 0 of 0, in the workspace."""
+        n, store = len(laplacian), laplacian.weights.dtype
+        inverse = self.engine.scratch(n, store)
+        self.engine.run(
+            self._kernels_in(store).invert_diagonal, n, np.int32(n), laplacian.starts,
+            laplacian.weights, inverse,
+        )  # fmt: skip
+        return inverse
 
     def compatible(self, source: cla.Array, volumes: cla.Array, rhs: cla.Array) -> cla.Array:
         """Set rhs_i = V_i (s_i - mean s), the mean weighted by volume, so that its sum is 0.
@@ -133,14 +158,15 @@ class Poisson:
             s, V, and where the result goes (also returned).
         """
         size = np.int32(len(rhs))
-        partial = self._krylov.partial
-        self.engine.run_blocks(self._kernels.source_sums, size, source, volumes, partial)
-        self.engine.run_blocks(self._kernels.compatible, size, source, volumes, rhs, partial)
+        partial, kernels = self._krylov.partial, self._kernels_in(self.engine.real)
+        self.engine.run_blocks(kernels.source_sums, size, source, volumes, partial)
+        self.engine.run_blocks(kernels.compatible, size, source, volumes, rhs, partial)
         return rhs
 
     def apply(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> None:
-        """Enqueue y = A x."""
-        self.engine.run_blocks(self._kernels.apply, *self._arguments(laplacian, x, y))
+        """Enqueue y = A x, both in the precision of the weights; x may be in the engine's."""
+        kernel, *args = self._launch(laplacian, x, y)
+        self.engine.run_blocks(kernel, *args)
 
     def set_up_multigrid(self, laplacian: Laplacian, numbering: object = None) -> Multigrid:
         """Make the preconditioner for `laplacian` unless it was made last; `solve` does so.
@@ -250,7 +276,7 @@ class Poisson:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
         operator = self._operator(laplacian)
 
-        def run(precondition: object, most: int, lookahead: int) -> Solution:
+        def run(precondition: cla.Array | Precondition, most: int, lookahead: int) -> Solution:
             return self._krylov.solve(
                 operator,
                 rhs,
@@ -262,8 +288,13 @@ class Poisson:
                 centre=True,
                 lookahead=lookahead,
                 from_zero=from_zero,
-                verify=tolerance < _ROUGH,
+                verify=tolerance < ROUGH,
+                store=laplacian.weights.dtype,
             )
+
+        def run_jacobi(most: int) -> Solution:
+            with self.engine.workspace.frame():
+                return run(self.inverse_diagonal(laplacian), most, 64)
 
         default = 500 + 30 * math.isqrt(n)
         if preconditioner == "auto":
@@ -271,7 +302,7 @@ class Poisson:
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":
             most = default if max_iterations is None else max_iterations
-            return run(laplacian.inverse_diagonal, most, 64)
+            return run_jacobi(most)
         try:
             most = _MOST_CYCLES if max_iterations is None else max_iterations
             multigrid = self.set_up_multigrid(laplacian, numbering)
@@ -279,7 +310,7 @@ class Poisson:
             self._latest = first.iterations
             self._at_best = self._at_best or first.iterations
             # Far above what the precision allows it is the preconditioner, in float32, that is stuck.
-            stuck = self.engine.real == np.float64 and first.residual > 1e-8
+            stuck = laplacian.weights.dtype == np.float64 and first.residual > 1e-8
             if first.reason == "stagnated" and stuck:
                 cause = "multigrid stagnated"
             elif first.reason == "max_iterations" and max_iterations is None:
@@ -294,7 +325,7 @@ class Poisson:
         done = len(residuals) - 1
         most = default if max_iterations is None else max(max_iterations - done, 0)
         from_zero = False
-        second = run(laplacian.inverse_diagonal, most, 64)
+        second = run_jacobi(most)
         return Solution(
             done + second.iterations,
             second.residual,
@@ -309,20 +340,19 @@ class Poisson:
 
         def apply(x: cla.Array, y: cla.Array) -> None:
             if last[0] is not x or last[1] is not y:
-                last[:] = (
-                    x,
-                    y,
-                    Launch(self.engine, self._kernels.apply, *self._arguments(laplacian, x, y)),
-                )
+                last[:] = x, y, Launch(self.engine, *self._launch(laplacian, x, y))
             last[2]()
 
         return apply
 
-    def _arguments(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> tuple:
-        return (
-            np.int32(len(laplacian)), np.int32(CURVATURE), laplacian.starts, laplacian.neighbours,
-            laplacian.weights, x, y, self._krylov.partial,
-        )  # fmt: skip
+    def _launch(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> tuple:
+        """Return the kernel that applies the operator, and its arguments."""
+        store = laplacian.weights.dtype
+        kernels, n = self._kernels_in(store), np.int32(len(laplacian))
+        operator = (laplacian.starts, laplacian.neighbours, laplacian.weights, x, y)
+        if x.dtype != store:
+            return kernels.apply_full, n, *operator
+        return kernels.apply, n, np.int32(CURVATURE), *operator, self._krylov.partial
 
 
 def _check(name: str, array: cla.Array, shape: tuple[int, ...]) -> None:
