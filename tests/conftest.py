@@ -17,3 +17,9 @@ def ctx():
     from clvoro.device import create_context
 
     return create_context()
+
+
+if "CLVORO_TEST_GROUPS" in os.environ:
+    from gpu_like import use_groups
+
+    use_groups(int(os.environ["CLVORO_TEST_GROUPS"]))
