@@ -77,7 +77,7 @@ def test_diagrams_from_many_threads(ctx):
 
 
 def test_processes_find_the_same_bits(ctx, alone):
-    program = "import sys; sys.path.insert(0, 'tests'); import test_concurrency as t, clvoro\n"
+    program = "import sys; sys.path.insert(0, 'tests'); import conftest, test_concurrency as t, clvoro\n"
     program += "a = clvoro.Adapter()\nfor k in (3, 1): print(t.run(a, t.WORK[k]))"
     # Another seed of Python's hashes: no order of a set may matter.
     done = subprocess.run(
