@@ -30,7 +30,8 @@ inline int child_side(int count)
     return side;
 }
 
-/* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins (and one entry that ends them)? */
+/* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins (and one entry that ends
+ * them)? */
 kernel void plan_children(const int size, global const int *counts, const int begin, const int may_divide,
                           global int *grid_flags, global int *child_bins)
 {
@@ -87,8 +88,9 @@ kernel void make_grids(const int size, global const int2 *bins, global const int
 }
 
 /* Per generator i whose bin was divided: count it into its new bin. */
-kernel void count_children(const int size, global const REAL *points, global const int2 *bins, global const FRAME *grid_frames,
-                           global const int4 *grid_shapes, global int *keys, global int *ranks, global int *counts)
+kernel void count_children(const int size, global const REAL *points, global const int2 *bins,
+                           global const FRAME *grid_frames, global const int4 *grid_shapes, global int *keys,
+                           global int *ranks, global int *counts)
 {
     WORK_ITEM(i);
     const int g = bins[keys[i]].s1;
@@ -100,33 +102,57 @@ kernel void count_children(const int size, global const REAL *points, global con
 }
 
 /* Per generator i: its place in the order of bins. */
-kernel void place_items(const int size, global const int *keys, global const int *ranks, global const int2 *bins, global int *items)
+kernel void place_items(const int size, global const int *keys, global const int *ranks, global const int2 *bins,
+                        global int *items)
 {
     WORK_ITEM(i);
     items[bins[keys[i]].s0 + ranks[i]] = i;
 }
 
-/* Per bin: sort its items by generator index: a leaf holds a handful, but duplicates may pile up. */
-kernel void sort_bins(const int size, global const int2 *bins, global const int *bin_grid,
-                      global const int4 *grid_shapes, global int *items)
+/* The edge that a bin of a plane would have if it held OCCUPANCY generators where a block of up to 3 x 3 bins of its
+   grid holds as many as it does: a leaf's own few generators tell less of how far neighbours are. */
+inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
-    WORK_ITEM(b);
-    const int4 shape = grid_shapes[bin_grid[b]];
-    if (b - shape.s0 == shape.s1 * shape.s2 * shape.s3 || bins[b].s1 != bins[b + 1].s1)
-        return;
-    const int count = bins[b + 1].s0 - bins[b].s0;
-    global int *list = items + bins[b].s0;
-    sort_list(list, count);
+    const int place = b - shape.s0;
+    const int row = place / shape.s1, column = place - row * shape.s1;
+    const int left = max(column - 1, 0), right = min(column + 1, shape.s1 - 1);
+    const int bottom = max(row - 1, 0), top = min(row + 1, shape.s2 - 1);
+    int count = 0;
+    for (int r = bottom; r <= top; ++r) {
+        global const int2 *row_bins = bins + shape.s0 + r * shape.s1;
+        count += row_bins[right + 1].s0 - row_bins[left].s0;
+    }
+    return edge * sqrt((REAL)(OCCUPANCY * (right - left + 1) * (top - bottom + 1)) / count);
 }
 
-/* Per place p: the generator's position, and the edge of the leaf that it lies in. */
-kernel void gather_items(const int size, global const int *items, global const REAL *points, global const int *keys,
-                         global const int *bin_grid, global const FRAME *grid_frames, global REAL *binned,
-                         global float *reach)
+/* Per bin: sort its items by generator index (a leaf holds a handful, but duplicates may pile up), and note for each
+   place the edge of its leaf and, in 2D, the spacing there. */
+kernel void sort_bins(const int size, global const int2 *bins, global const int *bin_grid,
+                      global const FRAME *grid_frames, global const int4 *grid_shapes, global int *items,
+                      global float *reach, global float *spacing)
+{
+    WORK_ITEM(b);
+    const int g = bin_grid[b];
+    const int4 shape = grid_shapes[g];
+    const int first = bins[b].s0, end = bins[b + 1].s0;
+    if (first == end || b - shape.s0 == shape.s1 * shape.s2 * shape.s3 || bins[b].s1 != bins[b + 1].s1)
+        return;
+    sort_list(items + first, end - first);
+    const REAL edge = 1 / FRAME_INVERSE(grid_frames[g]);
+    for (int p = first; p < end; ++p)
+        reach[p] = (float)edge;
+#if DIM == 2
+    const REAL mean = local_spacing(b, edge, shape, bins);
+    for (int p = first; p < end; ++p)
+        spacing[p] = (float)mean;
+#endif
+}
+
+/* Per place p: the generator's position. */
+kernel void gather_items(const int size, global const int *items, global const REAL *points, global REAL *binned)
 {
     WORK_ITEM(p);
     const int i = items[p];
     for (int a = 0; a < DIM; ++a)
         binned[DIM * p + a] = points[DIM * i + a];
-    reach[p] = (float)(1 / FRAME_INVERSE(grid_frames[bin_grid[keys[i]]]));
 }

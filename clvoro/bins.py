@@ -33,6 +33,8 @@ class BinnedPoints:
         Positions in the same order.
     reach : (>= n,) float32
         Edge of the leaf that holds the generator, in the same order.
+    spacing : (>= n,) float32
+        In 2D: the edge that a bin there would have if it held `OCCUPANCY` generators, by the bins about the leaf.
     bins : (b, 2) int32
     grid_frames : (g, 4) real
     grid_shapes : (g, 4) int32
@@ -41,6 +43,7 @@ class BinnedPoints:
     items: cla.Array
     points: cla.Array
     reach: cla.Array
+    spacing: cla.Array
     bins: cla.Array
     grid_frames: cla.Array
     grid_shapes: cla.Array
@@ -149,11 +152,12 @@ class Bins:
             begin, size, grids = end, new_bins, grids + new_grids
         total = begin + size
         engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
-        engine.run_each(k.sort_bins, total, self._bins, self._grid_of, self._shapes, self._items)
+        spacing = self._ranks.view(np.float32)  # ranks have done their work
         engine.run_each(
-            k.gather_items, n, self._items, points, self._keys, self._grid_of, self._frames,
-            self._points, self._reach,
+            k.sort_bins, total, self._bins, self._grid_of, self._frames, self._shapes, self._items,
+            self._reach, spacing,
         )  # fmt: skip
+        engine.run_each(k.gather_items, n, self._items, points, self._points)
         return BinnedPoints(
-            self._items, self._points, self._reach, self._bins, self._frames, self._shapes
+            self._items, self._points, self._reach, spacing, self._bins, self._frames, self._shapes
         )

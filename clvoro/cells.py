@@ -25,8 +25,8 @@ ROW_CAPACITY = 20
 LARGEST_ROW = 512
 LANES, WRAP_GROUP = 8, 16
 """Cells that a CPU's work-item makes at a time (`hulls.cl`), and its work-items per group."""
-FIRST_REACH = 2.0
-"""How far it looks for neighbours at first, in edges of a bin."""
+FIRST_REACH = 1.9
+"""How far it looks for neighbours at first, in units of the spacing that the bins know."""
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
 # FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
@@ -205,8 +205,8 @@ class Cells:
             if self._wrap is not None:
                 engine.run_each(
                     self._wrap, -(-total // LANES), np.int32(total), np.int32(n), binned.points,
-                    binned.items, *search, *corners, engine.real.type(FIRST_REACH), rows.slots,
-                    rows.counts, rows.places, group=WRAP_GROUP,
+                    binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
+                    rows.slots, rows.counts, rows.places, group=WRAP_GROUP,
                 )  # fmt: skip
             engine.run_each(
                 self._kernels.clip_cells, total, np.int32(n), binned.points, binned.items, *search,

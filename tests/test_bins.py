@@ -4,12 +4,12 @@ import numpy as np
 import patch
 import pytest
 
-from clvoro.bins import MAX_LEVELS, SPLIT_COUNT, Bins
+from clvoro.bins import MAX_LEVELS, OCCUPANCY, SPLIT_COUNT, Bins
 from clvoro.domain import Box
 
 
 def walk(binned, n, dim, eps):
-    """Return the leaves as (first, count, origin, edge, level, place in its grid, bins of the grid)."""
+    """Return the leaves as (first, count, origin, edge, level, place in its grid, bins of the grid, spacing)."""
     bins = binned.bins.get().reshape(-1, 2)
     frames = binned.grid_frames.get().reshape(-1, 4).astype(float)
     shapes = binned.grid_shapes.get().reshape(-1, 4)
@@ -22,13 +22,16 @@ def walk(binned, n, dim, eps):
         sides = sides[:dim]
         edge = 1 / frames[g, 3]
         held = 0
+        counts = np.diff(bins[first : first + np.prod(sides) + 1, 0]).reshape(sides[::-1])
         for place in range(int(np.prod(sides))):
             index = np.unravel_index(place, sides[::-1])[::-1]
             origin = frames[g, :dim] + np.array(index) * edge
             (start, grid), (end, next_grid) = bins[first + place : first + place + 2]
             count = end - start
             if grid == next_grid:
-                leaves.append((start, count, origin, edge, level, index, sides))
+                block = counts[tuple(slice(max(i - 1, 0), i + 2) for i in index[::-1])]
+                spacing = edge * (OCCUPANCY * block.size / max(block.sum(), 1)) ** (1 / dim)
+                leaves.append((start, count, origin, edge, level, index, sides, spacing))
             else:
                 assert frames[grid, :dim] == pytest.approx(origin, abs=8 * eps)
                 assert shapes[grid][1] / frames[grid, 3] == pytest.approx(edge, rel=8 * eps)
@@ -49,12 +52,15 @@ def check(binned, points, dim, eps):
     assert np.array_equal(binned.points.get().reshape(-1, dim)[:n], points[items])
     reach = binned.reach.get()[:n]
     covered = np.zeros(n, int)
-    for start, count, origin, edge, level, index, sides in leaves:
+    spacings = binned.spacing.get()[:n]
+    for start, count, origin, edge, level, index, sides, spacing in leaves:
         place = slice(start, start + count)
         covered[place] += 1
         assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
         assert count <= SPLIT_COUNT[dim] or level == MAX_LEVELS - 1
         assert np.allclose(reach[place], edge, rtol=1e-6)
+        if dim == 2:  # float32, and the grid's 1 / edge rounds
+            assert np.allclose(spacings[place], spacing, rtol=1e-6)
         # A generator lies in its bin but for the rounding of the bin's corner; outermost bins take what rounds out.
         inside = points[items[place]]
         for a in range(dim):
@@ -181,11 +187,7 @@ def test_leaves_are_sorted_whatever_order_atomics_leave(ctx):
     assert (mixed != expected).sum() > 2000
     items = engine.upload(mixed, np.int32)
     engine.run_each(
-        bins._kernels.sort_bins,
-        len(bins._bins) // 2 - 1,
-        bins._bins,
-        bins._grid_of,
-        bins._shapes,
-        items,
-    )
+        bins._kernels.sort_bins, len(bins._bins) // 2 - 1, bins._bins, bins._grid_of, bins._frames,
+        bins._shapes, items, binned.reach, binned.spacing,
+    )  # fmt: skip
     assert np.array_equal(items.get(), expected)

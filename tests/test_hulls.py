@@ -27,6 +27,7 @@ def point_sets():
     turn = np.linspace(0, 2 * np.pi, 41)[:-1]
     ring = 0.375 + 0.3 * np.column_stack([np.cos(turn), np.sin(turn)])
     spot = np.array([0.4, 0.3])
+    trio = np.array([[0, 0], [1, 0], [0, 1]])
     return {
         **{f"{n} random": random[:n] for n in (1, 2, 3, 7, 8, 9, 100)},
         "random": random,
@@ -46,6 +47,14 @@ def point_sets():
         "line": np.column_stack([np.linspace(0.01, 0.99, 777), np.full(777, 0.3)]),
         "walls": np.column_stack([rng.random(400), 0.75 * rng.integers(0, 2, 400)]),
         "near walls": np.concatenate([random[:300] * [1, 1e-5], random[300:900]]),
+        # Of a trio two may stand in line with a corner of a hull, to rounding, while the third does not.
+        **{
+            f"trios, {gap}": np.concatenate(
+                [(p + gap * trio) for p in random[:60]] + [random[60:900]]
+            )
+            for gap in (1e-6, 1e-8, 1e-9, 1e-10)
+        },
+        "around a hole": spot + 0.3 * np.exp(-7 * rng.random((4000, 1))) * unit(rng, 4000),
         "pairs": np.concatenate([random[:500], random[:500] + 1e-6 * (random[500:1000] - 0.5)]),
     }
 
@@ -64,10 +73,9 @@ def wrapped_rows(engine, points):
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
     rows = cells.take_rows(n)
     engine.run_each(
-        cells._wrap, -(-n // LANES), np.int32(n), np.int32(n), binned.points, binned.items, binned.reach,
-        binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
-        engine.real.type(FIRST_REACH), rows.slots, rows.counts, rows.places,
-        group=WRAP_GROUP,
+        cells._wrap, -(-n // LANES), np.int32(n), np.int32(n), binned.points, binned.items, binned.spacing,
+        binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
+        engine.real.type(FIRST_REACH), rows.slots, rows.counts, rows.places, group=WRAP_GROUP,
     )  # fmt: skip
     assert (rows.places.get() == np.arange(n)).all()
     return rows.counts.get(), rows.slots.get().reshape(n, -1)
@@ -117,6 +125,20 @@ def test_against_scipy(engine):
         hull = labels[ConvexHull(d / (d**2).sum(axis=1)[:, None]).vertices]
         least = int(np.argmin(hull))
         assert rows[i, : counts[i]].tolist() == np.roll(hull, -least).tolist()
+
+
+def test_cells_that_reach_over_many_bins(engine):
+    """Those around a hole meet in its middle: others that are as near by far cannot cut them, and are not looked at."""
+    points = np.clip(POINTS["around a hole"], 0, [1, 0.75])
+    nearest = np.argsort(np.hypot(*(points - [0.4, 0.3]).T))[:40]
+    cells, x = Cells(engine), engine.upload(points)
+    cells._wrap = None
+    t = patch.fetch(cells.tessellate(BOX, x, len(points), Bins(engine).build(BOX, x, len(points))))
+    for i in nearest:
+        d = np.delete(points, i, axis=0) - points[i]
+        hull = ConvexHull(d / (d**2).sum(axis=1)[:, None]).vertices
+        row = t.neighbours[t.starts[i] : t.starts[i + 1]]
+        assert set(row) == set(np.delete(np.arange(len(points)), i)[hull])
 
 
 def test_coinciding_generators_are_left(engine):

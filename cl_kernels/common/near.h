@@ -1,25 +1,41 @@
-/* Generators in a rectangle, collected from the bins that it covers, in double precision. */
+/* Generators near a rectangle, as places in the order of bins. */
 #include "common/bins.h"
 
 #ifndef MAX_DEPTH
 #error "build with -DMAX_DEPTH=levels that the bins may have"
 #endif
-#define NEAR_CAPACITY 384
+#define NEAR_CAPACITY 512
+#define NEAR_STEP 16
+/* What holds no more than WHOLE generators is taken whole: looking into divided bins costs more than testing a few that
+   are too far. */
+#define WHOLE 24
 
-/* Generators by their places in the order of bins. */
+/* Behind the last place there may be others, of no meaning. */
 typedef struct {
     int count;
-    double x[NEAR_CAPACITY], y[NEAR_CAPACITY];
-    int places[NEAR_CAPACITY];
+    int places[NEAR_CAPACITY + NEAR_STEP];
 } near_t;
 
-/* Collect the generators in a rectangle. False if they are too many. */
-inline bool collect_near(near_t *near, double2 lower, double2 upper, global const double *binned, global const int2 *bins,
+inline bool add_run(near_t *near, int first, int end)
+{
+    const int count = near->count + end - first;
+    if (count > NEAR_CAPACITY)
+        return false;
+    const int16 steps = (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (int *to = near->places + near->count; first < end; first += NEAR_STEP, to += NEAR_STEP)
+        vstore16(first + steps, 0, to);
+    near->count = count;
+    return true;
+}
+
+/* Collect the generators in a rectangle, and some beside it. False if they are too many. */
+inline bool collect_near(near_t *near, double2 lower, double2 upper, global const int2 *bins,
                          global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
     /* The grids that are open, from the root down, and the row and bin at which each was left. */
     int grids[MAX_DEPTH], rows[MAX_DEPTH], nexts[MAX_DEPTH];
-    int depth = 0, count = 0;
+    int depth = 0;
+    near->count = 0;
     grids[0] = 0;
     rows[0] = -1;
     while (depth >= 0) {
@@ -36,30 +52,23 @@ inline bool collect_near(near_t *near, double2 lower, double2 upper, global cons
         }
         while (row <= top && child < 0) {
             global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
-            while (next <= right && child < 0) {
-                /* A run of leaves beside each other is a run of items; where there are divided bins ahead, one bin. */
+            while (next <= right) {
+                /* Bins beside each other are a run of items. */
                 const int2 first = row_bins[next];
                 int2 end = row_bins[right + 1];
-                if (first.s1 == end.s1) {
+                if (first.s1 == end.s1 || end.s0 - first.s0 <= WHOLE) {
                     next = right + 1;
                 } else {
                     end = row_bins[++next];
-                    if (first.s1 != end.s1) {
+                    if (first.s1 != end.s1 && end.s0 - first.s0 > WHOLE) {
                         child = first.s1;
                         break;
                     }
                 }
-                if (count + end.s0 - first.s0 > NEAR_CAPACITY)
+                if (!add_run(near, first.s0, end.s0))
                     return false;
-                for (int q = first.s0; q < end.s0; ++q) {
-                    const double x = binned[2 * q], y = binned[2 * q + 1];
-                    near->x[count] = x;
-                    near->y[count] = y;
-                    near->places[count] = q;
-                    count += (x >= lower.s0) & (x <= upper.s0) & (y >= lower.s1) & (y <= upper.s1);
-                }
             }
-            if (next > right) {
+            if (next > right && child < 0) {
                 ++row;
                 next = left;
             }
@@ -74,6 +83,5 @@ inline bool collect_near(near_t *near, double2 lower, double2 upper, global cons
             --depth;
         }
     }
-    near->count = count;
     return true;
 }

@@ -1,0 +1,180 @@
+/* Lists of candidates for eight generators at a time, one in each lane of vectors; see `hulls.cl`. */
+#include "common/near.h"
+
+#if !IS_DOUBLE
+#error "single precision has too few digits to tell which decisions are certain"
+#endif
+#define LANES 8
+/* One lane of vector k of an array. */
+#define LANE(vectors, k, lane) ((vectors)[(k)*LANES + (lane)])
+
+/* Candidates of one generator. */
+#define LIST_CAPACITY 48
+/* A list that begins with more candidates than MANY is cut to about ENOUGH of the nearest. */
+#define MANY 36
+#define ENOUGH 28
+/* Candidates are compared in CHAINS that do not wait for each other, as a comparison takes a dozen cycles: lists end
+   with none up to a multiple. */
+#define CHAINS 4
+
+/* Per lane a list of candidates: relative positions inverted, NaN where there is none; place, or -1 - wall. The nearest
+   has p^2 = largest2. */
+typedef struct {
+    int length;
+    double8 x[LIST_CAPACITY + CHAINS], y[LIST_CAPACITY + CHAINS];
+    int8 places[LIST_CAPACITY];
+    double8 largest2;
+    long8 nearest;
+} list_t;
+
+inline bool any_lane(long8 lanes)
+{
+    const long4 four = lanes.lo | lanes.hi;
+    const long2 two = four.lo | four.hi;
+    return (two.lo | two.hi) < 0;
+}
+
+inline long max_lane(long8 values)
+{
+    const long4 four = max(values.lo, values.hi);
+    const long2 two = max(four.lo, four.hi);
+    return max(two.lo, two.hi);
+}
+
+inline double min_lane(double8 values)
+{
+    const double4 four = min(values.lo, values.hi);
+    const double2 two = min(four.lo, four.hi);
+    return min(two.lo, two.hi);
+}
+
+/* Of vector number k[lane] of an array, that lane. */
+inline double8 pick(const double8 *vectors, long8 k)
+{
+    const double *values = (const double *)vectors;
+    return (double8)(LANE(values, k.s0, 0), LANE(values, k.s1, 1), LANE(values, k.s2, 2), LANE(values, k.s3, 3),
+                     LANE(values, k.s4, 4), LANE(values, k.s5, 5), LANE(values, k.s6, 6), LANE(values, k.s7, 7));
+}
+
+/* Append one candidate per lane, at (dx, dy), NaN where there is none; their places are the caller's to write. The
+   generator itself is none: 0 times infinity is NaN. */
+inline void put_candidates(list_t *list, double8 dx, double8 dy)
+{
+    const double8 square = fma(dx, dx, dy * dy);
+    const double8 scale = 1 / square;
+    const int k = list->length++;
+    list->x[k] = dx * scale;
+    list->y[k] = dy * scale;
+    const long8 nearer = (scale > list->largest2) & (square > 0);
+    list->largest2 = nearer ? scale : list->largest2;
+    list->nearest = nearer ? (long8)k : list->nearest;
+}
+
+/* Append to the lists what `bits` say of the generators that are near, at most `most` each. */
+inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most, global const double *binned,
+                      int own, double8 x, double8 y)
+{
+    /* Positions beside each other, even lanes before odd ones, so that two vectors hold those of a row. */
+    double2 found[LIST_CAPACITY * LANES];
+    const int length = list->length;
+    const double16 self =
+        (double16)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6, x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
+    const int8 own_places = own + (int8)(0, 1, 2, 3, 4, 5, 6, 7);
+    for (int k = 0; k < most; ++k) {
+        vstore16(self, k, (double *)found);
+        list->places[length + k] = own_places;
+    }
+    for (int lane = 0; lane < LANES; ++lane) {
+        int *to = (int *)(list->places + length) + lane;
+        double2 *to_found = found + lane / 2 + lane % 2 * 4;
+        const int *places = near->places;
+        for (int word = 0; 64 * word < near->count; ++word, places += 64)
+            for (ulong left = LANE((const ulong *)bits, word, lane); left; left &= left - 1) {
+                const int q = places[popcount(~left & (left - 1))];
+                *to = q;
+                *to_found = vload2(q, binned);
+                to += LANES;
+                to_found += LANES;
+            }
+    }
+    double8 largest2 = list->largest2;
+    long8 nearest = list->nearest, same = 0;
+    for (int k = 0; k < most; ++k) {
+        const double8 even = vload8(2 * k, (const double *)found), odd = vload8(2 * k + 1, (const double *)found);
+        const double8 dx = (double8)(even.s0, odd.s0, even.s2, odd.s2, even.s4, odd.s4, even.s6, odd.s6) - x;
+        const double8 dy = (double8)(even.s1, odd.s1, even.s3, odd.s3, even.s5, odd.s5, even.s7, odd.s7) - y;
+        const double8 square = fma(dx, dx, dy * dy);
+        const double8 scale = 1 / square;
+        list->x[length + k] = dx * scale;
+        list->y[length + k] = dy * scale;
+        const long8 none = square == 0;
+        same |= none & convert_long8(list->places[length + k] != own_places);
+        const long8 nearer = (scale > largest2) & ~none;
+        largest2 = nearer ? scale : largest2;
+        nearest = nearer ? (long8)(length + k) : nearest;
+    }
+    list->length += most;
+    list->largest2 = largest2;
+    list->nearest = nearest;
+    return same;
+}
+
+/* Add the generators whose squared distance is in [from2, to2) to the lists of some lanes. Returns to2, which is less
+   than asked for where a first list (from2 = 0) would be long. Lists that do not fit, and those of generators at whose
+   place there is another, are in doubt. */
+inline double8 add_near(list_t *list, const near_t *near, global const double *binned, int own, double8 x, double8 y,
+                        long8 lanes, double8 from2, double8 to2, long8 *doubt)
+{
+    const int words = (near->count + 63) / 64;
+    ulong8 bits[NEAR_CAPACITY / 64];
+    long8 counts;
+    to2 = lanes ? to2 : from2;
+    for (int attempt = 0;; ++attempt) {
+        counts = 0;
+        for (int word = 0; word < words; ++word) {
+            const int *places = near->places + 64 * word;
+            const int end = min(64, near->count - 64 * word);
+            ulong8 seen = 0;
+            for (int c = 0; c < end; ++c) {
+                const long q = places[c];
+                const double8 dx = binned[2 * q] - x, dy = binned[2 * q + 1] - y;
+                const double8 d2 = fma(dx, dx, dy * dy);
+                seen |= as_ulong8((d2 < to2) & (d2 >= from2) & (1L << c));
+            }
+            bits[word] = seen;
+            counts += as_long8(popcount(seen));
+        }
+        const long8 many = (from2 == 0) & (counts > MANY);
+        if (attempt == 3 || !any_lane(many))
+            break;
+        to2 = many ? to2 * ENOUGH / convert_double8(counts) : to2;
+    }
+    const long8 fits = counts <= LIST_CAPACITY - list->length;
+    for (int word = 0; word < words; ++word)
+        bits[word] = fits ? bits[word] : 0;
+    *doubt |= ~fits | put_near(list, near, bits, max_lane(fits ? counts : 0), binned, own, x, y);
+    return to2;
+}
+
+/* Add the mirror images in the walls to the lists of some lanes, if there is room. */
+inline void add_walls(list_t *list, double8 x, double8 y, long8 lanes, double4 box_lower, double4 box_upper,
+                      long8 *doubt)
+{
+    if (list->length > LIST_CAPACITY - 4) {
+        *doubt |= lanes;
+        return;
+    }
+    for (int wall = 0; wall < 4; ++wall) {
+        const double8 across = 2 * (wall < 2 ? (wall == 0 ? box_lower.s0 : box_upper.s0) - x
+                                             : (wall == 2 ? box_lower.s1 : box_upper.s1) - y);
+        list->places[list->length] = -1 - wall;
+        put_candidates(list, lanes ? (wall < 2 ? across : 0) : NAN, wall < 2 ? 0 : across);
+    }
+}
+
+/* Fill the lists up to a multiple of CHAINS. */
+inline void pad_list(list_t *list)
+{
+    for (; list->length % CHAINS; ++list->length)
+        list->x[list->length] = list->y[list->length] = NAN;
+}
