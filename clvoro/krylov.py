@@ -125,7 +125,7 @@ class ConjugateGradient:
             The operator's null space is the constants: take the mean of the right side away first
             and that of x at the end.
         lookahead : int
-            The most iterations to enqueue before the host looks.
+            The most iterations to enqueue before the host looks; the first look is after that many, or 8.
         from_zero : bool
             Start from zero, whatever `x` holds: saves an application of the operator.
         verify : bool
@@ -287,8 +287,8 @@ class ConjugateGradient:
                 history.append(residual)
             done = end
             rate = math.log(first / residual) / done if residual < first else 0.0
-            left = 1 + math.log(residual / tolerance) / rate if rate > 0 else lookahead
-            ahead = int(min(max(left, 2), lookahead))
+            left = math.log(residual / tolerance) / rate if rate > 0 else lookahead
+            ahead = min(max(math.ceil(left), 1), lookahead)
         return done
 
     def _judge(
