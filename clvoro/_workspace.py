@@ -12,12 +12,16 @@ given back, to be taken by the next. The queue is in order, so that commands whi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
+
+MOST_VIEWS = 1000
+"""Arrays that are kept to be taken again; numbers of faces, say, change from step to step."""
 
 
 class Workspace:
@@ -43,7 +47,7 @@ class Workspace:
         if self._depth:
             return
         self._pieces: list[cl.Buffer] = []
-        self._views: dict[tuple[int, int, int], cl.Buffer] = {}
+        self._views: dict[tuple[object, ...], cla.Array] = {}
         self._piece = self._used = self._taken = self._most = 0
 
     @contextmanager
@@ -53,6 +57,8 @@ class Workspace:
             # One piece in the place of those that it took to find out how much is needed.
             self._pieces, self._views = [], {}
             self._add(self._most)
+        if self._depth == 0 and len(self._views) > MOST_VIEWS:
+            self._views = {}
         before = self._piece, self._used, self._taken
         self._depth += 1
         try:
@@ -65,7 +71,8 @@ class Workspace:
         """Return an array whose content is arbitrary, valid to the end of the frame; None outside of any."""
         if self._depth == 0:
             return None
-        size = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
+        items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
+        size = max(items * dtype.itemsize, 1)
         size = -(-size // self._unit) * self._unit
         while self._piece < len(self._pieces):
             if self._used + size <= self._pieces[self._piece].size:
@@ -73,13 +80,16 @@ class Workspace:
             self._piece, self._used = self._piece + 1, 0
         else:
             self._add(size)
-        key = self._piece, self._used, size
+        key = self._piece, self._used, shape, dtype
         if key not in self._views:
-            self._views[key] = self._pieces[self._piece].get_sub_region(self._used, size)
+            # Kept, as to make one costs as much as a launch.
+            view = self._pieces[self._piece].get_sub_region(self._used, size)
+            self._views[key] = cla.Array(self._queue, shape, dtype, data=view)
+        array = self._views[key]
         self._used += size
         self._taken += size
         self._most = max(self._most, self._taken)
-        return cla.Array(self._queue, shape, dtype, data=self._views[key])
+        return array
 
     def _add(self, size: int) -> None:
         self._pieces.append(cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size))

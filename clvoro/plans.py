@@ -112,7 +112,7 @@ COUNT_LEAST = 1e-3
 COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
 START_TOLERANCE, COUPLE_TOLERANCE = 3e-2, 0.1
-"""Relative residual of the Poisson solves in 2D, on the coarsest level and after refinement: the next step sees the rest.
+"""Relative residual of Poisson solves in 2D, on the coarsest level and after refinement: the next step sees the rest.
 Measured on F1, F2 and F3 (three starts each), a tenth of them changes neither sizes nor shapes."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
 EXACT_STEPS_3D = 3

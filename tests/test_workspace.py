@@ -5,6 +5,7 @@ import pyopencl as cl
 import pytest
 
 from clvoro._program import Engine
+from clvoro._workspace import MOST_VIEWS
 
 
 @pytest.fixture
@@ -112,3 +113,13 @@ def test_clearing_lets_go_of_the_memory_but_not_within_a_frame(engine, made):
     with engine.workspace.frame():
         check(take(engine))
     assert len(made) > before
+
+
+def test_few_views_are_kept(engine):
+    """Of all the sizes that there have been."""
+    with engine.workspace.frame():
+        engine.scratch(10**5)
+    for n in range(3 * MOST_VIEWS // 2):
+        with engine.workspace.frame():
+            assert engine.scratch(n + 1).shape == (n + 1,)
+    assert len(engine.workspace._views) <= MOST_VIEWS
