@@ -60,11 +60,14 @@ def read(folder):
         lists.append(np.array(text.split(), int))
         assert len(lists[-1]) == count
     count, text = entries(folder / "boundary")
-    found = re.findall(
-        r"([\w-]+)\s*\{\s*type\s+(\w+);\s*nFaces\s+(\d+);\s*startFace\s+(\d+);\s*\}", text
-    )
+    found = re.findall(r"([\w-]+)\s*\{(.*?)\}", text, re.DOTALL)
     assert len(found) == count
-    return points, faces, *lists, {name: (t, int(n), int(s)) for name, t, n, s in found}
+    patches = {}
+    for name, body in found:
+        about = dict(re.findall(r"(\w+) +([^;]+);", body))
+        patches[name] = about.pop("type"), int(about.pop("nFaces")), int(about.pop("startFace"))
+        patches[name] += (about,) if about else ()
+    return points, faces, *lists, patches
 
 
 @pytest.fixture
@@ -186,10 +189,10 @@ def test_as_vtk_reads_it(result, tmp_path):
     np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
 
 
-@pytest.mark.skipif(shutil.which("checkMesh") is None, reason="OpenFOAM is not installed")
-def test_as_openfoam_checks_it(result, tmp_path):
-    io.save(result, tmp_path / "case.foam")
-    system = tmp_path / "system"
+def check_mesh(result, folder):
+    """What OpenFOAM's checkMesh says of a result saved in `folder`."""
+    io.save(result, folder / "case.foam")
+    system = folder / "system"
     system.mkdir()
     times = "startTime 0; endTime 1; deltaT 1; writeInterval 1;"
     parts = ("ddt", "grad", "div", "laplacian", "interpolation", "snGrad")
@@ -200,10 +203,21 @@ def test_as_openfoam_checks_it(result, tmp_path):
     # Where Debian's package has its settings; others set it themselves.
     env = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
     done = subprocess.run(
-        ["checkMesh", "-case", str(tmp_path)], env=env, capture_output=True, text=True, check=False
+        ["checkMesh", "-case", str(folder)], env=env, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    topology = done.stdout.split("Checking topology...")[1].split("Checking geometry...")
+    return done.stdout
+
+
+needs_openfoam = pytest.mark.skipif(
+    shutil.which("checkMesh") is None, reason="OpenFOAM is not installed"
+)
+
+
+@needs_openfoam
+def test_as_openfoam_checks_it(result, tmp_path):
+    said = check_mesh(result, tmp_path)
+    topology = said.split("Checking topology...")[1].split("Checking geometry...")
     assert "***" not in topology[0]
     for line in ("Boundary openness", "Max cell openness", "Cell volumes", "Face pyramids"):
         assert re.search(f"{line}.*OK", topology[1]), line

@@ -38,7 +38,8 @@ def save(
         ``.npz`` holds everything and is read back by `load`; ``.vtu`` is for ParaView and other VTK
         programs (polygons or polyhedra with h, error, quality and more as cell data);
         ``.../constant/polyMesh`` is a folder for OpenFOAM, and ``CASE/name.foam`` the same within a
-        case, for ParaView, too (2D: one layer of prisms between patches of type `empty`); ``.vtk``,
+        case, for ParaView, too (2D: one layer of prisms between patches of type `empty`; seams of periodic boxes: pairs
+        of cyclic patches); ``.vtk``,
         ``.ply`` and ``.obj`` hold 2D meshes and are written through meshio (``pip install
         "clvoro[formats]"``), the latter two without cell data.
     patches : mapping, optional
