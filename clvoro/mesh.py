@@ -197,6 +197,7 @@ class Mesh:
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
         self.tessellator = Tessellator(stages, domain, self._spacing)
         self.summaries = Summaries(self.engine, SUMMARIES)
+        self._ordered: cla.Array | None = None
         n = len(points)
         self.next_label = n
         if labels is None:
@@ -396,8 +397,10 @@ class Mesh:
 
     def values(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
         """Fetch per-generator `array` (n, ...) in the order of labels, times `factor`."""
-        order = np.argsort(self.labels.get(), kind="stable")
-        return array.get()[order].astype(np.float64) * factor
+        # Generators get new labels, in an array of their own, whenever their order changes.
+        if self._ordered is not self.labels:
+            self._order, self._ordered = np.argsort(self.labels.get(), kind="stable"), self.labels
+        return array.get()[self._order].astype(np.float64) * factor
 
     def finish(self) -> Diagram:
         """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""
