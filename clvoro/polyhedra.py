@@ -1,4 +1,4 @@
-"""The tessellation in 3D: every cell clipped by its neighbours and walls, its faces and moments (`polyhedra.cl`)."""
+"""The tessellation in 3D: cells cut by neighbours and walls, faces, moments (`polyhedra.cl`; `walks.cl` on CPUs)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ FACE_CAPACITY = 64
 MOST_FACES = 512
 FACES_PER_CELL = 16.5
 """Room for faces at first: random cells have 15.54 of them on average; walls add some."""
+STRETCH = 128
+"""Generators whose cells a CPU's work-item makes, eight at a time (`walks.cl`)."""
+FIRST_REACH = 2.0
+"""How far it looks for neighbours at first, in edges of a bin."""
 
 
 class Polyhedra:
@@ -32,6 +36,10 @@ class Polyhedra:
         self._scan = Scan(engine)
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
+        self._wrap = None
+        if engine.group_size == 1 and engine.real == np.float64:
+            defines = {"STRETCH": STRETCH, "MAX_DEPTH": MAX_LEVELS}
+            self._wrap = engine.kernels("walks", defines).wrap_cells
         self._report = engine.empty(3, np.int32)
         self._capacity = self._room = self._n = 0
 
@@ -138,16 +146,26 @@ class Polyhedra:
             if previous is not None and warm
             else (row_counts, row_counts)
         )
-        capacity, again = FACE_CAPACITY, False
+        capacity, again, first_reach = FACE_CAPACITY, False, FIRST_REACH
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
+        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         while True:
+            room = np.int32(self._room)
+            written = (
+                row_places, row_counts, labels, measures, centroids, cells["volumes"],
+                cells["offsets"], cells["covariances"], self._report,
+            )  # fmt: skip
+            if self._wrap is not None and not again:
+                engine.run_each(
+                    self._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), binned.points,
+                    binned.items, *search, lower, upper, engine.real.type(first_reach), room,
+                    *written, group=1,
+                )  # fmt: skip
+            some = np.int32(again or self._wrap is not None)
             engine.run_each(
-                self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items, binned.reach,
-                binned.bins, binned.grid_frames, binned.grid_shapes, points, lower, upper,
-                np.int32(warm), *old, np.int32(again), np.int32(self._room), share, row_places,
-                row_counts, labels, measures, centroids, cells["volumes"], cells["offsets"],
-                cells["covariances"], self._report,
+                self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items,
+                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
@@ -155,7 +173,8 @@ class Polyhedra:
             if flags & ~(FULL | DOUBT | NARROW):
                 self._refuse(flags, generator)
             if m > self._room:
-                # All anew: what did not fit was not kept.
+                # All anew: what did not fit was not kept. How far to look is known now.
+                first_reach = 1.0
                 labels, measures, centroids = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.array([0, 2**31 - 1, 0], np.int32))

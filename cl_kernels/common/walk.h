@@ -1,0 +1,209 @@
+/* Cells in 3D walked along their edges, one in each lane of vectors. An edge leaves a vertex on two bisectors and ends
+   where the next one cuts it off: the same steps in every lane. Vertices are triangles of the three faces that meet
+   there, counter-clockwise seen from outside. */
+#include "common/walked.h"
+
+/* Bisectors are put off by this share of the generator's distance, so that those which an edge lies on do not end it.
+   Other than theirs, faces that are missed are smaller than what is certain. */
+#define BIAS 1e-14
+/* Least square of the volume that is spanned by the normals of three faces at a certain vertex. */
+#define CERTAIN_SINE2 1e-10
+
+#define NO_FACE 255
+
+/* Where a ray is cut off first: slack / speed from its beginning, by entry `at` of the list or, yet, by none (-1). */
+typedef struct {
+    double8 slack, speed;
+    long8 at;
+} stop_t;
+
+/* Cut a ray from `y` (given as -y) along `ray` off by entry k. */
+inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t minus_y, vectors_t ray)
+{
+    const double8 x = list->planes[k].x, y = list->planes[k].y, z = list->planes[k].z;
+    const double8 slack = fma(minus_y.x, x, fma(minus_y.y, y, fma(minus_y.z, z, 0.5 + BIAS)));
+    const double8 speed = fma(ray.x, x, fma(ray.y, y, ray.z * z));
+    const long8 sooner = fma(speed, stop->slack, -stop->speed * slack) > 0;
+    stop->slack = sooner ? slack : stop->slack;
+    stop->speed = sooner ? speed : stop->speed;
+    stop->at = sooner ? (long8)k : stop->at;
+}
+
+/* Walk from y along `ray`, to the vertex that is returned; `inverse` is that of the speed. */
+inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, vectors_t y, vectors_t ray, long8 active)
+{
+    const vectors_t minus_y = {-y.x, -y.y, -y.z};
+    /* Two chains of comparisons, as a processor works on both at a time. */
+    stop_t even = {1, 0, -1}, odd = even;
+    int k = 0;
+    for (int shell = 0; shell < SHELLS; ++shell) {
+        for (; k < list->ends[shell]; k += 2) {
+            cut_ray(&even, list, k, minus_y, ray);
+            cut_ray(&odd, list, k + 1, minus_y, ray);
+        }
+        const long8 sooner = fma(odd.speed, even.slack, -even.speed * odd.slack) > 0;
+        stop->slack = sooner ? odd.slack : even.slack;
+        stop->speed = sooner ? odd.speed : even.speed;
+        stop->at = sooner ? odd.at : even.at;
+        /* Nothing farther from x than twice the vertex can cut it off. */
+        const vectors_t scaled = {fma(stop->speed, y.x, stop->slack * ray.x),
+                                  fma(stop->speed, y.y, stop->slack * ray.y),
+                                  fma(stop->speed, y.z, stop->slack * ray.z)};
+        const double8 limit = list->radii2[shell] * stop->speed * stop->speed;
+        if (shell == SHELLS - 1 || !any(active & ~(4 * dot8(scaled, scaled) < limit)))
+            break;
+    }
+    *inverse = 1 / stop->speed;
+    return along8(y, (stop->slack - BIAS) * *inverse, ray);
+}
+
+/* The face of a lane that entry k of its list has; a new one if need be, HULL_CAPACITY if there is no room. What is
+   known is written once more: branches that cannot be foreseen cost more. */
+inline int face_of_entry(cells_t *cells, walk_t *walk, const list_t *list, int k, int lane)
+{
+    const int known = LANE(walk->face_of, k, lane), next = cells->faces[lane];
+    const bool is_new = known == NO_FACE;
+    const int f = is_new ? next : known;
+    LANE(walk->face_of, k, lane) = f;
+    cells->faces[lane] = next + (is_new && next < HULL_CAPACITY);
+    for (int component = 0; component < 4; ++component)
+        PLANE_LANE(cells->planes, f, component, lane) = PLANE_LANE(list->planes, k, component, lane);
+    LANE(cells->places, f, lane) = LANE(list->places, k, lane);
+    return f;
+}
+
+/* Put an edge on the stack, if `open`. */
+inline void put_edge(walk_t *walk, int lane, int a, int b, int corner, bool open)
+{
+    const edge_t edge = {a, b, corner};
+    LANE(walk->edges, walk->counts[lane], lane) = edge;
+    walk->counts[lane] += open;
+}
+
+/* Note that a lane's vertex number `corner` is between faces a, b, c. False if there is such a vertex already. */
+inline bool put_corner(walk_t *walk, int lane, int a, int b, int c, int corner)
+{
+    ulong *sides_a = &LANE(walk->sides, a, lane), *sides_b = &LANE(walk->sides, b, lane);
+    ulong *sides_c = &LANE(walk->sides, c, lane);
+    if (a == c || b == c || (((*sides_a >> b) | (*sides_b >> c) | (*sides_c >> a)) & 1) != 0)
+        return false;
+    *sides_a |= 1UL << b;
+    *sides_b |= 1UL << c;
+    *sides_c |= 1UL << a;
+    put_edge(walk, lane, b, c, corner, !((*sides_c >> b) & 1));
+    put_edge(walk, lane, c, a, corner, !((*sides_a >> c) & 1));
+    return true;
+}
+
+/* Choose the next edge of a lane, if there is one. */
+inline void next_edge(walk_t *walk, int lane)
+{
+    walk->active[lane] = 0;
+    while (walk->counts[lane] > 0) {
+        const edge_t edge = LANE(walk->edges, --walk->counts[lane], lane);
+        if ((LANE(walk->sides, edge.b, lane) >> edge.a) & 1)
+            continue;
+        /* On the other side the faces follow each other the other way round. */
+        walk->a[lane] = edge.b;
+        walk->b[lane] = edge.a;
+        walk->from[lane] = edge.corner;
+        walk->active[lane] = -1;
+        break;
+    }
+}
+
+/* Walk the cells of the chosen lanes. */
+inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 chosen)
+{
+    cells->reach2 = cells->square_x = cells->square_y = cells->square_z = 0;
+    cells->mixed_x = cells->mixed_y = cells->mixed_z = 0;
+    for (int k = 0; k < list->ends[SHELLS - 1]; ++k)
+        vstore8((uchar8)NO_FACE, k, walk->face_of);
+    for (int k = 0; k < HULL_CAPACITY * LANES; ++k)
+        cells->sums[k] = 0;
+    for (int k = 0; k < HULL_CAPACITY; ++k)
+        vstore8((ulong8)0, k, walk->sides);
+    /* The face of the nearest is there for sure; from its foot to the edge of the face, whichever it is. */
+    long first[LANES], second[LANES];
+    vstore8(list->nearest, 0, first);
+    const double8 middle = PLANE_LANES(list->planes, first, 3) / 2;
+    vectors_t a = planes_at(list->planes, first);
+    vectors_t y = {a.x * middle, a.y * middle, a.z * middle};
+    const long8 flat_x = (fabs(a.x) <= fabs(a.y)) & (fabs(a.x) <= fabs(a.z)),
+                flat_y = ~flat_x & (fabs(a.y) <= fabs(a.z));
+    const vectors_t axis = {flat_x ? 1.0 : 0.0, flat_y ? 1.0 : 0.0, (flat_x | flat_y) ? 0.0 : 1.0};
+    const long8 usable = list->nearest2 > 0;
+    stop_t stop;
+    double8 inverse;
+    y = walk_ray(&stop, &inverse, list, y, cross8(a, axis), chosen & usable);
+    vstore8(chosen & ~usable, 0, cells->doubt);
+    vstore8(stop.at, 0, second);
+    for (int lane = 0; lane < LANES; ++lane) {
+        cells->faces[lane] = cells->corners[lane] = walk->counts[lane] = 0;
+        cells->lost[lane] = second[lane] < 0 || second[lane] == first[lane] ? -1 : 0;
+        face_of_entry(cells, walk, list, first[lane], lane);
+        face_of_entry(cells, walk, list, max(second[lane], 0L), lane);
+        walk->a[lane] = walk->c[lane] = walk->from[lane] = 0;
+        walk->b[lane] = 1;
+    }
+    vstore8(chosen & usable & ~vload8(0, cells->lost), 0, walk->active);
+    a = planes_at(cells->planes, walk->a);
+    vectors_t b = planes_at(cells->planes, walk->b), ab = cross8(a, b);
+    long8 active = vload8(0, walk->active);
+    for (int corner = 0; any(active) && corner < CORNER_CAPACITY; ++corner) {
+        const vectors_t end = walk_ray(&stop, &inverse, list, y, ab, active);
+        long entries[LANES], certain[LANES], now[LANES];
+        vstore8(stop.at < 0 ? 0 : stop.at, 0, entries);
+        const vectors_t c = planes_at(list->planes, entries);
+        const vectors_t bc = cross8(b, c), ca = cross8(c, a);
+        const double8 a2 = dot8(a, a), b2 = dot8(b, b), c2 = dot8(c, c);
+        /* What rounding has left over from step to step does not add up. */
+        y = along8(end, (0.5 - dot8(a, end)) * inverse, bc);
+        y = along8(y, (0.5 - dot8(b, end)) * inverse, ca);
+        y = along8(y, (0.5 - dot8(c, end)) * inverse, ab);
+        walk->corners[corner].x = y.x;
+        walk->corners[corner].y = y.y;
+        walk->corners[corner].z = y.z;
+        vstore8(stop.speed * stop.speed > CERTAIN_SINE2 * a2 * b2 * c2, 0, certain);
+        const long8 none = stop.at < 0;
+        vstore8(vload8(0, cells->lost) | (active & none), 0, cells->lost);
+        vstore8(active & ~none, 0, now);
+        for (int lane = 0; lane < LANES; ++lane) {
+            if (!now[lane])
+                continue;
+            const int f = face_of_entry(cells, walk, list, entries[lane], lane);
+            const int fa = walk->a[lane], fb = walk->b[lane];
+            if (f == fa || f == fb) {
+                cells->lost[lane] = -1;
+                now[lane] = 0;
+            } else if (f == HULL_CAPACITY || !certain[lane] || !put_corner(walk, lane, fa, fb, f, corner)) {
+                cells->doubt[lane] = -1;
+                now[lane] = 0;
+            } else {
+                walk->c[lane] = f;
+                LANE(walk->corner_faces, corner, lane) = (uchar4)(fa, fb, f, 0);
+                ++cells->corners[lane];
+                if (corner == 0)
+                    put_edge(walk, lane, fa, fb, corner, true);
+            }
+        }
+        active = vload8(0, now);
+        cells->reach2 = active ? fmax(cells->reach2, dot8(y, y)) : cells->reach2;
+        add_corner(cells, walk, now, y, a, b, c, ab, bc, ca, a2, b2, c2);
+        for (int lane = 0; lane < LANES; ++lane) {
+            if (now[lane])
+                next_edge(walk, lane);
+            else
+                walk->active[lane] = 0;
+        }
+        active = vload8(0, walk->active);
+        y = planes_at(walk->corners, walk->from);
+        a = planes_at(cells->planes, walk->a);
+        b = planes_at(cells->planes, walk->b);
+        ab = cross8(a, b);
+    }
+    /* All edges have two sides, and Euler's formula holds. */
+    for (int lane = 0; lane < LANES; ++lane)
+        if (walk->active[lane] || cells->corners[lane] != 2 * cells->faces[lane] - 4)
+            cells->doubt[lane] = -1;
+}
