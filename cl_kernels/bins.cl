@@ -134,8 +134,10 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
     WORK_ITEM(b);
     const int g = bin_grid[b];
     const int4 shape = grid_shapes[g];
+    if (b - shape.s0 == shape.s1 * shape.s2 * shape.s3)
+        return; /* the end of a grid's last bin */
     const int first = bins[b].s0, end = bins[b + 1].s0;
-    if (first == end || b - shape.s0 == shape.s1 * shape.s2 * shape.s3 || bins[b].s1 != bins[b + 1].s1)
+    if (first == end || bins[b].s1 != bins[b + 1].s1)
         return;
     sort_list(items + first, end - first);
     const REAL edge = 1 / FRAME_INVERSE(grid_frames[g]);
