@@ -136,8 +136,8 @@ kernel void measure_cells(const int size, global const int *places, global const
                           global const int *slot_counts, global const int *old_starts,
                           global const int *old_neighbours, global const uint *keep, global const int *starts,
                           global const REAL *points, const REAL4 box_lower,
-                          const REAL4 box_upper, global int *neighbours, global REAL *face_measures,
-                          global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
+                          const REAL4 box_upper, global int *neighbours, global FACE *face_measures,
+                          global FACE *face_centroids, global REAL *volumes, global REAL *offsets,
                           global REAL *covariances)
 {
     WORK_ITEM(i);
@@ -170,6 +170,29 @@ kernel void measure_cells(const int size, global const int *places, global const
         }
     }
     write_moments(&moments, i, volumes, offsets, covariances);
+}
+
+/* Per generator i: the measures of its faces again, in full precision. */
+kernel void measure_faces(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
+                          const REAL4 box_lower, const REAL4 box_upper, global REAL *measures, global REAL *centroids)
+{
+    WORK_ITEM(i);
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int begin = starts[i], end = starts[i + 1];
+    const REAL2 origin = corner(i, x, neighbours[end - 1], neighbours[begin], points, lower, upper);
+    REAL2 v = origin;
+    for (int k = begin; k < end; ++k) {
+        const REAL2 w =
+            k == end - 1 ? origin : corner(i, x, neighbours[k], neighbours[k + 1], points, lower, upper);
+        const REAL2 e = w - v;
+        const REAL2 sum = v + w;
+        measures[k] = sqrt(dot(e, e));
+        centroids[2 * k] = sum.s0 / 2;
+        centroids[2 * k + 1] = sum.s1 / 2;
+        v = w;
+    }
 }
 
 /* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has them, if

@@ -20,7 +20,7 @@ inline REAL regular_roundness(int n)
    energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
    quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
-kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts, global const REAL *face_measures,
+kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts, global const FACE *face_measures,
                             global const REAL *offsets, global const REAL *covariances, global const REAL *h,
                             global REAL *error, global REAL *quality, global REAL *energy, global REAL *reach OUTLINE_ARGS)
 {

@@ -5,7 +5,7 @@
    grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i),
    which is exact for linear psi in a closed cell; walls carry no flux. speed[i] = |u| / h. */
 kernel void follow_potential(const int size, global const int *starts, global const int *neighbours,
-                              global const REAL *face_measures, global const REAL *face_centroids,
+                              global const FACE *face_measures, global const FACE *face_centroids,
                               global const REAL *volumes, global const REAL *points, global const REAL *psi,
                               global const REAL *h, global REAL *u, global REAL *speed)
 {

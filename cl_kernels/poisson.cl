@@ -10,11 +10,12 @@
 #include "common/rows.h"
 
 #define REAL8 CLVORO_JOIN(REAL, 8)
+#define CONVERT_REAL8 CLVORO_JOIN(convert_, REAL8)
 
 /* The measure that cell j has of its face with cell i, -1 if it has none; eight of its faces at a time on a CPU, as in
    row_difference. */
 inline REAL measured_by(
-    int j, int i, int last, global const int *starts, global const int *neighbours, global const REAL *face_measures)
+    int j, int i, int last, global const int *starts, global const int *neighbours, global const FACE *face_measures)
 {
     const int end = starts[j + 1];
     int k = starts[j];
@@ -22,14 +23,15 @@ inline REAL measured_by(
 #if GROUP_SIZE == 1
     for (; k < end && k <= last; k += 8) {
         const int8 is_i = (vload8(0, neighbours + k) == i) & (k + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < end);
-        const REAL8 m = select((REAL8)(-1), vload8(0, face_measures + k), MASK8(REAL)(is_i));
+        const REAL8 there = CONVERT_REAL8(vload8(0, face_measures + k));
+        const REAL8 m = select((REAL8)(-1), there, MASK8(REAL)(is_i));
         const REAL4 m4 = fmax(m.lo, m.hi);
         const REAL2 m2 = fmax(m4.lo, m4.hi);
         measure = fmax(measure, fmax(m2.s0, m2.s1));
     }
 #endif
     for (; k < end; ++k)
-        if (neighbours[k] == i) measure = fmax(measure, face_measures[k]);
+        if (neighbours[k] == i) measure = fmax(measure, (REAL)face_measures[k]);
     return measure;
 }
 
@@ -37,7 +39,7 @@ inline REAL measured_by(
    so that A is symmetric to the last bit. A face that only one of them has seen is shorter than rounding, and gets the
    weight 0, as do walls. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho is smooth. */
 kernel void assemble(
-    int n, int weighted, global const int *starts, global const int *neighbours, global const REAL *face_measures,
+    int n, int weighted, global const int *starts, global const int *neighbours, global const FACE *face_measures,
     global const REAL *points, global const REAL *density, global STORE *weights)
 {
     const int i = get_global_id(0);

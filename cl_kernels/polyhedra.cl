@@ -224,7 +224,7 @@ kernel void match_faces(const int size, global const int *row_places, global con
 kernel void place_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *centroids,
                         global const uchar *kept, const int doubt, global const int *starts, global int *neighbours,
-                        global REAL *face_measures, global REAL *face_centroids)
+                        global FACE *face_measures, global FACE *face_centroids)
 {
     WORK_ITEM(i);
     const int n = row_counts[i], from = row_places[i];

@@ -54,8 +54,8 @@ inline float penalty_of(float penalty, float lenience, float worst, float bound,
 /* Per generator i: own[i] = dr_i/dx_i h_i; for each face the derivatives across it, rows[k] = dr_i/dx_j h_j and
    columns[k] = dr_j/dx_i h_i; eps; the inverse of the diagonal of B B^T + eps; and the start of the iteration from u = 0,
    r = b = excess + J displacement. Generators of labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any size is in range. */
-kernel void assemble(int n, global const int *starts, global const int *neighbours, global const REAL *face_measures,
-                     global const REAL *face_centroids, global const REAL *volumes, global const REAL *points,
+kernel void assemble(int n, global const int *starts, global const int *neighbours, global const FACE *face_measures,
+                     global const FACE *face_centroids, global const REAL *volumes, global const REAL *points,
                      global const REAL *gradient, global const REAL *h, global const REAL *quality,
                      global const REAL *excess, global const REAL *displacement, const REAL penalty,
                      const REAL lenience, const REAL bound, global float *rows, global float *columns,

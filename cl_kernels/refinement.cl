@@ -20,7 +20,7 @@ inline bool is_fixed(int i, int j, global const int *labels, int fixed)
 
 #ifdef POLYGON
 /* A cell at the boundary brings one, before its longest edge there: of two equally long, the first. */
-inline bool is_wall_side(int k, int begin, int end, global const int *neighbours, global const REAL *face_measures, REAL volume)
+inline bool is_wall_side(int k, int begin, int end, global const int *neighbours, global const FACE *face_measures, REAL volume)
 {
     bool longest = neighbours[k] < 0 && face_measures[k] > SHORT_FACE * sqrt(volume);
     for (int m = begin; m < end && longest; ++m)
@@ -33,7 +33,7 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbours
 #endif
 
 /* Per generator i: how many new generators it brings. */
-kernel void count_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
+kernel void count_children(const int size, global const int *starts, global const int *neighbours, global const FACE *face_measures,
                            global const REAL *volumes, global const int *labels, const int fixed, global int *counts)
 {
     WORK_ITEM(i);
@@ -50,10 +50,10 @@ kernel void count_children(const int size, global const int *starts, global cons
 
 /* Per generator i: write itself to row i of `finer` and its new generators behind row n. firsts are the prefix sums of
    the counts; h is the size on the new level. */
-kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
+kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const FACE *face_measures,
                            global const REAL *volumes, global const REAL *points, global const int *labels,
                            const int fixed, global const REAL *h, const int n,
-                           DOMAIN_ARGS, global const int *firsts, global REAL *finer, global const REAL *face_centroids OUTLINE_ARGS)
+                           DOMAIN_ARGS, global const int *firsts, global REAL *finer, global const FACE *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);

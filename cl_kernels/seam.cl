@@ -96,7 +96,7 @@ kernel void measure_margin(const int size, global const int *items, global const
    rounding may let one see a face of no size that the other does not see. Such a face is to go, so that the graph is
    symmetric; counts are those of the others. */
 kernel void fold_rows(const int size, global const int *starts, global const int *neighbours,
-                      global const REAL *face_measures, global const REAL *volumes, global const REAL *points,
+                      global const FACE *face_measures, global const REAL *volumes, global const REAL *points,
                       global const int *owners, global const int *codes, const REAL share, const int nearest,
                       global int *folded, global int *face_codes, global uchar *kept, global int *counts,
                       global int *report)
@@ -143,9 +143,9 @@ kernel void fold_rows(const int size, global const int *starts, global const int
 
 /* Per generator i: its row without the faces that were not kept. places[k] is where a face was before. */
 kernel void close_rows(const int size, global const int *starts, global const uchar *kept, global const int *new_starts,
-                       global const int *folded, global const int *face_codes, global const REAL *face_measures,
-                       global const REAL *face_centroids, global int *new_folded, global int *new_codes,
-                       global REAL *new_measures, global REAL *new_centroids, global int *places)
+                       global const int *folded, global const int *face_codes, global const FACE *face_measures,
+                       global const FACE *face_centroids, global int *new_folded, global int *new_codes,
+                       global FACE *new_measures, global FACE *new_centroids, global int *places)
 {
     WORK_ITEM(i);
     int to = new_starts[i];

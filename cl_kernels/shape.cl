@@ -10,7 +10,7 @@
 
 /* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. Four generators per work-item, as their
    logarithms come at the price of one on a CPU. */
-kernel void load_cells(const int size, global const int *starts, global const REAL *face_measures, global const REAL *volumes,
+kernel void load_cells(const int size, global const int *starts, global const FACE *face_measures, global const REAL *volumes,
                        global const REAL *quality, const REAL emphasis, global REAL *tension, global REAL *pressure)
 {
     const int begin = 4 * get_global_id(0), count = min(4, size - begin);
@@ -65,8 +65,8 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points, global c
 
    The corner v between the faces to j and q obeys (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it moves
    along the wall. Its pull is the sum of its faces' tensions along them, each that of the two cells beside the face. */
-kernel void descend_shape(const int size, global const int *starts, global const int *neighbours, global const REAL *face_measures,
-                          global const REAL *face_centroids, global const REAL *points, global const REAL *tension,
+kernel void descend_shape(const int size, global const int *starts, global const int *neighbours, global const FACE *face_measures,
+                          global const FACE *face_centroids, global const REAL *points, global const REAL *tension,
                           global const REAL *pressure, global const REAL *h, const REAL rate, const REAL longest,
                           global REAL *lloyd OUTLINE_ARGS)
 {

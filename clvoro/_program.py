@@ -152,16 +152,33 @@ class Engine:
             object.__setattr__(engine, name, getattr(self, name))
         return engine
 
+    @property
+    def face(self) -> np.dtype:
+        """Precision of what a diagram at work knows of its faces.
+
+        Relative to the generator, and so to the size of the cell, single precision is enough for all that moves
+        generators: it halves what is most of a diagram in the plane. Trimmed cells and polyhedra are measured where
+        they are cut, and only there, so that theirs is full.
+        """
+        whole = self.dim == 3 or any(name == "POLYGON" for name, _ in self.domain_defines)
+        return self.real if whole else np.dtype(np.float32)
+
+    @staticmethod
+    def name_of(real: np.dtype) -> str:
+        """Return the name of a precision in OpenCL C."""
+        return "double" if real == np.float64 else "float"
+
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
     ) -> Kernels:
         """Build `cl_kernels/<stage>.cl` and return its kernels."""
-        real = "double" if self.real == np.float64 else "float"
         # What a source does not name would only have it built anew for every domain.
         text = source_text(f"{stage}.cl")
-        named = {name: value for name, value in self.domain_defines if name in text}
+        of_domain = (("FACE", self.name_of(self.face)), *self.domain_defines)
+        named = {name: value for name, value in of_domain if name in text}
         full = {
-            "DIM": self.dim, "REAL": real, "GROUP_SIZE": self.group_size, **named, **(defines or {}),
+            "DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named,
+            **(defines or {}),
         }  # fmt: skip
         return Kernels(build_program(self.ctx, f"{stage}.cl", full, prelude), stage)
 

@@ -154,8 +154,8 @@ class Adapter:
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with Naming(host, domain, self.dtype):
             tessellator = Tessellator(stages, domain)
-            t = tessellator.tessellate(sorted_points, n, exact=True)
-        return fetch_diagram(engine, domain, t, labels, unfolded=tessellator.unfolded)
+            t, unfolded = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True))
+        return fetch_diagram(engine, domain, t, labels, unfolded=unfolded)
 
     def run(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
@@ -44,9 +44,9 @@ class Tessellation:
     starts : (n + 1,) int32
     neighbours : (m,) int32
         A generator, or ``-1 - wall``; counter-clockwise in 2D.
-    face_measures : (m,) real
-    face_centroids : (m, d) real
-        Relative to the generator.
+    face_measures : (m,) real, or single
+    face_centroids : (m, d) real, or single
+        Relative to the generator; see `Engine.face` for the precision.
     volumes : (n,) real
     offsets : (n, d) real
         Centroid minus generator: the Lloyd displacement.
@@ -153,8 +153,8 @@ class Cells:
             engine, d = self.engine, self.engine.dim
             self._of_faces = {
                 "neighbours": engine.empty(most, np.int32),
-                "face_measures": engine.empty(most),
-                "face_centroids": engine.empty((most, d)),
+                "face_measures": engine.empty(most, engine.face),
+                "face_centroids": engine.empty((most, d), engine.face),
             }
             self._room = most
 
@@ -238,6 +238,18 @@ class Cells:
         if flags & ~DOUBT:
             return None
         return self._measure(rows, box, points, n, *old, starts, m, flags, exact=False)[0]
+
+    def measure_faces(self, box: Box, t: Tessellation) -> Tessellation:
+        """Return `t`, a diagram of `box`, with what is known of faces in full precision, in arrays of its own."""
+        if t.face_measures.dtype == self.engine.real:
+            return t
+        engine, m = self.engine, len(t.neighbours)
+        measures, centroids = engine.empty(m), engine.empty((m, engine.dim))
+        engine.run_each(
+            self._kernels.measure_faces, t.n, t.starts, t.neighbours, t.points,
+            *box.device_corners(engine.real), measures, centroids,
+        )  # fmt: skip
+        return replace(t, face_measures=measures, face_centroids=centroids)
 
     def _read_flags(self) -> tuple[int, int, int]:
         """Read what has gone wrong, with `DOUBT` where any cell is doubtful, the first generator concerned, and m."""

@@ -194,7 +194,8 @@ class Saved:
             **{f"mesh.{name}": ((n, d), real) for name in ("points", "velocity")},
             "mesh.labels": ((n,), np.int32), "mesh.signatures": ((n,), np.uint64),
             "diagram.starts": ((n + 1,), np.int32), "diagram.neighbours": ((m,), np.int32),
-            "diagram.face_measures": ((m,), real), "diagram.face_centroids": ((m, d), real),
+            "diagram.face_measures": ((m,), a["diagram.face_measures"].dtype),
+            "diagram.face_centroids": ((m, d), a["diagram.face_measures"].dtype),
             "diagram.volumes": ((n,), real), "diagram.offsets": ((n, d), real),
             "diagram.covariances": ((n, d * (d + 1) // 2), real),
             "summaries": ((len(SUMMARIES), 4), real),
@@ -282,6 +283,10 @@ class Saved:
         if isinstance(domain, Polygon):
             # Trimmed from another diagram, which is not kept: made anew, it has the same bits.
             mesh.tessellation = mesh.tessellator.tessellate(mesh.points, mesh.n)
+        elif t["face_measures"].dtype != engine.face:
+            raise InputError(
+                f"cannot resume from {self.name}: it is damaged (faces are {t['face_measures'].dtype})"
+            )
         else:
             mesh.tessellation = Tessellation(n=mesh.n, points=mesh.points, **t)
         mesh.next_label = state["next_label"]

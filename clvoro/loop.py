@@ -248,6 +248,7 @@ class Loop:
             with mesh.engine.workspace.frame():
                 self.last.displace(mesh)
                 final = self.displacements()
+        mesh.complete()
         labels = np.sort(mesh.labels.get())
         size = mesh.values(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)

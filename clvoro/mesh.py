@@ -192,21 +192,32 @@ class Mesh:
         free: Domain | None = None,
         fixed: int = 0,
     ) -> None:
+        if labels is None:
+            labels = stages.engine.upload(np.arange(len(points)), np.int32)
+        rows = {"points": points, "labels": labels}
+        self._set_up(stages, domain, sizing, rows, coarsening, free, fixed)
+
+    def _set_up(
+        self,
+        stages: Stages,
+        domain: Domain,
+        sizing: Sizing,
+        rows: dict[str, cla.Array],
+        coarsening: float,
+        free: Domain | None,
+        fixed: int,
+    ) -> None:
+        """Make the mesh of generators in `rows`, which is used up: its points and labels."""
         self.engine, self.fixed = stages.engine, fixed
         self.free = domain if free is None else free
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
         self.tessellator = Tessellator(stages, domain, self._spacing)
         self.summaries = Summaries(self.engine, SUMMARIES)
         self._ordered: cla.Array | None = None
-        n = len(points)
-        self.next_label = n
-        if labels is None:
-            labels = self.engine.upload(np.arange(n), np.int32)
-        rows = {
-            "points": points, "labels": labels, "velocity": self.engine.zeros(points.shape),
-            "signatures": self.engine.zeros(n, np.uint64), "ever": self.engine.zeros(n),
-        }  # fmt: skip
-        del points, labels
+        n = self.next_label = len(rows["points"])
+        rows["velocity"] = self.engine.zeros(rows["points"].shape)
+        rows["signatures"] = self.engine.zeros(n, np.uint64)
+        rows["ever"] = self.engine.zeros(n)
         self.adopt(rows)
 
     def _spacing(self, points: np.ndarray) -> np.ndarray:
@@ -382,15 +393,23 @@ class Mesh:
 
     def refine(self) -> Mesh:
         """Return the mesh of the next finer level; the present generators keep their labels."""
-        finer = self.coarsening / 2
         self.stages.metric.scale_sizes(0.5, self.h)
-        points = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, self.fixed)
-        labels = self.engine.upload(self.next_label + np.arange(len(points)) - self.n, np.int32)
-        labels[: self.n] = self.labels
-        mesh = Mesh(
-            self.stages, self.domain, self.sizing, points, labels, finer, self.free, self.fixed
+        rows = {
+            "points": self.stages.refinement.refine(
+                self.free, self.t, self.h, self.labels, self.fixed
+            )
+        }
+        n = len(rows["points"])
+        rows["labels"] = self.engine.upload(self.next_label + np.arange(n) - self.n, np.int32)
+        rows["labels"][: self.n] = self.labels
+        # Should the run be interrupted, `update` makes again what follows from the generators.
+        self.__dict__.update({**dict.fromkeys(_DERIVED), "tessellation": None})
+        # Not by its constructor, whose caller would hold on to the arrays.
+        mesh = Mesh.__new__(Mesh)
+        mesh._set_up(
+            self.stages, self.domain, self.sizing, rows, self.coarsening / 2, self.free, self.fixed
         )
-        mesh.next_label = self.next_label + len(points) - self.n
+        mesh.next_label = self.next_label + n - self.n
         return mesh
 
     # Results: physical units, the caller's order.
@@ -402,10 +421,16 @@ class Mesh:
             self._order, self._ordered = np.argsort(self.labels.get(), kind="stable"), self.labels
         return array.get()[self._order].astype(np.float64) * factor
 
+    def complete(self) -> None:
+        """Let go of what only steps take, and evaluate what there is in full precision: for `finish`."""
+        self.stages.clear("poisson")
+        self.engine.workspace.clear()
+        self.tessellation, self._unfolded = self.tessellator.final(self.t)
+        self._evaluate_metric()
+
     def finish(self) -> Diagram:
         """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""
-        t, unfolded = self.tessellator.final(self.t)
         self.stages.release()
         return fetch_diagram(
-            self.engine, self.domain, t, self.labels, copy=False, unfolded=unfolded
+            self.engine, self.domain, self.t, self.labels, copy=False, unfolded=self._unfolded
         )

@@ -15,6 +15,7 @@ class Metric:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("metric")
+        self._exact = engine.kernels("metric", {"FACE": engine.name_of(engine.real)})
 
     def evaluate(
         self,
@@ -26,8 +27,10 @@ class Metric:
         reach: cla.Array,
     ) -> None:
         """Write the paper's (3.1), signed, its (4.1), each cell's part of its (2.3), and min(L, h); all (n,)."""
+        exact = t.face_measures.dtype == self.engine.real
+        kernels = self._exact if exact else self._kernels
         self.engine.run_each(
-            self._kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
+            kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
             t.covariances, h, error, quality, energy, reach, *t.outlines,
         )  # fmt: skip
 

@@ -76,7 +76,7 @@ class Poisson:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._kernels: dict[np.dtype, Kernels] = {}
+        self._kernels: dict[tuple[np.dtype, np.dtype], Kernels] = {}
         self._krylov = ConjugateGradient(engine)
         self._multigrid: Multigrid | None = None
         self._prepared: Laplacian | None = None
@@ -89,11 +89,14 @@ class Poisson:
         if self._multigrid is not None:
             self._multigrid.clear()
 
-    def _kernels_in(self, store: np.dtype) -> Kernels:
-        if store not in self._kernels:
-            name = "double" if store == np.float64 else "float"
-            self._kernels[store] = self.engine.kernels("poisson", {"STORE": name})
-        return self._kernels[store]
+    def _kernels_in(self, store: np.dtype, face: np.dtype | None = None) -> Kernels:
+        """Return the kernels for vectors, and measures of faces, in these precisions."""
+        key = store, self.engine.face if face is None else face
+        if key not in self._kernels:
+            names = (self.engine.name_of(real) for real in key)
+            defines = dict(zip(("STORE", "FACE"), names, strict=True))
+            self._kernels[key] = self.engine.kernels("poisson", defines)
+        return self._kernels[key]
 
     def assemble(
         self,
@@ -112,7 +115,7 @@ class Poisson:
         starts : (n + 1,) int32
         neighbours : (m,) int32
             Negative entries are walls.
-        face_measures : (m,) real
+        face_measures : (m,) real or single
         points : (n, d) real
             Generators.
         density : (n,) real, optional
@@ -134,8 +137,9 @@ class Poisson:
         store = np.dtype(np.float32) if tolerance >= ROUGH else engine.real
         weights = engine.scratch(len(neighbours), store)
         engine.run(
-            self._kernels_in(store).assemble, n, np.int32(n), np.int32(density is not None), starts,
-            neighbours, face_measures, points, points if density is None else density, weights,
+            self._kernels_in(store, face_measures.dtype).assemble, n, np.int32(n),
+            np.int32(density is not None), starts, neighbours, face_measures, points,
+            points if density is None else density, weights,
         )  # fmt: skip
         return Laplacian(starts, neighbours, weights)
 
@@ -307,7 +311,9 @@ class Poisson:
             most = _MOST_CYCLES if max_iterations is None else max_iterations
             multigrid = self.set_up_multigrid(laplacian, numbering)
             # What is enqueued in vain costs a cycle each, a look of the host much less.
-            first = run(multigrid.apply, most, max(1, min(self._latest - 1, 4)) if self._latest else 4)
+            first = run(
+                multigrid.apply, most, max(1, min(self._latest - 1, 4)) if self._latest else 4
+            )
             self._latest = first.iterations
             self._at_best = self._at_best or first.iterations
             # Far above what the precision allows it is the preconditioner, in float32, that is stuck.

@@ -198,8 +198,8 @@ class Seam:
             left = int(starts[n].get())
             places = engine.empty(left, np.int32)
             closed = (
-                engine.empty(left, np.int32), engine.empty(left, np.int32), engine.empty(left),
-                engine.empty((left, engine.dim)),
+                engine.empty(left, np.int32), engine.empty(left, np.int32),
+                engine.empty(left, engine.face), engine.empty((left, engine.dim), engine.face),
             )  # fmt: skip
             engine.run_each(
                 k.close_rows, n, t.starts, kept, starts, *graph, *measures, *closed, places

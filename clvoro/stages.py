@@ -6,6 +6,7 @@ from typing import Protocol
 
 import pyopencl.array as cla
 
+from ._primitives import Gather
 from ._program import Engine
 from .bins import Bins
 from .cells import Cells, Tessellation
@@ -27,6 +28,7 @@ class DiagramStages(Protocol):
     seam: Seam
     folded: FoldedCells
     trim: Trim
+    gather: Gather
 
 
 def tessellate_box(

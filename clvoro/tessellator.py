@@ -11,6 +11,7 @@ from .cells import Tessellation
 from .domain import Domain
 from .polygon import Polygon
 from .polygonal import PolygonTessellator
+from .polyhedra import Polyhedra
 from .stages import DiagramStages, tessellate_box
 from .torus import Torus, Unfolded
 
@@ -44,11 +45,18 @@ class Tessellator:
         return None if self.torus is None else self.torus.latest
 
     def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
-        """Return `t`, the latest diagram, and in a periodic box what it was folded from: made anew if it was not."""
-        latest = self.unfolded
-        if self.torus is not None and (latest is None or latest.folded.tessellation is not t):
-            t = self.torus.tessellate(t.points, t.n, whole=True)
-        return t, self.unfolded
+        """Return `t`, the latest diagram, with what is known of faces in full precision.
+
+        Return also, in a periodic box, what it was folded from: made anew if it was not.
+        """
+        if self.torus is not None:
+            latest = self.unfolded
+            if latest is None or latest.folded.tessellation is not t:
+                self.torus.tessellate(t.points, t.n, whole=True)
+            return self.torus.measure_faces(), self.unfolded
+        if self._polygon is None and not isinstance(self.stages.cells, Polyhedra):
+            t = self.stages.cells.measure_faces(self.domain, t)
+        return t, None
 
     def tessellate(
         self,

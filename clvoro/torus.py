@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,6 +133,19 @@ class Torus:
             )
         self.latest = Unfolded(images, t, folded) if whole else None
         return folded.tessellation
+
+    def measure_faces(self) -> Tessellation:
+        """Return the `latest` diagram with what is known of faces in full precision."""
+        latest, stages = self.latest, self.stages
+        assert latest is not None
+        t, places = latest.folded.tessellation, latest.folded.places
+        if isinstance(stages.cells, Polyhedra) or t.face_measures.dtype == stages.engine.real:
+            return t
+        whole = stages.cells.measure_faces(latest.images.box, latest.tessellation)
+        faces = whole.face_measures, whole.face_centroids
+        if places is not None:
+            faces = tuple(stages.gather.rows(places, array) for array in faces)
+        return replace(t, face_measures=faces[0], face_centroids=faces[1])
 
     def _repaired(self, points: cla.Array, n: int, previous: Tessellation) -> Tessellation | None:
         """Return `previous` carried over to `points`, in 2D; None where too much has changed."""

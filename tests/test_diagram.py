@@ -248,6 +248,23 @@ def test_many_cocircular_neighbours_enlarge_the_capacity(adapter64):
     check_invariants(diagram, np.finfo(float).eps)
 
 
+@pytest.mark.parametrize("name", ["random", "graded"])
+def test_faces_at_work_are_those_of_the_result_rounded(adapter64, name):
+    """In full precision they are measured where the corners are: what is rounded of that has the same bits."""
+    engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))
+    points = engine.upload(POINTS[name] / BOX.frame[1])
+    n, cells = len(points), Cells(engine)
+    t = cells.tessellate(BOX, points, n, Bins(engine).build(BOX, points, n))
+    exact, m = cells.measure_faces(BOX, t), int(t.starts.get()[-1])
+    for array in ("face_measures", "face_centroids"):
+        at_work, full = (getattr(d, array).get()[:m] for d in (t, exact))
+        assert at_work.dtype == np.float32
+        assert full.dtype == np.float64
+        assert np.array_equal(at_work, full.astype(np.float32))
+        assert (at_work != full).mean() > 0.9
+    assert np.array_equal(exact.neighbours.get(), t.neighbours.get())
+
+
 def test_enlarged_capacity_is_for_those_that_need_it(adapter64):
     """A mesh with a cell of very many faces does not make every later, larger one reserve as much."""
     engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))

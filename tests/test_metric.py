@@ -5,7 +5,7 @@ import patch
 import pytest
 import reference
 
-from clvoro.cells import Tessellation
+from clvoro.cells import Cells, Tessellation
 from clvoro.metric import Metric
 
 N = 300
@@ -36,7 +36,12 @@ def test_definitions(engine):
     points = patch.random_points(N, 618).astype(engine.real).astype(float)
     rng = np.random.default_rng(55)
     h = np.exp(rng.uniform(np.log(0.01), np.log(0.3), N)).astype(engine.real).astype(float)
-    error, quality, energy, reach = evaluate(engine, patch.tessellate(engine, points), h)
+    t = patch.tessellate(engine, points)
+    _, rough, *_ = evaluate(engine, t, h)
+    t = Cells(engine).measure_faces(patch.BOX, t)
+    error, quality, energy, reach = evaluate(engine, t, h)
+    # The sum of faces in single precision is right to half an eps, at work.
+    assert rough == pytest.approx(quality, rel=2 * float(np.finfo(np.float32).eps))
     cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
     # Areas and lengths of cells of 0.05 carry eps of the unit box, and relative errors so 20 to 400 eps.
     close = {"rel": 2000 * float(np.finfo(engine.real).eps)}

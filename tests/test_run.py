@@ -72,8 +72,10 @@ def check(result, field, box=BOX, real="float64"):
     assert (h["cells"][-1], h["level"][-1]) == (n, 0)
     assert h["mean_error"][-1] == pytest.approx(np.abs(result.error).mean(), rel=1e4 * eps, abs=eps)
     assert h["max_error"][-1] == pytest.approx(np.abs(result.error).max(), rel=1e4 * eps, abs=eps)
-    assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), rel=64 * eps)
-    assert h["min_quality"][-1] == pytest.approx(result.quality.min(), rel=64 * eps)
+    # On the way the lengths of faces are in single precision.
+    close = {"rel": 2 * float(np.finfo(np.float32).eps)}
+    assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), **close)
+    assert h["min_quality"][-1] == pytest.approx(result.quality.min(), **close)
     assert set(np.diff(h["step"])) <= {0, 1}
     assert h["step"][0] == 0
     assert (np.diff(h["level"]) <= 0).all()
