@@ -111,9 +111,10 @@ COUNT_LEAST = 1e-3
 """The same while polishing: a cell that comes late has few steps left to get its shape."""
 COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
-START_TOLERANCE, COUPLE_TOLERANCE = 3e-2, 0.1
-"""Relative residual of Poisson solves in 2D, on the coarsest level and after refinement: the next step sees the rest.
-Measured on F1, F2 and F3 (three starts each), a tenth of them changes neither sizes nor shapes."""
+START_TOLERANCE, COUPLE_TOLERANCE, GLIDE_TOLERANCE = 3e-2, 0.1, 3e-2
+"""Relative residuals in 2D where there are coarser levels: of Poisson solves on the coarsest and after refinement, and
+of the projection while defects glide. The next step sees the rest: measured on F2 and F3, three starts each, a tenth
+of them changes neither sizes nor shapes."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
 EXACT_STEPS_3D = 3
 
@@ -239,7 +240,10 @@ def plan_adaptive(
 def _adaptive_2d(
     effort: Effort, levels: int, exact: bool, aim: float, warm: bool
 ) -> Iterator[Action]:
-    glide = ProjectedMethod("lloyd", effort.relaxation, effort.momentum, eps=0.1)
+    glide = ProjectedMethod(
+        "lloyd", effort.relaxation, effort.momentum, eps=0.1,
+        tolerance=GLIDE_TOLERANCE if levels else ProjectedMethod.tolerance,
+    )  # fmt: skip
     if warm:
         yield Settle(COUNT_SHARE)
     for level in range(levels, -1, -1):
@@ -251,6 +255,8 @@ def _adaptive_2d(
         else:
             couple = effort.start if level else effort.start // 2
         tolerance = COUPLE_TOLERANCE if level < levels else START_TOLERANCE
+        if levels == 0:
+            tolerance = WeightedMethod.tolerance
         yield from [Step(WeightedMethod(cautious=True, tolerance=tolerance))] * couple
         yield Settle(COUNT_SHARE)
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
