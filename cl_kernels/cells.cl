@@ -1,7 +1,10 @@
 #include "common/corner.h"
 #include "common/graph.h"
-#include "common/moments.h"
+#include "common/measures.h"
 #include "common/widening.h"
+#if IN_LANES
+#include "common/eight_cells.h"
+#endif
 
 /* Per place p in bin order: the cell of generator i = items[p] as its list of neighbours, counter-clockwise.
 
@@ -131,7 +134,9 @@ kernel void match_faces(const int size, global const int *places, global const i
    face_centroids (m, 2)
    volumes (n,)              A_i
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
-   covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area */
+   covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area
+
+   In LANES a work-item takes so many generators, and there are so many fewer work-items. */
 kernel void measure_cells(const int size, global const int *places, global const int *slots,
                           global const int *slot_counts, global const int *old_starts,
                           global const int *old_neighbours, global const uint *keep, global const int *starts,
@@ -140,36 +145,20 @@ kernel void measure_cells(const int size, global const int *places, global const
                           global FACE *face_centroids, global REAL *volumes, global REAL *offsets,
                           global REAL *covariances)
 {
-    WORK_ITEM(i);
-    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
-    const int place = places[i];
+    const measures_t to = {starts, neighbours, face_measures, face_centroids, volumes, offsets, covariances};
+#if IN_LANES
+    const int first = (int)get_global_id(0) * LANES;
+    if (first < size)
+        measure_eight(&to, first, size, &rows, keep, points, lower, upper);
+#else
+    WORK_ITEM(i);
     int faces[ROW_CAPACITY];
-    int n = 0, listed;
-    global const int *row = face_row(&rows, i, &listed);
-    for (int k = 0; k < listed; ++k)
-        if (place < 0 || ((keep[place * KEEP_WORDS + k / 32] >> (k % 32)) & 1u))
-            faces[n++] = row[k];
-    const int start = starts[i];
-    moments_t moments = {0, 0, 0, 0, 0, 0};
-    if (n >= 3) {
-        const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
-        REAL2 v = origin;
-        for (int k = 0; k < n; ++k) {
-            const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
-            const REAL2 e = w - v;
-            const REAL2 sum = v + w;
-            add_triangle(&moments, v, w);
-            neighbours[start + k] = faces[k];
-            face_measures[start + k] = sqrt(dot(e, e));
-            face_centroids[2 * (start + k)] = sum.s0 / 2;
-            face_centroids[2 * (start + k) + 1] = sum.s1 / 2;
-            v = w;
-        }
-    }
-    write_moments(&moments, i, volumes, offsets, covariances);
+    const int n = kept_faces(faces, &rows, keep, i);
+    measure_cell(&to, i, faces, n, points, lower, upper);
+#endif
 }
 
 /* Per generator i: the measures of its faces again, in full precision. */

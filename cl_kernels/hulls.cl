@@ -1,7 +1,6 @@
 #include "common/candidates.h"
 
-/* The cells of eight generators at a time, one in each lane of vectors: for CPUs, whose compilers make no vectors of
-   work-items that branch as clipping does.
+/* The cells of eight generators at a time, one in each lane of vectors: for CPUs.
 
    Invert every generator at d from x in a circle about x: p = d / |d|^2. The half-plane y.d <= |d|^2 / 2 is y.p <= 1/2,
    so the neighbours of x are the corners of the convex hull of all p, and the corners of its cell belong to the hull's

@@ -24,7 +24,7 @@ ROW_CAPACITY = 20
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
 LARGEST_ROW = 512
 LANES, WRAP_GROUP = 8, 16
-"""Cells that a CPU's work-item makes at a time (`hulls.cl`), and its work-items per group."""
+"""Cells that a CPU's work-item makes at a time, in lanes of vectors, and the work-items per group of `hulls.cl`."""
 FIRST_REACH = 1.9
 """How far it looks for neighbours at first, in units of the spacing that the bins know."""
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
@@ -104,6 +104,9 @@ class Cells:
     Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
     """
 
+    _lanes = 1
+    """Cells that a work-item measures."""
+
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
@@ -114,10 +117,9 @@ class Cells:
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
-        self._kernels = engine.kernels("cells", defines)
-        self._wrap = None
-        if engine.group_size == 1 and engine.real == np.float64:
-            self._wrap = engine.kernels("hulls", defines).wrap_cells
+        self._lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
+        self._kernels = engine.kernels("cells", {**defines, "IN_LANES": int(self._lanes > 1)})
+        self._wrap = engine.kernels("hulls", defines).wrap_cells if self._lanes > 1 else None
 
     @property
     def defines(self) -> dict[str, object]:
@@ -302,11 +304,11 @@ class Cells:
         new, faces = self._views, self._of_faces
         # The previous graph is read meanwhile, and stays if this call is broken off.
         neighbours = engine.scratch(m, np.int32)
-        engine.run_each(
-            self._kernels.measure_cells, n, rows.places, rows.slots, rows.counts, old_starts,
-            old_neighbours, rows.keep, starts, points, *corners, neighbours,
-            faces["face_measures"], faces["face_centroids"], new["volumes"], new["offsets"],
-            new["covariances"],
+        engine.run(
+            self._kernels.measure_cells, -(-n // self._lanes), np.int32(n), rows.places, rows.slots,
+            rows.counts, old_starts, old_neighbours, rows.keep, starts, points, *corners,
+            neighbours, faces["face_measures"], faces["face_centroids"], new["volumes"],
+            new["offsets"], new["covariances"],
         )  # fmt: skip
         generator = 0
         if flags & DOUBT:

@@ -5,7 +5,7 @@ import patch
 import pytest
 from scipy.spatial import ConvexHull
 
-from clvoro.bins import Bins
+from clvoro.bins import MAX_LEVELS, Bins
 from clvoro.cells import FIRST_REACH, LANES, WRAP_GROUP, Cells
 
 BOX = patch.BOX
@@ -100,6 +100,39 @@ def test_rows_are_those_of_clipping(engine, name):
     assert np.array_equal(a.volumes, b.volumes)
     # The radius is computed from inverted positions, which round by eps of the ratio of distances.
     assert reach_a == pytest.approx(reach_b, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["1 random", "9 random", "random", "clusters", "ring and centre", "lattice to the walls"],
+)
+def test_measures_in_lanes_are_those_of_one_cell(engine, name):
+    points = np.clip(POINTS[name], 0, [1, 0.75])
+    n, x = len(points), engine.upload(points)
+    found = []
+    for lanes in (LANES, 1):
+        cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
+        build = cells._build
+
+        def build_so(*capacities, cells=cells, build=build, lanes=lanes):  # capacities may grow
+            build(*capacities)
+            defines = {**cells.defines, "MAX_DEPTH": MAX_LEVELS, "IN_LANES": int(lanes > 1)}
+            cells._kernels, cells._lanes = engine.kernels("cells", defines), lanes
+
+        cells._build = build_so
+        cells._build(cells.cell_capacity, cells.row_capacity)
+        found.append(patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False)))
+    a, b = found
+    for field in (
+        "starts",
+        "neighbours",
+        "face_measures",
+        "face_centroids",
+        "volumes",
+        "offsets",
+        "covariances",
+    ):
+        assert np.array_equal(getattr(a, field), getattr(b, field)), field
 
 
 @pytest.mark.parametrize(

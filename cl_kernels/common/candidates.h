@@ -1,4 +1,5 @@
 /* Lists of candidates for eight generators at a time, one in each lane of vectors; see `hulls.cl`. */
+#include "common/lanes.h"
 #include "common/near.h"
 
 #if !IS_DOUBLE
@@ -27,35 +28,6 @@ typedef struct {
     long8 nearest;
 } list_t;
 
-inline bool any_lane(long8 lanes)
-{
-    const long4 four = lanes.lo | lanes.hi;
-    const long2 two = four.lo | four.hi;
-    return (two.lo | two.hi) < 0;
-}
-
-inline long max_lane(long8 values)
-{
-    const long4 four = max(values.lo, values.hi);
-    const long2 two = max(four.lo, four.hi);
-    return max(two.lo, two.hi);
-}
-
-inline double min_lane(double8 values)
-{
-    const double4 four = min(values.lo, values.hi);
-    const double2 two = min(four.lo, four.hi);
-    return min(two.lo, two.hi);
-}
-
-/* Of vector number k[lane] of an array, that lane. */
-inline double8 pick(const double8 *vectors, long8 k)
-{
-    const double *values = (const double *)vectors;
-    return (double8)(LANE(values, k.s0, 0), LANE(values, k.s1, 1), LANE(values, k.s2, 2), LANE(values, k.s3, 3),
-                     LANE(values, k.s4, 4), LANE(values, k.s5, 5), LANE(values, k.s6, 6), LANE(values, k.s7, 7));
-}
-
 /* Append one candidate per lane, at (dx, dy), NaN where there is none; their places are the caller's to write. The
    generator itself is none: 0 times infinity is NaN. */
 inline void put_candidates(list_t *list, double8 dx, double8 dy)
@@ -74,7 +46,6 @@ inline void put_candidates(list_t *list, double8 dx, double8 dy)
 inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most, global const double *binned,
                       int own, double8 x, double8 y)
 {
-    /* Positions beside each other, even lanes before odd ones, so that two vectors hold those of a row. */
     double2 found[LIST_CAPACITY * LANES];
     const int length = list->length;
     const double16 self =
@@ -86,7 +57,7 @@ inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int 
     }
     for (int lane = 0; lane < LANES; ++lane) {
         int *to = (int *)(list->places + length) + lane;
-        double2 *to_found = found + lane / 2 + lane % 2 * 4;
+        double2 *to_found = found + ROW_PLACE(0, lane);
         const int *places = near->places;
         for (int word = 0; 64 * word < near->count; ++word, places += 64)
             for (ulong left = LANE((const ulong *)bits, word, lane); left; left &= left - 1) {
@@ -100,9 +71,10 @@ inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int 
     double8 largest2 = list->largest2;
     long8 nearest = list->nearest, same = 0;
     for (int k = 0; k < most; ++k) {
-        const double8 even = vload8(2 * k, (const double *)found), odd = vload8(2 * k + 1, (const double *)found);
-        const double8 dx = (double8)(even.s0, odd.s0, even.s2, odd.s2, even.s4, odd.s4, even.s6, odd.s6) - x;
-        const double8 dy = (double8)(even.s1, odd.s1, even.s3, odd.s3, even.s5, odd.s5, even.s7, odd.s7) - y;
+        double8 dx, dy;
+        load_row(found, k, &dx, &dy);
+        dx -= x;
+        dy -= y;
         const double8 square = fma(dx, dx, dy * dy);
         const double8 scale = 1 / square;
         list->x[length + k] = dx * scale;
