@@ -109,24 +109,28 @@ kernel void place_items(const int size, global const int *keys, global const int
     items[bins[keys[i]].s0 + ranks[i]] = i;
 }
 
-/* The edge that a bin of a plane would have if it held OCCUPANCY generators where a block of up to 3 x 3 bins of its
-   grid holds as many as it does: a leaf's own few generators tell less of how far neighbours are. */
+/* The edge that a bin would have if it held OCCUPANCY generators where a block of up to 3 bins each way of its grid
+   holds as many as it does: a leaf's own few generators tell less of how far neighbours are. */
 inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
-    const int place = b - shape.s0;
-    const int row = place / shape.s1, column = place - row * shape.s1;
+    const int place = b - shape.s0, plane = shape.s1 * shape.s2;
+    const int layer = place / plane, row = (place - layer * plane) / shape.s1, column = place % shape.s1;
     const int left = max(column - 1, 0), right = min(column + 1, shape.s1 - 1);
-    const int bottom = max(row - 1, 0), top = min(row + 1, shape.s2 - 1);
+    const int front = max(row - 1, 0), back = min(row + 1, shape.s2 - 1);
+    const int bottom = max(layer - 1, 0), top = min(layer + 1, shape.s3 - 1);
     int count = 0;
-    for (int r = bottom; r <= top; ++r) {
-        global const int2 *row_bins = bins + shape.s0 + r * shape.s1;
-        count += row_bins[right + 1].s0 - row_bins[left].s0;
-    }
-    return edge * sqrt((REAL)(OCCUPANCY * (right - left + 1) * (top - bottom + 1)) / count);
+    for (int l = bottom; l <= top; ++l)
+        for (int r = front; r <= back; ++r) {
+            global const int2 *row_bins = bins + shape.s0 + (l * shape.s2 + r) * shape.s1;
+            count += row_bins[right + 1].s0 - row_bins[left].s0;
+        }
+    const int held = (right - left + 1) * (back - front + 1) * (top - bottom + 1);
+    const REAL share = (REAL)(OCCUPANCY * held) / count;
+    return edge * (DIM == 2 ? sqrt(share) : cbrt(share));
 }
 
 /* Per bin: sort its items by generator index (a leaf holds a handful, but duplicates may pile up), and note for each
-   place the edge of its leaf and, in 2D, the spacing there. */
+   place the edge of its leaf and the spacing there. */
 kernel void sort_bins(const int size, global const int2 *bins, global const int *bin_grid,
                       global const FRAME *grid_frames, global const int4 *grid_shapes, global int *items,
                       global float *reach, global float *spacing)
@@ -143,11 +147,9 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
     const REAL edge = 1 / FRAME_INVERSE(grid_frames[g]);
     for (int p = first; p < end; ++p)
         reach[p] = (float)edge;
-#if DIM == 2
     const REAL mean = local_spacing(b, edge, shape, bins);
     for (int p = first; p < end; ++p)
         spacing[p] = (float)mean;
-#endif
 }
 
 /* Per place p: the generator's position. */

@@ -17,8 +17,6 @@
 #define SPREAD 3
 #define MAX_ROUNDS 20
 #define GROWTH 1.4 /* of the radius where lists were too short */
-/* If more generators than these are near eight lanes, their radius was too large a guess. */
-#define CROWDED 640
 #ifndef STRETCH
 #error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8"
 #endif
@@ -28,17 +26,17 @@
 #define CERTAIN_NEAREST2 1e-7
 #define CERTAIN_AREA 1e-7
 
-/* Choose from the lanes to do those near the first of them; the box holds them, r is their greatest radius. */
-inline long8 choose_lanes(long8 todo, const double *xs, const double *ys, const double *zs, double8 radii,
-                          double spread, double4 *lower, double4 *upper, double *r)
+/* Choose from the lanes to do those near that of the first place; the box holds them, r is their greatest radius. */
+inline long8 choose_lanes(long8 todo, const int *places, const double *xs, const double *ys, const double *zs,
+                          double8 radii, double spread, double4 *lower, double4 *upper, double *r)
 {
     long wanted[LANES], chosen[LANES];
     double rs[LANES];
     vstore8(todo, 0, wanted);
     vstore8(radii, 0, rs);
-    int first = 0;
-    while (!wanted[first])
-        ++first;
+    int first = -1;
+    for (int lane = 0; lane < LANES; ++lane)
+        first = wanted[lane] && (first < 0 || places[lane] < places[first]) ? lane : first;
     const double4 centre = (double4)(xs[first], ys[first], zs[first], 0);
     *lower = *upper = centre;
     *r = rs[first];
@@ -242,89 +240,128 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
     write_cells(cells, &m, vload8(0, whole) & certain, places, need, out);
 }
 
+/* Choose lanes, and see what is near them. Radii that were guessed are changed where they hold too many or too few.
+   False if too much is near the chosen ones. */
+inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *places,
+                       const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen, double4 *lower,
+                       double4 *upper, double *widest, const search_t *in)
+{
+    const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
+    double spread = SPREAD;
+    for (int attempt = 0;; ++attempt) {
+        *chosen = choose_lanes(todo, places, xs, ys, zs, *r, spread, lower, upper, widest);
+        const bool fits = collect_runs(runs, *lower, *upper, *widest, in->bins, in->grid_frames, in->grid_shapes);
+        if (!fits || runs->total > NEAR_CAPACITY) {
+            if (attempt == 12)
+                return false;
+            /* Fewer lanes, then less about one. */
+            *r = (*chosen & (spread < SPREAD / 4.0 ? -1L : 0L)) ? 0.7 * *r : *r;
+            spread = spread < SPREAD / 4.0 ? 0 : spread / 2;
+            continue;
+        }
+        near->length = 0;
+        for (int run = 0; run < runs->n; ++run)
+            for (int c = 0; c < runs->counts[run]; ++c)
+                near->places[near->length++] = runs->firsts[run] + c;
+        for (;; ++attempt) {
+            see_near(near, list, in->binned, x, y, z, *chosen ? *r * *r : 0);
+            const double8 total = convert_double8(near->totals[SHELLS - 1]);
+            const long8 guessed = *chosen & fresh & ((total > MANY) | (total < FEW));
+            if (attempt >= 4 || !any(guessed))
+                return true;
+            *r = guessed ? *r * clamp(cbrt(ENOUGH / total), 0.5, 1.6) : *r;
+            if (any(guessed & (*r > *widest)))
+                break;
+        }
+    }
+}
+
 /* Per stretch of places in bin order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
    UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in edges of the
    generator's leaf. Only the first `rows` generators get cells. */
 kernel void wrap_cells(const int size, const int n, const int rows, global const double *binned,
-                       global const int *items, global float *reach, global const int2 *bins,
-                       global const FRAME *grid_frames, global const int4 *grid_shapes, const double4 box_lower,
-                       const double4 box_upper, const double first_reach, const int room, global int *row_places,
-                       global int *row_counts, global int *labels, global double *measures, global double *centroids,
-                       global double *volumes, global double *offsets, global double *covariances, global int *report)
+                       global const int *items, global const float *spacing, global float *reach,
+                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                       const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
+                       global int *row_places, global int *row_counts, global int *labels, global double *measures,
+                       global double *centroids, global double *volumes, global double *offsets,
+                       global double *covariances, global int *report)
 {
     WORK_ITEM(stretch);
     const output_t out = {room,   items,    reach,     row_places, row_counts, labels,
                           report, measures, centroids, volumes,    offsets,    covariances};
     const search_t in = {binned, bins, grid_frames, grid_shapes, box_lower, box_upper};
     runs_t runs;
+    near_t near;
     list_t list;
     cells_t cells;
     walk_t walk;
     later_t later;
     later.n = 0;
     const int end = min(n, (stretch + 1) * STRETCH);
-    for (int own = stretch * STRETCH; own < end; own += LANES) {
-        double xs[LANES], ys[LANES], zs[LANES], rs[LANES];
-        long wanted[LANES];
-        int places[LANES];
+    int next = stretch * STRETCH;
+    double xs[LANES], ys[LANES], zs[LANES], rs[LANES];
+    int places[LANES], rounds[LANES];
+    long wanted[LANES], guessed[LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        wanted[lane] = guessed[lane] = 0;
+        places[lane] = rounds[lane] = 0;
+        xs[lane] = ys[lane] = zs[lane] = rs[lane] = 0;
+    }
+    for (;;) {
+        /* The next generators take the lanes of those whose cells are done. */
         for (int lane = 0; lane < LANES; ++lane) {
-            const int p = min(own + lane, n - 1);
-            const bool mine = own + lane < n && items[p] < rows;
-            wanted[lane] = mine ? -1 : 0;
-            places[lane] = p;
-            xs[lane] = binned[3 * p];
-            ys[lane] = binned[3 * p + 1];
-            zs[lane] = binned[3 * p + 2];
-            rs[lane] = first_reach * reach[p];
-            if (mine)
-                row_counts[items[p]] = UNFINISHED;
-        }
-        double8 r = vload8(0, rs);
-        long8 todo = vload8(0, wanted), fresh = todo;
-        for (int round = 0; any(todo) && round < MAX_ROUNDS; ++round) {
-            double4 lower, upper;
-            double widest;
-            long8 chosen;
-            bool fits;
-            for (int attempt = 0;; ++attempt) {
-                chosen = choose_lanes(todo, xs, ys, zs, r, attempt < 6 ? SPREAD : 0, &lower, &upper, &widest);
-                fits = collect_runs(&runs, lower, upper, widest, bins, grid_frames, grid_shapes) &&
-                       runs.total <= NEAR_CAPACITY;
-                const bool shrink = !fits || (runs.total > CROWDED && any(chosen & fresh));
-                if (!shrink || attempt == 8)
-                    break;
-                r = chosen ? 0.75 * r : r;
+            if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
+                continue;
+            while (next < end && items[next] >= rows)
+                ++next;
+            wanted[lane] = guessed[lane] = next < end ? -1 : 0;
+            if (next < end) {
+                row_counts[items[next]] = UNFINISHED;
+                places[lane] = next;
+                rounds[lane] = 0;
+                xs[lane] = binned[3 * next];
+                ys[lane] = binned[3 * next + 1];
+                zs[lane] = binned[3 * next + 2];
+                rs[lane] = first_reach * spacing[next];
+                ++next;
             }
-            todo &= ~chosen;
-            if (!fits)
-                continue;
-            double8 seen = r;
-            chosen &= ~list_near(&list, &runs, binned, own, xs, ys, zs, chosen, lower, upper, widest, box_lower,
-                                 box_upper, fresh, &seen);
-            fresh &= ~chosen;
-            if (!any(chosen))
-                continue;
-            walk_cells(&cells, &walk, &list, chosen);
-            const long8 lost = chosen & vload8(0, cells.lost), closed = chosen & ~lost & ~vload8(0, cells.doubt);
-            const moments_t m = finish_cells(&cells, &walk, closed);
-            todo |= lost;
-            r = lost ? GROWTH * seen : r;
-            const double8 need = 2 * sqrt(cells.reach2) * (1 + 8 * DBL_EPSILON);
-            long far[LANES], whole[LANES];
-            double needs[LANES];
-            vstore8(closed & ~(need <= seen), 0, far);
-            vstore8(closed, 0, whole);
-            vstore8(need, 0, needs);
-            vstore8(seen, 0, rs);
-            for (int lane = 0; lane < LANES; ++lane)
-                if (far[lane] &&
-                    find_more(&later, &runs, &cells, &walk, lane, places[lane], rs[lane], needs[lane], &in) != 0) {
-                    whole[lane] = 0;
-                    while (later.n == LANES)
-                        walk_later(&later, &runs, &in, &out);
-                }
-            write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
         }
+        long8 todo = vload8(0, wanted), fresh = vload8(0, guessed), chosen;
+        if (!any(todo))
+            break;
+        double4 lower, upper;
+        double widest;
+        double8 r = vload8(0, rs);
+        const bool fits =
+            see_enough(&near, &list, &runs, todo, fresh, places, xs, ys, zs, &r, &chosen, &lower, &upper, &widest, &in);
+        vstore8(todo & ~chosen, 0, wanted);
+        if (!fits)
+            continue;
+        chosen &= ~list_near(&list, &near, binned, places, xs, ys, zs, lower, upper, widest, box_lower, box_upper);
+        if (!any(chosen))
+            continue;
+        walk_cells(&cells, &walk, &list, chosen);
+        const long8 lost = chosen & vload8(0, cells.lost), closed = chosen & ~lost & ~vload8(0, cells.doubt);
+        const moments_t m = finish_cells(&cells, &walk, closed);
+        const double8 need = 2 * sqrt(cells.reach2) * (1 + 8 * DBL_EPSILON);
+        long far[LANES], whole[LANES];
+        double needs[LANES];
+        vstore8(closed & ~(need <= r), 0, far);
+        vstore8(closed, 0, whole);
+        vstore8(need, 0, needs);
+        vstore8(r, 0, rs);
+        for (int lane = 0; lane < LANES; ++lane)
+            if (far[lane] &&
+                find_more(&later, &runs, &cells, &walk, lane, places[lane], rs[lane], needs[lane], &in) != 0) {
+                whole[lane] = 0;
+                while (later.n == LANES)
+                    walk_later(&later, &runs, &in, &out);
+            }
+        write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
+        vstore8(vload8(0, wanted) | lost, 0, wanted);
+        vstore8(fresh & ~chosen, 0, guessed);
+        vstore8(lost ? GROWTH * r : r, 0, rs);
     }
     while (later.n > 0)
         walk_later(&later, &runs, &in, &out);

@@ -34,7 +34,7 @@ class BinnedPoints:
     reach : (>= n,) float32
         Edge of the leaf that holds the generator, in the same order.
     spacing : (>= n,) float32
-        In 2D: the edge that a bin there would have if it held `OCCUPANCY` generators, by the bins about the leaf.
+        The edge that a bin there would have if it held `OCCUPANCY` generators, by the bins about the leaf.
     bins : (b, 2) int32
     grid_frames : (g, 4) real
     grid_shapes : (g, 4) int32

@@ -22,7 +22,7 @@ FACES_PER_CELL = 16.5
 STRETCH = 128
 """Generators whose cells a CPU's work-item makes, eight at a time (`walks.cl`)."""
 FIRST_REACH = 2.0
-"""How far it looks for neighbours at first, in edges of a bin."""
+"""How far it looks for neighbours at first, in units of the spacing that the bins know."""
 
 
 class Polyhedra:
@@ -146,7 +146,8 @@ class Polyhedra:
             if previous is not None and warm
             else (row_counts, row_counts)
         )
-        capacity, again, first_reach = FACE_CAPACITY, False, FIRST_REACH
+        capacity, again = FACE_CAPACITY, False
+        first_reach, spacing = FIRST_REACH, binned.spacing
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
@@ -159,8 +160,8 @@ class Polyhedra:
             if self._wrap is not None and not again:
                 engine.run_each(
                     self._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), binned.points,
-                    binned.items, *search, lower, upper, engine.real.type(first_reach), room,
-                    *written, group=1,
+                    binned.items, spacing, *search, lower, upper, engine.real.type(first_reach),
+                    room, *written, group=1,
                 )  # fmt: skip
             some = np.int32(again or self._wrap is not None)
             engine.run_each(
@@ -174,7 +175,7 @@ class Polyhedra:
                 self._refuse(flags, generator)
             if m > self._room:
                 # All anew: what did not fit was not kept. How far to look is known now.
-                first_reach = 1.0
+                first_reach, spacing = 1.0, binned.reach
                 labels, measures, centroids = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.array([0, 2**31 - 1, 0], np.int32))

@@ -59,8 +59,8 @@ def check(binned, points, dim, eps):
         assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
         assert count <= SPLIT_COUNT[dim] or level == MAX_LEVELS - 1
         assert np.allclose(reach[place], edge, rtol=1e-6)
-        if dim == 2:  # float32, and the grid's 1 / edge rounds
-            assert np.allclose(spacings[place], spacing, rtol=1e-6)
+        # float32, and the grid's 1 / edge rounds
+        assert np.allclose(spacings[place], spacing, rtol=1e-6)
         # A generator lies in its bin but for the rounding of the bin's corner; outermost bins take what rounds out.
         inside = points[items[place]]
         for a in range(dim):

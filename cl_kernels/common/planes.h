@@ -21,12 +21,15 @@ typedef struct {
 /* Lists have shells, by distance: the outer ends of all, as shares of the radius. */
 #define SHELLS 2
 constant const double SHELL_ENDS[SHELLS] = {0.86, 1};
-#define NEAR_CAPACITY 1024
 #define SHELL_CAPACITY 64
 #define LIST_CAPACITY (SHELLS * SHELL_CAPACITY + 8)
-/* A list of more than MANY is cut to about ENOUGH of the nearest. */
-#define MANY 96
-#define ENOUGH 56
+/* Lists of more than MANY or fewer than FEW, before the walls, are made to hold about ENOUGH. */
+#define MANY 100
+#define ENOUGH 76
+#define FEW 52
+/* What may be near the generators of all lanes. */
+#define NEAR_CAPACITY 1024
+#define NEAR_WORDS (NEAR_CAPACITY / 64)
 
 /* Shells are the same in length for all lanes: spare entries are p = 0, which cuts nothing. */
 typedef struct {
@@ -46,18 +49,52 @@ inline void put_plane(list_t *list, int k, int lane, double x, double y, double 
     LANE(list->places, k, lane) = place;
 }
 
-/* Add the generators whose bits are set, but those at places `own` + lane, to the lists of counts[lane] entries. */
-inline void add_seen(list_t *list, const int *near, int words, const long8 *bits, global const double *binned, int own,
+/* Which of the generators that may be near are so: bits for each shell; how many, with those of the shells before. */
+typedef struct {
+    int length;
+    int places[NEAR_CAPACITY];
+    long8 bits[SHELLS][NEAR_WORDS], totals[SHELLS];
+} near_t;
+
+/* Find out which generators are nearer than r, and in which shells. */
+inline void see_near(near_t *near, list_t *list, global const double *binned, double8 x, double8 y, double8 z,
+                     double8 r2)
+{
+    for (int shell = 0; shell < SHELLS; ++shell) {
+        list->radii2[shell] = r2 * (SHELL_ENDS[shell] * SHELL_ENDS[shell]);
+        near->totals[shell] = 0;
+    }
+    for (int word = 0; 64 * word < near->length; ++word) {
+        const int count = min(near->length - 64 * word, 64);
+        long8 seen[SHELLS] = {0}, bit = 1;
+        for (int c = 0; c < count; ++c) {
+            global const double *at = binned + 3 * near->places[64 * word + c];
+            const double8 dx = at[0] - x, dy = at[1] - y, dz = at[2] - z;
+            const double8 d2 = fma(dx, dx, fma(dy, dy, dz * dz));
+            _Pragma("unroll") for (int shell = 0; shell < SHELLS; ++shell) seen[shell] |=
+                (d2 < list->radii2[shell]) & bit;
+            bit += bit;
+        }
+        for (int shell = 0; shell < SHELLS; ++shell) {
+            near->bits[shell][word] = shell > 0 ? seen[shell] & ~seen[shell - 1] : seen[0];
+            near->totals[shell] += popcount(seen[shell]);
+        }
+    }
+}
+
+/* Add the generators of a shell, but those at places own[lane], to the lists of counts[lane] entries. */
+inline void add_seen(list_t *list, const near_t *near, int shell, global const double *binned, const int *own,
                      const double *xs, const double *ys, const double *zs, int *counts)
 {
+    const ulong *bits = (const ulong *)near->bits[shell];
     for (int lane = 0; lane < LANES; ++lane) {
         const double x = xs[lane], y = ys[lane], z = zs[lane];
         int k = counts[lane];
-        for (int word = 0; word < words; ++word)
-            for (ulong left = LANE((const ulong *)bits, word, lane); left; left &= left - 1) {
-                const int q = near[64 * word + (int)popcount(~left & (left - 1))];
+        for (int word = 0; 64 * word < near->length; ++word)
+            for (ulong left = LANE(bits, word, lane); left; left &= left - 1) {
+                const int q = near->places[64 * word + (int)popcount(~left & (left - 1))];
                 put_plane(list, k, lane, binned[3 * q] - x, binned[3 * q + 1] - y, binned[3 * q + 2] - z, q);
-                k += q != own + lane;
+                k += q != own[lane];
             }
         counts[lane] = k;
     }
@@ -88,51 +125,16 @@ inline void add_wall(list_t *list, double8 distances, int wall, int *counts)
                   wall > 3 ? along[lane] : 0, -1 - wall);
 }
 
-/* List all generators nearer than r, of `runs`, for the chosen lanes, and the walls that [lower, upper] and `reach`
-   about it touch. The radius of a `fresh` list that would be long is made less. Lists that do not fit are left empty;
-   returns those lanes. */
-inline long8 list_near(list_t *list, const runs_t *runs, global const double *binned, int own, const double *xs,
-                       const double *ys, const double *zs, long8 chosen, double4 lower, double4 upper, double reach,
-                       double4 box_lower, double4 box_upper, long8 fresh, double8 *r)
+/* List what has been seen near, and the walls that [lower, upper] and `reach` about it touch. Lists that do not fit are
+   left empty; returns those lanes. */
+inline long8 list_near(list_t *list, near_t *near, global const double *binned, const int *own, const double *xs,
+                       const double *ys, const double *zs, double4 lower, double4 upper, double reach,
+                       double4 box_lower, double4 box_upper)
 {
     const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
-    int near[NEAR_CAPACITY];
-    int length = 0;
-    for (int run = 0; run < runs->n; ++run)
-        for (int c = 0; c < runs->counts[run]; ++c)
-            near[length++] = runs->firsts[run] + c;
-    const int words = (length + 63) / 64;
-    long8 bits[SHELLS][NEAR_CAPACITY / 64], totals[SHELLS];
-    double8 r2 = chosen ? *r * *r : 0;
-    for (int attempt = 0;; ++attempt) {
-        for (int shell = 0; shell < SHELLS; ++shell) {
-            list->radii2[shell] = r2 * (SHELL_ENDS[shell] * SHELL_ENDS[shell]);
-            totals[shell] = 0;
-        }
-        for (int word = 0; word < words; ++word) {
-            const int count = min(length - 64 * word, 64);
-            long8 seen[SHELLS] = {0}, bit = 1;
-            for (int c = 0; c < count; ++c) {
-                global const double *at = binned + 3 * near[64 * word + c];
-                const double8 dx = at[0] - x, dy = at[1] - y, dz = at[2] - z;
-                const double8 d2 = fma(dx, dx, fma(dy, dy, dz * dz));
-                _Pragma("unroll") for (int shell = 0; shell < SHELLS; ++shell) seen[shell] |=
-                    (d2 < list->radii2[shell]) & bit;
-                bit += bit;
-            }
-            for (int shell = 0; shell < SHELLS; ++shell) {
-                bits[shell][word] = shell > 0 ? seen[shell] & ~seen[shell - 1] : seen[0];
-                totals[shell] += popcount(seen[shell]);
-            }
-        }
-        const long8 many = fresh & (totals[SHELLS - 1] > MANY);
-        if (attempt == 3 || !any(many))
-            break;
-        r2 = many ? r2 * pow(ENOUGH / convert_double8(totals[SHELLS - 1]), (double8)(2.0 / 3)) : r2;
-    }
-    long8 full = totals[0] > SHELL_CAPACITY;
+    long8 full = near->totals[0] > SHELL_CAPACITY;
     for (int shell = 1; shell < SHELLS; ++shell)
-        full |= totals[shell] - totals[shell - 1] > SHELL_CAPACITY;
+        full |= near->totals[shell] - near->totals[shell - 1] > SHELL_CAPACITY;
     int counts[LANES];
     for (int lane = 0; lane < LANES; ++lane)
         counts[lane] = 0;
@@ -150,9 +152,9 @@ inline long8 list_near(list_t *list, const runs_t *runs, global const double *bi
         add_wall(list, box_upper.s2 - z, 5, counts);
     for (int shell = 0; shell < SHELLS; ++shell) {
         if (any(full))
-            for (int word = 0; word < words; ++word)
-                bits[shell][word] &= ~full;
-        add_seen(list, near, words, bits[shell], binned, own, xs, ys, zs, counts);
+            for (int word = 0; 64 * word < near->length; ++word)
+                near->bits[shell][word] &= ~full;
+        add_seen(list, near, shell, binned, own, xs, ys, zs, counts);
         list->ends[shell] = pad_lists(list, counts);
     }
     list->nearest2 = INFINITY;
@@ -169,6 +171,5 @@ inline long8 list_near(list_t *list, const runs_t *runs, global const double *bi
         list->nearest2 = nearer ? d2 : list->nearest2;
         list->nearest = nearer ? (long8)k : list->nearest;
     }
-    *r = sqrt(r2);
-    return chosen & full;
+    return full;
 }
