@@ -32,10 +32,10 @@ inline REAL2 difference(global const REAL *points, int from, int to)
 
 /* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5 at
    a wall, 4 in a corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an
-   unstrained lattice. Only six-sided inner cells have weight. */
+   unstrained lattice, in single precision: it is compared with thresholds. Only six-sided inner cells have weight. */
 kernel void measure_strain(const int size, global const int *starts, global const int *neighbours,
                            global const REAL *points, global const REAL *h, global int2 *kinds,
-                           global REAL4 *strain OUTLINE_ARGS)
+                           global float4 *strain OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const int n = starts[i + 1] - starts[i];
@@ -59,27 +59,26 @@ kernel void measure_strain(const int size, global const int *starts, global cons
     kinds[i] = (int2)(n - (6 - min(walls, 2)), walls);
 #endif
     s /= max(n - walls, 1);
-    s.s3 = walls == 0 && n == 6;
-    strain[i] = s;
+    strain[i] = (float4)(s.s0, s.s1, s.s2, walls == 0 && n == 6);
 }
 
 /* Per generator i: the weighted mean of the strain over itself and its neighbours, and the sum of the weights. */
-kernel void average_strain(const int size, global const int *starts, global const int *neighbours, global const REAL4 *strain,
-                           global REAL4 *mean)
+kernel void average_strain(const int size, global const int *starts, global const int *neighbours,
+                           global const float4 *strain, global float4 *mean)
 {
     WORK_ITEM(i);
-    REAL4 own = strain[i];
-    REAL weight = own.s3;
-    REAL4 sum = own * own.s3;
+    const float4 own = strain[i];
+    float weight = own.s3;
+    float4 sum = own * own.s3;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
         if (j < 0)
             continue;
-        const REAL4 other = strain[j];
+        const float4 other = strain[j];
         sum += other * other.s3;
         weight += other.s3;
     }
-    sum = weight > 0 ? sum / weight : (REAL4)(1, 0, 1, 0);
+    sum = weight > 0 ? sum / weight : (float4)(1, 0, 1, 0);
     sum.s3 = weight;
     mean[i] = sum;
 }
@@ -88,7 +87,7 @@ kernel void average_strain(const int size, global const int *starts, global cons
    largest, t from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if wanted,
    come first: they can go altogether. So do those of a cell with a charge of 2, the worst cells that there are. */
 kernel void score_pairs(const int size, global const int *starts, global const int *neighbours,
-                        global const REAL *points, global const int2 *kinds, global const REAL4 *strain,
+                        global const REAL *points, global const int2 *kinds, global const float4 *strain,
                         const int at_walls, global int *partners, global REAL *pull, global ulong *keys)
 {
     WORK_ITEM(i);
@@ -104,7 +103,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
             if ((kind.s1 > 0 && kinds[j].s1 > 0) || (one_wall && !at_walls))
                 continue;
             const REAL2 d = difference(points, i, j);
-            const REAL4 s = (strain[i] + strain[j]) / 2;
+            const float4 s = (strain[i] + strain[j]) / 2;
             const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
             const REAL value = (across - along) / dot(d, d);
@@ -256,14 +255,14 @@ kernel void mark_pairs(const int size, global const ulong *chosen, global const 
 /* Per six-sided cell i among six-sided cells: the anisotropy of the strain, the difference of its eigenvalues, as a site
    where a pair may be made. */
 kernel void score_strain(const int size, global const int *starts, global const int *neighbours,
-                         global const int2 *kinds, global const REAL4 *strain, const REAL threshold,
+                         global const int2 *kinds, global const float4 *strain, const REAL threshold,
                          global ulong *keys)
 {
     WORK_ITEM(i);
     bool clean = kinds[i].s0 == 0 && kinds[i].s1 == 0;
     for (int k = starts[i]; k < starts[i + 1] && clean; ++k)
         clean = kinds[neighbours[k]].s0 == 0 && kinds[neighbours[k]].s1 == 0;
-    const REAL4 s = strain[i];
+    const float4 s = strain[i];
     const REAL anisotropy = sqrt((s.s0 - s.s2) * (s.s0 - s.s2) + 4 * s.s1 * s.s1);
     keys[i] = clean && anisotropy > threshold ? site_key(anisotropy, i) : 0;
 }

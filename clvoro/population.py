@@ -120,18 +120,22 @@ class PopulationControl:
             if nuclei:
                 self._nucleate(t, kinds, strain_1, marks, nuclei)
             gained = self._climb(t, reach, kinds, strain_2, marks, need, theta)
+            # Memory is scarce here, where generators are there twice in the end.
+            del kinds, strain_1, strain_2
+            self._room.clear("kinds", "strain", "partners", "pull")
             rest = need - gained
             if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
                 self._split_or_delete(t, excess, marks, rest)
         elif need:
             self._split_or_delete(t, excess, marks, need)
+        self._room.clear("keys", "spread", "chosen", "latest", "ranks")
         return self._apply(domain, t, rows, marks, next_label)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and walls (n, 2), and the strain averaged over one ring and over two (n, 4)."""
         engine, k, n = self.engine, self._kernels, t.n
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
-        raw, once = (self._room("strain", turn, size=4 * n) for turn in range(2))
+        raw, once = (self._room("strain", turn, size=4 * n, dtype=np.float32) for turn in range(2))
         engine.run_each(
             k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines
         )
