@@ -19,6 +19,7 @@ import clvoro
 from clvoro import _program
 from clvoro.mesh import Stages
 from clvoro.sizing import Circle, Distance, Expression, Graded, Polygon, Raster, minimum
+from tests.gpu_like import use_groups
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -307,6 +308,16 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
 }
 
 
+def buffers_of_their_own() -> Callable[[], None]:
+    """Have no array share its buffer with others, as those of the workspace do, so that it shows who leaves one.
+
+    Returns what ends that.
+    """
+    shared = _program.Engine.scratch
+    _program.Engine.scratch = _program.Engine.empty
+    return lambda: setattr(_program.Engine, "scratch", shared)
+
+
 def main(name: str, *options: str) -> None:
     context = clvoro.create_context("oclgrind")
     counts: collections.Counter[str] = collections.Counter()
@@ -319,14 +330,8 @@ def main(name: str, *options: str) -> None:
 
     cl.enqueue_nd_range_kernel = counted
     if "groups" in options:
-        made = _program.Engine.__post_init__
-
-        def like_a_gpu(self) -> None:
-            made(self)
-            object.__setattr__(self, "groups", 3)
-            object.__setattr__(self, "group_size", 16)
-
-        _program.Engine.__post_init__ = like_a_gpu
+        use_groups(16, 3)
+    buffers_of_their_own()
     adapter = clvoro.Adapter(context, "float32" if "float32" in options else "float64")
     WORK[name](adapter)
     adapter.queue.finish()
