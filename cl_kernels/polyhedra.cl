@@ -1,7 +1,6 @@
 #include "common/graph.h"
+#include "common/row_counts.h"
 #include "common/search.h"
-
-#define UNFINISHED INT_MIN /* count of a cell that was full: to be clipped again with more room */
 
 inline void raise_flag(global int *report, int flag, int generator)
 {
@@ -39,13 +38,14 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
                                  order, the next kernels bring them into it
    labels, measures, centroids   of the faces; report[2] counts them
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
-kernel void clip_cells(const int size, const int rows, global const REAL *binned, global const int *items, global float *reach,
-                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int warm,
-                       global const int *old_starts, global const int *old_neighbours, const int again,
-                       const int room, const REAL share, global int *row_places, global int *row_counts, global int *labels,
-                       global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
-                       global REAL *covariances, global int *report)
+kernel void clip_cells(const int size, const int rows, global const REAL *binned, global const int *items,
+                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                       global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                       const REAL4 box_upper, const int warm, global const int *old_starts,
+                       global const int *old_neighbours, const int again, const int room, const REAL share,
+                       global int *row_places, global int *row_counts, global int *labels, global REAL *measures,
+                       global REAL *centroids, global REAL *volumes, global REAL *offsets, global REAL *covariances,
+                       global int *report)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -177,15 +177,16 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
 /* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, rounding may let one
    of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
    If it is wider than rounding explains, generators are too close to tell apart (from far away, two an ulp apart have
-   the same bisector), and that is flagged. So it is where both see a face, but of areas that differ by more than a share
-   of the cell. What borders on a generator without a row is not looked at. */
+   the same bisector), and that is flagged. So it is where both see a face, but of areas that differ by more than a
+   share of the cell. What borders on a generator without a row is not looked at, nor are two cells that are certain. */
 kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *volumes,
                         global const REAL *points, const REAL share, const int some_doubtful, global uchar *kept,
                         global int *counts, global int *report)
 {
     WORK_ITEM(i);
-    const int n = row_counts[i];
+    const int n = COUNT_OF(row_counts[i]);
+    const bool certain = (row_counts[i] & CERTAIN) != 0;
     counts[i] = n;
     if (!some_doubtful)
         return;
@@ -193,9 +194,9 @@ kernel void match_faces(const int size, global const int *row_places, global con
     REAL apart = 0; /* the volume of the cones to what faces differ by */
     for (int k = row_places[i]; k < row_places[i] + n; ++k) {
         const int j = labels[k];
-        bool mutual = j < 0 || j >= size;
+        bool mutual = j < 0 || j >= size || (certain && (row_counts[j] & CERTAIN) != 0);
         if (!mutual) {
-            const int m = row_counts[j];
+            const int m = COUNT_OF(row_counts[j]);
             global const int *row = labels + row_places[j];
             int q = 0;
             while (q < m && row[q] != i)
@@ -227,7 +228,7 @@ kernel void place_faces(const int size, global const int *row_places, global con
                         global FACE *face_measures, global FACE *face_centroids)
 {
     WORK_ITEM(i);
-    const int n = row_counts[i], from = row_places[i];
+    const int n = COUNT_OF(row_counts[i]), from = row_places[i];
     int to = starts[i];
     for (int k = from; k < from + n; ++k) {
         if (doubt && !kept[k])

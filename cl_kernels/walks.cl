@@ -1,3 +1,4 @@
+#include "common/row_counts.h"
 #include "common/walk.h"
 
 /* The cells in 3D of eight generators at a time, one in each lane of vectors: for CPUs, whose compilers make no vectors
@@ -12,7 +13,6 @@
 #if !IS_DOUBLE
 #error "single precision has too few digits to tell which decisions are certain"
 #endif
-#define UNFINISHED INT_MIN /* count of a cell that is left */
 /* Lanes are searched for together if they are within SPREAD times the radius: rows of bins end within an eight. */
 #define SPREAD 3
 #define MAX_ROUNDS 20
@@ -90,7 +90,7 @@ inline void write_cells(const cells_t *cells, const moments_t *m, long8 done, co
         const int i = out->items[places[lane]], count = cells->faces[lane];
         out->reach[places[lane]] = (float)reaches[lane];
         out->row_places[i] = place;
-        out->row_counts[i] = count;
+        out->row_counts[i] = count | CERTAIN;
         for (int f = 0; f < count && fits; ++f, ++place) {
             const int other = LANE(cells->places, f, lane);
             out->labels[place] = other < 0 ? other : out->items[other];
@@ -277,8 +277,8 @@ inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, lon
 }
 
 /* Per stretch of places in bin order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
-   UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in edges of the
-   generator's leaf. Only the first `rows` generators get cells. */
+   UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in units of
+   `spacing`. Only the first `rows` generators get cells. */
 kernel void wrap_cells(const int size, const int n, const int rows, global const double *binned,
                        global const int *items, global const float *spacing, global float *reach,
                        global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,

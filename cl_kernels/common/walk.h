@@ -59,12 +59,12 @@ inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, ve
 
 /* The face of a lane that entry k of its list has; a new one if need be, HULL_CAPACITY if there is no room. What is
    known is written once more: branches that cannot be foreseen cost more. */
-inline int face_of_entry(cells_t *cells, walk_t *walk, const list_t *list, int k, int lane)
+inline int face_of_entry(cells_t *cells, lane_walk_t *own, const list_t *list, int k, int lane)
 {
-    const int known = LANE(walk->face_of, k, lane), next = cells->faces[lane];
+    const int known = own->face_of[k], next = cells->faces[lane];
     const bool is_new = known == NO_FACE;
     const int f = is_new ? next : known;
-    LANE(walk->face_of, k, lane) = f;
+    own->face_of[k] = f;
     cells->faces[lane] = next + (is_new && next < HULL_CAPACITY);
     for (int component = 0; component < 4; ++component)
         PLANE_LANE(cells->planes, f, component, lane) = PLANE_LANE(list->planes, k, component, lane);
@@ -72,44 +72,44 @@ inline int face_of_entry(cells_t *cells, walk_t *walk, const list_t *list, int k
     return f;
 }
 
-/* Put an edge on the stack, if `open`. */
-inline void put_edge(walk_t *walk, int lane, int a, int b, int corner, bool open)
+/* Note that vertex number `corner` is between faces a, b, c. False if there is such a vertex already. */
+inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
 {
-    const edge_t edge = {a, b, corner};
-    LANE(walk->edges, walk->counts[lane], lane) = edge;
-    walk->counts[lane] += open;
-}
-
-/* Note that a lane's vertex number `corner` is between faces a, b, c. False if there is such a vertex already. */
-inline bool put_corner(walk_t *walk, int lane, int a, int b, int c, int corner)
-{
-    ulong *sides_a = &LANE(walk->sides, a, lane), *sides_b = &LANE(walk->sides, b, lane);
-    ulong *sides_c = &LANE(walk->sides, c, lane);
-    if (a == c || b == c || (((*sides_a >> b) | (*sides_b >> c) | (*sides_c >> a)) & 1) != 0)
+    const ulong sides_a = own->sides[a] | 1UL << b, sides_b = own->sides[b], sides_c = own->sides[c];
+    if (a == c || b == c || (((own->sides[a] >> b) | (sides_b >> c) | (sides_c >> a)) & 1) != 0)
         return false;
-    *sides_a |= 1UL << b;
-    *sides_b |= 1UL << c;
-    *sides_c |= 1UL << a;
-    put_edge(walk, lane, b, c, corner, !((*sides_c >> b) & 1));
-    put_edge(walk, lane, c, a, corner, !((*sides_a >> c) & 1));
+    own->sides[a] = sides_a;
+    own->sides[b] = sides_b | 1UL << c;
+    own->sides[c] = sides_c | 1UL << a;
+    own->corner_faces[corner] = (uchar4)(a, b, c, 0);
+    /* Edges of which the other side is not known are to be walked. */
+    int open = own->open;
+    own->edges[open] = (uchar4)(b, c, corner, 0);
+    open += !((sides_c >> b) & 1);
+    own->edges[open] = (uchar4)(c, a, corner, 0);
+    open += !((sides_a >> c) & 1);
+    own->open = open;
     return true;
 }
 
 /* Choose the next edge of a lane, if there is one. */
 inline void next_edge(walk_t *walk, int lane)
 {
+    lane_walk_t *own = &walk->lanes[lane];
+    int open = own->open;
     walk->active[lane] = 0;
-    while (walk->counts[lane] > 0) {
-        const edge_t edge = LANE(walk->edges, --walk->counts[lane], lane);
-        if ((LANE(walk->sides, edge.b, lane) >> edge.a) & 1)
+    while (open > 0) {
+        const uchar4 edge = own->edges[--open];
+        if ((own->sides[edge.s1] >> edge.s0) & 1)
             continue;
         /* On the other side the faces follow each other the other way round. */
-        walk->a[lane] = edge.b;
-        walk->b[lane] = edge.a;
-        walk->from[lane] = edge.corner;
+        walk->a[lane] = edge.s1;
+        walk->b[lane] = edge.s0;
+        walk->from[lane] = edge.s2;
         walk->active[lane] = -1;
         break;
     }
+    own->open = open;
 }
 
 /* Walk the cells of the chosen lanes. */
@@ -117,12 +117,17 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
 {
     cells->reach2 = cells->square_x = cells->square_y = cells->square_z = 0;
     cells->mixed_x = cells->mixed_y = cells->mixed_z = 0;
-    for (int k = 0; k < list->ends[SHELLS - 1]; ++k)
-        vstore8((uchar8)NO_FACE, k, walk->face_of);
     for (int k = 0; k < HULL_CAPACITY * LANES; ++k)
         cells->sums[k] = 0;
-    for (int k = 0; k < HULL_CAPACITY; ++k)
-        vstore8((ulong8)0, k, walk->sides);
+    cells->planes[HULL_CAPACITY].d2 = 0;
+    for (int lane = 0; lane < LANES; ++lane) {
+        lane_walk_t *own = &walk->lanes[lane];
+        own->open = 0;
+        for (int k = 0; k < HULL_CAPACITY; ++k)
+            own->sides[k] = 0;
+        for (int k = 0; k < LIST_CAPACITY; ++k)
+            own->face_of[k] = NO_FACE;
+    }
     /* The face of the nearest is there for sure; from its foot to the edge of the face, whichever it is. */
     long first[LANES], second[LANES];
     vstore8(list->nearest, 0, first);
@@ -139,11 +144,11 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
     vstore8(chosen & ~usable, 0, cells->doubt);
     vstore8(stop.at, 0, second);
     for (int lane = 0; lane < LANES; ++lane) {
-        cells->faces[lane] = cells->corners[lane] = walk->counts[lane] = 0;
+        cells->faces[lane] = cells->corners[lane] = 0;
         cells->lost[lane] = second[lane] < 0 || second[lane] == first[lane] ? -1 : 0;
-        face_of_entry(cells, walk, list, first[lane], lane);
-        face_of_entry(cells, walk, list, max(second[lane], 0L), lane);
-        walk->a[lane] = walk->c[lane] = walk->from[lane] = 0;
+        face_of_entry(cells, &walk->lanes[lane], list, first[lane], lane);
+        face_of_entry(cells, &walk->lanes[lane], list, max(second[lane], 0L), lane);
+        walk->a[lane] = walk->from[lane] = 0;
         walk->b[lane] = 1;
     }
     vstore8(chosen & usable & ~vload8(0, cells->lost), 0, walk->active);
@@ -168,34 +173,34 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         const long8 none = stop.at < 0;
         vstore8(vload8(0, cells->lost) | (active & none), 0, cells->lost);
         vstore8(active & ~none, 0, now);
+        long at_a[LANES], at_b[LANES], at_c[LANES];
         for (int lane = 0; lane < LANES; ++lane) {
+            at_a[lane] = at_b[lane] = at_c[lane] = HULL_CAPACITY;
+            walk->active[lane] = 0;
             if (!now[lane])
                 continue;
-            const int f = face_of_entry(cells, walk, list, entries[lane], lane);
+            lane_walk_t *own = &walk->lanes[lane];
+            const int f = face_of_entry(cells, own, list, entries[lane], lane);
             const int fa = walk->a[lane], fb = walk->b[lane];
             if (f == fa || f == fb) {
                 cells->lost[lane] = -1;
                 now[lane] = 0;
-            } else if (f == HULL_CAPACITY || !certain[lane] || !put_corner(walk, lane, fa, fb, f, corner)) {
+            } else if (f == HULL_CAPACITY || !certain[lane] || !put_corner(own, fa, fb, f, corner)) {
                 cells->doubt[lane] = -1;
                 now[lane] = 0;
             } else {
-                walk->c[lane] = f;
-                LANE(walk->corner_faces, corner, lane) = (uchar4)(fa, fb, f, 0);
+                at_a[lane] = fa;
+                at_b[lane] = fb;
+                at_c[lane] = f;
                 ++cells->corners[lane];
                 if (corner == 0)
-                    put_edge(walk, lane, fa, fb, corner, true);
+                    own->edges[own->open++] = (uchar4)(fa, fb, corner, 0);
+                next_edge(walk, lane);
             }
         }
-        active = vload8(0, now);
-        cells->reach2 = active ? fmax(cells->reach2, dot8(y, y)) : cells->reach2;
-        add_corner(cells, walk, now, y, a, b, c, ab, bc, ca, a2, b2, c2);
-        for (int lane = 0; lane < LANES; ++lane) {
-            if (now[lane])
-                next_edge(walk, lane);
-            else
-                walk->active[lane] = 0;
-        }
+        const long8 some = vload8(0, now);
+        cells->reach2 = some ? fmax(cells->reach2, dot8(y, y)) : cells->reach2;
+        add_corner(cells, some, at_a, at_b, at_c, y, a, b, c, ab, bc, ca, a2, b2, c2);
         active = vload8(0, walk->active);
         y = planes_at(walk->corners, walk->from);
         a = planes_at(cells->planes, walk->a);

@@ -44,20 +44,20 @@ typedef struct {
     double8 square_x, square_y, square_z, mixed_x, mixed_y, mixed_z; /* xx, yy, zz; yz, zx, xy */
 } cells_t;
 
-/* An edge that is to be walked: away from `corner`, its faces those that follow each other there. */
+/* What one lane's walk knows. */
 typedef struct {
-    uchar a, b, corner;
-} edge_t;
+    ulong sides[HULL_CAPACITY];           /* bit b of [a]: a and b follow each other at some vertex */
+    uchar4 corner_faces[CORNER_CAPACITY]; /* counter-clockwise */
+    uchar4 edges[CORNER_CAPACITY + 4];    /* to be walked: faces that follow each other at a corner, and that */
+    int open;                             /* of these */
+    uchar face_of[LIST_CAPACITY];         /* of an entry of the list, or NO_FACE */
+} lane_walk_t;
 
-/* How the walk stands, per lane. */
+/* How the walk stands. */
 typedef struct {
     planes_t corners[CORNER_CAPACITY];
-    uchar4 corner_faces[CORNER_CAPACITY * LANES];   /* counter-clockwise */
-    ulong sides[HULL_CAPACITY * LANES];             /* bit b of [a]: a and b follow each other at some vertex */
-    edge_t edges[(CORNER_CAPACITY + 4) * LANES];    /* to be walked */
-    int counts[LANES];                              /* of these */
-    uchar face_of[LIST_CAPACITY * LANES];           /* of an entry of the list, or NO_FACE */
-    long a[LANES], b[LANES], c[LANES], from[LANES]; /* the faces at the present vertex; where the edge came from */
+    lane_walk_t lanes[LANES];
+    long a[LANES], b[LANES], from[LANES]; /* the faces of the present edge, and the corner that it comes from */
     long active[LANES];
 } walk_t;
 
@@ -80,18 +80,20 @@ inline share_t share_edge(double8 g, vectors_t p, vectors_t q, double8 p2, doubl
     return share;
 }
 
-/* Add what belongs to vertex y of faces a, b, c (counter-clockwise), for some lanes.
+/* Add what belongs to vertex y of faces a, b, c (counter-clockwise), numbers at_*, for some lanes; of others these are
+   HULL_CAPACITY.
 
    x, the foot of x on a face, that on an edge of the face and a vertex of the edge make a tetrahedron, with a sign
    where a foot lies outside: six at every vertex. For a face at p the triangle of the feet and the vertex has area g
    (p^2 - p.q) / (4 |p|) and the tetrahedron volume g (p^2 - p.q) / (24 p^2). First moments are those of the sums of
    foot and vertex. Of second moments here is the part of the two, of which the foot on the face is no factor: v v + f f
    + (v + f) (v + f). */
-inline void add_corner(cells_t *cells, const walk_t *walk, const long *lanes, vectors_t y, vectors_t a, vectors_t b,
-                       vectors_t c, vectors_t ab, vectors_t bc, vectors_t ca, double8 a2, double8 b2, double8 c2)
+inline void add_corner(cells_t *cells, long8 some, const long *at_a, const long *at_b, const long *at_c, vectors_t y,
+                       vectors_t a, vectors_t b, vectors_t c, vectors_t ab, vectors_t bc, vectors_t ca, double8 a2,
+                       double8 b2, double8 c2)
 {
-    const double8 ia = PLANE_LANES(cells->planes, walk->a, 3), ib = PLANE_LANES(cells->planes, walk->b, 3);
-    const double8 ic = PLANE_LANES(cells->planes, walk->c, 3);
+    const double8 ia = PLANE_LANES(cells->planes, at_a, 3), ib = PLANE_LANES(cells->planes, at_b, 3);
+    const double8 ic = PLANE_LANES(cells->planes, at_c, 3);
     const double8 ab2 = dot8(ab, ab), bc2 = dot8(bc, bc), ca2 = dot8(ca, ca), inverse = 1 / (ab2 * bc2 * ca2);
     const share_t of_ab = share_edge(dot8(y, ab) * bc2 * ca2 * inverse, a, b, a2, b2, ia + ib);
     const share_t of_bc = share_edge(dot8(y, bc) * ca2 * ab2 * inverse, b, c, b2, c2, ib + ic);
@@ -102,12 +104,6 @@ inline void add_corner(cells_t *cells, const walk_t *walk, const long *lanes, ve
     const vectors_t first_a = along8(along8(none, of_ab.part_p, to_ab), of_ca.part_q, to_ca);
     const vectors_t first_b = along8(along8(none, of_bc.part_p, to_bc), of_ab.part_q, to_ab);
     const vectors_t first_c = along8(along8(none, of_ca.part_p, to_ca), of_bc.part_q, to_bc);
-    long at_a[LANES], at_b[LANES], at_c[LANES];
-    const long8 some = vload8(0, lanes);
-    /* What is not wanted is added where nothing is. */
-    vstore8(some ? vload8(0, walk->a) : HULL_CAPACITY, 0, at_a);
-    vstore8(some ? vload8(0, walk->b) : HULL_CAPACITY, 0, at_b);
-    vstore8(some ? vload8(0, walk->c) : HULL_CAPACITY, 0, at_c);
     const double8 area_a = of_ab.part_p + of_ca.part_q, area_b = of_bc.part_p + of_ab.part_q;
     const double8 area_c = of_ca.part_p + of_bc.part_q;
 #define ADD_TO_FACES(lane)                                                                                             \
@@ -162,7 +158,7 @@ inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, in
     uchar ins[HULL_CAPACITY], outs[HULL_CAPACITY], at[HULL_CAPACITY];
     int n = 0;
     for (int v = 0; v < cells->corners[lane] && n < HULL_CAPACITY; ++v) {
-        const uchar4 faces = LANE(walk->corner_faces, v, lane);
+        const uchar4 faces = walk->lanes[lane].corner_faces[v];
         ins[n] = faces.s0 == f ? faces.s1 : (faces.s1 == f ? faces.s2 : faces.s0);
         outs[n] = faces.s0 == f ? faces.s2 : (faces.s1 == f ? faces.s0 : faces.s1);
         at[n] = v;
