@@ -77,12 +77,14 @@ class Density:
         h: cla.Array,
         lloyd: cla.Array | None = None,
         gradient: cla.Array | None = None,
+        excess: cla.Array | None = None,
     ) -> Weighting:
-        """Return the weighting of `t` for sizes `h` (n,), with `lloyd` and `gradient` (n, d) in given arrays if any."""
+        """Return the weighting of `t` for sizes `h` (n,), in the arrays that are given."""
         engine, k, shape = self.engine, self._kernels, (t.n, self.engine.dim)
         lloyd = engine.scratch(shape) if lloyd is None else lloyd
         gradient = engine.scratch(shape) if gradient is None else gradient
-        w = Weighting(*(engine.scratch(t.n) for _ in range(3)), gradient, lloyd)
+        excess = engine.scratch(t.n) if excess is None else excess
+        w = Weighting(engine.scratch(t.n), engine.scratch(t.n), excess, gradient, lloyd)
         with engine.workspace.frame():
             log_h = self._weigh(t, h, w)
             engine.run_each(k.fit_gradient, t.n, t.starts, t.neighbours, t.points, log_h, gradient)

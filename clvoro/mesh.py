@@ -36,9 +36,9 @@ from .trim import Trim
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-PEAK = {2: (49, 59), 3: (151, 102)}
+PEAK = {2: (23, 72), 3: (151, 102)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
-OUTPUT = {2: (34, 26), 3: (13, 950)}
+OUTPUT = {2: (30, 25), 3: (13, 950)}
 """The same while the finished diagram is read, corners, loops and all."""
 _DERIVED = ("h", "error", "quality", "reach", "potential")
 """Arrays of a mesh that follow from its generators."""
@@ -152,7 +152,7 @@ class Mesh:
     potential : (n,) real
         Solution of the latest Poisson solve: the next one's start.
     source : (n,) real
-        Its right side; this and what follows is of the workspace, made by `begin_step`.
+        Its right side; this and what follows is of the workspace, and of a step alone.
     lloyd, correction : (n, d) real
         The two halves of the latest step. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
     velocity : (n, d) real
@@ -244,7 +244,6 @@ class Mesh:
         self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, "tessellation": None})
         del new
         self.update(first)
-        # The next diagrams are repaired from this one, most likely.
         stages.bins.clear()
         self.engine.workspace.clear()
 
@@ -256,10 +255,15 @@ class Mesh:
 
     def begin_step(self) -> None:
         """Take room for what generators are displaced by, to the end of the workspace's frame."""
-        engine, n, shape = self.engine, self.n, self.points.shape
-        self.lloyd, self.correction = engine.scratch(shape), engine.scratch(shape)
-        self.lloyd_speed, self.correction_speed = engine.scratch(n), engine.scratch(n)
-        self.source = engine.scratch(n)
+        self.lloyd, self.correction = (self.engine.scratch(self.points.shape) for _ in range(2))
+
+    def take_source(self) -> None:
+        """Take room for the right side of a Poisson equation."""
+        self.source = self.engine.scratch(self.n)
+
+    def take_speeds(self) -> None:
+        """Take room for the displacements' lengths."""
+        self.lloyd_speed, self.correction_speed = (self.engine.scratch(self.n) for _ in range(2))
 
     def note_speeds(self) -> None:
         """Summarise how far generators are displaced."""
@@ -285,6 +289,9 @@ class Mesh:
         stages = self.stages
         self._make_room()
         self.tessellation = self.tessellator.tessellate(self.points, self.n, self.tessellation)
+        if self.engine.dim == 2:
+            # The next diagrams are repaired from this one, most likely.
+            stages.bins.clear()
         self.sizing.evaluate(self.points, self.n, self.h)
         if self.coarsening != 1:
             stages.metric.scale_sizes(self.coarsening, self.h)
@@ -314,9 +321,11 @@ class Mesh:
         if self.fixed:
             self.stages.motion.hold_generators(self.labels, self.fixed, displacement)
 
-    def weigh(self, gradient: cla.Array | None = None) -> Weighting:
+    def weigh(
+        self, gradient: cla.Array | None = None, excess: cla.Array | None = None
+    ) -> Weighting:
         """Evaluate density, excess and, as `lloyd`, weighted centroids of the present cells: see `Density.evaluate`."""
-        return self.stages.density.evaluate(self.t, self.h, self.lloyd, gradient)
+        return self.stages.density.evaluate(self.t, self.h, self.lloyd, gradient, excess)
 
     def _excess(self, w: Excess) -> Summary:
         """Summarise the excess, log(V / h^d)."""

@@ -67,7 +67,7 @@ class PublishedMethod:
         motion, poisson = stages.motion, stages.poisson
         mesh.begin_step()
         mesh.lloyd = t.offsets
-        motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
+        mesh.take_source()
         poisson.compatible(mesh.error, t.volumes, mesh.source)
         balance_pieces(mesh, t.volumes)
         with mesh.engine.workspace.frame():
@@ -77,6 +77,8 @@ class PublishedMethod:
             solution = poisson.solve(
                 laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
             )
+        mesh.take_speeds()
+        motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         mesh.hold(mesh.correction)
         mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
@@ -115,10 +117,10 @@ class WeightedMethod:
         stages, t = mesh.stages, mesh.t
         motion, poisson = stages.motion, stages.poisson
         mesh.begin_step()
+        mesh.take_source()
         # Nobody asks for the gradient afterwards.
         w = mesh.weigh(gradient=mesh.correction)
         mesh.hold(mesh.lloyd)
-        motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         poisson.compatible(w.excess, w.weight, mesh.source)
         balance_pieces(mesh, w.weight)
         with mesh.engine.workspace.frame():
@@ -131,6 +133,8 @@ class WeightedMethod:
                 laplacian, mesh.source, mesh.potential, tolerance=self.tolerance,
                 numbering=mesh.labels, from_zero=True,
             )  # fmt: skip
+        mesh.take_speeds()
+        motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
         mesh.hold(mesh.correction)
         mesh.note_speeds()
@@ -198,29 +202,33 @@ class ProjectedMethod:
         """Evaluate the descent, with momentum, and its projection."""
         stages, t = mesh.stages, mesh.t
         mesh.begin_step()
-        w = mesh.weigh()
-        if self.aim and self.steps > 2:
-            off = mesh.mean_log_error(w)
-            change = self.aim / max(off, 1e-9)  # every cell may be exactly right
-            self.eps = min(3.0, max(1e-3, self.eps * min(1.33, max(0.75, change))))
-        self.steps += 1
-        if self.sampled_gradient:
-            mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, mesh.source, w.gradient)
-        if self.descent == "shape":
-            stages.shape.descend(
-                t, mesh.reach, mesh.quality, mesh.lloyd, emphasis=self.emphasis, rate=self.rate
-            )
-        stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
-        mesh.hold(mesh.lloyd)
-        stages.motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        if not self.keep_mean:
-            stages.density.remove_mean(w)
+        gradient, excess = mesh.engine.scratch(mesh.points.shape), mesh.engine.scratch(mesh.n)
+        with mesh.engine.workspace.frame():
+            w = mesh.weigh(gradient, excess)
+            if self.aim and self.steps > 2:
+                off = mesh.mean_log_error(w)
+                change = self.aim / max(off, 1e-9)  # every cell may be exactly right
+                self.eps = min(3.0, max(1e-3, self.eps * min(1.33, max(0.75, change))))
+            self.steps += 1
+            if self.sampled_gradient:
+                sizes = mesh.engine.scratch(mesh.n)
+                mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
+            if self.descent == "shape":
+                stages.shape.descend(
+                    t, mesh.reach, mesh.quality, mesh.lloyd, emphasis=self.emphasis, rate=self.rate
+                )
+            stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
+            mesh.hold(mesh.lloyd)
+            if not self.keep_mean:
+                stages.density.remove_mean(w)
         solution = stages.projection.project(
-            t, mesh.reach, w.gradient, w.excess, mesh.lloyd, mesh.correction, mesh.quality,
+            t, mesh.reach, gradient, excess, mesh.lloyd, mesh.correction, mesh.quality,
             eps=self.eps, lenience=self.lenience, bound=self.bound,
             max_iterations=self.iterations, tolerance=self.tolerance, labels=mesh.labels,
             fixed=mesh.fixed,
         )  # fmt: skip
+        mesh.take_speeds()
+        stages.motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
         stages.motion.measure_displacement(mesh.correction, mesh.h, mesh.correction_speed)
         mesh.note_speeds()
         return solution
