@@ -23,10 +23,10 @@ CELL_CAPACITY = 24
 ROW_CAPACITY = 20
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
 LARGEST_ROW = 512
-LANES, WRAP_GROUP = 8, 16
-"""Cells that a CPU's work-item makes at a time, in lanes of vectors, and the work-items per group of `hulls.cl`."""
+LANES, EIGHTS = 8, 16
+"""Cells that a CPU's work-item makes at a time, in lanes of vectors, and how many times `hulls.cl` does so."""
 FIRST_REACH = 1.9
-"""How far it looks for neighbours at first, in units of the spacing that the bins know."""
+"""How far it looks for neighbours at first, or less, in units of the spacing that the bins know."""
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
 # FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
@@ -119,7 +119,9 @@ class Cells:
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
         self._lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
         self._kernels = engine.kernels("cells", {**defines, "IN_LANES": int(self._lanes > 1)})
-        self._wrap = engine.kernels("hulls", defines).wrap_cells if self._lanes > 1 else None
+        self._wrap = None
+        if self._lanes > 1:
+            self._wrap = engine.kernels("hulls", {**defines, "EIGHTS": EIGHTS}).wrap_cells
 
     @property
     def defines(self) -> dict[str, object]:
@@ -206,9 +208,9 @@ class Cells:
             search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
             if self._wrap is not None:
                 engine.run_each(
-                    self._wrap, -(-total // LANES), np.int32(total), np.int32(n), binned.points,
+                    self._wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
                     binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
-                    rows.slots, rows.counts, rows.places, group=WRAP_GROUP,
+                    rows.slots, rows.counts, rows.places, group=1,
                 )  # fmt: skip
             engine.run_each(
                 self._kernels.clip_cells, total, np.int32(n), binned.points, binned.items, *search,

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from clvoro.bins import MAX_LEVELS, Bins
-from clvoro.cells import FIRST_REACH, LANES, WRAP_GROUP, Cells
+from clvoro.cells import EIGHTS, FIRST_REACH, LANES, Cells
 
 BOX = patch.BOX
 
@@ -67,15 +67,15 @@ def unit(rng, n):
 POINTS = point_sets()
 
 
-def wrapped_rows(engine, points):
+def wrapped_rows(engine, points, first_reach=FIRST_REACH):
     """Return the counts of faces after wrapping alone, 0 where a cell is left, and the rows."""
     n, x = len(points), engine.upload(points)
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
     rows = cells.take_rows(n)
     engine.run_each(
-        cells._wrap, -(-n // LANES), np.int32(n), np.int32(n), binned.points, binned.items, binned.spacing,
+        cells._wrap, -(-n // (LANES * EIGHTS)), np.int32(n), np.int32(n), binned.points, binned.items, binned.spacing,
         binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
-        engine.real.type(FIRST_REACH), rows.slots, rows.counts, rows.places, group=WRAP_GROUP,
+        engine.real.type(first_reach), rows.slots, rows.counts, rows.places, group=1,
     )  # fmt: skip
     assert (rows.places.get() == np.arange(n)).all()
     return rows.counts.get(), rows.slots.get().reshape(n, -1)
@@ -142,6 +142,21 @@ def test_most_cells_are_wrapped(engine, name, share):
     """Else the kernel would be right but useless; lattices, where every decision is near to rounding, are left."""
     counts, _ = wrapped_rows(engine, np.clip(POINTS[name], 0, [1, 0.75]))
     assert np.count_nonzero(counts) >= share * len(counts)
+
+
+@pytest.mark.parametrize("first_reach", [0.2, 0.7, 5.0])
+@pytest.mark.parametrize("name", ["random", "radial", "hexagons", "near walls"])
+def test_rows_do_not_depend_on_where_the_search_begins(engine, name, first_reach):
+    """Too near, no hull holds the generator at first, and searches are repeated; too far, lists are cut."""
+    points = np.clip(POINTS[name], 0, [1, 0.75])
+    (counts, rows), (others, other_rows) = (
+        wrapped_rows(engine, points, reach) for reach in (FIRST_REACH, first_reach)
+    )
+    both = (counts > 0) & (others > 0)
+    assert np.count_nonzero(both) > 0.6 * len(points)  # beside a wall too many rounds may be needed
+    assert np.array_equal(counts[both], others[both])
+    listed = both[:, None] & (np.arange(rows.shape[1]) < counts[:, None])
+    assert np.array_equal(rows[listed], other_rows[listed])
 
 
 def test_against_scipy(engine):

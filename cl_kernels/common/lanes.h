@@ -30,6 +30,13 @@ inline double min_lane(double8 values)
     return min(two.lo, two.hi);
 }
 
+inline double sum_lanes(double8 values)
+{
+    const double4 four = values.lo + values.hi;
+    const double2 two = four.lo + four.hi;
+    return two.lo + two.hi;
+}
+
 /* Of vector number k[lane] of an array, that lane. */
 inline double8 pick(const double8 *vectors, long8 k)
 {
