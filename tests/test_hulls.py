@@ -145,7 +145,7 @@ def test_most_cells_are_wrapped(engine, name, share):
 
 
 @pytest.mark.parametrize("first_reach", [0.2, 0.7, 5.0])
-@pytest.mark.parametrize("name", ["random", "radial", "hexagons", "near walls"])
+@pytest.mark.parametrize("name", ["random", "radial", "hexagons", "cubed"])
 def test_rows_do_not_depend_on_where_the_search_begins(engine, name, first_reach):
     """Too near, no hull holds the generator at first, and searches are repeated; too far, lists are cut."""
     points = np.clip(POINTS[name], 0, [1, 0.75])
@@ -153,7 +153,7 @@ def test_rows_do_not_depend_on_where_the_search_begins(engine, name, first_reach
         wrapped_rows(engine, points, reach) for reach in (FIRST_REACH, first_reach)
     )
     both = (counts > 0) & (others > 0)
-    assert np.count_nonzero(both) > 0.6 * len(points)  # beside a wall too many rounds may be needed
+    assert np.count_nonzero(both) > 0.8 * len(points)
     assert np.array_equal(counts[both], others[both])
     listed = both[:, None] & (np.arange(rows.shape[1]) < counts[:, None])
     assert np.array_equal(rows[listed], other_rows[listed])
