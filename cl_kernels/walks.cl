@@ -16,6 +16,8 @@
 /* Lanes are searched for together if they are within SPREAD times the radius: rows of bins end within an eight. */
 #define SPREAD 3
 #define MAX_ROUNDS 20
+/* Where hardly any of the first cells of a stretch are certain, as in lattices that are off by little, it is left. */
+#define TRIALS 24
 #define GROWTH 1.4 /* of the radius where lists were too short */
 #ifndef STRETCH
 #error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8"
@@ -69,19 +71,22 @@ typedef struct {
     global double *measures, *centroids, *volumes, *offsets, *covariances;
 } output_t;
 
-/* Write the cells of some lanes, of generators at `places`; `reach` is twice the distance of the farthest vertex. */
-inline void write_cells(const cells_t *cells, const moments_t *m, long8 done, const int *places, double8 reach,
-                        const output_t *out)
+/* Write the cells of some lanes, of generators at `places`, and return how many. `reach` is twice the distance of the
+   farthest vertex. */
+inline int write_cells(const cells_t *cells, const moments_t *m, long8 done, const int *places, double8 reach,
+                       const output_t *out)
 {
     long lanes[LANES];
     double reaches[LANES];
     vstore8(done, 0, lanes);
     vstore8(reach, 0, reaches);
-    int total = 0;
-    for (int lane = 0; lane < LANES; ++lane)
+    int total = 0, made = 0;
+    for (int lane = 0; lane < LANES; ++lane) {
         total += lanes[lane] ? cells->faces[lane] : 0;
-    if (total == 0)
-        return;
+        made += lanes[lane] != 0;
+    }
+    if (made == 0)
+        return 0;
     int place = atomic_add(out->report + 2, total);
     const bool fits = place + total <= out->room;
     for (int lane = 0; lane < LANES; ++lane) {
@@ -111,6 +116,7 @@ inline void write_cells(const cells_t *cells, const moments_t *m, long8 done, co
         out->covariances[6 * i + 4] = LANE((const double *)&m->yz, 0, lane);
         out->covariances[6 * i + 5] = LANE((const double *)&m->zz, 0, lane);
     }
+    return made;
 }
 
 /* Lanes in which the cell, walked among all that is nearer than `reach`, is certain. */
@@ -299,7 +305,7 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
     later_t later;
     later.n = 0;
     const int end = min(n, (stretch + 1) * STRETCH);
-    int next = stretch * STRETCH;
+    int next = stretch * STRETCH, tried = 0, made = 0;
     double xs[LANES], ys[LANES], zs[LANES], rs[LANES];
     int places[LANES], rounds[LANES];
     long wanted[LANES], guessed[LANES];
@@ -320,6 +326,7 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
                 row_counts[items[next]] = UNFINISHED;
                 places[lane] = next;
                 rounds[lane] = 0;
+                ++tried;
                 xs[lane] = binned[3 * next];
                 ys[lane] = binned[3 * next + 1];
                 zs[lane] = binned[3 * next + 2];
@@ -328,7 +335,7 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
             }
         }
         long8 todo = vload8(0, wanted), fresh = vload8(0, guessed), chosen;
-        if (!any(todo))
+        if (!any(todo) || (tried > TRIALS && 8 * made < tried))
             break;
         double4 lower, upper;
         double widest;
@@ -355,14 +362,19 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
             if (far[lane] &&
                 find_more(&later, &runs, &cells, &walk, lane, places[lane], rs[lane], needs[lane], &in) != 0) {
                 whole[lane] = 0;
+                ++made;
                 while (later.n == LANES)
                     walk_later(&later, &runs, &in, &out);
             }
-        write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
+        made +=
+            later.n + write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
         vstore8(vload8(0, wanted) | lost, 0, wanted);
         vstore8(fresh & ~chosen, 0, guessed);
         vstore8(lost ? GROWTH * r : r, 0, rs);
     }
+    for (; next < end; ++next)
+        if (items[next] < rows)
+            row_counts[items[next]] = UNFINISHED;
     while (later.n > 0)
         walk_later(&later, &runs, &in, &out);
 }

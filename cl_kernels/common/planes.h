@@ -24,9 +24,9 @@ constant const double SHELL_ENDS[SHELLS] = {0.86, 1};
 #define SHELL_CAPACITY 64
 #define LIST_CAPACITY (SHELLS * SHELL_CAPACITY + 8)
 /* Lists of more than MANY or fewer than FEW, before the walls, are made to hold about ENOUGH. */
-#define MANY 100
-#define ENOUGH 76
-#define FEW 52
+#define MANY 92
+#define ENOUGH 66
+#define FEW 40
 /* What may be near the generators of all lanes. */
 #define NEAR_CAPACITY 1024
 #define NEAR_WORDS (NEAR_CAPACITY / 64)
