@@ -4,9 +4,10 @@
                            [--device NAME] [--dtype float32] [--json]
 
 Every buffer that is made meanwhile is counted until it is freed, by the module of clvoro that
-asked for it (`mesh`: what a generator carries; `fetch` and `loops`: the finished diagram). Each
-field is scaled to the count. The figures are bytes per cell of the finished mesh; "output" is the
-peak while all arrays of the diagram are fetched, which comes after the run's own.
+asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in turn; `fetch` and
+`loops`: the finished diagram). Each field is scaled to the count. The figures are bytes per cell of
+the finished mesh; "output" is the peak while all arrays of the diagram are fetched, which comes
+after the run's own.
 `clvoro.mesh.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
 """
 

@@ -52,17 +52,17 @@ NEEDS = {
     # kernel: (reals, integers, operations) per cell of six faces
     "repair.check_rows": (2, 6 + 3, 6 * 40),
     "cells.match_faces": (0, 4, 0),
-    "cells.measure_cells": (2 + 6 + 12 + 1 + 2 + 3, 6 + 6 + 4, 6 * 75 + 40),
-    "metric.evaluate_metric": (1 + 6 + 2 + 3 + 1 + 4, 1, 60),
+    "cells.measure_cells": (2 + 1 + 2 + 3, 6 + 6 + 4 + 6 + 12, 6 * 75 + 40),
+    "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
     "metric.compare_neighbours": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
     "density.fit_gradient": (2 + 1 + 2, 6 + 1, 6 * 20 + 40),
-    "shape.descend_shape": (6 + 12 + 2 + 2 + 1 + 2, 6 + 1, 6 * 60),
+    "shape.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
-    "projection.assemble": (6 + 12 + 2 + 1 + 2 + 1 + 2, 6 + 1 + 12 + 12, 6 * 40),
+    "projection.assemble": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),
     "projection.descend": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
     "projection.update": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
 }
-"""What each kernel must read or write, and compute. The projection's vectors are single."""
+"""What each kernel must read or write, and compute. Faces and the projection's vectors are single: integers here."""
 
 PEAK = """
 kernel void multiply_add(const int size, const REAL a, const REAL b, global REAL *out)

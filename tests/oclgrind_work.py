@@ -119,7 +119,8 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
     engine.run_each(
         stages.seam._kernels.close_rows, n, t.starts, engine.upload(kept, np.uint8),
         engine.upload(starts, np.int32), t.neighbours, torus.latest.folded.codes, t.face_measures,
-        t.face_centroids, ints[0], ints[1], engine.empty(left), engine.empty((left, 2)), ints[2],
+        t.face_centroids, ints[0], ints[1], engine.empty(left, engine.face),
+        engine.empty((left, 2), engine.face), ints[2],
     )  # fmt: skip
     assert (ints[2].get() == np.flatnonzero(kept)).all()
 

@@ -1,11 +1,15 @@
 """Memory that stages use in turn: arrays of a frame do not overlap, those of the next take their place."""
 
 import numpy as np
+import patch
 import pyopencl as cl
 import pytest
 
+from clvoro import sizing
 from clvoro._program import Engine
 from clvoro._workspace import MOST_VIEWS
+from clvoro.mesh import Mesh, Stages
+from clvoro.methods import ProjectedMethod, WeightedMethod
 
 
 @pytest.fixture
@@ -123,3 +127,22 @@ def test_few_views_are_kept(engine):
         with engine.workspace.frame():
             assert engine.scratch(n + 1).shape == (n + 1,)
     assert len(engine.workspace._views) <= MOST_VIEWS
+
+
+@pytest.mark.parametrize(
+    "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("shape", 0.3)]
+)
+def test_steps_allocate_nothing(engine, made, method):
+    """Once there have been two like it: a step displaces, moves, repairs the diagram and judges it."""
+    field = sizing.Expression("0.05 + 0.02 * x")
+    points = engine.upload(patch.relaxed_points(500, 3) / patch.BOX.frame[1])
+    mesh = Mesh(Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points)
+    counts = []
+    for _ in range(7):
+        with engine.workspace.frame():
+            method.displace(mesh)
+            method.move(mesh)
+        mesh.update()
+        mesh.assess()
+        counts.append(len(made))
+    assert counts[3:] == counts[3:4] * 4
