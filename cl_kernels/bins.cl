@@ -113,8 +113,8 @@ kernel void place_items(const int size, global const int *keys, global const int
    holds as many as it does: a leaf's own few generators tell less of how far neighbours are. */
 inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
-    const int place = b - shape.s0, plane = shape.s1 * shape.s2;
-    const int layer = place / plane, row = (place - layer * plane) / shape.s1, column = place % shape.s1;
+    const int place = b - shape.s0, rows = place / shape.s1, column = place - rows * shape.s1;
+    const int layer = DIM == 2 ? 0 : rows / shape.s2, row = rows - layer * shape.s2;
     const int left = max(column - 1, 0), right = min(column + 1, shape.s1 - 1);
     const int front = max(row - 1, 0), back = min(row + 1, shape.s2 - 1);
     const int bottom = max(layer - 1, 0), top = min(layer + 1, shape.s3 - 1);
@@ -145,11 +145,11 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
         return;
     sort_list(items + first, end - first);
     const REAL edge = 1 / FRAME_INVERSE(grid_frames[g]);
-    for (int p = first; p < end; ++p)
-        reach[p] = (float)edge;
     const REAL mean = local_spacing(b, edge, shape, bins);
-    for (int p = first; p < end; ++p)
+    for (int p = first; p < end; ++p) {
+        reach[p] = (float)edge;
         spacing[p] = (float)mean;
+    }
 }
 
 /* Per place p: the generator's position. */
