@@ -191,7 +191,7 @@ class Engine:
         the kernel must leave out what lies beyond.
         """
         group = self.item_group if group is None else group
-        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+        kernel.set_args(*[a.data if isinstance(a, cla.Array) else a for a in args])
         whole = -(-max(int(size), 1) // group) * group
         return cl.enqueue_nd_range_kernel(self.queue, kernel, (whole,), (group,))
 
@@ -203,7 +203,7 @@ class Engine:
 
     def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel`: `groups` work-groups of `group_size` (see common/blocks.h)."""
-        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+        kernel.set_args(*[a.data if isinstance(a, cla.Array) else a for a in args])
         size = (self.groups * self.group_size,)
         return cl.enqueue_nd_range_kernel(self.queue, kernel, size, (self.group_size,))
 

@@ -87,10 +87,17 @@ class Domain(ABC):
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners of `clip_box` in the device's coordinates, padded to four numbers as kernels take them."""
-        origin, scale = self.frame
-        corners = np.zeros((2, 4), real)
-        corners[:, : self.dim] = (np.array(self.clip_box) - origin) / scale
-        return corners[0], corners[1]
+        # Every stage asks for them in every step.
+        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = self.__dict__.setdefault(
+            "_corners", {}
+        )
+        if real not in known:
+            origin, scale = self.frame
+            corners = np.zeros((2, 4), real)
+            corners[:, : self.dim] = (np.array(self.clip_box) - origin) / scale
+            corners.setflags(write=False)
+            known[real] = corners[0], corners[1]
+        return known[real]
 
     def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
         """Names and values that kernels are built with for this kind of domain; see common/domain.h."""
