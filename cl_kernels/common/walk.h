@@ -149,7 +149,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         face_of_entry(cells, &walk->lanes[lane], list, first[lane], lane);
         face_of_entry(cells, &walk->lanes[lane], list, max(second[lane], 0L), lane);
         walk->a[lane] = walk->from[lane] = 0;
-        walk->b[lane] = 1;
+        walk->b[lane] = cells->faces[lane] - 1; /* 1, but where the second is lost */
     }
     vstore8(chosen & usable & ~vload8(0, cells->lost), 0, walk->active);
     a = planes_at(cells->planes, walk->a);
