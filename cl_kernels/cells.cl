@@ -86,6 +86,15 @@ kernel void match_faces(const int size, global const int *places, global const i
         return;
     }
     const bool some = flags[2]; /* which the kernels before have written: no race with other work-items here */
+    if (!some && !repaired) {
+        /* Every new row is certain: all its faces are seen from both sides. */
+        for (int left = n, k = 0; left > 0; left -= 32, ++k)
+            keep[place * KEEP_WORDS + k] = left < 32 ? (1u << left) - 1 : ~0u;
+        counts[i] = n;
+        if (n < 3)
+            raise_flag(flags, FLAG_COLLAPSED, i);
+        return;
+    }
     uint word = 0;
     int count = 0;
     for (int k = 0; k < n; ++k) {
