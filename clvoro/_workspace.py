@@ -46,26 +46,28 @@ class Workspace:
         """Let go of all memory, outside of any frame; within one, nothing is done."""
         if self._depth:
             return
+        # Each piece is taken from its beginning on; so many bytes of it are.
         self._pieces: list[cl.Buffer] = []
+        self._taken: list[int] = []
         self._views: dict[tuple[object, ...], cla.Array] = {}
-        self._piece = self._used = self._taken = self._most = 0
+        self._most = 0
 
     @contextmanager
     def frame(self) -> Iterator[None]:
         """Give back at the end what is taken meanwhile."""
         if self._depth == 0 and len(self._pieces) > 1:
             # One piece in the place of those that it took to find out how much is needed.
-            self._pieces, self._views = [], {}
+            self._pieces, self._taken, self._views = [], [], {}
             self._add(self._most)
         if self._depth == 0 and len(self._views) > MOST_VIEWS:
             self._views = {}
-        before = self._piece, self._used, self._taken
+        before = self._taken.copy()
         self._depth += 1
         try:
             yield
         finally:
             self._depth -= 1
-            self._piece, self._used, self._taken = before
+            self._taken[:] = before + [0] * (len(self._pieces) - len(before))
 
     def take(self, shape: int | tuple[int, ...], dtype: np.dtype) -> cla.Array | None:
         """Return an array whose content is arbitrary, valid to the end of the frame; None outside of any."""
@@ -74,22 +76,21 @@ class Workspace:
         items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
         size = max(items * dtype.itemsize, 1)
         size = -(-size // self._unit) * self._unit
-        while self._piece < len(self._pieces):
-            if self._used + size <= self._pieces[self._piece].size:
-                break
-            self._piece, self._used = self._piece + 1, 0
-        else:
+        number = 0
+        while number < len(self._pieces) and self._taken[number] + size > self._pieces[number].size:
+            number += 1
+        if number == len(self._pieces):
             self._add(size)
-        key = self._piece, self._used, shape, dtype
+        start = self._taken[number]
+        key = number, start, shape, dtype
         if key not in self._views:
             # Kept, as to make one costs as much as a launch.
-            view = self._pieces[self._piece].get_sub_region(self._used, size)
+            view = self._pieces[number].get_sub_region(start, size)
             self._views[key] = cla.Array(self._queue, shape, dtype, data=view)
-        array = self._views[key]
-        self._used += size
-        self._taken += size
-        self._most = max(self._most, self._taken)
-        return array
+        self._taken[number] += size
+        self._most = max(self._most, sum(self._taken))
+        return self._views[key]
 
     def _add(self, size: int) -> None:
         self._pieces.append(cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size))
+        self._taken.append(0)

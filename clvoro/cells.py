@@ -155,6 +155,7 @@ class Cells:
         most = max(m, 6 * n + 12)
         if most > self._room:
             engine, d = self.engine, self.engine.dim
+            self._of_faces: dict[str, cla.Array] = {}
             self._of_faces = {
                 "neighbours": engine.empty(most, np.int32),
                 "face_measures": engine.empty(most, engine.face),

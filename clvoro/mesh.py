@@ -36,7 +36,7 @@ from .trim import Trim
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
-PEAK = {2: (23, 72), 3: (151, 102)}
+PEAK = {2: (21, 73), 3: (151, 102)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
 OUTPUT = {2: (30, 25), 3: (13, 950)}
 """The same while the finished diagram is read, corners, loops and all."""
@@ -242,7 +242,7 @@ class Mesh:
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
         # At one stroke: whoever interrupts the run finds arrays that fit each other, or none, which `update` makes.
         self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, "tessellation": None})
-        del new
+        del new, items
         self.update(first)
         stages.bins.clear()
         self.engine.workspace.clear()
