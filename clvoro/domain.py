@@ -220,6 +220,7 @@ class Box(Domain):
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
         lower, upper = super().device_corners(real)
         if any(self.periodic):
+            upper = upper.copy()
             upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
         return lower, upper
 
