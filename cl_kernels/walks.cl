@@ -13,8 +13,6 @@
 #if !IS_DOUBLE
 #error "single precision has too few digits to tell which decisions are certain"
 #endif
-/* Lanes are searched for together if they are within SPREAD times the radius: rows of bins end within an eight. */
-#define SPREAD 3
 #define MAX_ROUNDS 20
 /* Where hardly any of the first cells of a stretch are certain, as in lattices that are off by little, it is left. */
 #define TRIALS 24
@@ -27,40 +25,6 @@
    ratio of a face's area and the latter. */
 #define CERTAIN_NEAREST2 1e-7
 #define CERTAIN_AREA 1e-7
-
-/* Choose from the lanes to do those near that of the first place; the box holds them, r is their greatest radius. */
-inline long8 choose_lanes(long8 todo, const int *places, const double *xs, const double *ys, const double *zs,
-                          double8 radii, double spread, double4 *lower, double4 *upper, double *r)
-{
-    long wanted[LANES], chosen[LANES];
-    double rs[LANES];
-    vstore8(todo, 0, wanted);
-    vstore8(radii, 0, rs);
-    int first = -1;
-    for (int lane = 0; lane < LANES; ++lane)
-        first = wanted[lane] && (first < 0 || places[lane] < places[first]) ? lane : first;
-    const double4 centre = (double4)(xs[first], ys[first], zs[first], 0);
-    *lower = *upper = centre;
-    *r = rs[first];
-    for (int lane = 0; lane < LANES; ++lane) {
-        const double4 x = (double4)(xs[lane], ys[lane], zs[lane], 0);
-        const bool near = wanted[lane] && (lane == first || all(fabs(x - centre) <= spread * rs[first]));
-        *lower = near ? fmin(*lower, x) : *lower;
-        *upper = near ? fmax(*upper, x) : *upper;
-        *r = near ? fmax(*r, rs[lane]) : *r;
-        chosen[lane] = near ? -1 : 0;
-    }
-    return vload8(0, chosen);
-}
-
-/* Where to look for generators and walls. */
-typedef struct {
-    global const double *binned;
-    global const int2 *bins;
-    global const FRAME *grid_frames;
-    global const int4 *grid_shapes;
-    double4 box_lower, box_upper;
-} search_t;
 
 /* Where cells are written to, in the layout of `clip_cells` (polyhedra.cl). */
 typedef struct {
@@ -160,14 +124,18 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
     const double4 low = in->box_lower - x, high = in->box_upper - x;
     const double walls[6] = {low.s0, high.s0, low.s1, high.s1, low.s2, high.s2};
     const double ends[6] = {lower.s0, upper.s0, lower.s1, upper.s1, lower.s2, upper.s2};
+    bool known[6] = {false};
+    for (int f = 0; f < faces; ++f)
+        if (LANE(cells->places, f, lane) < 0)
+            known[-1 - LANE(cells->places, f, lane)] = true;
     for (int wall = 0; wall < 6; ++wall)
-        if (fabs(ends[wall]) > fabs(walls[wall]) * (1 + 2 * BIAS)) {
+        if (!known[wall] && fabs(ends[wall]) > fabs(walls[wall]) * (1 + 2 * BIAS)) {
             put_plane(list, k, slot, 0, 0, 0, -1 - wall);
             PLANE_LANE(list->planes, k, wall >> 1, slot) = 0.5 / walls[wall];
             PLANE_LANE(list->planes, k++, 3, slot) = 4 * walls[wall] * walls[wall];
         }
     double to = from;
-    while (to < need && k == faces) {
+    do {
         const double begin2 = to * to;
         to = fmin(need, GROWTH * to);
         if (!collect_runs(runs, x, x, to, in->bins, in->grid_frames, in->grid_shapes))
@@ -188,7 +156,7 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
                 put_plane(list, k, slot, dx / d2, dy / d2, dz / d2, q);
                 PLANE_LANE(list->planes, k++, 3, slot) = d2;
             }
-    }
+    } while (to < need && k == faces);
     if (k == faces)
         return 0;
     for (int f = 0; f < faces; ++f) {
@@ -244,42 +212,6 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
             find_more(later, runs, cells, &later->walk, lane, places[lane], froms[lane], needs[lane], in) != 0)
             whole[lane] = 0;
     write_cells(cells, &m, vload8(0, whole) & certain, places, need, out);
-}
-
-/* Choose lanes, and see what is near them. Radii that were guessed are changed where they hold too many or too few.
-   False if too much is near the chosen ones. */
-inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *places,
-                       const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen, double4 *lower,
-                       double4 *upper, double *widest, const search_t *in)
-{
-    const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
-    double spread = SPREAD;
-    for (int attempt = 0;; ++attempt) {
-        *chosen = choose_lanes(todo, places, xs, ys, zs, *r, spread, lower, upper, widest);
-        const bool fits = collect_runs(runs, *lower, *upper, *widest, in->bins, in->grid_frames, in->grid_shapes);
-        if (!fits || runs->total > NEAR_CAPACITY) {
-            if (attempt == 12)
-                return false;
-            /* Fewer lanes, then less about one. */
-            *r = (*chosen & (spread < SPREAD / 4.0 ? -1L : 0L)) ? 0.7 * *r : *r;
-            spread = spread < SPREAD / 4.0 ? 0 : spread / 2;
-            continue;
-        }
-        near->length = 0;
-        for (int run = 0; run < runs->n; ++run)
-            for (int c = 0; c < runs->counts[run]; ++c)
-                near->places[near->length++] = runs->firsts[run] + c;
-        for (;; ++attempt) {
-            see_near(near, list, in->binned, x, y, z, *chosen ? *r * *r : 0);
-            const double8 total = convert_double8(near->totals[SHELLS - 1]);
-            const long8 guessed = *chosen & fresh & ((total > MANY) | (total < FEW));
-            if (attempt >= 4 || !any(guessed))
-                return true;
-            *r = guessed ? *r * clamp(cbrt(ENOUGH / total), 0.5, 1.6) : *r;
-            if (any(guessed & (*r > *widest)))
-                break;
-        }
-    }
 }
 
 /* Per stretch of places in bin order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
@@ -366,8 +298,7 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
                 while (later.n == LANES)
                     walk_later(&later, &runs, &in, &out);
             }
-        made +=
-            later.n + write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
+        made += write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
         vstore8(vload8(0, wanted) | lost, 0, wanted);
         vstore8(fresh & ~chosen, 0, guessed);
         vstore8(lost ? GROWTH * r : r, 0, rs);

@@ -71,8 +71,8 @@ inline void see_near(near_t *near, list_t *list, global const double *binned, do
             global const double *at = binned + 3 * near->places[64 * word + c];
             const double8 dx = at[0] - x, dy = at[1] - y, dz = at[2] - z;
             const double8 d2 = fma(dx, dx, fma(dy, dy, dz * dz));
-            _Pragma("unroll") for (int shell = 0; shell < SHELLS; ++shell) seen[shell] |=
-                (d2 < list->radii2[shell]) & bit;
+            for (int shell = 0; shell < SHELLS; ++shell)
+                seen[shell] |= (d2 < list->radii2[shell]) & bit;
             bit += bit;
         }
         for (int shell = 0; shell < SHELLS; ++shell) {
@@ -172,4 +172,77 @@ inline long8 list_near(list_t *list, near_t *near, global const double *binned, 
         list->nearest = nearer ? (long8)k : list->nearest;
     }
     return full;
+}
+
+/* Lanes are searched for together if they are within SPREAD times the radius: rows of bins end within an eight. */
+#define SPREAD 3
+
+/* Where to look for generators and walls. */
+typedef struct {
+    global const double *binned;
+    global const int2 *bins;
+    global const FRAME *grid_frames;
+    global const int4 *grid_shapes;
+    double4 box_lower, box_upper;
+} search_t;
+
+/* Choose from the lanes to do those near that of the first place; the box holds them, r is their greatest radius. */
+inline long8 choose_lanes(long8 todo, const int *places, const double *xs, const double *ys, const double *zs,
+                          double8 radii, double spread, double4 *lower, double4 *upper, double *r)
+{
+    long wanted[LANES], chosen[LANES];
+    double rs[LANES];
+    vstore8(todo, 0, wanted);
+    vstore8(radii, 0, rs);
+    int first = -1;
+    for (int lane = 0; lane < LANES; ++lane)
+        first = wanted[lane] && (first < 0 || places[lane] < places[first]) ? lane : first;
+    const double4 centre = (double4)(xs[first], ys[first], zs[first], 0);
+    *lower = *upper = centre;
+    *r = rs[first];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const double4 x = (double4)(xs[lane], ys[lane], zs[lane], 0);
+        const bool near = wanted[lane] && (lane == first || all(fabs(x - centre) <= spread * rs[first]));
+        *lower = near ? fmin(*lower, x) : *lower;
+        *upper = near ? fmax(*upper, x) : *upper;
+        *r = near ? fmax(*r, rs[lane]) : *r;
+        chosen[lane] = near ? -1 : 0;
+    }
+    return vload8(0, chosen);
+}
+
+/* Choose lanes, and see what is near them. Radii that were guessed are changed where they hold too many or too few.
+   False if too much is near the chosen ones. */
+inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *places,
+                       const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen, double4 *lower,
+                       double4 *upper, double *widest, const search_t *in)
+{
+    const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
+    double spread = SPREAD;
+    for (int attempt = 0;; ++attempt) {
+        *chosen = choose_lanes(todo, places, xs, ys, zs, *r, spread, lower, upper, widest);
+        const bool fits = collect_runs(runs, *lower, *upper, *widest, in->bins, in->grid_frames, in->grid_shapes);
+        if (!fits || runs->total > NEAR_CAPACITY) {
+            if (attempt == 12)
+                return false;
+            /* Fewer lanes, then less about one. */
+            *r = (*chosen & (spread < SPREAD / 4.0 ? -1L : 0L)) ? 0.7 * *r : *r;
+            spread = spread < SPREAD / 4.0 ? 0 : spread / 2;
+            continue;
+        }
+        near->length = 0;
+        for (int run = 0; run < runs->n; ++run)
+            for (int c = 0; c < runs->counts[run]; ++c)
+                near->places[near->length++] = runs->firsts[run] + c;
+        for (;; ++attempt) {
+            see_near(near, list, in->binned, x, y, z, *chosen ? *r * *r : 0);
+            const double8 total = convert_double8(near->totals[SHELLS - 1]);
+            const long8 guessed = *chosen & fresh & ((total > MANY) | (total < FEW));
+            if (attempt >= 4 || !any(guessed))
+                return true;
+            *r = guessed ? *r * clamp(cbrt(ENOUGH / total), 0.5, 1.6) : *r;
+            if (any(guessed & (*r > *widest)))
+                break;
+        }
+    }
 }
