@@ -149,7 +149,7 @@ class Adapter:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
-        check_memory(engine, n)
+        check_memory(engine, n, domain)
         binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with Naming(host, domain, self.dtype):

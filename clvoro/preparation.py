@@ -151,7 +151,7 @@ class Preparation:
         else:
             asked = count_cells(self.sizing, self.free) + len(self.rows)
         self.target = n_cells if n_cells is not None else max(1, round(asked))
-        check_memory(stages.engine, max(self.target, 0 if points is None else len(points)))
+        check_memory(stages.engine, max(self.target, 0 if points is None else len(points)), domain)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
@@ -175,7 +175,7 @@ class Preparation:
                 f"level has {2**d} times fewer"
             )
         begun = 0 if points is None else len(points) * 2.0 ** (d * min(count, 99))
-        check_memory(self.stages.engine, begun)
+        check_memory(self.stages.engine, begun, self.domain)
         return count
 
     def generators(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import clvoro
@@ -43,12 +44,27 @@ def test_figures_are_what_runs_hold(monkeypatch, dim, field, n):
             )
 
 
+@pytest.mark.skipif(not BENCH.is_dir(), reason="the tests lie outside a source tree")
+@pytest.mark.parametrize(("dim", "n"), [(2, 8000), (3, 2000)])
+def test_periodic_boxes_hold_images_and_folded_graphs(monkeypatch, ctx, dim, n):
+    """How far images are taken from follows from the mesh; output may take a quarter less, as above."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    memory = importlib.import_module("memory")
+    box = clvoro.Box((0,) * dim, (1,) * dim, periodic=True)
+    monkeypatch.setattr(memory, "domain_of", lambda _: box)
+    monkeypatch.setattr(memory, "test_field", lambda _: clvoro.sizing.Constant(1.0))
+    found = memory.measure(Namespace(device=None, dtype="float64"), "", n, "adaptive", "default")
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))
+    cells = found["cells"]
+    expected = mesh.memory_needed(engine, cells, box) / cells
+    assert 0.75 <= max(found["run"], found["output"]) / expected <= 1.1
+    assert expected > 1.5 * mesh.memory_needed(engine, cells) / cells
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_what_does_not_fit_is_refused(ctx, dim, real):
     """Of the run and what comes after it, the larger counts."""
-    import pyopencl as cl
-
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
     room = ctx.devices[0].global_mem_size
     size = engine.real.itemsize
