@@ -19,7 +19,7 @@ from .torus import Torus, Unfolded
 class Tessellator:
     """Tessellate one domain again and again.
 
-    Buffers are the stages': the call after next overwrites the graph of a `Tessellation`, the next one its measures.
+    Buffers are the stages': the next call overwrites a `Tessellation`, its graph once the new one is made.
 
     Parameters
     ----------
