@@ -13,7 +13,7 @@
 /* Faces of a cell. */
 #define HULL_CAPACITY 16
 /* Lanes are searched for together if they are within so many spacings: rows of bins end within an eight. */
-#define SPREAD 8
+#define SPREAD 20
 #ifndef EIGHTS
 #error "build with -DEIGHTS=eights of cells that a work-item does"
 #endif

@@ -8,7 +8,7 @@
 #define NEAR_STEP 16
 /* What holds no more than WHOLE generators is taken whole: looking into divided bins costs more than testing a few that
    are too far. */
-#define WHOLE 24
+#define WHOLE 32
 
 /* Behind the last place there may be others, of no meaning. */
 typedef struct {
