@@ -151,6 +151,7 @@ class Coarsening:
             _, second = self._group(middle)
             ratio = (len(second) / n) ** (1 / dim)
             coarse = self._graph_of(middle, second, ratio, level)
+            assert inverse is not None
             return inverse, self._compose(first, second, level), coarse
 
     def clear(self) -> None:

@@ -88,9 +88,7 @@ class Domain(ABC):
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners of `clip_box` in the device's coordinates, padded to four numbers as kernels take them."""
         # Every stage asks for them in every step.
-        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = self.__dict__.setdefault(
-            "_corners", {}
-        )
+        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = vars(self).setdefault("_corners", {})
         if real not in known:
             origin, scale = self.frame
             corners = np.zeros((2, 4), real)
