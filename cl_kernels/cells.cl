@@ -16,10 +16,11 @@
    rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt
 
    If `wrapped`, rows that have faces are there already (`hulls.cl`). */
-kernel void clip_cells(const int size, const int rows_wanted, global const REAL *binned, global const int *items, global float *reach,
-                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int wrapped,
-                       global int *rows, global int *row_counts, global int *places, global int *flags)
+kernel void clip_cells(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
+                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                       global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                       const REAL4 box_upper, const int wrapped, global int *rows, global int *row_counts,
+                       global int *places, global int *flags)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -66,15 +67,15 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
     return area;
 }
 
-/* Per generator i: bit k of keep[KEEP_WORDS * its slot ...] marks a neighbour that also lists i. Rounding may let one of
-   two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so that
-   the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two cells,
-   generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is flagged. What
-   borders on a generator without a row is not looked at. */
-kernel void match_faces(const int size, global const int *places, global const int *slots, global const int *slot_counts,
-                        global const int *old_starts, global const int *old_neighbours, global const REAL *points,
-                        const REAL4 box_lower, const REAL4 box_upper, const int repaired, const REAL share,
-                        global uint *keep, global int *counts, global int *flags)
+/* Per generator i: bit k of keep[KEEP_WORDS * its slot ...] marks a neighbour that also lists i. Rounding may let one
+   of two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so
+   that the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two
+   cells, generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is
+   flagged. What borders on a generator without a row is not looked at. */
+kernel void match_faces(const int size, global const int *places, global const int *slots,
+                        global const int *slot_counts, global const int *old_starts, global const int *old_neighbours,
+                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int repaired,
+                        const REAL share, global uint *keep, global int *counts, global int *flags)
 {
     WORK_ITEM(i);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
@@ -147,12 +148,11 @@ kernel void match_faces(const int size, global const int *places, global const i
 
    In LANES a work-item takes so many generators, and there are so many fewer work-items. */
 kernel void measure_cells(const int size, global const int *places, global const int *slots,
-                          global const int *slot_counts, global const int *old_starts,
-                          global const int *old_neighbours, global const uint *keep, global const int *starts,
-                          global const REAL *points, const REAL4 box_lower,
-                          const REAL4 box_upper, global int *neighbours, global FACE *face_measures,
-                          global FACE *face_centroids, global REAL *volumes, global REAL *offsets,
-                          global REAL *covariances)
+                          global const int *slot_counts, global const int *old_starts, global const int *old_neighbours,
+                          global const uint *keep, global const int *starts, global const REAL *points,
+                          const REAL4 box_lower, const REAL4 box_upper, global int *neighbours,
+                          global FACE *face_measures, global FACE *face_centroids, global REAL *volumes,
+                          global REAL *offsets, global REAL *covariances)
 {
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
@@ -171,8 +171,9 @@ kernel void measure_cells(const int size, global const int *places, global const
 }
 
 /* Per generator i: the measures of its faces again, in full precision. */
-kernel void measure_faces(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
-                          const REAL4 box_lower, const REAL4 box_upper, global REAL *measures, global REAL *centroids)
+kernel void measure_faces(const int size, global const int *starts, global const int *neighbours,
+                          global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                          global REAL *measures, global REAL *centroids)
 {
     WORK_ITEM(i);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
@@ -182,8 +183,7 @@ kernel void measure_faces(const int size, global const int *starts, global const
     const REAL2 origin = corner(i, x, neighbours[end - 1], neighbours[begin], points, lower, upper);
     REAL2 v = origin;
     for (int k = begin; k < end; ++k) {
-        const REAL2 w =
-            k == end - 1 ? origin : corner(i, x, neighbours[k], neighbours[k + 1], points, lower, upper);
+        const REAL2 w = k == end - 1 ? origin : corner(i, x, neighbours[k], neighbours[k + 1], points, lower, upper);
         const REAL2 e = w - v;
         const REAL2 sum = v + w;
         measures[k] = sqrt(dot(e, e));
@@ -193,12 +193,12 @@ kernel void measure_faces(const int size, global const int *starts, global const
     }
 }
 
-/* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has them, if
-   one of the two is doubtful? Where rounding has let two cells see different neighbours, what they disagree about must be
-   as little as rounding makes of the box, and no more than a share of the cell; else generators are too close to tell
-   apart, which is flagged. */
-kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts, global const int *starts, global const int *neighbours,
-                           global const REAL *volumes,
+/* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has
+   them, if one of the two is doubtful? Where rounding has let two cells see different neighbours, what they disagree
+   about must be as little as rounding makes of the box, and no more than a share of the cell; else generators are too
+   close to tell apart, which is flagged. */
+kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
+                           global const int *starts, global const int *neighbours, global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
                            global int *flags)
 {
