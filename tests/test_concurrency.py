@@ -77,7 +77,9 @@ def test_diagrams_from_many_threads(ctx):
 
 
 def test_processes_find_the_same_bits(ctx, alone):
-    program = "import sys; sys.path.insert(0, 'tests'); import conftest, test_concurrency as t, clvoro\n"
+    program = (
+        "import sys; sys.path.insert(0, 'tests'); import conftest, test_concurrency as t, clvoro\n"
+    )
     program += "a = clvoro.Adapter()\nfor k in (3, 1): print(t.run(a, t.WORK[k]))"
     # Another seed of Python's hashes: no order of a set may matter.
     done = subprocess.run(
@@ -93,16 +95,28 @@ def resident():
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
+SHORE = [(0, 0), (3, -0.3), (4, 1), (2.6, 1.2), (2.5, 2.2), (1, 2)]
+DOMAINS = {
+    "box": (BOX, 0.06),
+    "polygon": (clvoro.Polygon(SHORE, [[(1, 0.8), (1.6, 0.7), (1.5, 1.2)]]), 0.12),
+    "periodic": (clvoro.Box((0, 0), (1, 1), periodic=True), 0.05),
+    "space": (clvoro.Box((0, 0, 0), (1, 1, 1)), 0.2),
+}
+"""With a mean size: some hundred cells."""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
-def test_memory_of_two_hundred_runs_does_not_grow(ctx):
-    """With `python -m pytest -m slow tests/test_concurrency.py`, half a minute."""
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_memory_of_two_hundred_runs_does_not_grow(ctx, name):
+    """With `python -m pytest -m slow tests/test_concurrency.py`, up to a minute each."""
+    domain, size = DOMAINS[name]
     kept = clvoro.Adapter(ctx)
     sizes = []
     for k in range(200):
         adapter = clvoro.Adapter(ctx) if k % 2 else kept
         options = {"method": "coupled", "max_steps": 2, "seed": k}
-        adapter.run(BOX, 0.05 + 0.0005 * (k % 20), **options).diagram.vertices  # noqa: B018
+        adapter.run(domain, size * (1 + 0.01 * (k % 20)), **options).diagram.vertices  # noqa: B018
         if k % 20 == 19:
             sizes.append(resident())
     # From the first forty runs, after which all is compiled and the allocator has its pools, to the last.
