@@ -8,7 +8,7 @@ asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in
 `loops`: the finished diagram). Each field is scaled to the count. The figures are bytes per cell of
 the finished mesh; "output" is the peak while all arrays of the diagram are fetched, which comes
 after the run's own.
-`clvoro.mesh.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
+`clvoro.memory.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
 """
 
 from __future__ import annotations

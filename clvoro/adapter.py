@@ -20,7 +20,8 @@ from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
 from .layers import Layers
 from .loop import Loop
-from .mesh import Stages, check_memory
+from .memory import check_memory
+from .mesh import Stages
 from .preparation import Options, Preparation, check_options
 from .results import Diagram, Result
 from .tessellator import Tessellator

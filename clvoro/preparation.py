@@ -11,7 +11,8 @@ from ._arrays import Naming, check_choice, check_integer, check_number
 from .domain import Domain
 from .errors import InputError
 from .layers import Layers, apart_from, bounded, free_domain, place_layers
-from .mesh import Mesh, Stages, check_memory
+from .memory import check_memory
+from .mesh import Mesh, Stages
 from .methods import PUBLISHED, Relaxation, make_method
 from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
 from .precision import check_precision

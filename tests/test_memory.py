@@ -1,4 +1,4 @@
-"""What a run is refused by, `mesh.PEAK` and `mesh.OUTPUT`, is what runs hold on the device."""
+"""What a run is refused by, PEAK and OUTPUT of `clvoro.memory`, is what runs hold on the device."""
 
 import importlib
 from argparse import Namespace
@@ -9,9 +9,10 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro import mesh, poisson
+from clvoro import poisson
 from clvoro._program import Engine
 from clvoro.errors import MemoryLimitError
+from clvoro.memory import MOST_CELLS, OUTPUT, PEAK, check_memory, memory_needed
 
 BENCH = Path(__file__).parent.parent / "bench"
 CASES = [(2, "F2", 8000), (3, "S1", 4000)]
@@ -29,7 +30,7 @@ def test_figures_are_what_runs_hold(monkeypatch, dim, field, n):
         real: measure(Namespace(device=None, dtype=real), field, n, "adaptive", "default")
         for real in ("float64", "float32")
     }
-    for name, figures in (("run", mesh.PEAK), ("output", mesh.OUTPUT)):
+    for name, figures in (("run", PEAK), ("output", OUTPUT)):
         double, single = (found[real][name] for real in ("float64", "float32"))
         # 8 r + 4 i bytes and 4 r + 4 i.
         fitting = round((double - single) / 4), round((2 * single - double) / 4)
@@ -56,9 +57,9 @@ def test_periodic_boxes_hold_images_and_folded_graphs(monkeypatch, ctx, dim, n):
     found = memory.measure(Namespace(device=None, dtype="float64"), "", n, "adaptive", "default")
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))
     cells = found["cells"]
-    expected = mesh.memory_needed(engine, cells, box) / cells
+    expected = memory_needed(engine, cells, box) / cells
     assert 0.75 <= max(found["run"], found["output"]) / expected <= 1.1
-    assert expected > 1.5 * mesh.memory_needed(engine, cells) / cells
+    assert expected > 1.5 * memory_needed(engine, cells) / cells
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -68,11 +69,11 @@ def test_what_does_not_fit_is_refused(ctx, dim, real):
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
     room = ctx.devices[0].global_mem_size
     size = engine.real.itemsize
-    most = max(r * size + 4 * i for r, i in (mesh.PEAK[dim], mesh.OUTPUT[dim]))
-    fits = min(room / most, mesh.MOST_CELLS)
-    mesh.check_memory(engine, 0.99 * fits)
+    most = max(r * size + 4 * i for r, i in (PEAK[dim], OUTPUT[dim]))
+    fits = min(room / most, MOST_CELLS)
+    check_memory(engine, 0.99 * fits)
     with pytest.raises(MemoryLimitError, match="GiB"):
-        mesh.check_memory(engine, 1.01 * fits)
+        check_memory(engine, 1.01 * fits)
     with pytest.raises(MemoryLimitError, match="GiB"):
         clvoro.Adapter(ctx, real).run(
             clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits)
