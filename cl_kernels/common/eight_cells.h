@@ -83,7 +83,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
     outlines_t middles;
     double8 lengths[ROW_CAPACITY];
     double8 area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
-    const long8 ends = vload8(0, counts), last = max(ends - 1, 0L);
+    const long8 ends = vload8(0, counts), last = max(ends - 1, (long8)(0));
     double8 vx = pick(corners.x, last), vy = pick(corners.y, last);
     for (int k = 0; k < most; ++k) {
         const double8 wx = corners.x[k], wy = corners.y[k];

@@ -25,7 +25,7 @@ inline STORE row_difference(
     const int last = starts[n] - 8;
     for (; k < end && k <= last; k += 8) {
         const int8 inside = k + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < end;
-        const int8 c = max(vload8(0, columns + k), 0);
+        const int8 c = max(vload8(0, columns + k), (int8)(0));
         const STORE8 w = select((STORE8)(0), vload8(0, weights + k), MASK8(STORE)(inside));
         const STORE8 there = (STORE8)(x[c.s0], x[c.s1], x[c.s2], x[c.s3], x[c.s4], x[c.s5], x[c.s6], x[c.s7]);
         const STORE8 p = w * (xi - there);
