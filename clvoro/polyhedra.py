@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Scan
@@ -147,7 +148,8 @@ class Polyhedra:
             else (row_counts, row_counts)
         )
         capacity, again = FACE_CAPACITY, False
-        first_reach, spacing = FIRST_REACH, binned.spacing
+        first_reach, first = engine.real.type(FIRST_REACH), engine.scratch(n, np.float32)
+        cl.enqueue_copy(engine.queue, first.data, binned.reach.data, byte_count=4 * n)
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
@@ -160,8 +162,8 @@ class Polyhedra:
             if self._wrap is not None and not again:
                 engine.run_each(
                     self._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), binned.points,
-                    binned.items, spacing, *search, lower, upper, engine.real.type(first_reach),
-                    room, *written, group=1,
+                    binned.items, binned.spacing, *search, lower, upper, first_reach, room,
+                    *written, group=1,
                 )  # fmt: skip
             some = np.int32(again or self._wrap is not None)
             engine.run_each(
@@ -174,8 +176,9 @@ class Polyhedra:
             if flags & ~(FULL | DOUBT | NARROW):
                 self._refuse(flags, generator)
             if m > self._room:
-                # All anew: what did not fit was not kept. How far to look is known now.
-                first_reach, spacing = 1.0, binned.reach
+                # All anew: what did not fit was not kept. With the radii from before, as the last bits depend on them,
+                # and should not on how much room there was.
+                cl.enqueue_copy(engine.queue, binned.reach.data, first.data, byte_count=4 * n)
                 labels, measures, centroids = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
