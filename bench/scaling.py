@@ -1,7 +1,8 @@
 """Time against cells of all that a run is made of, log-log, with slopes and peers, in one picture.
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python bench/scaling.py [--sizes 1e4,1e5,1e6,4e6]
-                        [--run-sizes 1e4,1e5,1e6] [--from FILE] [--out DIR] [--device NAME] [--json]
+                        [--solid-sizes 1e4,1e5,1e6] [--run-sizes 1e4,1e5,1e6] [--processor-time]
+                        [--from FILE] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
 Writes `scaling.png` into `bench/pictures` or `--out`, and prints the slopes. Seconds come from the scripts that measure
 each part (`diagram.py`, `poisson.py`, `run.py`), which it calls; `scaling.jsonl` beside the picture holds them, and
@@ -65,12 +66,12 @@ def measure(options: Any) -> list[dict[str, Any]]:
     common = ["--dtype", options.dtype, "--json"]
     if options.device:
         common += ["--device", options.device]
-    sizes = ["--sizes", options.sizes]
-    if options.processor_time:
-        sizes.append("--processor-time")
+    clock = ["--processor-time"] if options.processor_time else []
+    sizes = ["--sizes", options.sizes, *clock]
+    solid_sizes = ["--sizes", options.solid_sizes, *clock]
     jobs: tuple[tuple[str, list[str], Callable[[dict[str, Any]], Points]], ...] = (
         ("diagram.py", [*sizes, "--sets", "uniform,hexagonal", "--scipy"], of_diagram),
-        ("diagram.py", [*sizes, "--sets", "uniform", "--dim", "3"], of_solid_diagram),
+        ("diagram.py", [*solid_sizes, "--sets", "uniform", "--dim", "3"], of_solid_diagram),
         ("poisson.py", [*sizes, "--jacobi-up-to", "0"], of_solve),
         ("run.py", ["--sizes", options.run_sizes, "--no-profile"], of_run),
     )
@@ -133,6 +134,7 @@ def draw(curves: dict[str, list[tuple[int, float]]], title: str, path: Path) -> 
 def main() -> None:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", default="1e4,1e5,1e6,4e6")
+    options_of.add_argument("--solid-sizes", default="1e4,1e5,1e6")
     options_of.add_argument("--run-sizes", default="1e4,1e5,1e6")
     options_of.add_argument("--processor-time", action="store_true")
     options_of.add_argument("--from", dest="source", type=Path, metavar="FILE")

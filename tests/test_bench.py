@@ -76,7 +76,15 @@ def test_a_table_is_markdown():
 def test_scaling(tmp_path):
     pytest.importorskip("matplotlib")
     rows = records(
-        "scaling.py", "--sizes", "500,1e3", "--run-sizes", "500,1e3", "--out", str(tmp_path)
+        "scaling.py",
+        "--sizes",
+        "500,1e3",
+        "--solid-sizes",
+        "500,1e3",
+        "--run-sizes",
+        "500,1e3",
+        "--out",
+        str(tmp_path),
     )
     names = {r["curve"] for r in rows}
     assert {"diagram", "next diagram", "3D diagram", "Poisson", "fast run", "default run"} <= names
