@@ -46,6 +46,10 @@ def point_sets():
         "clusters": np.concatenate(
             [spot + s * (rng.random((300, 3)) - 0.5) for s in (1e-2, 1e-4, 1e-6)] + [random[:50]]
         ),
+        # Cells as long as the box with neighbours at a thousandth of that: edges lie on bisectors to a few roundings.
+        "spots": np.clip(
+            random[:150].repeat(20, axis=0) + 1e-3 * rng.standard_normal((3000, 3)), 1e-6, 1
+        ),
         "a dense and an empty half": np.concatenate([random[:2000] * [0.3, 1, 1], [[0.99, 0.7, 0.2]]]),
         "cubic": lattice([[0, 0, 0]], 8),
         "bcc": bcc,
