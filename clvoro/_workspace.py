@@ -6,22 +6,37 @@ solve, the marks of insertions. Such arrays are taken from one stretch of memory
     with engine.workspace.frame():
         marks = engine.scratch(n, np.int32)
 
-as local variables are from the stack of a program: frames nest, and at the end of one all that was taken within it is
-given back, to be taken by the next. The queue is in order, so that commands which still use it are done by then.
+or by a method that is `framed`, as local variables are from the stack of a program: frames nest, and at the end of one
+all that was taken within it is given back, to be taken by the next. The queue is in order, so that commands which still
+use it are done by then.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from typing import Any, TypeVar
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+Method = TypeVar("Method", bound=Callable[..., Any])
 MOST_VIEWS = 1000
 """Arrays that are kept to be taken again; numbers of faces, say, change from step to step."""
+
+
+def framed(method: Method) -> Method:
+    """Have a stage's method run within a frame of its engine's workspace."""
+
+    @wraps(method)
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self.engine.workspace.frame():
+            return method(self, *args, **kwargs)
+
+    return run  # type: ignore[return-value]
 
 
 class Workspace:

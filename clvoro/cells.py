@@ -11,6 +11,7 @@ import pyopencl.array as cla
 
 from ._primitives import Scan
 from ._program import Engine
+from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import Box
 from .errors import ClvoroError, InputError, MemoryLimitError
@@ -163,6 +164,7 @@ class Cells:
             }
             self._room = most
 
+    @framed
     def tessellate(
         self,
         box: Box,
@@ -191,14 +193,7 @@ class Cells:
         ClvoroError
             If a cell has more than `LARGEST_ROW` faces, or a little more.
         """
-        with self.engine.workspace.frame():
-            return self._tessellate(box, points, n, binned, exact, n if wanted is None else wanted)
-
-    def _tessellate(
-        self, box: Box, points: cla.Array, total: int, binned: BinnedPoints, exact: bool, n: int
-    ) -> Tessellation:
-        """Tessellate by `total` generators, of which the cells of the first `n` are wanted."""
-        engine = self.engine
+        engine, total, n = self.engine, n, n if wanted is None else wanted
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)

@@ -11,6 +11,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ._program import Engine, Kernels
+from ._workspace import framed
 from .errors import SolverError
 
 Apply = Callable[[cla.Array, cla.Array], object]
@@ -89,6 +90,7 @@ class ConjugateGradient:
             self._kernels[store] = self.engine.kernels("krylov", {"STORE": name})
         return self._kernels[store]
 
+    @framed
     def solve(
         self,
         apply: Apply,
@@ -144,27 +146,7 @@ class ConjugateGradient:
         BreakdownError
             If the operator or preconditioner is not positive definite: a SolverError, too.
         """
-        with self.engine.workspace.frame():
-            return self._solve(
-                apply, rhs, x, precondition, tolerance, max_iterations, fused, centre, lookahead,
-                from_zero, verify, self.engine.real if store is None else np.dtype(store),
-            )  # fmt: skip
-
-    def _solve(
-        self,
-        apply: Apply,
-        rhs: cla.Array,
-        x: cla.Array,
-        precondition: cla.Array | Precondition,
-        tolerance: float,
-        max_iterations: int,
-        fused: bool,
-        centre: bool,
-        lookahead: int,
-        from_zero: bool,
-        verify: bool,
-        store: np.dtype,
-    ) -> Solution:
+        store = self.engine.real if store is None else np.dtype(store)
         n = len(rhs)
         if max_iterations > self._record_capacity:
             self._record_capacity = max_iterations

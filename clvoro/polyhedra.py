@@ -10,6 +10,7 @@ import pyopencl.array as cla
 
 from ._primitives import Scan
 from ._program import Engine
+from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .cells import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
 from .domain import Box
@@ -86,6 +87,7 @@ class Polyhedra:
             faces["face_centroids"] = engine.empty((m, 3))
         return faces
 
+    @framed
     def tessellate(
         self,
         box: Box,
@@ -119,19 +121,6 @@ class Polyhedra:
         """
         rows = n if rows is None else rows
         self._reserve_cells(rows)
-        with self.engine.workspace.frame():
-            return self._tessellate(box, points, n, binned, previous, exact, rows)
-
-    def _tessellate(
-        self,
-        box: Box,
-        points: cla.Array,
-        n: int,
-        binned: BinnedPoints,
-        previous: Tessellation | None,
-        exact: bool,
-        rows: int,
-    ) -> Tessellation:
         engine, k = self.engine, self._kernels(FACE_CAPACITY)
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
         labels, measures, centroids = self._take_faces(

@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
+from ._workspace import framed
 from .cells import Tessellation
 from .errors import SolverError
 from .krylov import Launch, Solution
@@ -57,6 +58,7 @@ class Projection:
             **{name: engine.scratch(n, store) for name in ("eps", "inverse", "r", "z", "p")},
         )
 
+    @framed
     def project(
         self,
         t: Tessellation,
@@ -104,29 +106,6 @@ class Projection:
         SolverError
             If a number is not finite.
         """
-        with self.engine.workspace.frame():
-            return self._project(
-                t, h, gradient, excess, displacement, correction, quality, eps, lenience, bound,
-                max_iterations, tolerance, labels, fixed,
-            )  # fmt: skip
-
-    def _project(
-        self,
-        t: Tessellation,
-        h: cla.Array,
-        gradient: cla.Array,
-        excess: cla.Array,
-        displacement: cla.Array,
-        correction: cla.Array,
-        quality: cla.Array,
-        eps: float,
-        lenience: float,
-        bound: float,
-        max_iterations: int,
-        tolerance: float,
-        labels: cla.Array | None,
-        fixed: int,
-    ) -> Solution:
         engine, n = self.engine, t.n
         real = engine.real.type
         store = np.dtype(np.float32) if tolerance >= SINGLE else engine.real
