@@ -1,6 +1,6 @@
-/* Rows of a weighted graph: columns[starts[i] .. starts[i + 1]) with their weights; starts has n + 1 entries. A column may be
-   negative (a wall) if its weight is 0. Weights and vectors are in STORE, by default REAL.
-   Include after real.h and blocks.h. */
+/* Rows of a weighted graph: columns[starts[i] .. starts[i + 1]) with their weights; starts has n + 1 entries. A column
+   may be negative (a wall) if its weight is 0. Weights and vectors are in STORE, by default REAL. Include after real.h
+   and blocks.h. */
 
 #ifndef STORE
 #define STORE REAL
@@ -12,10 +12,11 @@
 #define MASK8(TYPE) CLVORO_JOIN(MASK8_, TYPE)
 
 /* (A x)_i = sum_k w_k (x_i - x_columns[k]). On a CPU eight entries at a time, those behind the row's end (of the next
-   rows) with weight 0: rows are short and of all lengths, so that a plain loop waits for mispredicted branches most of the time (measured: 2.7
-   times as long). Near the end of the arrays, where eight entries might reach beyond them, it is that plain loop. */
-inline STORE row_difference(
-    int i, int n, global const int *starts, global const int *columns, global const STORE *weights, global const STORE *x)
+   rows) with weight 0: rows are short and of all lengths, so that a plain loop waits for mispredicted branches most of
+   the time (measured: 2.7 times as long). Near the end of the arrays, where eight entries might reach beyond them, it
+   is that plain loop. */
+inline STORE row_difference(int i, int n, global const int *starts, global const int *columns,
+                            global const STORE *weights, global const STORE *x)
 {
     const STORE xi = x[i];
     const int end = starts[i + 1];
@@ -35,6 +36,7 @@ inline STORE row_difference(
     }
 #endif
     for (; k < end; ++k)
-        if (columns[k] >= 0) sum += weights[k] * (xi - x[columns[k]]);
+        if (columns[k] >= 0)
+            sum += weights[k] * (xi - x[columns[k]]);
     return sum;
 }
