@@ -329,32 +329,22 @@ OVERLOADED int convert_int_rte(double a)
 }
 
 /* Work-items of a group may be threads, where barriers are met. */
-#define ATOMIC(T, SPACE)                                                                                               \
-    OVERLOADED T atomic_add(volatile SPACE T *a, T b)                                                                  \
+#define ATOMIC(NAME, FETCH, T, SPACE)                                                                                  \
+    OVERLOADED T NAME(volatile SPACE T *a, T b)                                                                        \
     {                                                                                                                  \
-        return __atomic_fetch_add(a, b, __ATOMIC_RELAXED);                                                             \
-    }                                                                                                                  \
+        return FETCH(a, b, __ATOMIC_RELAXED);                                                                          \
+    }
+#define ATOMICS(T, SPACE)                                                                                              \
+    ATOMIC(atomic_add, __atomic_fetch_add, T, SPACE)                                                                   \
+    ATOMIC(atomic_or, __atomic_fetch_or, T, SPACE)                                                                     \
+    ATOMIC(atomic_and, __atomic_fetch_and, T, SPACE)                                                                   \
+    ATOMIC(atomic_min, __atomic_fetch_min, T, SPACE)                                                                   \
+    ATOMIC(atomic_max, __atomic_fetch_max, T, SPACE)                                                                   \
     OVERLOADED T atomic_inc(volatile SPACE T *a)                                                                       \
     {                                                                                                                  \
-        return __atomic_fetch_add(a, 1, __ATOMIC_RELAXED);                                                             \
-    }                                                                                                                  \
-    OVERLOADED T atomic_or(volatile SPACE T *a, T b)                                                                   \
-    {                                                                                                                  \
-        return __atomic_fetch_or(a, b, __ATOMIC_RELAXED);                                                              \
-    }                                                                                                                  \
-    OVERLOADED T atomic_and(volatile SPACE T *a, T b)                                                                  \
-    {                                                                                                                  \
-        return __atomic_fetch_and(a, b, __ATOMIC_RELAXED);                                                             \
-    }                                                                                                                  \
-    OVERLOADED T atomic_min(volatile SPACE T *a, T b)                                                                  \
-    {                                                                                                                  \
-        return __atomic_fetch_min(a, b, __ATOMIC_RELAXED);                                                             \
-    }                                                                                                                  \
-    OVERLOADED T atomic_max(volatile SPACE T *a, T b)                                                                  \
-    {                                                                                                                  \
-        return __atomic_fetch_max(a, b, __ATOMIC_RELAXED);                                                             \
+        return atomic_add(a, (T)1);                                                                                    \
     }
-ATOMIC(int, global)
-ATOMIC(uint, global)
-ATOMIC(int, local)
-ATOMIC(uint, local)
+ATOMICS(int, global)
+ATOMICS(uint, global)
+ATOMICS(int, local)
+ATOMICS(uint, local)

@@ -54,8 +54,8 @@ def test_numbers_add_up(run):
     assert taken.device + taken.host == pytest.approx(taken.wall, **close)
     # The device works at one thing at a time, and between opening and closing.
     assert 0 < taken.device < taken.wall
-    # Spans follow each other without a gap; only the profile's own opening and closing are outside.
-    assert sum(s.wall for s in taken.spans) == pytest.approx(taken.wall, rel=1e-2)
+    # Spans follow each other without a gap, from opening to closing.
+    assert sum(s.wall for s in taken.spans) == pytest.approx(taken.wall, rel=1e-9)
     assert sum(cost.calls for cost in stages.values()) == taken.launches
 
 
@@ -227,17 +227,9 @@ def test_table_says_what_the_profile_knows(run):
 
 def test_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    options = [
-        "run",
-        "paper",
-        "--cells",
-        "90",
-        "--steps",
-        "3",
-        "--method",
-        "coupled",
-        "--no-report",
-    ]
+    # Kernels of a small share of the time are not listed apart: which those are, the machine's load decides.
+    monkeypatch.setattr(profile, "SMALL", 0.0)
+    options = "run paper --cells 90 --steps 3 --method coupled --no-report".split()
     assert cli.main([*options, "--json"]) == cli.OK
     assert "profile" not in json.loads(capsys.readouterr().out)
     assert cli.main([*options, "--json", "--profile"]) == cli.OK
