@@ -3,7 +3,7 @@
 Runs Lloyd only, Poisson only and both coupled from the same uniform random start, for several
 starts, and prints for each claim of the paper what was measured and whether it holds:
 
-    python bench/paper_case.py [--seeds 3] [--steps 100] [--k 1] [--device NAME] [--json]
+    python bench/paper_case.py [--seeds 3] [--steps 100] [--k 1] [--device NAME] [--dtype float32] [--json]
 
 Exits with 1 if a claim does not hold. `--markdown` prints the tables of README.md, and
 `--pictures DIR` writes the pictures of the first start.
@@ -11,7 +11,6 @@ Exits with 1 if a claim does not hold. `--markdown` prints the tables of README.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from _common import FIRST_SEED, make_adapter, parser
 
 import clvoro
 from clvoro.cases import load_case
@@ -26,7 +26,6 @@ from clvoro.results import Result
 from clvoro.summary import summary
 
 METHODS = ("lloyd", "poisson", "coupled")
-FIRST_SEED = 20251
 
 
 @dataclass(frozen=True)
@@ -275,17 +274,15 @@ def print_markdown(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--device", help="as for clvoro run")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="random starts (3)")
-    parser.add_argument("--steps", type=int, default=100, help="steps per run (100)")
-    parser.add_argument("--k", type=float, default=1.0, help="the paper's k (1)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--markdown", action="store_true", help="print the README's tables")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write the report here")
-    arguments = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--seeds", type=int, default=3, metavar="N", help="random starts (3)")
+    options.add_argument("--steps", type=int, default=100, help="steps per run (100)")
+    options.add_argument("--k", type=float, default=1.0, help="the paper's k (1)")
+    options.add_argument("--markdown", action="store_true", help="print the README's tables")
+    options.add_argument("--pictures", type=Path, metavar="DIR", help="write the report here")
+    arguments = options.parse_args()
 
-    adapter = clvoro.Adapter(clvoro.create_context(arguments.device))
+    adapter = make_adapter(arguments)
     runs = [
         run_methods(adapter, FIRST_SEED + 17 * n, arguments.steps, arguments.k)
         for n in range(arguments.seeds)
