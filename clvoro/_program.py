@@ -10,7 +10,7 @@ import re
 import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,8 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
 _programs: dict[tuple, cl.Program] = {}
 _building = 0.0
+_UNTYPED_CALLS = 3
+"""Calls of a kernel before PyOpenCL is told the types of its arguments."""
 
 
 def kernel_folder() -> Path:
@@ -74,6 +76,32 @@ class Kernels(SimpleNamespace):
         kernel.stage = self._stage  # type: ignore[attr-defined]
         setattr(self, name, kernel)
         return kernel
+
+
+def bind(kernel: cl.Kernel, args: Iterable[object]) -> list[object]:
+    """Set the arguments of `kernel`; arrays pass as their buffers. Return what has been set.
+
+    PyOpenCL finds out what an argument is by trying one kind after the other, which for a number takes five times as
+    long as the launch. Once it has been told their types it need not; that costs as much as twenty numbers, and is done
+    for kernels that are called again and again. An argument is of the same type in every call.
+    """
+    given = [a.data if isinstance(a, cla.Array) else a for a in args]
+    calls = getattr(kernel, "calls", 0)
+    if calls == _UNTYPED_CALLS:
+        kernel.set_arg_types([_type_of(a) for a in given])
+    if calls <= _UNTYPED_CALLS:
+        kernel.calls = calls + 1  # type: ignore[attr-defined]
+    kernel.set_args(*given)
+    return given
+
+
+def _type_of(argument: object) -> np.dtype | None:
+    """Return the type of a number, raw bytes for a vector, None for a buffer."""
+    if isinstance(argument, np.number):
+        return argument.dtype
+    if isinstance(argument, np.ndarray):
+        return np.dtype((np.void, argument.nbytes))
+    return None
 
 
 def build_program(
@@ -191,7 +219,7 @@ class Engine:
         the kernel must leave out what lies beyond.
         """
         group = self.item_group if group is None else group
-        kernel.set_args(*[a.data if isinstance(a, cla.Array) else a for a in args])
+        bind(kernel, args)
         whole = -(-max(int(size), 1) // group) * group
         return cl.enqueue_nd_range_kernel(self.queue, kernel, (whole,), (group,))
 
@@ -203,7 +231,7 @@ class Engine:
 
     def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
         """Enqueue a block-wise `kernel`: `groups` work-groups of `group_size` (see common/blocks.h)."""
-        kernel.set_args(*[a.data if isinstance(a, cla.Array) else a for a in args])
+        bind(kernel, args)
         size = (self.groups * self.group_size,)
         return cl.enqueue_nd_range_kernel(self.queue, kernel, size, (self.group_size,))
 
