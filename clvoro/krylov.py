@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from ._program import Engine, Kernels
+from ._program import Engine, Kernels, bind
 from ._workspace import framed
 from .errors import SolverError
 
@@ -299,7 +299,7 @@ class Launch:
     """
 
     def __init__(self, engine: Engine, kernel: cl.Kernel, *args: object) -> None:
-        kernel.set_args(*(a.data if isinstance(a, cla.Array) else a for a in args))
+        self._args = bind(kernel, args)
         self._kernel = kernel
         self._queue = engine.queue
         self._size = (engine.groups * engine.group_size,)
@@ -307,7 +307,8 @@ class Launch:
 
     def set_first(self, value: int) -> None:
         """Set the kernel's first argument, an int."""
-        self._kernel.set_arg(0, np.int32(value))
+        self._args[0] = np.int32(value)
+        bind(self._kernel, self._args)
 
     def __call__(self) -> None:
         """Enqueue the kernel."""

@@ -13,7 +13,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Room
-from ._program import Engine, Kernels
+from ._program import Engine, Kernels, bind
 from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, whole_groups
 
 _COARSEST = 64
@@ -95,7 +95,7 @@ class _Bound:
         """Set the arguments."""
         given = [a.data if isinstance(a, cla.Array) else a for a in args]
         if len(given) != len(self._args) or any(map(is_not, given, self._args)):
-            self._kernel.set_args(*given)
+            bind(self._kernel, given)
             self._args, self._size = given, (whole_groups(size),)
         return self
 
