@@ -1,12 +1,14 @@
 #include "common/domain.h"
 
 /* Periodic boxes. The generators x in [0, P) are extended by their images x + c P, c in {-1, 0, 1}^d, that lie within a
-   margin M of the box; the diagram of them all in the box [-M, P + M] is made by kernels that know of no period, and its
+   margin beyond the seams; the diagram of them all in a box around is made by kernels that know of no period, and its
    rows of the generators themselves are folded: images become their owners, with the code of c.
 
-   A cell is right if the ball of twice its reach around its generator lies in the extended box: nobody outside of it can
-   cut. With M = P along an axis it is right in any case: a cell is no longer than P, as it is cut by the images of its own
-   generator, and so of every generator the nearest image to one of its points lies within [-P, 2 P]. */
+   Every seam is divided into blocks, each with a margin of its own, so that a large cell at one place of a seam does
+   not ask for images of all the small ones at others. A cell is right if each block has a margin as deep as the ball of
+   twice its reach around its generator goes there: nobody outside of the ball can cut. A margin of P is deep enough for
+   any ball: a cell is no longer than P, as it is cut by the images of its own generator, and so of every generator the
+   nearest image to one of its points lies within [-P, 2 P]. */
 
 #ifndef PERIODIC
 #error "build with -DPERIODIC -DPERIOD_0=... -DPERIOD_1=... -DPERIOD_2=..."
@@ -14,6 +16,8 @@
 
 #define CODES (DIM == 2 ? 9 : 27) /* sum over the axes of (c + 1) 3^a */
 #define CENTRE (CODES / 2)
+#define BLOCKS (DIM == 2 ? 128 : 32) /* per axis along a seam */
+#define WHOLE 4.0f                   /* more than any depth: positions lie in the unit box */
 
 /* Bits of report[1]. */
 #define FLAG_DROPPED 1   /* a face that only one of its cells sees, of no size, is to be dropped */
@@ -25,76 +29,165 @@ inline int step_of(int code, int a)
     return (a == 0 ? code : a == 1 ? code / 3 : code / 9) % 3 - 1;
 }
 
-/* The image y of x that has the code; does it lie in the extended box? */
-inline bool make_image(const REAL *x, int code, REAL4 margins, REAL *y)
+/* The axes along which seams across axis a are divided; the second one in space only. */
+#define FIRST_ALONG(a) ((a) == 0 ? 1 : 0)
+#define SECOND_ALONG(a) ((a) == 2 ? 1 : 2)
+
+/* Block of coordinate y along an axis: the outermost ones go on for ever. */
+inline int block_of(REAL y, int a, REAL4 lower, REAL4 edge)
 {
-    const REAL margin[4] = {margins.s0, margins.s1, margins.s2, margins.s3};
-    bool inside = true;
-    EACH_AXIS(a) {
-        const int step = step_of(code, a);
-        const REAL period = PERIOD(a);
-        y[a] = x[a] + step * period;
-        inside = inside && (step == 0 || (period > 0 && y[a] >= -margin[a] && y[a] <= period + margin[a]));
+    const REAL from[4] = {lower.s0, lower.s1, lower.s2, lower.s3}, length[4] = {edge.s0, edge.s1, edge.s2, edge.s3};
+    return (int)clamp(floor((y - from[a]) / length[a]), R(0), R(BLOCKS - 1));
+}
+
+/* Place of a block of the seam at the lower (side 0) or upper end (1) of axis a. */
+inline int block_place(int a, int side, int first, int second)
+{
+    const int along = DIM == 2 ? first : first * BLOCKS + second;
+    return (2 * a + side) * (DIM == 2 ? BLOCKS : BLOCKS * BLOCKS) + along;
+}
+
+/* The image y of x that has the code; is it within the margins? */
+inline bool make_image(const REAL *x, int code, global const float *margins, REAL4 lower, REAL4 edge, REAL *y)
+{
+    EACH_AXIS(a)
+    {
+        y[a] = x[a] + step_of(code, a) * PERIOD(a);
+        if (step_of(code, a) != 0 && !(PERIOD(a) > 0))
+            return false;
     }
-    return inside;
+    EACH_AXIS(a)
+    {
+        const int step = step_of(code, a);
+        if (step == 0)
+            continue;
+        const int first = block_of(y[FIRST_ALONG(a)], FIRST_ALONG(a), lower, edge);
+        const int second = DIM == 2 ? 0 : block_of(y[DIM == 2 ? 0 : SECOND_ALONG(a)], SECOND_ALONG(a), lower, edge);
+        const REAL depth = step < 0 ? -y[a] : y[a] - PERIOD(a);
+        if (!(depth <= margins[block_place(a, step > 0, first, second)]))
+            return false;
+    }
+    return true;
+}
+
+/* Per block: the margin that images are taken from next. needed is what cells needed, there and in the blocks around
+   it, as cells move; it grows by `factor`. With `grow`, to no less than before. widest[a] collects the largest along
+   axis a, as bits of a float, which are in the order of floats >= 0. */
+kernel void next_margins(const int size, global const float *needed, const float factor, const int grow,
+                         global float *margins, global int *widest)
+{
+    WORK_ITEM(k);
+    const int per_seam = DIM == 2 ? BLOCKS : BLOCKS * BLOCKS;
+    const int a = k / (2 * per_seam), seam = k / per_seam, along = k % per_seam;
+    const int first = DIM == 2 ? along : along / BLOCKS, second = DIM == 2 ? 0 : along % BLOCKS;
+    const REAL period = a == 0 ? PERIOD(0) : a == 1 ? PERIOD(1) : PERIOD(2);
+    float margin = 0;
+    for (int i = max(first - 1, 0); i <= min(first + 1, BLOCKS - 1); ++i)
+        for (int j = max(second - 1, 0); j <= min(second + 1, DIM == 2 ? 0 : BLOCKS - 1); ++j)
+            margin = fmax(margin, factor * needed[block_place(seam / 2, seam % 2, i, j)]);
+    if (grow)
+        margin = fmax(margin, margins[k]);
+    if (margin > 0.99f * (float)period)
+        margin = WHOLE; /* at least as deep as any image, whatever rounds */
+    margins[k] = margin;
+    if (margin > 0 && period > 0)
+        atomic_max(widest + a, as_int(margin));
 }
 
 /* Per generator i: how many images it has. */
-kernel void count_images(const int size, global const REAL *points, const REAL4 margins, global int *counts)
+kernel void count_images(const int size, global const REAL *points, global const float *margins, const REAL4 lower,
+                         const REAL4 edge, global int *counts)
 {
     WORK_ITEM(i);
     REAL x[DIM], y[DIM];
     EACH_AXIS(a)
-        x[a] = points[DIM * i + a];
+    x[a] = points[DIM * i + a];
     int count = 0;
     for (int code = 0; code < CODES; ++code)
-        count += code != CENTRE && make_image(x, code, margins, y);
+        count += code != CENTRE && make_image(x, code, margins, lower, edge, y);
     counts[i] = count;
 }
 
-/* Per generator i: its row of `extended`, and those of its images behind row n, in the order of owners and codes, whatever
-   the margin; firsts are the prefix sums of the counts. */
-kernel void place_images(const int size, global const REAL *points, const REAL4 margins, global const int *firsts,
-                         global REAL *extended, global int *owners, global int *codes)
+/* Per generator i: its row of `extended`, and those of its images behind row n, in the order of owners and codes,
+   whatever the margins; firsts are the prefix sums of the counts. */
+kernel void place_images(const int size, global const REAL *points, global const float *margins, const REAL4 lower,
+                         const REAL4 edge, global const int *firsts, global REAL *extended, global int *owners,
+                         global int *codes)
 {
     WORK_ITEM(i);
     REAL x[DIM], y[DIM];
     EACH_AXIS(a)
-        extended[DIM * i + a] = x[a] = points[DIM * i + a];
+    extended[DIM * i + a] = x[a] = points[DIM * i + a];
     int g = firsts[i];
     for (int code = 0; code < CODES; ++code)
-        if (code != CENTRE && make_image(x, code, margins, y)) {
+        if (code != CENTRE && make_image(x, code, margins, lower, edge, y)) {
             EACH_AXIS(a)
-                extended[DIM * (size + g) + a] = y[a];
+            extended[DIM * (size + g) + a] = y[a];
             owners[g] = i;
             codes[g++] = code;
         }
 }
 
-/* Per place p in bin order: the margin that the cell of generator items[p] needs, reach[p] being twice its reach. report[0]
-   collects the largest, as bits of a float, which are in the order of floats >= 0. */
-kernel void measure_margin(const int size, global const int *items, global const float *reach,
-                           global const REAL *points, const int n, const REAL4 margins, global int *report)
+/* How far x lies from a block along an axis; a little less, as positions are put into blocks with rounding. */
+inline REAL block_distance(REAL x, REAL from, REAL length, int block)
+{
+    const REAL below = block > 0 ? from + block * length - x : R(0);
+    const REAL above = block < BLOCKS - 1 ? x - (from + (block + 1) * length) : R(0);
+    return fmax(fmax(below, above) - 16 * REAL_EPS, R(0));
+}
+
+/* Per place p in bin order: how deep the ball goes beyond each block of the seams whose radius reach[p] is twice the
+   reach of the cell of generator items[p]. needs collects the largest, as bits of floats. */
+kernel void measure_margins(const int size, global const int *items, global const float *reach,
+                            global const REAL *points, const int n, const REAL4 lower, const REAL4 edge,
+                            global int *needs)
 {
     WORK_ITEM(p);
     const int i = items[p];
     if (i >= n)
         return;
-    const REAL margin[4] = {margins.s0, margins.s1, margins.s2, margins.s3};
-    float need = 0;
+    const REAL from[4] = {lower.s0, lower.s1, lower.s2, lower.s3}, length[4] = {edge.s0, edge.s1, edge.s2, edge.s3};
+    const REAL radius = reach[p] * R(1.000001); /* it was rounded to a float */
+    REAL x[DIM];
     EACH_AXIS(a)
-        if (margin[a] < PERIOD(a)) {
-            const REAL x = points[DIM * i + a];
-            need = fmax(need, (float)(reach[p] - fmin(x, PERIOD(a) - x)));
-        }
-    if (need > 0)
-        atomic_max(report, as_int(need * 1.000001f));
+    x[a] = points[DIM * i + a];
+    for (int seam = 0; seam < 2 * DIM; ++seam) {
+        const int a = seam / 2, b = FIRST_ALONG(a), c = DIM == 2 ? b : SECOND_ALONG(a);
+        const REAL period = a == 0 ? PERIOD(0) : a == 1 ? PERIOD(1) : PERIOD(2);
+        const REAL to_seam = seam % 2 ? period - x[a] : x[a];
+        if (!(period > 0 && to_seam < radius))
+            continue;
+        const int last_b = block_of(x[b] + radius, b, lower, edge);
+        const int last_c = DIM == 2 ? 0 : block_of(x[c] + radius, c, lower, edge);
+        for (int j = block_of(x[b] - radius, b, lower, edge); j <= last_b; ++j)
+            for (int k = DIM == 2 ? 0 : block_of(x[c] - radius, c, lower, edge); k <= last_c; ++k) {
+                const REAL s = block_distance(x[b], from[b], length[b], j);
+                const REAL t = DIM == 2 ? R(0) : block_distance(x[c], from[c], length[c], k);
+                const REAL deep = sqrt(fmax(radius * radius - s * s - t * t, R(0))) - to_seam;
+                const float need = 1.00001f * (float)(deep + 4 * REAL_EPS);
+                if (need > 0)
+                    atomic_max(needs + block_place(a, seam % 2, j, k), as_int(need));
+            }
+    }
+}
+
+/* Per block: is its margin as deep as was needed? needed takes what was, and needs begins anew. report[0] is set where
+   one is not. */
+kernel void compare_margins(const int size, global const float *margins, global int *needs, global float *needed,
+                            global int *report)
+{
+    WORK_ITEM(k);
+    const float need = as_float(needs[k]);
+    needs[k] = 0;
+    needed[k] = need;
+    if (!(need <= margins[k]) && margins[k] < WHOLE)
+        atomic_or(report, 1);
 }
 
 /* Per generator i: its row of the extended diagram with the owners of images, and each face's code. kept[k]: does the
-   neighbour see the face, too? Cells in the box and beyond it are made of the same differences, but cut in another order:
-   rounding may let one see a face of no size that the other does not see. Such a face is to go, so that the graph is
-   symmetric; counts are those of the others. */
+   neighbour see the face, too? Cells in the box and beyond it are made of the same differences, but cut in another
+   order: rounding may let one see a face of no size that the other does not see. Such a face is to go, so that the
+   graph is symmetric; counts are those of the others. */
 kernel void fold_rows(const int size, global const int *starts, global const int *neighbours,
                       global const FACE *face_measures, global const REAL *volumes, global const REAL *points,
                       global const int *owners, global const int *codes, const REAL share, const int nearest,
@@ -119,7 +212,8 @@ kernel void fold_rows(const int size, global const int *starts, global const int
         if (label >= 0 && (!mutual || nearest)) {
             REAL d2 = 0;
             bool far = false;
-            EACH_AXIS(a) {
+            EACH_AXIS(a)
+            {
                 const REAL d = points[DIM * label + a] - points[DIM * i + a];
                 far = far || DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) != d;
                 d2 += d * d;
@@ -156,16 +250,17 @@ kernel void close_rows(const int size, global const int *starts, global const uc
         new_codes[to] = face_codes[k];
         new_measures[to] = face_measures[k];
         EACH_AXIS(a)
-            new_centroids[DIM * to + a] = face_centroids[DIM * k + a];
+        new_centroids[DIM * to + a] = face_centroids[DIM * k + a];
         places[to++] = k;
     }
 }
 
-/* Per generator i: its row in an earlier folded graph as one of the extended graph: images in the place of their owners,
-   where they are nearest now, -1 for whom there is no image. Where to begin with the cells: nobody is relied on. */
+/* Per generator i: its row in an earlier folded graph as one of the extended graph: images in the place of their
+   owners, where they are nearest now, -1 for whom there is no image. Where to begin with the cells: nobody is relied
+   on. */
 kernel void unfold_rows(const int size, global const int *starts, global const int *neighbours,
-                        global const REAL *points, const REAL4 margins, global const int *firsts,
-                        global int *unfolded)
+                        global const REAL *points, global const float *margins, const REAL4 lower, const REAL4 edge,
+                        global const int *firsts, global int *unfolded)
 {
     WORK_ITEM(i);
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -174,7 +269,8 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
         if (j >= 0) {
             REAL x[DIM], y[DIM];
             int wanted = 0;
-            EACH_AXIS(a) {
+            EACH_AXIS(a)
+            {
                 const REAL period = PERIOD(a);
                 x[a] = points[DIM * j + a];
                 const int step = period > 0 ? -convert_int_rte((x[a] - points[DIM * i + a]) / period) : 0;
@@ -182,10 +278,10 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
             }
             if (wanted == CENTRE) {
                 label = j;
-            } else if (make_image(x, wanted, margins, y)) {
+            } else if (make_image(x, wanted, margins, lower, edge, y)) {
                 label = size + firsts[j];
                 for (int code = 0; code < wanted; ++code)
-                    label += code != CENTRE && make_image(x, code, margins, y);
+                    label += code != CENTRE && make_image(x, code, margins, lower, edge, y);
             }
         }
         unfolded[k] = label;

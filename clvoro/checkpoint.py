@@ -24,19 +24,30 @@ from .mesh import SUMMARIES, Mesh, Stages
 from .plans import Action, Step
 from .polygon import Polygon
 from .results import HISTORY_DTYPE, Displacements
+from .seam import block_count
 
 if TYPE_CHECKING:
     from .domain import Domain
     from .loop import Loop
     from .sizing import Sizing
 
-FORMAT, VERSION = "clvoro-checkpoint", 2
+FORMAT, VERSION = "clvoro-checkpoint", 3
 _MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
 _PER_FACE = ("neighbours", "face_measures", "face_centroids")
 _DIAGRAM = (
     "starts", "neighbours", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
 )  # fmt: skip
-_COUNTS = ("position", "level", "n_start", "steps", "inserted", "deleted", "next_label", "spare")
+_COUNTS = (
+    "position",
+    "level",
+    "n_start",
+    "steps",
+    "inserted",
+    "deleted",
+    "next_label",
+    "spare",
+    "seam_cells",
+)
 
 
 def describe(
@@ -120,6 +131,10 @@ class Checkpointer:
             arrays[f"diagram.{name}"] = (array[:m] if name in _PER_FACE else array).get()
         for name, array in mesh.stages.poisson.save(mesh.labels).items():
             arrays[f"multigrid.{name}"] = array
+        torus = mesh.tessellator.torus
+        if torus is not None:
+            # Within what images are taken: in 3D, sums of a cell depend on it in their last bits.
+            arrays["seam.needed"] = torus.margins.needed.get()
         if loop.initial is not None:
             for field in dataclasses.fields(Displacements):
                 arrays[f"initial.{field.name}"] = getattr(loop.initial, field.name)
@@ -132,7 +147,7 @@ class Checkpointer:
             "elapsed": time.perf_counter() - loop.began,
             "methods": [_state_of(method) for method in _methods(loop.plan)],
             "capacities": _capacities(mesh.stages), "levels": loop.levels,
-            "margin": _margin(mesh),
+            "seam_cells": 0 if torus is None else torus.margins.cells,
         }  # fmt: skip
         about = {"made_by": self.made_by, "plan": self.plan, "state": state}
         arrays["about"] = np.array(json.dumps(about))
@@ -165,14 +180,16 @@ class Saved:
                 raise ValueError("counts")
             self.coarsening = float.fromhex(state["coarsening"])
             self.elapsed = float(state["elapsed"])
-            self.levels, self.margin = int(state["levels"]), float(state["margin"])
+            self.levels = int(state["levels"])
             if not (0 < self.coarsening < np.inf and 0 <= self.elapsed < np.inf):
                 raise ValueError("coarsening")
-            if not (self.levels >= 0 and 0 <= self.margin <= 1):
+            if not self.levels >= 0:
                 raise ValueError("levels")
             lower, _, *more = self.made_by["domain"]
             walls = int(more[0]) if more else 2 * len(lower)
             self._check(len(lower), walls, np.dtype(self.made_by["dtype"]))
+            if len(more) > 1:
+                self._check_seams(len(lower))
         except (
             KeyError,
             ValueError,
@@ -219,6 +236,14 @@ class Saved:
             raise ValueError("sizes")
         if self.state["spare"] > 64 * n + 64 or not len(a["history"]):
             raise ValueError("spare")
+
+    def _check_seams(self, d: int) -> None:
+        """Check what a periodic box of `d` dimensions has beside."""
+        needed = self.arrays["seam.needed"]
+        if needed.shape != (block_count(d),) or needed.dtype != np.float32:
+            raise ValueError("seam.needed")
+        if not (np.isfinite(needed).all() and needed.min() >= 0):
+            raise ValueError("seam.needed")
 
     def fit(self, made_by: dict) -> None:
         """Refuse a checkpoint of another domain or of other settings, naming the first that differs.
@@ -290,8 +315,10 @@ class Saved:
         else:
             mesh.tessellation = Tessellation(n=mesh.n, points=mesh.points, **t)
         mesh.next_label = state["next_label"]
-        if mesh.tessellator.torus is not None:
-            mesh.tessellator.torus.margin = self.margin
+        torus = mesh.tessellator.torus
+        if torus is not None:
+            torus.margins.needed.set(a["seam.needed"])
+            torus.margins.cells = state["seam_cells"]
         mesh._evaluate_metric()
         mesh.summaries.values.set(a["summaries"])
         levels = {
@@ -335,11 +362,6 @@ class Saved:
         if all(array is not None for array in initial):
             loop.initial = Displacements(*initial)  # type: ignore[arg-type]
         loop.began = time.perf_counter() - self.elapsed
-
-
-def _margin(mesh: Mesh) -> float:
-    """Return within what images are taken in a periodic box: in 3D, sums of a cell depend on it in their last bits."""
-    return 0.0 if mesh.tessellator.torus is None else mesh.tessellator.torus.margin
 
 
 def _methods(plan: list[Action]) -> list[Any]:

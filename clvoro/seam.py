@@ -15,6 +15,40 @@ from .domain import Box
 
 DROPPED, FAR, COLLAPSED = 1, 2, 4
 """Bits of a report: see `seam.cl`."""
+BLOCKS = {2: 128, 3: 32}
+"""Blocks per axis along a seam by dimension."""
+
+
+def block_count(dim: int) -> int:
+    """Return the number of blocks of all seams, those across axes with walls included."""
+    return 2 * dim * BLOCKS[dim] ** (dim - 1)
+
+
+class Margins:
+    """How far beyond the seams of a periodic box images are taken, block by block; see `seam.cl`.
+
+    Blocks are in the order of axes, ends (lower, upper) and places along the seam.
+
+    Attributes
+    ----------
+    needed : (blocks,) float32, device
+        How deep balls around the cells of the latest diagram went.
+    cells : int
+        Generators of that diagram; 0 before the first one.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        count = block_count(engine.dim)
+        self.needed = engine.zeros(count, np.float32)
+        self.cells = 0
+        self.widths = engine.zeros(count, np.float32)
+        self.needs = engine.zeros(count, np.int32)
+        self.widest = engine.empty(4, np.int32)
+
+    def fill(self, margin: float, cells: int) -> None:
+        """Have `margin` needed everywhere by the diagram of `cells` generators."""
+        self.needed.fill(margin)
+        self.cells = cells
 
 
 @dataclass(frozen=True)
@@ -46,8 +80,10 @@ class Images:
     n, count : int
         Generators; generators and images.
     box : ExtendedBox
-    margins : (4,) real, host
-        How far it goes beyond the seams; 0 along axes with walls.
+    margins : Margins
+        Within which images were taken.
+    blocks : (2, 4) real, host
+        Where blocks of the seams begin along each axis, and how long they are there.
     points : (>= count, d) real
         Generators first, then images in the order of owners and codes.
     firsts : (n + 1,) int32
@@ -60,7 +96,8 @@ class Images:
     n: int
     count: int
     box: ExtendedBox
-    margins: np.ndarray
+    margins: Margins
+    blocks: np.ndarray
     points: cla.Array
     firsts: cla.Array
     owners: cla.Array
@@ -112,27 +149,45 @@ class Seam:
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
-    def extend(self, domain: Box, points: cla.Array, n: int, margin: float) -> Images:
-        """Return the first `n` of `points` (n, d) with their images within `margin` (at most a period) of the seams."""
+    def extend(
+        self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
+    ) -> Images:
+        """Return the first `n` of `points` (n, d) with their images beyond the seams.
+
+        Parameters
+        ----------
+        margins : Margins
+            They become what was needed, times `factor`.
+        grow : bool
+            But nowhere less than they were.
+        """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
-        # On a coarse grid, so that the corners of the extended box are exact.
-        margins = np.zeros(4, engine.real)
-        margins[:d] = np.minimum(periods, np.ceil(margin * 2.0**20) / 2.0**20)
+        corners = np.array(domain.device_corners(engine.real))
+        blocks = np.stack([corners[0], np.maximum((corners[1] - corners[0]) / BLOCKS[d], 1e-30)])
+        blocks = blocks.astype(engine.real)
+        margins.widest.fill(0)
+        engine.run_each(
+            k.next_margins, block_count(d), margins.needed, np.float32(factor), np.int32(grow),
+            margins.widths, margins.widest,
+        )  # fmt: skip
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
-        engine.run_each(k.count_images, n, points, margins, firsts)
+        engine.run_each(k.count_images, n, points, margins.widths, *blocks, firsts)
         self._scan.exclusive(firsts, firsts, n)
         ghosts = int(firsts[n].get())
         count = n + ghosts
         extended = self._room("points", size=d * count).reshape(-1, d)
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
-        engine.run_each(k.place_images, n, points, margins, firsts, extended, owners, codes)
-        lower, upper = (
-            corner[:d].astype(np.float64) for corner in domain.device_corners(engine.real)
+        engine.run_each(
+            k.place_images, n, points, margins.widths, *blocks, firsts, extended, owners, codes
         )
-        box = ExtendedBox(lower - margins[:d], upper + margins[:d])
-        return Images(n, count, box, margins, extended, firsts, owners, codes)
+        lower, upper = (corner[:d].astype(np.float64) for corner in corners)
+        # On a coarse grid, so that the corners of the extended box are exact.
+        widest = np.ceil(margins.widest.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
+        wide = np.minimum(periods, widest).astype(engine.real)
+        box = ExtendedBox(lower - wide, upper + wide)
+        return Images(n, count, box, margins, blocks, extended, firsts, owners, codes)
 
     def unfold(self, images: Images, previous: Tessellation) -> Rows:
         """Return rows of the extended graph for the generators, from `previous`: the same ones at earlier positions."""
@@ -140,7 +195,7 @@ class Seam:
         neighbours = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
             self._kernels.unfold_rows, images.n, previous.starts, previous.neighbours,
-            images.points, images.margins, images.firsts, neighbours,
+            images.points, images.margins.widths, *images.blocks, images.firsts, neighbours,
         )  # fmt: skip
         return Rows(images.n, previous.starts, neighbours)
 
@@ -152,7 +207,7 @@ class Seam:
         points: cla.Array,
         share: float,
         nearest: bool,
-    ) -> tuple[Folded, float, int, int]:
+    ) -> tuple[Folded, bool, int, int]:
         """Fold `t`, the diagram of `images`, which lie in `binned`.
 
         Parameters
@@ -167,17 +222,23 @@ class Seam:
         Returns
         -------
         folded : Folded
-        margin : float
-            What the cells need: if it is more than `images` have, and less than a period, the diagram is not right.
+        enough : bool
+            Whether the margins were wide enough for all cells: else the diagram is not right. What they need is noted.
         flags, generator : int
             `FAR` and `COLLAPSED` where that is so, and the first generator concerned.
         """
         engine, k, n = self.engine, self._kernels, images.n
         self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
+        margins = images.margins
         engine.run_each(
-            k.measure_margin, images.count, binned.items, binned.reach, images.points, np.int32(n),
-            images.margins, self._report,
+            k.measure_margins, images.count, binned.items, binned.reach, images.points, np.int32(n),
+            *images.blocks, margins.needs,
         )  # fmt: skip
+        engine.run_each(
+            k.compare_margins, block_count(engine.dim), margins.widths, margins.needs,
+            margins.needed, self._report,
+        )  # fmt: skip
+        margins.cells = n
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
         graph = [
@@ -208,5 +269,4 @@ class Seam:
         folded = Tessellation(
             n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n]
         )
-        margin = float(words[:1].view(np.float32)[0])
-        return Folded(folded, graph[1], places), margin, flags & ~DROPPED, int(words[2])
+        return Folded(folded, graph[1], places), not words[0], flags & ~DROPPED, int(words[2])

@@ -13,15 +13,15 @@ from .cells import EXACT_SHARE, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import InputError
 from .polyhedra import Polyhedra
-from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images
+from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images, Margins
 
 if TYPE_CHECKING:
     from .stages import DiagramStages
 
 FIRST_MARGIN = 4.0
-"""Mean spacings that images are taken from at first."""
+"""Mean spacings within which images are taken at first."""
 SLACK = 1.15
-"""Margin of the next diagram over what this one needed."""
+"""Margins of the next diagram over what this one needed."""
 
 
 class FewCellsError(InputError):
@@ -50,8 +50,8 @@ class Torus:
 
     Attributes
     ----------
-    margin : float
-        From the seams, within which images are taken; 0 before the first diagram.
+    margins : Margins
+        From the seams, within which images are taken.
     latest : Unfolded or None
         Of the latest diagram, if that was a whole one.
     """
@@ -67,7 +67,7 @@ class Torus:
         # Wide enough for every cell, from wherever its generator is.
         self._wide = ExtendedBox(lower - self.periods, upper + self.periods)
         self._sums = Summaries(stages.engine, ("volumes",))
-        self.margin = 0.0
+        self.margins = Margins(stages.engine)
         self.latest: Unfolded | None = None
 
     def tessellate(
@@ -95,18 +95,20 @@ class Torus:
             If generators are too close to each other to be told apart.
         FewCellsError
         """
-        stages, longest = self.stages, float(self.periods.max())
+        stages, margins, dim = self.stages, self.margins, self.domain.dim
         seam, cells = stages.seam, stages.cells
         if previous is not None and not exact and not isinstance(cells, Polyhedra):
             t = self._repaired(points, n, previous)
             if t is not None:
                 self.latest = None
                 return t
-        if self.margin == 0:
-            volume = self.domain.measure / self.domain.frame[1] ** self.domain.dim
-            self.margin = FIRST_MARGIN * (volume / n) ** (1 / self.domain.dim)
+        if margins.cells == 0:
+            volume = self.domain.measure / self.domain.frame[1] ** dim
+            margins.fill(FIRST_MARGIN * (volume / n) ** (1 / dim), n)
+        grow = False
         while True:
-            images = seam.extend(self.domain, points, n, self.margin)
+            factor = SLACK * (margins.cells / n) ** (1 / dim)
+            images = seam.extend(self.domain, points, n, margins, factor, grow)
             binned = stages.bins.build(images.box, images.points, images.count)
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
@@ -115,11 +117,10 @@ class Torus:
             else:
                 t = cells.tessellate(*args, exact, None if whole else n)
             share = EXACT_SHARE if exact else ROUGH_SHARE
-            folded, needed, flags, generator = seam.fold(images, binned, t, points, share, nearest)
-            if needed <= float(images.margins.max()) or self.margin >= longest:
+            folded, enough, flags, generator = seam.fold(images, binned, t, points, share, nearest)
+            if enough:
                 break
-            self.margin = min(SLACK * needed, longest)
-        self.margin = min(max(SLACK * needed, 1e-3 * longest), longest)
+            grow = True
         if flags & COLLAPSED:
             raise InputError(
                 f"generator {generator} is too close to others in {stages.engine.real}; expected distinct generators: "
