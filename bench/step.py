@@ -126,10 +126,10 @@ def take_steps(
     original = tessellator.tessellate
     spent = 0.0
 
-    def tessellate(*args: Any) -> Any:
+    def tessellate(*args: Any, **named: Any) -> Any:
         nonlocal spent
         kept: list[Any] = []
-        spent = timed(lambda: kept.append(original(*args)))
+        spent = timed(lambda: kept.append(original(*args, **named)))
         return kept[0]
 
     def finish() -> None:

@@ -152,6 +152,13 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
     }
 }
 
+/* Per place p: itself, which is what it holds once the generators have been brought into the order of the bins. */
+kernel void number_items(const int size, global int *items)
+{
+    WORK_ITEM(p);
+    items[p] = p;
+}
+
 /* Per place p: the generator's position. */
 kernel void gather_items(const int size, global const int *items, global const REAL *points, global REAL *binned)
 {

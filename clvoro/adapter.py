@@ -155,7 +155,9 @@ class Adapter:
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with Naming(host, domain, self.dtype):
             tessellator = Tessellator(stages, domain)
-            t, unfolded = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True))
+            stages.bins.renumber(binned, n)
+            t = tessellator.tessellate(sorted_points, n, exact=True, binned=binned)
+            t, unfolded = tessellator.final(t)
         return fetch_diagram(engine, domain, t, labels, unfolded=unfolded)
 
     def run(

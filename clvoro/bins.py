@@ -170,3 +170,10 @@ class Bins:
         return BinnedPoints(
             self._items, self._points, self._reach, spacing, self._bins, self._frames, self._shapes
         )
+
+    def renumber(self, binned: BinnedPoints, n: int) -> None:
+        """Make of `binned` what `build` would make of its `n` generators in the order that they have there.
+
+        Bit by bit so: they lie in the same bins, and in their order.
+        """
+        self.engine.run_each(self._kernels.number_items, n, binned.items)

@@ -12,7 +12,7 @@ import pyopencl.array as cla
 
 from ._primitives import Gather, Summaries, Summary
 from ._program import Engine
-from .bins import Bins
+from .bins import BinnedPoints, Bins
 from .cells import Cells, Tessellation
 from .density import Density, Excess, Weighting
 from .domain import Domain
@@ -205,13 +205,15 @@ class Mesh:
         """
         stages, first = self.stages, not hasattr(self, "tessellation")
         n = len(rows["points"])
-        items = stages.bins.build(self.domain, rows["points"], n).items[:n].copy()
+        binned = stages.bins.build(self.domain, rows["points"], n)
+        items = binned.items[:n].copy()
         # One after the other, so that each is let go of when it has been sorted.
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
         # At one stroke: whoever interrupts the run finds arrays that fit each other, or none, which `update` makes.
         self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, "tessellation": None})
         del new, items
-        self.update(first)
+        stages.bins.renumber(binned, n)
+        self.update(first, binned)
         stages.bins.clear()
         self.engine.workspace.clear()
 
@@ -244,8 +246,10 @@ class Mesh:
         assert self.tessellation is not None
         return self.tessellation
 
-    def update(self, first: bool = False) -> None:
+    def update(self, first: bool = False, binned: BinnedPoints | None = None) -> None:
         """Tessellate the generators where they are now, and evaluate size, error and quality.
+
+        `binned` has them in their bins, where the caller does.
 
         Raises
         ------
@@ -256,7 +260,9 @@ class Mesh:
         """
         stages = self.stages
         self._make_room()
-        self.tessellation = self.tessellator.tessellate(self.points, self.n, self.tessellation)
+        self.tessellation = self.tessellator.tessellate(
+            self.points, self.n, self.tessellation, binned=binned
+        )
         if self.engine.dim == 2:
             # The next diagrams are repaired from this one, most likely.
             stages.bins.clear()

@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from .bins import BinnedPoints
 from .cells import Tessellation
 from .chords import Boundary
 from .polygon import Polygon
@@ -44,7 +45,12 @@ class PolygonTessellator:
         self._all: cla.Array | None = None
 
     def tessellate(
-        self, points: cla.Array, n: int, previous: Tessellation | None, exact: bool
+        self,
+        points: cla.Array,
+        n: int,
+        previous: Tessellation | None,
+        exact: bool,
+        binned: BinnedPoints | None = None,
     ) -> Tessellation:
         """Tessellate; see `Tessellator.tessellate`."""
         stages, domain = self.stages, self.domain
@@ -62,7 +68,9 @@ class PolygonTessellator:
                 points.data,
                 byte_count=2 * n * self.engine.real.itemsize,
             )
-            convex = tessellate_box(stages, domain, self._all, total, convex, exact)
+            if total > n:
+                binned = None  # sentinels are not among these
+            convex = tessellate_box(stages, domain, self._all, total, convex, exact, binned)
             # The vertices of the boundary are found from the cells that held them before, or from the least.
             chords = self._boundary.cut(convex, n)
             if not isinstance(chords, np.ndarray):

@@ -8,7 +8,7 @@ import pyopencl.array as cla
 
 from ._primitives import Gather
 from ._program import Engine
-from .bins import Bins
+from .bins import BinnedPoints, Bins
 from .cells import Cells, Tessellation
 from .domain import Domain
 from .folded import FoldedCells
@@ -38,13 +38,15 @@ def tessellate_box(
     n: int,
     previous: Tessellation | None,
     exact: bool,
+    binned: BinnedPoints | None = None,
 ) -> Tessellation:
     """Tessellate the box that cells of `domain` are clipped by; see `Tessellator.tessellate`."""
     if isinstance(stages.cells, Polyhedra):
-        binned = stages.bins.build(domain, points, n)
+        binned = stages.bins.build(domain, points, n) if binned is None else binned
         return stages.cells.tessellate(domain, points, n, binned, previous, exact)
     if previous is not None and not exact:
         t = stages.repair.follow(stages.cells, domain, points, previous)
         if t is not None:
             return t
-    return stages.cells.tessellate(domain, points, n, stages.bins.build(domain, points, n), exact)
+    binned = stages.bins.build(domain, points, n) if binned is None else binned
+    return stages.cells.tessellate(domain, points, n, binned, exact)

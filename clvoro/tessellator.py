@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl.array as cla
 
+from .bins import BinnedPoints
 from .cells import Tessellation
 from .domain import Domain
 from .polygon import Polygon
@@ -64,6 +65,7 @@ class Tessellator:
         n: int,
         previous: Tessellation | None = None,
         exact: bool = False,
+        binned: BinnedPoints | None = None,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points` (n, d), in the coordinates of the domain's frame.
 
@@ -73,6 +75,8 @@ class Tessellator:
             The latest diagram, of the same generators at earlier positions: what has stayed of it is kept.
         exact : bool
             Refuse generators so close together that rounding makes a share of a cell uncertain; see `Cells.tessellate`.
+        binned : BinnedPoints, optional
+            The generators in bins of the domain, where the caller has them.
 
         Raises
         ------
@@ -82,5 +86,5 @@ class Tessellator:
         if self.torus is not None:
             return self.torus.tessellate(points, n, previous, exact, not exact, whole=exact)
         if self._polygon is not None:
-            return self._polygon.tessellate(points, n, previous, exact)
-        return tessellate_box(self.stages, self.domain, points, n, previous, exact)
+            return self._polygon.tessellate(points, n, previous, exact, binned)
+        return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned)

@@ -152,6 +152,24 @@ def test_repeats_bit_by_bit_whatever_came_before(ctx, real):
             assert np.array_equal(items, first[name]), name
 
 
+@pytest.mark.parametrize("box", BOXES)
+def test_renumbered_bins_are_those_of_the_sorted_generators(ctx, real, box):
+    """Bit by bit: a diagram of generators in any order bins them once, to sort them and to search among them."""
+    box = BOXES[box]
+    engine = patch.make_engine(ctx, real, box.dim)
+    for name, points in sets(box.dim, box).items():
+        points, n = np.minimum(points, box.upper).astype(real), len(points)
+        once, anew = Bins(engine), Bins(engine)
+        binned = once.build(box, engine.upload(points), n)
+        items = binned.items.get()[:n]
+        again = anew.build(box, engine.upload(points[items]), n)
+        once.renumber(binned, n)
+        for field, array in vars(binned).items():
+            assert np.array_equal(array.get(), getattr(again, field).get()), (name, field)
+        if name == "random":
+            assert not np.array_equal(items, np.arange(n)), "the set was in order before"
+
+
 def test_only_the_first_n_are_binned(ctx):
     engine = patch.make_engine(ctx)
     points = patch.random_points(300, 4)
