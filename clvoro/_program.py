@@ -20,6 +20,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import make_array
 from ._workspace import Workspace
 from .errors import BuildError
 
@@ -237,7 +238,7 @@ class Engine:
 
     def empty(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
         """Return an uninitialised device array; `dtype` defaults to the engine's precision."""
-        return cla.empty(self.queue, shape, self.real if dtype is None else dtype)
+        return make_array(self.queue, shape, np.dtype(self.real if dtype is None else dtype))
 
     def scratch(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
         """Return the same, but of the workspace, valid to the end of its frame; outside of one, an array of its own."""
@@ -247,10 +248,11 @@ class Engine:
 
     def zeros(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
         """Return a device array of zeros."""
-        return cla.zeros(self.queue, shape, self.real if dtype is None else dtype)
+        return self.empty(shape, dtype).fill(0)
 
     def upload(self, host: object, dtype: object = None) -> cla.Array:
         """Copy a host array to the device in the engine's precision (or `dtype`)."""
-        return cla.to_device(
-            self.queue, np.ascontiguousarray(host, self.real if dtype is None else dtype)
-        )
+        given = np.ascontiguousarray(host, self.real if dtype is None else dtype)
+        array = self.empty(given.shape, given.dtype)
+        array.set(given)
+        return array

@@ -23,6 +23,8 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import make_array
+
 Method = TypeVar("Method", bound=Callable[..., Any])
 MOST_VIEWS = 1000
 """Arrays that are kept to be taken again; numbers of faces, say, change from step to step."""
@@ -101,7 +103,7 @@ class Workspace:
         if key not in self._views:
             # Kept, as to make one costs as much as a launch.
             view = self._pieces[number].get_sub_region(start, size)
-            self._views[key] = cla.Array(self._queue, shape, dtype, data=view)
+            self._views[key] = make_array(self._queue, shape, dtype, view)
         self._taken[number] += size
         self._most = max(self._most, sum(self._taken))
         return self._views[key]
