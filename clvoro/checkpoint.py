@@ -188,7 +188,7 @@ class Saved:
             lower, _, *more = self.made_by["domain"]
             walls = int(more[0]) if more else 2 * len(lower)
             self._check(len(lower), walls, np.dtype(self.made_by["dtype"]))
-            if len(more) > 1:
+            if len(more) > 1 and isinstance(more[1], list):  # directions, not a polygon's digest
                 self._check_seams(len(lower))
         except (
             KeyError,
