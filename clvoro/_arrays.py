@@ -64,14 +64,16 @@ def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
     return i, j
 
 
-def check_integer(name: str, value: object, least: int) -> int:
-    """Return `value` as an int of at least `least`."""
+def check_integer(name: str, value: object, least: int, most: float = 2**63 - 1) -> int:
+    """Return `value` as an int of at least `least`, at most `most`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise InputTypeError(
             f"{name} is {value!r} of type {type(value).__name__}, expected an integer"
         )
     if value < least:
         raise InputError(f"{name} is {value}, expected at least {least}")
+    if value > most:
+        raise InputError(f"{name} has {len(str(value))} digits, expected at most {most:.3g}")
     return int(value)
 
 
@@ -85,6 +87,8 @@ def check_number(
         raise InputTypeError(
             f"{name} is {value!r} of type {type(value).__name__}, expected a number"
         ) from None
+    except OverflowError:
+        number = np.inf
     if not np.isfinite(number) or number <= above or number < least:
         bound = f"> {above:g}" if above > -np.inf else f">= {least:g}"
         raise InputError(f"{name} is {value!r}, expected a finite number {bound}")

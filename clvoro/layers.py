@@ -22,6 +22,7 @@ _SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin 
 _NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
 _GROWTH = 1.2  # of sizes beyond layers that do not grow themselves
 _APART = 0.3  # of a width, between the last row and the generators that move
+_MOST = 2.0**62  # columns, more than any device holds: numbers of them stay finite
 _NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
 _OWN = 0.9  # of its distance from the wall: a generator that another wall is nearer to than this is not in its place
 
@@ -79,13 +80,18 @@ class Layers:
 
     @property
     def thickness(self) -> float:
-        """Height of all layers together."""
-        return float(self.heights.sum())
+        """Height of all layers together, infinite where numbers end."""
+        count, g = self.count, self.growth
+        with np.errstate(over="ignore"):
+            return float(self.height * (count if g == 1 else np.expm1(count * np.log(g)) / (g - 1)))
 
     @property
     def width(self) -> float:
         """Width of the cells along the wall."""
-        return float(self.heights[-1]) if self.spacing is None else self.spacing
+        if self.spacing is not None:
+            return self.spacing
+        with np.errstate(over="ignore"):
+            return float(self.height * np.float64(self.growth) ** (self.count - 1))
 
     @property
     def rows(self) -> np.ndarray:
@@ -132,8 +138,6 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     polygon, number = as_polygon(domain)
     found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
     for layer in layers:
-        if not isinstance(layer, Layers):
-            raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
         for chain in _chains(polygon, _chosen(polygon, number, layer)):
             feet, normals = _columns(chain, layer.width, layer.thickness)
             for y in layer.rows:
@@ -170,6 +174,27 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     return points
 
 
+def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
+    """Return how many generators `place_layers` will choose from, before it makes any.
+
+    Raises
+    ------
+    InputError
+        If the layers of one wall alone fill the domain, or an edge is not there.
+    InputTypeError
+        If something is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
+    """
+    polygon, number = as_polygon(domain)
+    total = 0
+    for layer in layers:
+        chains = _chains(polygon, _chosen(polygon, number, layer))
+        if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
+            raise InputError(_NO_ROOM)
+        columns = sum(sum(_counts(chain, layer.width, layer.thickness)) for chain in chains)
+        total += columns * (layer.count + 1)
+    return total
+
+
 def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
     """Return a domain in 2D as a polygon, and for each of its edges the number by which `Layers.edges` means it."""
     if isinstance(domain, Polygon):
@@ -191,6 +216,8 @@ def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
 
 
 def _chosen(polygon: Polygon, number: np.ndarray, layer: Layers) -> np.ndarray:
+    if not isinstance(layer, Layers):
+        raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
     if layer.edges is None:
         return np.ones(len(number), bool)
     missing = np.setdiff1d(layer.edges, number)
@@ -235,13 +262,20 @@ def _chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
     return chains
 
 
+def _counts(chain: Chain, width: float, thickness: float) -> tuple[int, int]:
+    """Return how many columns stand along the chain, and how many are spokes about its end."""
+    length = float(np.hypot(*np.diff(chain.corners, axis=0).T).sum())
+    count, fan = length / width, chain.fan * (thickness + width) / 2 / width
+    return max(1, round(min(count, _MOST))), round(min(fan, _MOST))
+
+
 def _columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the wall and unit normals (c, 2) into the domain of columns about `width` apart."""
     corners = chain.corners
     along = np.diff(corners, axis=0)
     lengths = np.hypot(*along.T)
     reached = np.concatenate([[0], np.cumsum(lengths)])
-    count = max(1, round(reached[-1] / width))
+    count, fan = _counts(chain, width, thickness)
     at = (np.arange(count) + 0.5) * (reached[-1] / count)
     edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
     share = ((at - reached[edge]) / lengths[edge])[:, None]
@@ -259,7 +293,6 @@ def _columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, 
         + to_last * (at_corners[edge + 1] - normal[edge])
     )
     feet, normals = corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
-    fan = round(chain.fan * (thickness / 2 + width / 2) / width)
     angles = -chain.fan * (np.arange(fan) + 0.5) / max(fan, 1)
     end = math.atan2(normal[-1, 1], normal[-1, 0])
     spokes = np.column_stack([np.cos(end + angles), np.sin(end + angles)])

@@ -9,8 +9,8 @@ import numpy as np
 
 from ._arrays import Naming, check_choice, check_integer, check_number
 from .domain import Domain
-from .errors import InputError
-from .layers import Layers, apart_from, bounded, free_domain, place_layers
+from .errors import InputError, InputTypeError
+from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
 from .memory import check_memory
 from .mesh import Mesh, Stages
 from .methods import PUBLISHED, Relaxation, make_method
@@ -73,12 +73,14 @@ def check_options(
     check_choice("method", method, METHODS)
     check_choice("start", start, STARTS)
     check_choice("effort", effort, tuple(EFFORTS))
+    if not isinstance(layers, Layers | Sequence):
+        raise InputTypeError(f"layers is {layers!r}, expected clvoro.Layers or a sequence of them")
     return Options(
         method=method,
         start=start,
         effort=effort,
         levels=levels,
-        seed=check_integer("seed", seed, 0),
+        seed=check_integer("seed", seed, 0, np.inf),
         tol=check_number("tol", tol, least=0),
         k=check_number("k", k, above=0),
         alpha=None if alpha is None else check_number("alpha", alpha, above=0),
@@ -141,6 +143,7 @@ class Preparation:
             )
         self.rows, self.free = np.empty((0, d)), domain
         if options.layers:
+            check_memory(stages.engine, count_rows(domain, options.layers), domain)
             self.rows, self.free = (
                 place_layers(domain, options.layers),
                 free_domain(domain, options.layers),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.errors import InputError, InputTypeError
-from clvoro.layers import Layers, free_domain, place_layers
+from clvoro.errors import InputError, InputTypeError, MemoryLimitError
+from clvoro.layers import Layers, count_rows, free_domain, place_layers
 
 BOX = clvoro.Box((0, 0), (2, 1))
 HOLE = 0.2 * np.stack(
@@ -118,6 +118,48 @@ def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
 def test_what_cannot_be_is_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+@pytest.mark.parametrize(
+    ("layers", "expected"),
+    [
+        # Refused in no time: what they would take is known before any generator is made.
+        (lambda: Layers(1e-9), MemoryLimitError),
+        (lambda: Layers(5e-324), MemoryLimitError),
+        (lambda: Layers(1e-3, spacing=1e-9), MemoryLimitError),
+        (lambda: Layers(1e-5, count=1000, growth=1), MemoryLimitError),
+        (lambda: Layers(1e300), InputError),
+        (lambda: Layers(0.01, count=10**7, growth=1), InputError),
+        (lambda: Layers(0.01, count=10**18), InputError),
+        (lambda: Layers(0.01, count=10**400), InputError),
+        (lambda: Layers(10**400), InputError),
+        (lambda: Layers(0.01, count=3, growth=1e200), InputError),
+        (lambda: Layers(1e308, count=2, growth=1e308), InputError),
+        (lambda: Layers(0.01, spacing=1e308), InputError),
+        (lambda: 5, InputTypeError),
+        (lambda: None, InputTypeError),
+        (lambda: ["thin"], InputTypeError),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_layers_out_of_all_proportion_are_refused(adapter, layers, expected):
+    for domain in (BOX, CHANNEL):
+        with pytest.raises(expected):
+            adapter.run(domain, 0.2, layers=layers(), effort="fast")
+
+
+@pytest.mark.parametrize("growth", [1, 1 + 1e-15, 1.2, 3])
+def test_thickness_is_that_of_all_heights(growth):
+    layers = Layers(0.01, count=7, growth=growth)
+    assert layers.thickness == pytest.approx(layers.heights.sum(), rel=1e-14)
+    assert layers.width == pytest.approx(layers.heights[-1], rel=1e-14)
+
+
+@pytest.mark.parametrize(("domain", "edges"), [(BOX, None), (CHANNEL, None), (CHANNEL, range(4))])
+def test_no_more_are_placed_than_are_counted(domain, edges):
+    layers = Layers(0.02, count=3, edges=edges)
+    count, placed = count_rows(domain, [layers]), len(place_layers(domain, [layers]))
+    assert 0.8 * count < placed <= count
 
 
 def test_domains_without_walls_in_2d_are_refused():
