@@ -3,20 +3,21 @@
 
 /* The diagram of generators that have moved a little, from the one before, without a search.
 
-   The intersection C_i of the box and the half-planes of *any* generators holds the cell V_i of them all. If around every
-   corner of C_i the cells that meet there name each other as neighbours, in the order of that corner, the C_i fit together
-   without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbours from before, check
-   that every cell is still convex and fits its neighbours (`check_rows`), clip those that do not by all the neighbours
-   of their neighbours (`clip_marked`), check these (`check_clipped`), and so on until all fit.
+   The intersection C_i of the box and the half-planes of *any* generators holds the cell V_i of them all. If around
+   every corner of C_i the cells that meet there name each other as neighbours, in the order of that corner, the C_i fit
+   together without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbours from
+   before, check that every cell is still convex and fits its neighbours (`check_rows`), clip those that do not by all
+   the neighbours of their neighbours (`clip_marked`), check these (`check_clipped`), and so on until all fit.
 
-   In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbours are nearest images. Cells without gap might cover
-   that more than once; their volumes tell. */
+   In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbours are nearest images. Cells without gap might
+   cover that more than once; their volumes tell. */
 
 /* A cell with more is clipped anew each time: it is rare, and would hold up its work-group. */
 #define CHECKED_FACES 16
 
-/* Is a gap between corners, given by its square, no more than their rounding? d2 is the squared distance of the generators
-   across the face. In single precision a spacing may be a thousand roundings of a position, and a corner is worse. */
+/* Is a gap between corners, given by its square, no more than their rounding? d2 is the squared distance of the
+   generators across the face. In single precision a spacing may be a thousand roundings of a position, and a corner is
+   worse. */
 inline bool is_rounding(REAL gap2, REAL d2)
 {
     return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
@@ -43,10 +44,10 @@ inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v
            (s == before || is_rounding(corner_gap2(u, i, j, i, s, points, lower, upper), d2));
 }
 
-/* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from the
-   directions, which are at hand, where both are generators. */
-inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points, const REAL *lower,
-                       const REAL *upper)
+/* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from
+   the directions, which are at hand, where both are generators. */
+inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
+                       const REAL *lower, const REAL *upper)
 {
     if (a < 0 || b < 0)
         return corner(i, x, a, b, points, lower, upper);
@@ -55,17 +56,11 @@ inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, glo
     return w2 > R(1e-3) * u2 ? circumcentre(u, v, u2, dot(v, v)) : corner(i, x, a, b, points, lower, upper);
 }
 
-/* Per generator i: marks[i] = 1, and its neighbours' at the face in question, where the neighbours from before no longer
-   enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; many may
-   write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up. */
-kernel void check_rows(const int size, global const int *starts, global const int *neighbours,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *fits,
-                       global int *marks)
+/* Check the row of generator i; see `check_rows`. */
+inline void check_row(int i, global const int *starts, global const int *neighbours, global const REAL *points,
+                      const REAL *lower, const REAL *upper, global int *fits, global int *marks)
 {
-    WORK_ITEM(i);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const int start = starts[i], n = starts[i + 1] - start;
     global const int *row = neighbours + start;
     if (n < 3 || n > CHECKED_FACES) {
@@ -89,8 +84,8 @@ kernel void check_rows(const int size, global const int *starts, global const in
         reach2 = fmax(reach2, r2);
         turns += d.s1 < 0 && d_after.s1 >= 0;
         const REAL d2 = face >= 0 ? dot(d, d) : r2;
-        bool good = d.s0 * d_after.s1 - d.s1 * d_after.s0 > 0 && d.s0 * e.s1 - d.s1 * e.s0 > 0 &&
-                    dot(e, e) >= REAL_EPS * d2;
+        bool good =
+            d.s0 * d_after.s1 - d.s1 * d_after.s0 > 0 && d.s0 * e.s1 - d.s1 * e.s0 > 0 && dot(e, e) >= REAL_EPS * d2;
         if (face >= 0) {
             least2 = fmin(least2, d2);
             if (!known) {
@@ -119,6 +114,31 @@ kernel void check_rows(const int size, global const int *starts, global const in
         atomic_or(marks + i, 1);
     if (!known)
         fits[i] = fit;
+}
+
+#if IN_LANES
+#include "common/eight_rows.h"
+#endif
+
+/* Per generator i: marks[i] = 1, and its neighbours' at the face in question, where the neighbours from before no
+   longer enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; many may
+   write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up.
+
+   In LANES a work-item takes so many generators, and there are so many fewer work-items. */
+kernel void check_rows(const int size, global const int *starts, global const int *neighbours,
+                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *fits,
+                       global int *marks)
+{
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+#if IN_LANES
+    const int first = (int)get_global_id(0) * LANES;
+    if (first < size)
+        check_eight(first, size, starts, neighbours, points, lower, upper, fits, marks);
+#else
+    WORK_ITEM(i);
+    check_row(i, starts, neighbours, points, lower, upper, fits, marks);
+#endif
 }
 
 /* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */
@@ -197,9 +217,9 @@ inline void mark_both(int i, int j, global int *marks)
 /* Per listed generator: mark it and its neighbours where they do not fit together. Those who were not clipped have been
    checked against each other before. */
 kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
-                          global const int *slot_counts, global const int *old_starts,
-                          global const int *old_neighbours, global const REAL *points, const REAL4 box_lower,
-                          const REAL4 box_upper, global int *marks, global int *fits)
+                          global const int *slot_counts, global const int *old_starts, global const int *old_neighbours,
+                          global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *marks,
+                          global int *fits)
 {
     WORK_ITEM(w);
     const int i = listed[w];

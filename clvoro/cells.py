@@ -105,8 +105,8 @@ class Cells:
     Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
     """
 
-    _lanes = 1
-    """Cells that a work-item measures."""
+    lanes = 1
+    """Cells that a work-item measures, or checks."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -118,10 +118,10 @@ class Cells:
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
         self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
         engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
-        self._lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
-        self._kernels = engine.kernels("cells", {**defines, "IN_LANES": int(self._lanes > 1)})
+        self.lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
+        self._kernels = engine.kernels("cells", {**defines, "IN_LANES": int(self.lanes > 1)})
         self._wrap = None
-        if self._lanes > 1:
+        if self.lanes > 1:
             self._wrap = engine.kernels("hulls", {**defines, "EIGHTS": EIGHTS}).wrap_cells
 
     @property
@@ -133,6 +133,8 @@ class Cells:
         """Make room for the diagrams of `n` generators, but for their faces."""
         engine, d = self.engine, self.engine.dim
         if n > self._capacity:
+            # The old ones are let go of first.
+            self._of_cells = self._views = {}
             self._of_cells = {
                 "starts": engine.empty(n + 1, np.int32),
                 "volumes": engine.empty(n),
@@ -303,7 +305,7 @@ class Cells:
         # The previous graph is read meanwhile, and stays if this call is broken off.
         neighbours = engine.scratch(m, np.int32)
         engine.run(
-            self._kernels.measure_cells, -(-n // self._lanes), np.int32(n), rows.places, rows.slots,
+            self._kernels.measure_cells, -(-n // self.lanes), np.int32(n), rows.places, rows.slots,
             rows.counts, old_starts, old_neighbours, rows.keep, starts, points, *corners,
             neighbours, faces["face_measures"], faces["face_centroids"], new["volumes"],
             new["offsets"], new["covariances"],

@@ -51,7 +51,8 @@ class Repair:
         engine, n = self.engine, previous.n
         key = tuple(cells.defines.values())
         if key not in self._kernels:
-            self._kernels[key] = engine.kernels("repair", cells.defines)
+            in_lanes = int(cells.lanes > 1)
+            self._kernels[key] = engine.kernels("repair", {**cells.defines, "IN_LANES": in_lanes})
         k = self._kernels[key]
         if n != self._n:
             self._n, self._fits = n, engine.empty(n, np.int32)
@@ -66,7 +67,9 @@ class Repair:
         old = (previous.starts, previous.neighbours)
         marks.fill(0)
         rows.places.fill(-1)
-        engine.run_each(k.check_rows, n, *old, points, *corners, self._fits, marks)
+        engine.run(
+            k.check_rows, -(-n // cells.lanes), np.int32(n), *old, points, *corners, self._fits, marks
+        )  # fmt: skip
         base = 0
         for _ in range(MAX_ROUNDS):
             self._scan.exclusive(marks, sums, n)

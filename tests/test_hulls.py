@@ -117,7 +117,7 @@ def test_measures_in_lanes_are_those_of_one_cell(engine, name):
         def build_so(*capacities, cells=cells, build=build, lanes=lanes):  # capacities may grow
             build(*capacities)
             defines = {**cells.defines, "MAX_DEPTH": MAX_LEVELS, "IN_LANES": int(lanes > 1)}
-            cells._kernels, cells._lanes = engine.kernels("cells", defines), lanes
+            cells._kernels, cells.lanes = engine.kernels("cells", defines), lanes
 
         cells._build = build_so
         cells._build(cells.cell_capacity, cells.row_capacity)
