@@ -1,6 +1,7 @@
 #include "common/domain.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
+#include "common/at_once.h"
 
 /* The exact derivative of the cells' volumes by the generators,
 
@@ -13,21 +14,23 @@
      z = D^-1 r    p = z + beta p    s = B^T p = B^T z + beta s    beta = (r, z) / (r, z)_before
      q = B s + eps p    alpha = (r, z) / (p, q)    r -= alpha q    u -= alpha s
 
-   with (p, q) = |s|^2 + (p, eps p), which is known before q is: an iteration takes two kernels, `descend` and `update`, and
-   y itself is never needed. Each group leaves its part of a sum, and all groups add the same parts in the next kernel.
+   with (p, q) = |s|^2 + (p, eps p), which is known before q is: an iteration takes two kernels, `descend` and `update`,
+   and y itself is never needed. Each group leaves its part of a sum, and all groups add the same parts in the next
+   kernel.
 
-   Derivatives across faces are in single precision, in which the two cells of a face agree well enough; vectors in STORE, which
-   is single too where the tolerance allows it: memory traffic is the cost. Sums are in REAL. */
+   Derivatives across faces are in single precision, in which the two cells of a face agree well enough; vectors in
+   STORE, which is single too where the tolerance allows it: memory traffic is the cost. Sums are in REAL. */
 
-#define ROW(q) (partial + (q) * get_num_groups(0))
-#define NORM(k) ((k) & 1)
-#define GAMMA(k) (2 + ((k) & 1))
+#define ROW(q) (partial + (q)*get_num_groups(0))
+#define NORM(k) ((k)&1)
+#define GAMMA(k) (2 + ((k)&1))
 #define CURVATURE 4
 
-#define PUT(q, sum)                                              \
-    {                                                            \
-        const REAL put_ = group_sum((sum), scratch);             \
-        if (get_local_id(0) == 0) ROW(q)[get_group_id(0)] = put_; \
+#define PUT(q, sum)                                                                                                    \
+    {                                                                                                                  \
+        const REAL put_ = group_sum((sum), scratch);                                                                   \
+        if (get_local_id(0) == 0)                                                                                      \
+            ROW(q)[get_group_id(0)] = put_;                                                                            \
     }
 
 /* One row of the record per iteration. */
@@ -36,10 +39,10 @@
 #define RECORD_RUNNING 2
 #define RECORD_CURVATURE 3
 
-/* eps = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of its neighbours, `worst`
-   the least Q of them. Bad cells and those around them are let off their size a little, for they are what costs quality; cells
-   that are far off give way less than those that are nearly right, which caps the largest error. A lenience or bound of 0
-   leaves its factor out. */
+/* eps = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of its neighbours,
+   `worst` the least Q of them. Bad cells and those around them are let off their size a little, for they are what costs
+   quality; cells that are far off give way less than those that are nearly right, which caps the largest error. A
+   lenience or bound of 0 leaves its factor out. */
 inline float penalty_of(float penalty, float lenience, float worst, float bound, float excess)
 {
     float e = penalty;
@@ -52,23 +55,26 @@ inline float penalty_of(float penalty, float lenience, float worst, float bound,
 }
 
 /* Per generator i: own[i] = dr_i/dx_i h_i; for each face the derivatives across it, rows[k] = dr_i/dx_j h_j and
-   columns[k] = dr_j/dx_i h_i; eps; the inverse of the diagonal of B B^T + eps; and the start of the iteration from u = 0,
-   r = b = excess + J displacement. Generators of labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any size is in range. */
-kernel void assemble(int n, global const int *starts, global const int *neighbours, global const FACE *face_measures,
-                     global const FACE *face_centroids, global const REAL *volumes, global const REAL *points,
-                     global const REAL *gradient, global const REAL *h, global const REAL *quality,
-                     global const REAL *excess, global const REAL *displacement, const REAL penalty,
-                     const REAL lenience, const REAL bound, global float *rows, global float *columns,
-                     global STORE *own, global STORE *eps, global STORE *inverse_diagonal, global STORE *r,
-                     global STORE *z, global STORE *p, global STORE *s, global STORE *u, global REAL *partial,
-                     global const int *labels, const int fixed)
+   columns[k] = dr_j/dx_i h_i, axis by axis in arrays of `room`; eps; the inverse of the diagonal of B B^T + eps; and
+   the start of the iteration from u = 0, r = b = excess + J displacement. Walls have derivatives of 0. Generators of
+   labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any size is in range.
+ */
+kernel void assemble(int n, const int room, global const int *starts, global const int *neighbours,
+                     global const FACE *face_measures, global const FACE *face_centroids, global const REAL *volumes,
+                     global const REAL *points, global const REAL *gradient, global const REAL *h,
+                     global const REAL *quality, global const REAL *excess, global const REAL *displacement,
+                     const REAL penalty, const REAL lenience, const REAL bound, global float *rows,
+                     global float *columns, global STORE *own, global STORE *eps, global STORE *inverse_diagonal,
+                     global STORE *r, global STORE *z, global REAL *partial, global const int *labels, const int fixed)
 {
     local REAL scratch[GROUP_SIZE];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
+    const int faces = starts[n], until = starts[block_end(n)];
     for (BLOCK_LOOP(i, n)) {
         REAL x[DIM];
         float self[DIM], moved = 0;
         const REAL hi = h[i], unit = 1 / hi, content = DIM == 2 ? hi * hi : hi * hi * hi;
+        const REAL per_face = DIM == 2 ? unit : unit * unit;
         const float shrink = content / volumes[i];
         float diagonal = 0, worst = quality[i];
         const bool still = fixed > 0 && labels[i] < fixed;
@@ -77,30 +83,39 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
             x[a] = points[DIM * i + a];
             self[a] = 0;
         }
-        for (int k = starts[i]; k < starts[i + 1]; ++k) {
-            const int j = neighbours[k];
-            if (j < 0)
-                continue;
-            float d[DIM], d2 = 0, square = 0;
+        const int end = starts[i + 1];
+        for (int k = starts[i]; k < end; k += AT_ONCE) {
+            const MANY(int) facing = TAKE(int, neighbours, k, faces), counts = INSIDE(k, end) & (facing >= 0);
+            const MANY(int) j = select((MANY(int))(i), facing, counts);
+            MANY(float) d[DIM], d2 = 0, square = 0, changed = 0;
             EACH_AXIS(a)
             {
-                d[a] = DIFFERENCE(a, x[a], points[DIM * j + a]) * unit;
+                d[a] = CONVERT(float, nearest_images(PICK(REAL, points, j, DIM, a) - x[a], PERIOD(a)) * unit);
                 d2 += d[a] * d[a];
             }
-            const bool stands = fixed > 0 && labels[j] < fixed;
-            const float w = (float)(face_measures[k] * (DIM == 2 ? unit : unit * unit)) / sqrt(d2);
-            const float there = w * ((float)content / (float)volumes[j]), here = w * shrink, ratio = h[j] * unit;
+            /* 0 where nothing counts, and no division by its distance of 0. */
+            const MANY(float) length = CONVERT(float, CONVERT(REAL, TAKE(FACE, face_measures, k, faces)) * per_face);
+            const MANY(float) w = select((MANY(float))(0), length, counts) / sqrt(select((MANY(float))(1), d2, counts));
+            const MANY(float) there = w * ((float)content / CONVERT(float, PICK(REAL, volumes, j, 1, 0)));
+            const MANY(float) here = w * shrink, ratio = CONVERT(float, PICK(REAL, h, j, 1, 0) * unit);
+            MANY(int) stands = 0;
+            if (fixed > 0)
+                stands = PICK(int, labels, j, 1, 0) < fixed;
             EACH_AXIS(a)
             {
-                const float m = face_centroids[DIM * k + a] * unit, other = here * (d[a] - m);
-                moved += other * (float)(displacement[DIM * j + a] * unit);
+                const MANY(float) m =
+                    CONVERT(float, CONVERT(REAL, TAKE_ROWS(FACE, face_centroids, a, k, faces)) * unit);
+                const MANY(float) middle = select((MANY(float))(0), m, counts), other = here * (d[a] - middle);
+                changed += other * CONVERT(float, PICK(REAL, displacement, j, DIM, a) * unit);
                 square += other * other;
-                self[a] += here * m;
-                rows[DIM * k + a] = stands ? 0 : other * ratio;
-                columns[DIM * k + a] = still ? 0 : -there * m;
+                self[a] += SUM(float, here *middle);
+                put_float(select(other * ratio, (MANY(float))(0), stands), rows + a * room, k, end, until);
+                put_float(still ? (MANY(float))(0) : -there * middle, columns + a * room, k, end, until);
             }
-            diagonal += stands ? 0 : square * ratio * ratio;
-            worst = fmin(worst, (float)quality[j]);
+            moved += SUM(float, changed);
+            diagonal += SUM(float, select(square * ratio * ratio, (MANY(float))(0), stands));
+            if (lenience > 0)
+                worst = fmin(worst, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
         EACH_AXIS(a)
         {
@@ -109,8 +124,6 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
             moved += t * (float)(displacement[DIM * i + a] * unit);
             diagonal += t * t;
             own[DIM * i + a] = t;
-            s[DIM * i + a] = 0;
-            u[DIM * i + a] = 0;
         }
         const float e = penalty_of(penalty, lenience, worst, bound, excess[i]);
         const REAL inverse = 1 / (diagonal + e), b = excess[i] + moved;
@@ -118,7 +131,6 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
         inverse_diagonal[i] = inverse;
         r[i] = b;
         z[i] = inverse * b;
-        p[i] = 0;
         sum_add(&norm, b * b);
         sum_add(&gamma, inverse * b * b);
     }
@@ -126,12 +138,13 @@ kernel void assemble(int n, global const int *starts, global const int *neighbou
     PUT(GAMMA(0), gamma.value);
 }
 
-/* p = z + beta p and s = B^T z + beta s. From the iteration on that finds the residual at its target, or is the last (or finds
-   anything out of order, NaN included), record[k].running is 0 and nothing changes any more, so that the host may run ahead
-   without changing the result. */
-kernel void descend(int k, int n, int most, REAL tolerance, global const int *starts, global const int *neighbours,
-                    global const float *columns, global const STORE *own, global const STORE *eps,
-                    global const STORE *z, global STORE *p, global STORE *s, global REAL *partial, global REAL *record)
+/* p = z + beta p and s = B^T z + beta s. From the iteration on that finds the residual at its target, or is the last
+   (or finds anything out of order, NaN included), record[k].running is 0 and nothing changes any more, so that the host
+   may run ahead without changing the result. */
+kernel void descend(int k, int n, int most, REAL tolerance, const int room, global const int *starts,
+                    global const int *neighbours, global const float *columns, global const STORE *own,
+                    global const STORE *eps, global const STORE *z, global STORE *p, global STORE *s,
+                    global REAL *partial, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     const int first = get_global_id(0) == 0;
@@ -141,7 +154,8 @@ kernel void descend(int k, int n, int most, REAL tolerance, global const int *st
     const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
     const REAL start = k > 0 ? record[RECORD_NORM] : norm;
     const int running = !over && k < most && norm > tolerance * tolerance * start && norm <= REAL_MAX && gamma > 0;
-    if (first) now[RECORD_RUNNING] = running;
+    if (first)
+        now[RECORD_RUNNING] = running;
     if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
@@ -150,21 +164,22 @@ kernel void descend(int k, int n, int most, REAL tolerance, global const int *st
     const STORE beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
     Sum curvature = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
-        const STORE zi = z[i], pi = zi + beta * p[i];
+        const STORE zi = z[i], pi = k > 0 ? zi + beta * p[i] : zi;
         STORE sum[DIM];
         EACH_AXIS(a)
-            sum[a] = own[DIM * i + a] * zi + beta * s[DIM * i + a];
+        sum[a] = own[DIM * i + a] * zi + (k > 0 ? beta * s[DIM * i + a] : 0);
         for (int f = starts[i]; f < starts[i + 1]; ++f) {
             const int j = neighbours[f];
             if (j < 0)
                 continue;
             const STORE zj = z[j];
             EACH_AXIS(a)
-                sum[a] += columns[DIM * f + a] * zj;
+            sum[a] += columns[a * room + f] * zj;
         }
         p[i] = pi;
         REAL product = (REAL)eps[i] * pi * pi;
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             s[DIM * i + a] = sum[a];
             product += (REAL)sum[a] * sum[a];
         }
@@ -174,36 +189,38 @@ kernel void descend(int k, int n, int most, REAL tolerance, global const int *st
 }
 
 /* u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
-kernel void update(int k, int n, global const int *starts, global const int *neighbours, global const float *rows,
-                   global const STORE *own, global const STORE *eps, global const STORE *inverse_diagonal,
-                   global const STORE *p, global const STORE *s, global STORE *u, global STORE *r, global STORE *z,
-                   global REAL *partial, global REAL *record)
+kernel void update(int k, int n, const int room, global const int *starts, global const int *neighbours,
+                   global const float *rows, global const STORE *own, global const STORE *eps,
+                   global const STORE *inverse_diagonal, global const STORE *p, global const STORE *s, global STORE *u,
+                   global STORE *r, global STORE *z, global REAL *partial, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch);
-    if (running && get_global_id(0) == 0) now[RECORD_CURVATURE] = curvature;
+    if (running && get_global_id(0) == 0)
+        now[RECORD_CURVATURE] = curvature;
     const int end = running && curvature > 0 ? n : 0;
     const STORE alpha = now[RECORD_GAMMA] / curvature;
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
         /* One sum per axis: a single one would have to wait for itself twice as long. */
         STORE sum[DIM], q = eps[i] * p[i];
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             const STORE si = s[DIM * i + a];
             sum[a] = own[DIM * i + a] * si;
-            u[DIM * i + a] -= alpha * si;
+            u[DIM * i + a] = (k > 0 ? u[DIM * i + a] : 0) - alpha * si;
         }
         for (int f = starts[i]; f < starts[i + 1]; ++f) {
             const int j = neighbours[f];
             if (j < 0)
                 continue;
             EACH_AXIS(a)
-                sum[a] += rows[DIM * f + a] * s[DIM * j + a];
+            sum[a] += rows[a * room + f] * s[DIM * j + a];
         }
         EACH_AXIS(a)
-            q += sum[a];
+        q += sum[a];
         const STORE ri = r[i] - alpha * q, zi = inverse_diagonal[i] * ri;
         r[i] = ri;
         z[i] = zi;
@@ -219,5 +236,5 @@ kernel void put_correction(const int size, global const STORE *u, global const R
 {
     WORK_ITEM(i);
     EACH_AXIS(a)
-        correction[DIM * i + a] = h[i] * u[DIM * i + a];
+    correction[DIM * i + a] = h[i] * u[DIM * i + a];
 }

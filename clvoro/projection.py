@@ -53,7 +53,7 @@ class Projection:
         if 4 * (most + 1) > len(self._record):
             self._record = engine.empty(4 * (most + 1))
         return SimpleNamespace(
-            **{name: engine.scratch((m, d), np.float32) for name in ("rows", "columns")},
+            **{name: engine.scratch((d, m), np.float32) for name in ("rows", "columns")},
             **{name: engine.scratch((n, d), store) for name in ("own", "s", "u")},
             **{name: engine.scratch(n, store) for name in ("eps", "inverse", "r", "z", "p")},
         )
@@ -111,23 +111,27 @@ class Projection:
         store = np.dtype(np.float32) if tolerance >= SINGLE else engine.real
         v = self._reserve(n, t.neighbours.shape[0], store, max_iterations)
         k = self._kernels_in(store)
+        room = np.int32(t.neighbours.shape[0])
         faces, partial, record = (t.starts, t.neighbours), self._partial, self._record
         engine.run_blocks(
-            k.assemble, np.int32(n), *faces, t.face_measures, t.face_centroids, t.volumes,
+            k.assemble, np.int32(n), room, *faces, t.face_measures, t.face_centroids, t.volumes,
             t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
-            real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, v.p, v.s,
-            v.u, partial, t.starts if labels is None else labels, np.int32(fixed),
+            real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, partial,
+            t.starts if labels is None else labels, np.int32(fixed),
         )  # fmt: skip
         descend = Launch(
             engine, k.descend, np.int32(0), np.int32(n), np.int32(max_iterations),
-            real(tolerance), *faces, v.columns, v.own, v.eps, v.z, v.p, v.s, partial, record,
+            real(tolerance), room, *faces, v.columns, v.own, v.eps, v.z, v.p, v.s, partial, record,
         )  # fmt: skip
         update = Launch(
-            engine, k.update, np.int32(0), np.int32(n), *faces, v.rows, v.own, v.eps,
+            engine, k.update, np.int32(0), np.int32(n), room, *faces, v.rows, v.own, v.eps,
             v.inverse, v.p, v.s, v.u, v.r, v.z, partial, record,
         )  # fmt: skip
         solution = self._iterate(descend, update, tolerance, max_iterations)
-        engine.run_each(k.put_correction, n, v.u, h, correction)
+        if solution.iterations:
+            engine.run_each(k.put_correction, n, v.u, h, correction)
+        else:
+            correction.fill(0)
         return solution
 
     def _iterate(self, descend: Launch, update: Launch, tolerance: float, most: int) -> Solution:

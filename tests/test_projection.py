@@ -13,9 +13,10 @@ N = 60
 SLOPE = np.array([0.9, -1.4])
 
 
-@pytest.fixture(scope="module")
-def engine(ctx):
-    return patch.make_engine(ctx)
+@pytest.fixture(scope="module", params=[None, 16], ids=["one item a group", "16 items a group"])
+def engine(ctx, request):
+    """On a CPU and as on a GPU."""
+    return patch.make_engine(ctx, group_size=request.param)
 
 
 def sizes(points):
@@ -50,7 +51,7 @@ class Assembled:
         inner = host.neighbours >= 0
         i, j = host.owners[inner], host.neighbours[inner]
         m = len(host.neighbours)
-        rows, columns = (a.get()[:m][inner] for a in (v.rows, v.columns))
+        rows, columns = (a.get()[:, :m][:, inner].T for a in (v.rows, v.columns))
         diagonal = v.own.get()
         # In displacements over h, B = J h: B by rows, and its transpose by rows.
         self.B, self.C = np.zeros((n, n, 2)), np.zeros((n, n, 2))

@@ -1,0 +1,99 @@
+/* Entries of rows, AT_ONCE at a time: eight, in the lanes of vectors, on a CPU, where a work-item goes through many
+   rows; one on a GPU. Rows are short and of all lengths, so that a loop over their entries waits for mispredicted
+   branches most of the time; in the plane next to every row ends within eight.
+
+       for (int k = starts[i]; k < end; k += AT_ONCE) {
+           const MANY(int) inside = INSIDE(k, end), j = TAKE(int, columns, k, size);
+           sum += SUM(REAL, select(..., x, inside));
+       }
+
+   Lanes behind the row's end hold entries of the next rows, or the last of all `size`: they have to be left out.
+   Include after domain.h and blocks.h. */
+#if GROUP_SIZE == 1
+#define AT_ONCE 8
+#define MANY(TYPE) CLVORO_JOIN(TYPE, 8)
+/* Which entries lie before the end. */
+#define INSIDE(k, end) ((k) + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < (end))
+#define PICK(TYPE, array, j, stride, a)                                                                                \
+    ((MANY(TYPE))((array)[(j).s0 * (stride) + (a)], (array)[(j).s1 * (stride) + (a)],                                  \
+                  (array)[(j).s2 * (stride) + (a)], (array)[(j).s3 * (stride) + (a)],                                  \
+                  (array)[(j).s4 * (stride) + (a)], (array)[(j).s5 * (stride) + (a)],                                  \
+                  (array)[(j).s6 * (stride) + (a)], (array)[(j).s7 * (stride) + (a)]))
+
+#define AT_ONCE_FOR(TYPE)                                                                                              \
+    inline MANY(TYPE) CLVORO_JOIN(take_, TYPE)(global const TYPE *array, int k, int size)                              \
+    {                                                                                                                  \
+        if (k + 8 <= size)                                                                                             \
+            return vload8(0, array + k);                                                                               \
+        const int8 at = min(k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), (int8)(size - 1));                                     \
+        return PICK(TYPE, array, at, 1, 0);                                                                            \
+    }                                                                                                                  \
+    inline MANY(TYPE) CLVORO_JOIN(take_rows_, TYPE)(global const TYPE *array, int a, int k, int size)                  \
+    {                                                                                                                  \
+        const int8 at = min(k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), (int8)(size - 1));                                     \
+        return PICK(TYPE, array, at, DIM, a);                                                                          \
+    }                                                                                                                  \
+    inline TYPE CLVORO_JOIN(sum_, TYPE)(MANY(TYPE) x)                                                                  \
+    {                                                                                                                  \
+        const CLVORO_JOIN(TYPE, 4) x4 = x.lo + x.hi;                                                                   \
+        const CLVORO_JOIN(TYPE, 2) x2 = x4.lo + x4.hi;                                                                 \
+        return x2.s0 + x2.s1;                                                                                          \
+    }
+AT_ONCE_FOR(int)
+AT_ONCE_FOR(float)
+#if IS_DOUBLE
+AT_ONCE_FOR(double)
+#endif
+
+inline float least_float(float8 x)
+{
+    const float4 x4 = fmin(x.lo, x.hi);
+    const float2 x2 = fmin(x4.lo, x4.hi);
+    return fmin(x2.s0, x2.s1);
+}
+
+/* The entries from k on, up to the row's `end`. Whoever writes rows in their order may write behind that, `until` where
+   somebody else's rows begin. */
+inline void put_float(float8 x, global float *array, int k, int end, int until)
+{
+    if (k + 8 <= until) {
+        vstore8(x, 0, array + k);
+        return;
+    }
+    const float *lanes = (const float *)&x;
+    for (int lane = 0; lane < 8 && k + lane < end; ++lane)
+        array[k + lane] = lanes[lane];
+}
+
+/* As `nearest_image`. */
+#ifdef PERIODIC
+inline MANY(REAL) nearest_images(MANY(REAL) d, REAL period)
+{
+    const REAL half_period = period / 2;
+    return period > 0 ? select(select(d, d + period, d < -half_period), d - period, d > half_period) : d;
+}
+#else
+#define nearest_images(d, period) (d)
+#endif
+#else
+#define AT_ONCE 1
+#define MANY(TYPE) TYPE
+#define INSIDE(k, end) ((k) < (end))
+#define PICK(TYPE, array, j, stride, a) ((array)[(j) * (stride) + (a)])
+#define take_int(array, k, size) ((array)[k])
+#define take_float(array, k, size) ((array)[k])
+#define take_double(array, k, size) ((array)[k])
+#define take_rows_float(array, a, k, size) ((array)[(k)*DIM + (a)])
+#define take_rows_double(array, a, k, size) ((array)[(k)*DIM + (a)])
+#define sum_float(x) (x)
+#define sum_double(x) (x)
+#define least_float(x) (x)
+#define put_float(x, array, k, end, until) ((array)[k] = (x))
+#define nearest_images(d, period) nearest_image(d, period)
+#endif
+
+#define TAKE(TYPE, array, k, size) CLVORO_JOIN(take_, TYPE)(array, k, size)
+/* Coordinate `a` of rows of DIM. */
+#define TAKE_ROWS(TYPE, array, a, k, size) CLVORO_JOIN(take_rows_, TYPE)(array, a, k, size)
+#define SUM(TYPE, x) CLVORO_JOIN(sum_, TYPE)(x)
+#define CONVERT(TYPE, x) CLVORO_JOIN(convert_, MANY(TYPE))(x)
