@@ -58,20 +58,46 @@ def _paste(name: str, seen: set[str]) -> str:
     return "\n".join(lines)
 
 
+class KernelPool:
+    """Kernels of any program, each in one hand at a time.
+
+    To make one, and to tell PyOpenCL of its arguments, costs as much as a hundred launches, and stages come and go with
+    every run.
+    """
+
+    def __init__(self) -> None:
+        self._free: dict[tuple[int, str], list[cl.Kernel]] = {}
+        self._taken: list[tuple[tuple[int, str], cl.Kernel]] = []
+
+    def take(self, program: cl.Program, name: str) -> cl.Kernel:
+        """Return a kernel that nobody else has, until all are taken back."""
+        key = program.int_ptr, name
+        free = self._free.setdefault(key, [])
+        kernel = free.pop() if free else cl.Kernel(program, name)
+        self._taken.append((key, kernel))
+        return kernel
+
+    def take_back(self) -> None:
+        """Free all kernels: whoever has had one no longer relies on its arguments."""
+        for key, kernel in self._taken:
+            self._free[key].append(kernel)
+        self._taken.clear()
+
+
 class Kernels(SimpleNamespace):
-    """Kernels of a program as attributes, made when first asked for: to make one costs as much as ten launches.
+    """Kernels of a program as attributes, taken when first asked for.
 
     Each has arguments of its own, and knows its `stage`, for a profile.
     """
 
-    def __init__(self, program: cl.Program, stage: str) -> None:
-        super().__init__(_program=program, _stage=stage)
+    def __init__(self, program: cl.Program, stage: str, pool: KernelPool) -> None:
+        super().__init__(_program=program, _stage=stage, _pool=pool)
 
     def __getattr__(self, name: str) -> cl.Kernel:
         if name.startswith("_"):
             raise AttributeError(name)
         try:
-            kernel = cl.Kernel(self._program, name)
+            kernel = self._pool.take(self._program, name)
         except cl.LogicError as error:
             raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
         kernel.stage = self._stage  # type: ignore[attr-defined]
@@ -164,6 +190,8 @@ class Engine:
     """Work-items per group of a kernel that does one item each."""
     workspace: Workspace = field(init=False, repr=False, compare=False)
     """Memory that stages use in turn; see `scratch`."""
+    pool: KernelPool = field(init=False, repr=False, compare=False, default_factory=KernelPool)
+    """Where stages have their kernels from."""
 
     def __post_init__(self) -> None:
         device = self.queue.device
@@ -175,9 +203,9 @@ class Engine:
         object.__setattr__(self, "workspace", Workspace(self.queue))
 
     def single(self) -> Engine:
-        """Return the same engine in float32, with the same workspace."""
+        """Return the same engine in float32, with the same workspace and kernels."""
         engine = replace(self, real=np.dtype(np.float32))
-        for name in ("groups", "group_size", "item_group", "workspace"):
+        for name in ("groups", "group_size", "item_group", "workspace", "pool"):
             object.__setattr__(engine, name, getattr(self, name))
         return engine
 
@@ -209,7 +237,8 @@ class Engine:
             "DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named,
             **(defines or {}),
         }  # fmt: skip
-        return Kernels(build_program(self.ctx, f"{stage}.cl", full, prelude), stage)
+        program = build_program(self.ctx, f"{stage}.cl", full, prelude)
+        return Kernels(program, stage, self.pool)
 
     def run(
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 from collections.abc import Mapping
 from typing import ClassVar
@@ -85,11 +84,10 @@ class Stages:
 
     def release(self) -> None:
         """Let go of all stages and their buffers; those that are used again are made again."""
-        gone = [self.__dict__.pop(name, None) for name in Stages._CLASSES]
+        for name in Stages._CLASSES:
+            self.__dict__.pop(name, None)
         self.engine.workspace.clear()
-        if any(stage is not None for stage in gone):
-            del gone
-            gc.collect()  # stages and the launches that they keep refer to each other
+        self.engine.pool.take_back()
 
 
 class Mesh:

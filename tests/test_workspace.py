@@ -1,5 +1,8 @@
 """Memory that stages use in turn: arrays of a frame do not overlap, those of the next take their place."""
 
+import gc
+import weakref
+
 import numpy as np
 import patch
 import pyopencl as cl
@@ -9,7 +12,7 @@ from clvoro import sizing
 from clvoro._program import Engine
 from clvoro._workspace import MOST_VIEWS
 from clvoro.mesh import Mesh, Stages
-from clvoro.methods import ProjectedMethod, WeightedMethod
+from clvoro.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 
 
 @pytest.fixture
@@ -146,3 +149,55 @@ def test_steps_allocate_nothing(engine, made, method):
         mesh.assess()
         counts.append(len(made))
     assert counts[3:] == counts[3:4] * 4
+
+
+def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
+    """At once, not when Python looks for references in circles: a launch that refers to its stage would make one."""
+    alive, plain = weakref.WeakSet(), cl.Buffer
+
+    class Watched(plain):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            alive.add(self)
+
+    monkeypatch.setattr(cl, "Buffer", Watched)
+    stages, host = Stages(engine), patch.relaxed_points(500, 3) / patch.BOX.frame[1]
+    gc.collect()
+    gc.disable()
+    try:
+        size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
+        mesh = Mesh(stages, patch.BOX, size, engine.upload(host))
+        for method in (
+            PublishedMethod(Relaxation(), True, True),
+            WeightedMethod(),
+            ProjectedMethod(),
+        ):
+            with engine.workspace.frame():
+                method.displace(mesh)
+                method.move(mesh)
+            mesh.update()
+        mesh.reorganise()
+        stages.poisson.set_up_multigrid(
+            stages.poisson.assemble(
+                mesh.t.starts, mesh.t.neighbours, mesh.t.face_measures, mesh.points
+            )
+        )
+        assert len(alive) > 20
+        stages.release()
+        del mesh, size
+        assert len(alive) == 0
+    finally:
+        gc.enable()
+
+
+def test_a_kernel_is_in_one_hand_until_all_are_taken_back(engine):
+    first, second = engine.kernels("primitives"), engine.kernels("primitives")
+    held = {kernels.scan_few.int_ptr for kernels in (first, second)}
+    assert first.scan_few is first.scan_few
+    assert len(held) == 2
+    engine.pool.take_back()
+    third, fourth = engine.kernels("primitives"), engine.single().kernels("primitives")
+    assert third.scan_few.int_ptr in held
+    assert fourth.scan_few.int_ptr not in held  # another program
+    with pytest.raises(AttributeError, match="has no kernel nothing"):
+        _ = third.nothing
