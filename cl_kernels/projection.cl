@@ -78,8 +78,7 @@ kernel void assemble(int n, const int room, global const int *starts, global con
         const float shrink = content / volumes[i];
         float diagonal = 0, worst = quality[i];
         const bool still = fixed > 0 && labels[i] < fixed;
-        EACH_AXIS(a)
-        {
+        EACH_AXIS(a) {
             x[a] = points[DIM * i + a];
             self[a] = 0;
         }
@@ -88,8 +87,7 @@ kernel void assemble(int n, const int room, global const int *starts, global con
             const MANY(int) facing = TAKE(int, neighbours, k, faces), counts = INSIDE(k, end) & (facing >= 0);
             const MANY(int) j = select((MANY(int))(i), facing, counts);
             MANY(float) d[DIM], d2 = 0, square = 0, changed = 0;
-            EACH_AXIS(a)
-            {
+            EACH_AXIS(a) {
                 d[a] = CONVERT(float, nearest_images(PICK(REAL, points, j, DIM, a) - x[a], PERIOD(a)) * unit);
                 d2 += d[a] * d[a];
             }
@@ -101,8 +99,7 @@ kernel void assemble(int n, const int room, global const int *starts, global con
             MANY(int) stands = 0;
             if (fixed > 0)
                 stands = PICK(int, labels, j, 1, 0) < fixed;
-            EACH_AXIS(a)
-            {
+            EACH_AXIS(a) {
                 const MANY(float) m =
                     CONVERT(float, CONVERT(REAL, TAKE_ROWS(FACE, face_centroids, a, k, faces)) * unit);
                 const MANY(float) middle = select((MANY(float))(0), m, counts), other = here * (d[a] - middle);
@@ -117,8 +114,7 @@ kernel void assemble(int n, const int room, global const int *starts, global con
             if (lenience > 0)
                 worst = fmin(worst, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
-        EACH_AXIS(a)
-        {
+        EACH_AXIS(a) {
             /* The size of a cell whose generator does not move does not change by its motion. */
             const float t = still ? 0 : self[a] - DIM * (float)(gradient[DIM * i + a] * hi);
             moved += t * (float)(displacement[DIM * i + a] * unit);
@@ -137,6 +133,12 @@ kernel void assemble(int n, const int room, global const int *starts, global con
     PUT(NORM(0), norm.value);
     PUT(GAMMA(0), gamma.value);
 }
+
+/* Of the faces from f on: the cells beyond, any one beyond a wall, and the derivatives across, 0 there and for other
+   rows' faces. */
+#define FACING(f) max(TAKE(int, neighbours, f, faces), (MANY(int))(0))
+#define DERIVATIVE(across, f, a)                                                                                       \
+    CONVERT(STORE, select((MANY(float))(0), TAKE(float, across + (a)*room, f, faces), inside))
 
 /* p = z + beta p and s = B^T z + beta s. From the iteration on that finds the residual at its target, or is the last
    (or finds anything out of order, NaN included), record[k].running is 0 and nothing changes any more, so that the host
@@ -162,24 +164,23 @@ kernel void descend(int k, int n, int most, REAL tolerance, const int room, glob
     }
     const int end = running ? n : 0;
     const STORE beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
+    const int faces = starts[n];
     Sum curvature = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
         const STORE zi = z[i], pi = k > 0 ? zi + beta * p[i] : zi;
         STORE sum[DIM];
         EACH_AXIS(a)
-        sum[a] = own[DIM * i + a] * zi + (k > 0 ? beta * s[DIM * i + a] : 0);
-        for (int f = starts[i]; f < starts[i + 1]; ++f) {
-            const int j = neighbours[f];
-            if (j < 0)
-                continue;
-            const STORE zj = z[j];
+            sum[a] = own[DIM * i + a] * zi + (k > 0 ? beta * s[DIM * i + a] : 0);
+        const int end_of_row = starts[i + 1];
+        for (int f = starts[i]; f < end_of_row; f += AT_ONCE) {
+            const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
+            const MANY(STORE) zj = PICK(STORE, z, j, 1, 0);
             EACH_AXIS(a)
-            sum[a] += columns[a * room + f] * zj;
+                sum[a] += SUM(STORE, DERIVATIVE(columns, f, a) * zj);
         }
         p[i] = pi;
         REAL product = (REAL)eps[i] * pi * pi;
-        EACH_AXIS(a)
-        {
+        EACH_AXIS(a) {
             s[DIM * i + a] = sum[a];
             product += (REAL)sum[a] * sum[a];
         }
@@ -202,25 +203,23 @@ kernel void update(int k, int n, const int room, global const int *starts, globa
         now[RECORD_CURVATURE] = curvature;
     const int end = running && curvature > 0 ? n : 0;
     const STORE alpha = now[RECORD_GAMMA] / curvature;
+    const int faces = starts[n];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
-        /* One sum per axis: a single one would have to wait for itself twice as long. */
-        STORE sum[DIM], q = eps[i] * p[i];
-        EACH_AXIS(a)
-        {
+        STORE q = eps[i] * p[i];
+        EACH_AXIS(a) {
             const STORE si = s[DIM * i + a];
-            sum[a] = own[DIM * i + a] * si;
+            q += own[DIM * i + a] * si;
             u[DIM * i + a] = (k > 0 ? u[DIM * i + a] : 0) - alpha * si;
         }
-        for (int f = starts[i]; f < starts[i + 1]; ++f) {
-            const int j = neighbours[f];
-            if (j < 0)
-                continue;
+        const int end_of_row = starts[i + 1];
+        for (int f = starts[i]; f < end_of_row; f += AT_ONCE) {
+            const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
+            MANY(STORE) sum = 0;
             EACH_AXIS(a)
-            sum[a] += rows[a * room + f] * s[DIM * j + a];
+                sum += DERIVATIVE(rows, f, a) * PICK(STORE, s, j, DIM, a);
+            q += SUM(STORE, sum);
         }
-        EACH_AXIS(a)
-        q += sum[a];
         const STORE ri = r[i] - alpha * q, zi = inverse_diagonal[i] * ri;
         r[i] = ri;
         z[i] = zi;
@@ -236,5 +235,5 @@ kernel void put_correction(const int size, global const STORE *u, global const R
 {
     WORK_ITEM(i);
     EACH_AXIS(a)
-    correction[DIM * i + a] = h[i] * u[DIM * i + a];
+        correction[DIM * i + a] = h[i] * u[DIM * i + a];
 }
