@@ -14,11 +14,24 @@ from collections.abc import Callable
 
 import numpy as np
 import pyopencl as cl
+from scipy.spatial import ConvexHull
 
 import clvoro
 from clvoro import _program
+from clvoro._primitives import Scan
 from clvoro.mesh import Stages
-from clvoro.sizing import Circle, Distance, Expression, Graded, Polygon, Raster, minimum
+from clvoro.sizing import (
+    Circle,
+    Distance,
+    Expression,
+    Graded,
+    Polygon,
+    Raster,
+    Sizing,
+    Sphere,
+    Surface,
+    minimum,
+)
 from tests.gpu_like import use_groups
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
@@ -203,24 +216,39 @@ def copy(adapter: clvoro.Adapter) -> None:
 
 
 def fields(adapter: clvoro.Adapter) -> None:
-    """Every kind of size field, and a callable."""
-    many = Polygon(0.75 + 0.4 * np.stack([np.cos(t := np.linspace(0, 6.2, 150)), np.sin(t)], 1))
+    """Every kind of size field at some places, with its gradient; runs with some of them, and with a callable."""
+    turn = np.linspace(0, 6.2, 150)
+    many = Polygon(0.75 + 0.4 * np.stack([np.cos(turn), np.sin(turn)], 1))
     raster = Raster(0.2 + 0.1 * points(12).reshape(4, 6), BOX.lower, BOX.upper)
     few = Distance([Circle((0.5, 0.5), 0.2)], 0.1, growth=1.3, h_max=0.4)
-    for size in (
-        minimum(few, raster),
-        Distance([many], 0.2, slope=0.3),
-        lambda x: 0.3 + 0 * x[:, 0],
-    ):
+    corners = 0.5 + 0.3 * (x := points(14, 3) - 0.5) / np.linalg.norm(x, axis=1)[:, None]
+    body = Surface(corners, ConvexHull(corners).simplices)
+    cube = Raster(0.2 + 0.1 * points(12).reshape(2, 4, 3), CUBE.lower, CUBE.upper)
+    flat = minimum(few, raster), Distance([many], 0.2, slope=0.3), Expression(GRADED)
+    solid = (
+        Distance(body, 0.1, slope=0.3),
+        Distance(Sphere((0.5, 0.5, 0.4), 0.2), 0.1, slope=0.3) + cube,
+    )
+    for box, size in (*((BOX, size) for size in flat), *((CUBE, size) for size in solid)):
+        n, d = 40, box.dim
+        engine = _program.Engine(adapter.ctx, adapter.queue, d, np.dtype(adapter.dtype))
+        origin, scale = box.frame
+        at = engine.upload((points(n, d) * box.extent - origin) / scale)
+        stage, h = Sizing(engine, box, size), engine.empty(n)
+        stage.evaluate(at, n, h)
+        stage.evaluate_with_gradient(at, n, h, slope := engine.empty((n, d)))
+        assert (h.get() > 0).all()
+        assert np.isfinite(slope.get()).all()
+    for size in (minimum(few, raster), lambda x: 0.3 + 0 * x[:, 0]):
         adapter.run(BOX, size, method="weighted", max_steps=1, seed=911)
     adapter.run(BOX, few, method="exact", n_cells=60, effort="fast", seed=911, max_steps=3)
 
 
 def multigrid(adapter: clvoro.Adapter) -> None:
-    """The preconditioner, which runs would only take for larger meshes."""
-    from clvoro.poisson import Poisson
+    """The preconditioner, which runs would only take for larger meshes; a solve in two precisions."""
+    from clvoro.poisson import ROUGH, Poisson
 
-    n = 400
+    n = 300  # the fewest that take every kernel of it
     stages = stages_of(adapter)
     engine, (origin, scale) = stages.engine, BOX.frame
     on_device = engine.upload((points(n) - origin) / scale)
@@ -235,6 +263,17 @@ def multigrid(adapter: clvoro.Adapter) -> None:
         )
         assert solution.converged
         stage.apply(laplacian, potential, rhs)
+    # One that starts from something else than zero.
+    rough = stage.assemble(t.starts, t.neighbours, t.face_measures, t.points, tolerance=ROUGH)
+    assert stage.solve(rough, rhs, engine.upload(points(n)[:, 1]), tolerance=ROUGH).converged
+
+
+def scan(adapter: clvoro.Adapter) -> None:
+    """Prefix sums of an array of no round length that is too long for one work-item."""
+    engine, n = stages_of(adapter).engine, 8219
+    values, sums = engine.upload(np.arange(n) % 7, np.int32), engine.empty(n - 2, np.int32)
+    Scan(engine).exclusive(values, sums, n - 3, first=3)
+    assert (np.diff(sums.get()) == np.arange(3, n) % 7).all()
 
 
 def stages_of(adapter: clvoro.Adapter) -> Stages:
@@ -288,6 +327,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "solid": solid,
     "fields": fields,
     "multigrid": multigrid,
+    "scan": scan,
     "transfer": transfer,
     "gradation": gradation,
     "copy": copy,
