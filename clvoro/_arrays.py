@@ -22,6 +22,11 @@ def check_points(points: object, domain: Domain) -> np.ndarray:
     InputError
         If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
     """
+    if np.ma.is_masked(points):
+        raise InputError(
+            f"points has {np.ma.count_masked(points)} masked numbers, expected all to be there; pass "
+            "numpy.ma.compress_rows(points)"
+        )
     try:
         array = np.asarray(points)
     except ValueError as error:
@@ -82,6 +87,8 @@ def check_number(
 ) -> float:
     """Return `value` as a finite float above `above` and not under `least`."""
     try:
+        if isinstance(value, str | bytes):  # in which float() would find a number
+            raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise InputTypeError(

@@ -54,6 +54,11 @@ class Adapter:
             real = np.dtype(object)
         if dtype is None or real not in (np.dtype(np.float64), np.dtype(np.float32)):
             raise InputError(f"dtype is {dtype!r}, expected 'float64' or 'float32'")
+        if ctx is not None and not isinstance(ctx, cl.Context):
+            raise InputTypeError(
+                f"ctx is {ctx!r} of type {type(ctx).__name__}, expected a pyopencl.Context or None; write "
+                "clvoro.create_context(device), with a device or a part of its name"
+            )
         self.ctx = device.create_context() if ctx is None else ctx
         self.dtype = real
         if real == np.float64:
@@ -115,7 +120,11 @@ class Adapter:
 
     def _stages_for(self, domain: Domain) -> Stages:
         if not isinstance(domain, Domain):
-            raise InputTypeError(f"domain is a {type(domain).__name__}, expected a clvoro.Box")
+            shapely = type(domain).__module__.startswith("shapely")
+            hint = "; write clvoro.Polygon.from_shapely(domain)" if shapely else ""
+            raise InputTypeError(
+                f"domain is a {type(domain).__name__}, expected a clvoro.Box or a clvoro.Polygon{hint}"
+            )
         kind = domain.dim, domain.defines(self.dtype)
         if kind not in self._stages:
             engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, kind[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -115,7 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.command
     ]
     try:
-        return command(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return command(arguments)
     except (InputError, InputTypeError) as error:
         return _complain(error, BAD_INPUT)
     except BuildError as error:
@@ -126,6 +129,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(error, FAILED)
     except (KeyboardInterrupt, Aborted):
         return _complain("interrupted, nothing more has been written", INTERRUPTED)
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    """Print a warning without the place in the code, which says nothing to people."""
+    print(f"clvoro: warning: {message}", file=sys.stderr)
 
 
 def _complain(message: object, code: int) -> int:
@@ -188,11 +196,11 @@ def _check(arguments: argparse.Namespace) -> int:
     code = OK
     for name in arguments.files:
         path = Path(name)
-        if path.suffix.lower() not in (".npz", ".vtu"):
-            raise InputError(
-                f"{name} is no mesh.npz and no mesh.vtu, which are what can be checked"
-            )
         try:
+            if path.suffix.lower() not in (".npz", ".vtu"):
+                raise InputError(
+                    f"{name} is no mesh.npz and no mesh.vtu, which are what can be checked"
+                )
             report = (load if path.suffix.lower() == ".npz" else load_vtu)(path).check()
         except InputError as error:  # the other files are looked at all the same
             code = _complain(error, BAD_INPUT)

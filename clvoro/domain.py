@@ -137,8 +137,14 @@ class Box(Domain):
     periodic: tuple[bool, ...] = False  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        lower = np.asarray(self.lower, dtype=float)
-        upper = np.asarray(self.upper, dtype=float)
+        try:
+            lower = np.asarray(self.lower, dtype=float)
+            upper = np.asarray(self.upper, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputTypeError(
+                f"Box got lower {self.lower!r} and upper {self.upper!r}, expected 2 or 3 numbers each; "
+                "write Box((0, 0), (2.5, 1.5))"
+            ) from error
         if lower.ndim != 1 or lower.shape != upper.shape or lower.size not in (2, 3):
             raise InputError(
                 f"Box got corners of shape {lower.shape} and {upper.shape}, expected 2 or 3 "

@@ -37,5 +37,9 @@ class Aborted(BaseException):
     """The user wants to quit at once; unlike KeyboardInterrupt, which a run answers with what it has so far."""
 
 
+class CoarseSizeWarning(UserWarning):
+    """A size field asks for less than half a cell in the whole domain: units that do not agree, most likely."""
+
+
 class PrecisionWarning(UserWarning):
     """A run cannot meet its size field as well as usual in the precision asked for; says what limits it."""

@@ -21,13 +21,16 @@ from .polygon import Polygon
 from .profile import Profile
 from .results import Result
 from .sequence import frames_line, run_frames
-from .summary import boundary_line, measures_line, summary
+from .summary import boundary_line, summary
 
 _REPEATED = (
     "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
     "seed", "dtype",
 )  # fmt: skip
 """Settings that a run reports and that its `case.toml` fixes, whatever later defaults are."""
+
+_MANY = 5000
+"""Cells from which files and pictures take so long that one says so."""
 
 
 @dataclass
@@ -195,6 +198,9 @@ class Job:
         from . import __version__
 
         *others, (_, main) = results.items()
+        if not self.quiet and (sys.stderr.isatty() or len(main.points) > _MANY):
+            work = "mesh and report" if self.report else "mesh"
+            print(f"{self.case.name}: writing {work} into {self.out}", file=sys.stderr, flush=True)
         save(main, self.out / "mesh.vtu")
         save(main, self.out / "mesh.npz")
         write_history(main, self.out / "history.csv")
@@ -274,7 +280,7 @@ class Job:
             )
         for name, result in results.items():
             if result.diagram.domain.dim == 3:
-                print(f"{name}: {measures_line(result)}")
+                print(f"{name}: {result.measures.line()}")
             if isinstance(result.diagram.domain, Polygon):
                 print(f"{name}: {boundary_line(result)}")
         first = "report.html" if self.report else "mesh.vtu"

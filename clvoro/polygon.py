@@ -112,7 +112,13 @@ class Polygon(Domain):
             Feature or collection of these. Coordinates are taken as they are, in the plane: project
             longitudes and latitudes before.
         """
-        return cls.from_pieces(pieces_of_geojson(source))
+        pieces = pieces_of_geojson(source)
+        try:
+            return cls.from_pieces(pieces)
+        except InputError as error:
+            if isinstance(source, Mapping) or str(source).lstrip().startswith("{"):
+                raise
+            raise InputError(f"{source}: {error}") from error
 
     def _build(self, pieces: Sequence[Sequence[object]]) -> None:
         made = make_rings(pieces)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ._arrays import Naming, check_choice, check_integer, check_number
 from .domain import Domain
-from .errors import InputError, InputTypeError
+from .errors import CoarseSizeWarning, InputError, InputTypeError
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
 from .memory import check_memory
 from .mesh import Mesh, Stages
@@ -155,6 +156,12 @@ class Preparation:
         else:
             asked = count_cells(self.sizing, self.free) + len(self.rows)
         self.target = n_cells if n_cells is not None else max(1, round(asked))
+        if n_cells is None and asked < 0.5:
+            message = (
+                f"the size field asks for {asked:.2g} cells in a domain of {domain.measure:.6g}, so that there will be "
+                "one, too small; are h and the domain in the same unit of length?"
+            )
+            warnings.warn(message, CoarseSizeWarning, stacklevel=4)
         check_memory(stages.engine, max(self.target, 0 if points is None else len(points)), domain)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0

@@ -13,7 +13,7 @@ from .results import Diagram
 from .walls import wall_planes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measures:
     """What `measure_mesh` finds: per cell (n,), or per face of the diagram's graph (m,).
 
@@ -54,6 +54,18 @@ class Measures:
     faces: np.ndarray
     inner: np.ndarray
     polygonal: bool = False
+
+    def __repr__(self) -> str:
+        return f"Measures({self.line()})"
+
+    def line(self) -> str:
+        """Return in a line what finite-volume methods ask of a mesh."""
+        s = self.summary()
+        return (
+            f"{s['mean_faces']:.2f} faces per cell; skewness mean {s['mean_skewness']:.3f}, "
+            f"max {s['max_skewness']:.3f}; angle of centroids mean {s['mean_centroid_angle']:.2f}°, "
+            f"max {s['max_centroid_angle']:.1f}°"
+        )
 
     def worst_of_cell(self, name: str) -> np.ndarray:
         """Return the largest value of `name`, a measure of faces, among the faces of each cell, (n,)."""

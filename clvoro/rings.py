@@ -153,7 +153,7 @@ def _check_lengths(rings: Sequence[Ring]) -> None:
             raise InputError(
                 f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}, "
                 f"{_at(ring.vertices[e])}, expected at least {SHORTEST_EDGE:g} of the domain's size; "
-                "merge its ends"
+                "merge its ends (shapely.remove_repeated_points(geometry, tolerance) does)"
             )
 
 

@@ -62,13 +62,3 @@ def boundary_line(result: Result) -> str:
         for name, s in beside_boundary(result).items()
         if s["cells"]
     )
-
-
-def measures_line(result: Result) -> str:
-    """Return in a line what finite-volume methods ask of a mesh."""
-    s = result.measures.summary()
-    return (
-        f"{s['mean_faces']:.2f} faces per cell; skewness mean {s['mean_skewness']:.3f}, "
-        f"max {s['max_skewness']:.3f}; angle of centroids mean {s['mean_centroid_angle']:.2f}°, "
-        f"max {s['max_centroid_angle']:.1f}°"
-    )

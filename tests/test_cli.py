@@ -1,5 +1,6 @@
 """The command line: files, exit codes, progress, Ctrl-C, and that a run can be repeated."""
 
+import functools
 import io
 import json
 import os
@@ -13,7 +14,7 @@ import pytest
 
 import clvoro
 from clvoro import cli, jobs, progress
-from clvoro.errors import BuildError, DeviceError, MemoryLimitError
+from clvoro.errors import BuildError, DeviceError, MemoryLimitError, SolverError
 from clvoro.io import load
 from clvoro.results import HISTORY_DTYPE
 
@@ -142,12 +143,45 @@ def test_interrupt_keeps_what_there_is(here, monkeypatch, capsys, last_step):
     assert "interrupted" in (out / "case.toml").read_text().splitlines()[0]
 
 
-def test_failure_of_a_later_method_keeps_the_earlier_ones(here, capsys):
-    text = CASE.replace('"lloyd", "coupled"', '"lloyd", "magic"')
-    (here / "late.toml").write_text(text)
-    assert call("run", "late.toml", "--no-report") == cli.BAD_INPUT
-    assert "magic" in capsys.readouterr().err
-    assert len(load(here / "out" / "late" / "mesh.npz").history) == 5
+def test_failure_of_a_later_method_keeps_the_earlier_ones(here, monkeypatch, capsys):
+    plain = clvoro.Adapter.run
+
+    @functools.wraps(plain)
+    def run(self, *arguments, method, **options):
+        if method == "coupled":
+            raise SolverError("no convergence")
+        return plain(self, *arguments, method=method, **options)
+
+    monkeypatch.setattr(clvoro.Adapter, "run", run)
+    assert call("run", "small.toml", "--no-report") == cli.FAILED
+    assert "no convergence" in capsys.readouterr().err
+    assert len(load(here / "out" / "small" / "mesh.npz").history) == 5
+
+
+def test_an_unknown_method_is_refused_before_the_first_runs(here, capsys):
+    assert call("run", "small.toml", "--method", "lloyd,copled") == cli.BAD_INPUT
+    assert "run.methods[1] is 'copled' (did you mean 'coupled'?)" in capsys.readouterr().err
+    assert not (here / "out").exists()
+
+
+def test_warnings_are_one_line(here, capsys):
+    text = CASE.replace("size = 0.11", "size = 110")
+    assert text != CASE
+    (here / "metres.toml").write_text(text)
+    assert call("run", "metres.toml", "--no-report", "--quiet", "--method", "lloyd") == cli.OK
+    printed = capsys.readouterr().err
+    assert printed.startswith("clvoro: warning: the size field asks for")
+    assert printed.count("\n") == 1
+
+
+def test_every_file_is_checked(here, capsys):
+    call("run", "small.toml", "--no-report", "--quiet")
+    files = "small.toml", "nothing.npz", "out/small/mesh.npz"
+    assert call("check", *files) == cli.BAD_INPUT
+    printed = capsys.readouterr()
+    assert "small.toml is no mesh.npz" in printed.err
+    assert "nothing.npz" in printed.err
+    assert "out/small/mesh.npz: " in printed.out
 
 
 def test_second_interrupt_quits_at_once(here, monkeypatch, capsys):

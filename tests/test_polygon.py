@@ -87,6 +87,11 @@ def test_sources_agree(tmp_path) -> None:
     sources = geometry, feature, collection, group, json.dumps(feature), path, str(path)
     for source in sources:
         assert clvoro.Polygon.from_geojson(source) == several
+    path.write_text('{"type": "Polygon", "coordinates": [[[0, 0], [2, 2], [2, 0], [0, 2]]]}')
+    with pytest.raises(
+        InputError, match=r"domain\.geojson: Polygon is not valid: Self-intersection"
+    ):
+        clvoro.Polygon.from_geojson(path)
     assert clvoro.Polygon.from_shapely(parts[0]) == clvoro.Polygon(SQUARE, [HOLE])
 
 

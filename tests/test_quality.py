@@ -11,7 +11,6 @@ from clvoro.domain import Box
 from clvoro.faces import face_corners, face_owners
 from clvoro.quality import measure_mesh
 from clvoro.results import Diagram
-from clvoro.summary import measures_line
 
 LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
 
@@ -152,7 +151,7 @@ def test_result_measures_itself_once(solid):
 def test_line_for_people(solid):
     result = solids.solid_result(solid)
     s = result.measures.summary()
-    numbers = [float(x) for x in re.findall(r"[\d.]+", measures_line(result))]
+    numbers = [float(x) for x in re.findall(r"[\d.]+", str(result.measures))]
     names = (
         "mean_faces", "mean_skewness", "max_skewness", "mean_centroid_angle", "max_centroid_angle",
     )  # fmt: skip

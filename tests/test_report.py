@@ -120,6 +120,18 @@ def test_side_shares_are_complete(result):
     assert sum(shares) == pytest.approx(100, abs=0.05 * len(shares))
 
 
+def test_infinite_values_have_the_colour_beyond_the_scale(adapter):
+    # The generator on the wall is not amid its face there.
+    points = np.array([[0.3, 2.0], [-0.8, 2.2], [0.0, 2.7], [0.7, 2.5]])
+    result = adapter.run(BOX, 0.5, points=points, method="lloyd", max_steps=0)
+    assert np.isinf(result.measures.worst_of_cell("skewness")).tolist() == [True] + 3 * [False]
+    (cells,) = of_kind(plot_cells(result, "skewness"), PolyCollection)
+    cells.update_scalarmappable()
+    largest = cells.to_rgba(cells.get_clim()[1])
+    assert np.array_equal(cells.get_facecolor()[0], largest)
+    assert (cells.get_facecolor()[:, 3] == 1).all()
+
+
 def test_unknown_colour_is_named(result):
     with pytest.raises(InputError, match=r"'hue'.*error, quality, size, sides, skewness"):
         plot_cells(result, "hue")

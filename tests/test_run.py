@@ -1,13 +1,17 @@
 """`Adapter.run` as a user meets it: its promises, its figures on the test field, bad input and nasty size fields."""
 
+import warnings
+
 import numpy as np
 import pytest
 import reference
+import shapely
 
 import clvoro
 from clvoro import sizing
 from clvoro.errors import (
     ClvoroError,
+    CoarseSizeWarning,
     InputError,
     InputTypeError,
     MemoryLimitError,
@@ -599,7 +603,19 @@ def test_one_cell_of_the_right_size(adapter):
         ({"size": lambda p: 0.1}, ClvoroError, "shape"),
         ({"size": 1e-6}, MemoryLimitError, r"3\.75e\+12 cells.*GiB"),
         ({"n_cells": 10**11}, MemoryLimitError, r"1e\+11 cells.*GiB"),
-        ({"domain": "box"}, InputTypeError, "domain is a str"),
+        ({"domain": "box"}, InputTypeError, "domain is a str, expected .*Box or a clvoro.Polygon"),
+        ({"domain": shapely.box(0, 0, 1, 1)}, InputTypeError, r"Polygon\.from_shapely\(domain\)"),
+        ({"tol": "1e-3"}, InputTypeError, "tol is '1e-3' of type str"),
+        (
+            {"points": np.ma.masked_less(random_points(9, 1), 0.2)},
+            InputError,
+            r"points has \d+ masked numbers",
+        ),
+        (
+            {"size": sizing.Raster(np.ones((3, 3)), (50, 7), (58, 13))},
+            InputError,
+            r"lies beside the domain.*order of the coordinates",
+        ),
         ({"domain": clvoro.Box((0, 0, 0), (1, 1, 1))}, ClvoroError, "dimension"),
     ],
 )
@@ -607,6 +623,31 @@ def test_bad_input(adapter, change, error, message):
     arguments = {"domain": BOX, "size": F1, **change}
     with pytest.raises(error, match=message):
         adapter.run(**arguments)
+
+
+@pytest.mark.parametrize("corner", [("a", "b"), None, "ab"])
+def test_bad_corners(corner):
+    with pytest.raises(ClvoroError, match=r"Box got .*write Box\(\(0, 0\), \(2.5, 1.5\)\)"):
+        clvoro.Box(corner, (1, 1))
+
+
+@pytest.mark.parametrize("given", ["gpu", 0])
+def test_bad_context(given):
+    with pytest.raises(
+        InputTypeError, match=r"expected a pyopencl.Context.*create_context\(device"
+    ):
+        clvoro.Adapter(given)
+
+
+def test_sizes_in_another_unit(adapter):
+    """Metres for kilometres make one cell, with a warning at the caller's line; what fits has none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CoarseSizeWarning)
+        adapter.run(BOX, 2.7, effort="fast")  # 0.51 cells
+        adapter.run(BOX, 100, effort="fast", n_cells=2)
+    with pytest.warns(CoarseSizeWarning, match=r"0\.00038 cells in a domain of 3\.75") as caught:
+        assert len(adapter.run(BOX, 100, effort="fast").points) == 1
+    assert caught[0].filename == __file__
 
 
 @pytest.mark.parametrize("dtype", ["float16", "int32", "banana", None, 8])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import InputError
+from ..preparation import METHODS
 
 Check = Callable[[object, str], Any]
 """Takes a value and its place in the file; returns it in its final type or raises InputError."""
@@ -315,6 +316,12 @@ _DOMAINS = Kinds(
 def domain(value: object, place: str) -> dict[str, Any]:
     """Check a domain: a box by its corners, a polygon by a file or its rings."""
     if isinstance(value, Mapping) and "kind" not in value:
+        corners = [key for key in ("lower", "upper", "periodic") if key in value]
+        rings = [key for key in ("polygon", "outer", "holes") if key in value]
+        if corners and rings:
+            raise InputError(
+                f"{place} has both {corners[0]}, of a box, and {rings[0]}, of a polygon; leave one of them out"
+            )
         if "polygon" in value:
             rest = {key: item for key, item in value.items() if key != "polygon"}
             value = {"kind": "polygon", "file": text(value["polygon"], f"{place}.polygon"), **rest}
@@ -329,8 +336,8 @@ def domain(value: object, place: str) -> dict[str, Any]:
 RUN = Table(
     {},
     {
-        "method": text,
-        "methods": list_of(text),
+        "method": one_of(*METHODS),
+        "methods": list_of(one_of(*METHODS)),
         "start": one_of("density", "uniform"),
         "points": text,
         "n_cells": whole(1),

@@ -20,7 +20,7 @@ from ..outlines import face_ends
 from ..polygon import Polygon
 from ..results import Diagram, Result
 from .boundary import clip_to_domain, frame_part
-from .colours import COLOURINGS, Colouring, cell_norm, colouring
+from .colours import COLOURINGS, Colouring, cell_norm, colouring, without_ends
 from .style import WIDTH, grid_height, interactive_figure, styled
 
 
@@ -110,7 +110,7 @@ def draw_cells(
     ]
     cells = PolyCollection(
         polygons,
-        array=values[shown],
+        array=without_ends(values[shown]),
         cmap=scheme.colour_map,
         norm=cell_norm(scheme, limits),
         # An outline in the cell's own colour hides the seams that smoothing leaves between cells.

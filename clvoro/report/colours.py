@@ -155,3 +155,8 @@ def cell_norm(scheme: Colouring, limits: tuple[float, float]) -> Normalize:
         classes = scheme.colour_map.N
         return BoundaryNorm(np.linspace(low, high, classes + 1), classes)
     return LogNorm(low, high) if scheme.logarithmic and high > 3 * low > 0 else Normalize(low, high)
+
+
+def without_ends(values: np.ndarray) -> np.ndarray:
+    """Return `values` with large numbers in the place of infinite ones, for which Matplotlib has no colour."""
+    return np.clip(values, -1e30, 1e30)

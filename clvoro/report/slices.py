@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..faces import face_owners
 from ..results import Diagram, Result
 from .cells import add_key, edge_style
-from .colours import Colouring, cell_norm, colouring
+from .colours import Colouring, cell_norm, colouring, without_ends
 from .cutaway import draw_cutaway
 from .section import Section, cut_cells, plane_axes
 from .style import WIDTH, frame_domain, interactive_figure, new_figure, styled
@@ -222,7 +222,7 @@ def _draw_section(
     """Add the filled polygons, an outline in their own colour hiding the seams."""
     cells = PolyCollection(
         np.split(flat, section.starts[1:-1]),
-        array=values[section.cells],
+        array=without_ends(values[section.cells]),
         cmap=scheme.colour_map,
         norm=cell_norm(scheme, limits),
         edgecolors="face",

@@ -343,7 +343,10 @@ def slope_of(what: str, growth: object, slope: object) -> float:
     if growth is not None:
         rate = positive(f"{what} growth", growth)
         if rate < 1:
-            raise InputError(f"{what} growth is {growth}, expected at least 1, such as 1.2")
+            raise InputError(
+                f"{what} growth is {growth}, expected at least 1: the ratio of neighbouring cells, such as 1.2; "
+                "write slope= for dh/dx"
+            )
         return math.log(rate)
     if not (isinstance(slope, Real) and 0 <= slope < math.inf):
         raise InputError(f"{what} slope is {slope!r}, expected a finite number >= 0")

@@ -135,6 +135,11 @@ class Raster(Field):
         domain = binder.domain
         corners = domain.vertices if isinstance(domain, Polygon) else [domain.lower, domain.upper]
         self._refuse_outside(np.array(corners))
+        if (self.upper < domain.lower).any() or (self.lower > domain.upper).any():
+            raise InputError(
+                f"{self!r} lies beside the domain, from {list(domain.lower)} to {list(domain.upper)}, expected an "
+                "overlap; are units and the order of the coordinates (x, y) the same?"
+            )
         gain, origin = self._index_map()
         shift = -binder.normalise(origin) * (gain * binder.scale)
         at = binder.store(gain * binder.scale, shift, self.values / binder.scale)
@@ -207,7 +212,8 @@ def check_corners(
         )
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise InputError(
-            f"{what} got lower {lower} and upper {upper}, expected finite numbers with lower < upper"
+            f"{what} got lower {lower} and upper {upper}, expected finite numbers with lower < upper; turn the "
+            "values of an axis that runs downwards round, as in values[::-1]"
         )
     if at not in ("nodes", "centres"):
         raise InputError(f"{what} got at={at!r}, expected 'nodes' or 'centres'")
