@@ -136,52 +136,69 @@ kernel void assemble(int n, const int room, global const int *starts, global con
 
 /* Of the faces from f on: the cells beyond, any one beyond a wall, and the derivatives across, 0 there and for other
    rows' faces. */
-#define FACING(f) max(TAKE(int, neighbours, f, faces), (MANY(int))(0))
+#define FACING(f) max(TAKE(int, it->neighbours, f, faces), (MANY(int))(0))
 #define DERIVATIVE(across, f, a)                                                                                       \
-    CONVERT(STORE, select((MANY(float))(0), TAKE(float, across + (a)*room, f, faces), inside))
+    CONVERT(STORE, select((MANY(float))(0), TAKE(float, across + (a)*it->room, f, faces), inside))
+
+/* What the iteration works on. */
+typedef struct {
+    int n, most, room;
+    REAL tolerance;
+    global const int *starts, *neighbours;
+    global const float *rows, *columns;
+    global const STORE *own, *eps, *inverse_diagonal;
+    global STORE *p, *s, *u, *r, *z;
+    global REAL *partial, *record;
+} iteration_t;
+
+#define ITERATION_ARGS                                                                                                 \
+    const int n, const int most, const int room, const REAL tolerance, global const int *starts,                       \
+        global const int *neighbours, global const float *rows, global const float *columns, global const STORE *own,  \
+        global const STORE *eps, global const STORE *inverse_diagonal, global STORE *p, global STORE *s,               \
+        global STORE *u, global STORE *r, global STORE *z, global REAL *partial, global REAL *record
+#define ITERATION                                                                                                      \
+    {                                                                                                                  \
+        n, most, room, tolerance, starts, neighbours, rows, columns, own, eps, inverse_diagonal, p, s, u, r, z,        \
+            partial, record                                                                                            \
+    }
 
 /* p = z + beta p and s = B^T z + beta s. From the iteration on that finds the residual at its target, or is the last
    (or finds anything out of order, NaN included), record[k].running is 0 and nothing changes any more, so that the host
    may run ahead without changing the result. */
-kernel void descend(int k, int n, int most, REAL tolerance, const int room, global const int *starts,
-                    global const int *neighbours, global const float *columns, global const STORE *own,
-                    global const STORE *eps, global const STORE *z, global STORE *p, global STORE *s,
-                    global REAL *partial, global REAL *record)
+inline void go_down(int k, const iteration_t *it, local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
-    const int first = get_global_id(0) == 0;
-    global REAL *now = record + 4 * k;
+    global REAL *partial = it->partial, *now = it->record + 4 * k;
     global const REAL *last = now - 4;
+    const int first = get_global_id(0) == 0;
     const int over = k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0);
     const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
-    const REAL start = k > 0 ? record[RECORD_NORM] : norm;
-    const int running = !over && k < most && norm > tolerance * tolerance * start && norm <= REAL_MAX && gamma > 0;
+    const REAL target = it->tolerance * it->tolerance * (k > 0 ? it->record[RECORD_NORM] : norm);
+    const int running = !over && k < it->most && norm > target && norm <= REAL_MAX && gamma > 0;
     if (first)
         now[RECORD_RUNNING] = running;
     if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
     }
-    const int end = running ? n : 0;
     const STORE beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
-    const int faces = starts[n];
+    const int end = running ? it->n : 0, faces = it->starts[it->n];
     Sum curvature = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
-        const STORE zi = z[i], pi = k > 0 ? zi + beta * p[i] : zi;
+        const STORE zi = it->z[i], pi = k > 0 ? zi + beta * it->p[i] : zi;
         STORE sum[DIM];
         EACH_AXIS(a)
-            sum[a] = own[DIM * i + a] * zi + (k > 0 ? beta * s[DIM * i + a] : 0);
-        const int end_of_row = starts[i + 1];
-        for (int f = starts[i]; f < end_of_row; f += AT_ONCE) {
+            sum[a] = it->own[DIM * i + a] * zi + (k > 0 ? beta * it->s[DIM * i + a] : 0);
+        const int end_of_row = it->starts[i + 1];
+        for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
-            const MANY(STORE) zj = PICK(STORE, z, j, 1, 0);
+            const MANY(STORE) zj = PICK(STORE, it->z, j, 1, 0);
             EACH_AXIS(a)
-                sum[a] += SUM(STORE, DERIVATIVE(columns, f, a) * zj);
+                sum[a] += SUM(STORE, DERIVATIVE(it->columns, f, a) * zj);
         }
-        p[i] = pi;
-        REAL product = (REAL)eps[i] * pi * pi;
+        it->p[i] = pi;
+        REAL product = (REAL)it->eps[i] * pi * pi;
         EACH_AXIS(a) {
-            s[DIM * i + a] = sum[a];
+            it->s[DIM * i + a] = sum[a];
             product += (REAL)sum[a] * sum[a];
         }
         sum_add(&curvature, product);
@@ -190,44 +207,68 @@ kernel void descend(int k, int n, int most, REAL tolerance, const int room, glob
 }
 
 /* u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
-kernel void update(int k, int n, const int room, global const int *starts, global const int *neighbours,
-                   global const float *rows, global const STORE *own, global const STORE *eps,
-                   global const STORE *inverse_diagonal, global const STORE *p, global const STORE *s, global STORE *u,
-                   global STORE *r, global STORE *z, global REAL *partial, global REAL *record)
+inline void go_up(int k, const iteration_t *it, local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
-    global REAL *now = record + 4 * k;
+    global REAL *partial = it->partial, *now = it->record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch);
     if (running && get_global_id(0) == 0)
         now[RECORD_CURVATURE] = curvature;
-    const int end = running && curvature > 0 ? n : 0;
     const STORE alpha = now[RECORD_GAMMA] / curvature;
-    const int faces = starts[n];
+    const int end = running && curvature > 0 ? it->n : 0, faces = it->starts[it->n];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
-        STORE q = eps[i] * p[i];
+        STORE q = it->eps[i] * it->p[i];
         EACH_AXIS(a) {
-            const STORE si = s[DIM * i + a];
-            q += own[DIM * i + a] * si;
-            u[DIM * i + a] = (k > 0 ? u[DIM * i + a] : 0) - alpha * si;
+            const STORE si = it->s[DIM * i + a];
+            q += it->own[DIM * i + a] * si;
+            it->u[DIM * i + a] = (k > 0 ? it->u[DIM * i + a] : 0) - alpha * si;
         }
-        const int end_of_row = starts[i + 1];
-        for (int f = starts[i]; f < end_of_row; f += AT_ONCE) {
+        const int end_of_row = it->starts[i + 1];
+        for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             MANY(STORE) sum = 0;
             EACH_AXIS(a)
-                sum += DERIVATIVE(rows, f, a) * PICK(STORE, s, j, DIM, a);
+                sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, DIM, a);
             q += SUM(STORE, sum);
         }
-        const STORE ri = r[i] - alpha * q, zi = inverse_diagonal[i] * ri;
-        r[i] = ri;
-        z[i] = zi;
+        const STORE ri = it->r[i] - alpha * q, zi = it->inverse_diagonal[i] * ri;
+        it->r[i] = ri;
+        it->z[i] = zi;
         sum_add(&norm, (REAL)ri * ri);
         sum_add(&gamma, (REAL)ri * zi);
     }
     PUT(NORM(k + 1), norm.value);
     PUT(GAMMA(k + 1), gamma.value);
+}
+
+kernel void descend(const int k, ITERATION_ARGS)
+{
+    local REAL scratch[GROUP_SIZE];
+    const iteration_t it = ITERATION;
+    go_down(k, &it, scratch);
+}
+
+kernel void update(const int k, ITERATION_ARGS)
+{
+    local REAL scratch[GROUP_SIZE];
+    const iteration_t it = ITERATION;
+    go_up(k, &it, scratch);
+}
+
+/* One group, where cells are few: all iterations. */
+kernel void iterate(ITERATION_ARGS)
+{
+    local REAL scratch[GROUP_SIZE];
+    const iteration_t it = ITERATION;
+    bool running = true;
+    for (int k = 0; running; ++k) {
+        go_down(k, &it, scratch);
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        running = record[4 * k + RECORD_RUNNING] != 0;
+        go_up(k, &it, scratch);
+        barrier(CLK_GLOBAL_MEM_FENCE);
+    }
 }
 
 /* Per generator i: what the projection takes from the displacement, correction = h u. */

@@ -292,17 +292,29 @@ class ConjugateGradient:
         )
 
 
+def most_alone(engine: Engine) -> int:
+    """Return up to how many unknowns one work-group is through an iteration before others could be of help.
+
+    On a CPU the launches of an iteration cost some 20 us, as much as a core takes for 500 unknowns; with two cores at
+    work, half of the unknowns would be its own in any case.
+    """
+    return 2000 if engine.group_size == 1 else 4 * engine.group_size
+
+
 class Launch:
     """A block-wise kernel with its arguments set: calling it costs no more than the enqueueing.
 
-    The kernel must not be used elsewhere meanwhile, as it has but one set of arguments.
+    It is enqueued over as many `groups`, by default the engine's. The kernel must not be used elsewhere meanwhile, as
+    it has but one set of arguments.
     """
 
-    def __init__(self, engine: Engine, kernel: cl.Kernel, *args: object) -> None:
+    def __init__(
+        self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None
+    ) -> None:
         self._args = bind(kernel, args)
         self._kernel = kernel
         self._queue = engine.queue
-        self._size = (engine.groups * engine.group_size,)
+        self._size = ((engine.groups if groups is None else groups) * engine.group_size,)
         self._group = (engine.group_size,)
 
     def set_first(self, value: int) -> None:

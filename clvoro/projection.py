@@ -14,7 +14,7 @@ from ._program import Engine
 from ._workspace import framed
 from .cells import Tessellation
 from .errors import SolverError
-from .krylov import Launch, Solution
+from .krylov import Launch, Solution, most_alone
 
 SINGLE = 1e-4
 """Tolerance from which on the iteration's vectors are in single precision."""
@@ -31,7 +31,8 @@ class Projection:
 
     Conjugate gradients with the diagonal as a preconditioner, from y = 0, in two kernels an iteration. The host
     enqueues as many as the last solve took and then reads their record; the iterate is frozen on the device when the
-    tolerance is met, so the result does not depend on when the host looks.
+    tolerance is met, so the result does not depend on when the host looks. Where cells are few, one kernel of one
+    work-group does all of that alone.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -40,6 +41,7 @@ class Projection:
         self._record = engine.empty(4 * 64)
         self._kernels: dict[np.dtype, SimpleNamespace] = {}
         self._ahead = 8
+        self._most_alone = most_alone(engine)
 
     def _kernels_in(self, store: np.dtype) -> SimpleNamespace:
         if store not in self._kernels:
@@ -111,31 +113,37 @@ class Projection:
         store = np.dtype(np.float32) if tolerance >= SINGLE else engine.real
         v = self._reserve(n, t.neighbours.shape[0], store, max_iterations)
         k = self._kernels_in(store)
-        room = np.int32(t.neighbours.shape[0])
+        sizes = np.int32(n), np.int32(max_iterations), np.int32(t.neighbours.shape[0])
+        number, _, room = sizes
         faces, partial, record = (t.starts, t.neighbours), self._partial, self._record
-        engine.run_blocks(
-            k.assemble, np.int32(n), room, *faces, t.face_measures, t.face_centroids, t.volumes,
+        groups = 1 if n <= self._most_alone else engine.groups
+        Launch(
+            engine, k.assemble, number, room, *faces, t.face_measures, t.face_centroids, t.volumes,
             t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
             real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, partial,
-            t.starts if labels is None else labels, np.int32(fixed),
+            t.starts if labels is None else labels, np.int32(fixed), groups=groups,
+        )()  # fmt: skip
+        iteration = (
+            *sizes, real(tolerance), *faces, v.rows, v.columns, v.own, v.eps, v.inverse, v.p, v.s,
+            v.u, v.r, v.z, partial, record,
         )  # fmt: skip
-        descend = Launch(
-            engine, k.descend, np.int32(0), np.int32(n), np.int32(max_iterations),
-            real(tolerance), room, *faces, v.columns, v.own, v.eps, v.z, v.p, v.s, partial, record,
-        )  # fmt: skip
-        update = Launch(
-            engine, k.update, np.int32(0), np.int32(n), room, *faces, v.rows, v.own, v.eps,
-            v.inverse, v.p, v.s, v.u, v.r, v.z, partial, record,
-        )  # fmt: skip
-        solution = self._iterate(descend, update, tolerance, max_iterations)
+        if groups == 1:
+            Launch(engine, k.iterate, *iteration, groups=1)()
+            rows = self._read(max_iterations)
+        else:
+            steps = (
+                Launch(engine, kernel, np.int32(0), *iteration) for kernel in (k.descend, k.update)
+            )
+            rows = self._iterate(*steps, max_iterations)
+        solution = self._judge(rows, tolerance)
         if solution.iterations:
             engine.run_each(k.put_correction, n, v.u, h, correction)
         else:
             correction.fill(0)
         return solution
 
-    def _iterate(self, descend: Launch, update: Launch, tolerance: float, most: int) -> Solution:
-        """Iterate until the tolerance is met, or `most` times."""
+    def _iterate(self, descend: Launch, update: Launch, most: int) -> np.ndarray:
+        """Iterate until the tolerance is met, or `most` times; return the record up to then, or later."""
         descend()
         done, ahead = 0, self._ahead
         while True:
@@ -144,13 +152,19 @@ class Projection:
                 for launch, number in ((update, k), (descend, k + 1)):
                     launch.set_first(number)
                     launch()
-            rows = self._record[: 4 * (end + 1)].get().reshape(-1, 4).astype(np.float64)
-            stopped = np.flatnonzero(rows[:, _RUNNING] == 0)
-            if stopped.size:
-                break
+            rows = self._read(end)
+            if not rows[:, _RUNNING].all():
+                self._ahead = _stop(rows) + 2
+                return rows
             done, ahead = end, 4
-        iterations = int(stopped[0])
-        self._ahead = iterations + 2
+
+    def _read(self, end: int) -> np.ndarray:
+        """Return the rows of the record up to iteration `end`."""
+        return self._record[: 4 * (end + 1)].get().reshape(-1, 4).astype(np.float64)
+
+    def _judge(self, rows: np.ndarray, tolerance: float) -> Solution:
+        """Return how it went, by the record."""
+        iterations = _stop(rows)
         flat = bool(iterations and not rows[iterations - 1, _CURVATURE] > 0)
         iterations -= flat
         norms, curvature = rows[: iterations + 1, _NORM], rows[iterations, _CURVATURE]
@@ -166,3 +180,8 @@ class Projection:
         converged = bool(residuals[-1] <= tolerance)
         reason = "converged" if converged else "stagnated" if flat else "max_iterations"
         return Solution(iterations, float(residuals[-1]), residuals, converged, reason)
+
+
+def _stop(rows: np.ndarray) -> int:
+    """Return the first iteration that was not carried out; what the record holds behind it is of no meaning."""
+    return int(np.flatnonzero(rows[:, _RUNNING] == 0)[0])

@@ -5,6 +5,7 @@ import patch
 import pytest
 import reference
 
+from clvoro import projection
 from clvoro.density import Density
 from clvoro.errors import SolverError
 from clvoro.projection import Projection
@@ -13,10 +14,17 @@ N = 60
 SLOPE = np.array([0.9, -1.4])
 
 
-@pytest.fixture(scope="module", params=[None, 16], ids=["one item a group", "16 items a group"])
+@pytest.fixture(
+    scope="module",
+    params=[(None, 0), (16, 0), (None, 1000), (16, 1000)],
+    ids=["cpu", "gpu", "cpu, one group", "gpu, one group"],
+)
 def engine(ctx, request):
-    """On a CPU and as on a GPU."""
-    return patch.make_engine(ctx, group_size=request.param)
+    """On a CPU and as on a GPU; in many launches and in one."""
+    group_size, alone = request.param
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(projection, "most_alone", lambda engine: alone)
+        yield patch.make_engine(ctx, group_size=group_size)
 
 
 def sizes(points):
