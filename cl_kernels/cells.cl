@@ -71,11 +71,13 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
    of two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so
    that the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two
    cells, generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is
-   flagged. What borders on a generator without a row is not looked at. */
+   flagged. What borders on a generator without a row is not looked at.
+
+   If `repaired`, fits[i] tells of rows to whose neighbours i stands between the same two; of others it is not read. */
 kernel void match_faces(const int size, global const int *places, global const int *slots,
                         global const int *slot_counts, global const int *old_starts, global const int *old_neighbours,
                         global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int repaired,
-                        const REAL share, global uint *keep, global int *counts, global int *flags)
+                        const REAL share, global int *fits, global uint *keep, global int *counts, global int *flags)
 {
     WORK_ITEM(i);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
@@ -87,8 +89,8 @@ kernel void match_faces(const int size, global const int *places, global const i
         return;
     }
     const bool some = flags[2]; /* which the kernels before have written: no race with other work-items here */
-    if (!some && !repaired) {
-        /* Every new row is certain: all its faces are seen from both sides. */
+    if (repaired ? fits[i] : !some) {
+        /* All its faces are seen from both sides, as it fits its neighbours', or every new row is certain. */
         for (int left = n, k = 0; left > 0; left -= 32, ++k)
             keep[place * KEEP_WORDS + k] = left < 32 ? (1u << left) - 1 : ~0u;
         counts[i] = n;
@@ -126,6 +128,14 @@ kernel void match_faces(const int size, global const int *places, global const i
             if (!(cut < 512 * REAL_EPS && cut <= share * listed_area(&rows, i, points, lower, upper) &&
                   cut <= share * listed_area(&rows, j, points, lower, upper)))
                 raise_flag(flags, FLAG_COLLAPSED, i);
+            if (repaired) {
+                /* Now `before` and `after` follow each other. */
+                atomic_and(fits + i, 0);
+                if (a >= 0)
+                    atomic_and(fits + a, 0);
+                if (b >= 0)
+                    atomic_and(fits + b, 0);
+            }
         }
         if (k % 32 == 31 || k == n - 1) {
             keep[place * KEEP_WORDS + k / 32] = word;

@@ -23,12 +23,19 @@ inline bool is_rounding(REAL gap2, REAL d2)
     return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
 }
 
-/* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
-   `after`, at corners u and v; so in j's row i must stand between `after` and `before`; it is `exact` if it does. */
-inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
-                           global const REAL *points, const REAL *lower, const REAL *upper, bool *exact)
+/* Does i stand between `before` and `after` in a row of n? */
+inline bool stands_between(int i, int before, int after, global const int *row, int n)
 {
-    *exact = false;
+    const int q = place_in_row(row, n, i);
+    return q < n && row[q == 0 ? n - 1 : q - 1] == before && row[q == n - 1 ? 0 : q + 1] == after;
+}
+
+/* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
+   `after`, at corners u and v; so in j's row i must stand between `after` and `before`, or what it stands between must
+   meet it there but for rounding. */
+inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
+                           global const REAL *points, const REAL *lower, const REAL *upper)
+{
     const int q = place_in_row(row, n, i);
     if (q == n) {
         /* A face of no length, which i is then doubtful of, will be dropped. */
@@ -36,9 +43,6 @@ inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v
         return is_rounding(dot(e, e), d2);
     }
     const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
-    *exact = p == after && s == before;
-    if (*exact)
-        return true;
     /* Where four or more cells meet in a point, cells may leave out different faces of no length. */
     return (p == after || is_rounding(corner_gap2(v, i, j, p, i, points, lower, upper), d2)) &&
            (s == before || is_rounding(corner_gap2(u, i, j, i, s, points, lower, upper), d2));
@@ -90,10 +94,10 @@ inline void check_row(int i, global const int *starts, global const int *neighbo
             least2 = fmin(least2, d2);
             if (!known) {
                 const int other = starts[face], m = starts[face + 1] - other;
-                bool exact;
-                good = good && fits_neighbour(i, face, before, after, u, v, d2, neighbours + other, m, points, lower,
-                                              upper, &exact);
-                fit = fit && good && exact;
+                const bool exact = stands_between(i, after, before, neighbours + other, m);
+                good = good && (exact || fits_neighbour(i, face, before, after, u, v, d2, neighbours + other, m, points,
+                                                        lower, upper));
+                fit = fit && exact;
             }
         }
         if (!good) {
@@ -172,7 +176,7 @@ inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n
 kernel void clip_marked(const int size, global const int *listed, const int base, global const int *places,
                         global int *slots, global int *slot_counts, global const int *old_starts,
                         global const int *old_neighbours, global const REAL *points, const REAL4 box_lower,
-                        const REAL4 box_upper, global int *flags)
+                        const REAL4 box_upper, global int *fits, global int *flags)
 {
     WORK_ITEM(w);
     const int i = listed[w];
@@ -184,6 +188,10 @@ kernel void clip_marked(const int size, global const int *listed, const int base
     start_cell(&cell, i, x, lower, upper);
     int n, m;
     global const int *row = face_row(&rows, i, &n);
+    /* Clipped once more, it may leave some that have been found to fit it. */
+    for (int k = 0; k < n && places[i] >= 0; ++k)
+        if (row[k] >= 0)
+            atomic_and(fits + row[k], 0);
     int flag = clip_by_row(&cell, x, row, n, points);
     for (int k = 0; k < n && flag == 0; ++k)
         if (row[k] >= 0) {
@@ -199,13 +207,14 @@ kernel void clip_marked(const int size, global const int *listed, const int base
     store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags);
 }
 
-/* Per listed generator: put its new row in the place of the old one. */
+/* Per listed generator: put its new row in the place of the old one. It fits until a neighbour says otherwise. */
 kernel void place_clipped(const int size, global const int *listed, const int base, global int *places,
                           global int *marks, global int *fits)
 {
     WORK_ITEM(w);
     places[listed[w]] = base + w;
-    marks[listed[w]] = fits[listed[w]] = 0;
+    marks[listed[w]] = 0;
+    fits[listed[w]] = 1;
 }
 
 inline void mark_both(int i, int j, global int *marks)
@@ -229,20 +238,18 @@ kernel void check_clipped(const int size, global const int *listed, global const
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
     int n, m;
     global const int *row = face_row(&rows, i, &n);
-    if (n == 0)
-        return;
-    REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
     for (int k = 0; k < n; ++k) {
         const int j = row[k], a = row[k == 0 ? n - 1 : k - 1], b = row[k == n - 1 ? 0 : k + 1];
-        const REAL2 u = v;
-        v = corner(i, x, j, b, points, lower, upper);
         if (j < 0)
             continue;
-        const REAL2 d = face_direction(j, x, points);
         global const int *other = face_row(&rows, j, &m);
-        bool exact;
+        if (stands_between(i, b, a, other, m))
+            continue;
+        atomic_and(fits + i, 0);
         atomic_and(fits + j, 0);
-        if (!fits_neighbour(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper, &exact))
+        const REAL2 u = corner(i, x, a, j, points, lower, upper), v = corner(i, x, j, b, points, lower, upper);
+        const REAL2 d = face_direction(j, x, points);
+        if (!fits_neighbour(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
             mark_both(i, j, marks);
     }
     /* Whom the row from before names is told as well: he may still name i. */
@@ -251,17 +258,13 @@ kernel void check_clipped(const int size, global const int *listed, global const
         const int j = old_neighbours[k];
         if (j < 0)
             continue;
-        bool here = false, there = false;
-        for (int q = 0; q < n && !here; ++q)
-            here = row[q] == j;
-        if (here)
+        if (place_in_row(row, n, j) < n)
             continue;
         global const int *other = face_row(&rows, j, &m);
-        if (places[j] >= 0 && slot_counts[places[j]] < 0)
-            continue; /* it is doubtful itself: its faces will be matched with its neighbours' */
-        for (int q = 0; q < m && !there; ++q)
-            there = other[q] == i;
-        if (there)
+        if (place_in_row(other, m, i) == m)
+            continue;
+        atomic_and(fits + j, 0);
+        if (!is_doubtful_row(&rows, j)) /* else its faces will be matched with its neighbours' */
             mark_both(i, j, marks);
     }
 }

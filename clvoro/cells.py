@@ -229,14 +229,20 @@ class Cells:
         return t
 
     def complete(
-        self, rows: FaceRows, box: Box, points: cla.Array, previous: Tessellation
+        self,
+        rows: FaceRows,
+        box: Box,
+        points: cla.Array,
+        previous: Tessellation,
+        fits: cla.Array,
     ) -> Tessellation | None:
         """Return the diagram of `points` whose rows are those of `previous` or, where `rows` has a place, new ones.
 
-        None if they do not make a diagram.
+        None if they do not make a diagram. `fits` (n,) has 1 for rows of which every neighbour names the generator
+        between the right two; 0 is put where a face that rounding has made is left out.
         """
         n, old = previous.n, (previous.starts, previous.neighbours)
-        flags, _, m, starts = self._match(rows, box, points, n, *old, exact=False)
+        flags, _, m, starts = self._match(rows, box, points, n, *old, exact=False, fits=fits)
         if flags & ~DOUBT:
             return None
         return self._measure(rows, box, points, n, *old, starts, m, flags, exact=False)[0]
@@ -267,14 +273,15 @@ class Cells:
         old_starts: cla.Array,
         old_neighbours: cla.Array,
         exact: bool,
+        fits: cla.Array | None = None,
     ) -> tuple[int, int, int, cla.Array]:
         """Make the rows symmetric; return the flags, the first generator concerned, the faces and where rows start."""
         engine, starts = self.engine, self.engine.scratch(n + 1, np.int32)
         engine.run_each(
             self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, old_starts,
             old_neighbours, points, *box.device_corners(engine.real),
-            np.int32(old_starts is not rows.places), self._share(exact), rows.keep, starts,
-            rows.flags,
+            np.int32(fits is not None), self._share(exact), rows.places if fits is None else fits,
+            rows.keep, starts, rows.flags,
         )  # fmt: skip
         self._scan.exclusive(starts, starts, n)
         # The host reads all at once.

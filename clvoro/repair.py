@@ -75,13 +75,13 @@ class Repair:
             self._scan.exclusive(marks, sums, n)
             count = int(sums[n].get())
             if count == 0:
-                return cells.complete(rows, box, points, previous)
+                return cells.complete(rows, box, points, previous, self._fits)
             if base + count > most:
                 return None
             engine.run_each(k.list_marked, n, marks, sums, listed)
             engine.run_each(
                 k.clip_marked, count, listed, np.int32(base), rows.places, rows.slots,
-                rows.counts, *old, points, *corners, rows.flags,
+                rows.counts, *old, points, *corners, self._fits, rows.flags,
             )  # fmt: skip
             engine.run_each(
                 k.place_clipped, count, listed, np.int32(base), rows.places, marks,

@@ -12,9 +12,7 @@ inline bool fits_exactly(int i, global const int *row, int n, global const int *
     bool fit = true;
     for (int k = 0; k < n && fit; ++k) {
         const int other = starts[row[k]], m = starts[row[k] + 1] - other;
-        const int q = place_in_row(neighbours + other, m, i);
-        fit = q < m && neighbours[other + (q == 0 ? m - 1 : q - 1)] == row[k == n - 1 ? 0 : k + 1] &&
-              neighbours[other + (q == m - 1 ? 0 : q + 1)] == row[k == 0 ? n - 1 : k - 1];
+        fit = stands_between(i, row[k == n - 1 ? 0 : k + 1], row[k == 0 ? n - 1 : k - 1], neighbours + other, m);
     }
     return fit;
 }
