@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ._arrays import check_integer, check_number
 from .domain import Box, Domain
@@ -69,6 +69,10 @@ class Layers:
         if self.spacing is not None:
             check_number("Layers spacing", self.spacing, above=0)
         if self.edges is not None:
+            if not isinstance(self.edges, Iterable):
+                raise InputTypeError(
+                    f"Layers edges is {self.edges!r}, expected a sequence of integers"
+                )
             object.__setattr__(
                 self, "edges", tuple(check_integer("Layers edges", e, 0) for e in self.edges)
             )
@@ -147,7 +151,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
     kept = polygon.contains(points)
     walls_of_all = np.concatenate([chosen_segments(domain, layer) for layer in layers])
-    tree = shapely.STRtree(shapely.linestrings(walls_of_all))
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(walls_of_all)))
     _, nearest = tree.query_nearest(
         shapely.points(points[kept]), return_distance=True, all_matches=False
     )
@@ -155,7 +159,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     points, limit = points[kept], limit[kept]
     # Those nearest to the wall come first, in every chain; of two that are too near the later one goes.
     close = (
-        cKDTree(points).query_pairs(limit.max(), output_type="ndarray")
+        KDTree(points).query_pairs(limit.max(), output_type="ndarray")
         if len(points)
         else np.empty((0, 2), int)
     )
@@ -330,18 +334,19 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
         if not (corners[0] < corners[1]).all():
             raise InputError(_NO_ROOM)
         return _FreeBox(tuple(corners[0]), tuple(corners[1]), whole=domain)
+    polygon, _ = as_polygon(domain)
     strips = [
-        shapely.union_all(shapely.linestrings(chosen_segments(domain, layer)), axis=0).buffer(
+        shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer)))).buffer(
             distance
         )
         for layer, distance in zip(layers, distances, strict=True)
     ]
-    left = domain.geometry.difference(shapely.union_all(strips))
+    left = polygon.geometry.difference(shapely.union_all(strips))
     parts = [part for part in getattr(left, "geoms", [left]) if part.area > 1e-6 * domain.measure]
     if not parts:
         raise InputError(_NO_ROOM)
     inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
-    inner.framed_by = domain
+    inner.framed_by = polygon
     return inner
 
 
@@ -359,5 +364,5 @@ class _FreeBox(Box):
 
 def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
     """Return those of `points` (n, 2) that lie in the `free` domain, and not on one of `rows` (k, 2)."""
-    apart = free.contains(points) & (cKDTree(rows).query(points)[0] > 0)
+    apart = free.contains(points) & (KDTree(rows).query(points)[0] > 0)
     return points[apart]

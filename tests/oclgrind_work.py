@@ -112,6 +112,29 @@ def method(
     return work
 
 
+def in_many_launches(
+    work: Callable[[clvoro.Adapter], None],
+) -> Callable[[clvoro.Adapter], None]:
+    """Have iterations take their launches, as for large meshes, where one work-group would do it all alone."""
+
+    def launching(adapter: clvoro.Adapter) -> None:
+        modules = [
+            m
+            for k, m in sys.modules.items()
+            if k.startswith("clvoro.") and hasattr(m, "most_alone")
+        ]
+        alone = modules[0].most_alone
+        for module in modules:
+            module.most_alone = lambda engine: 0
+        try:
+            work(adapter)
+        finally:
+            for module in modules:
+                module.most_alone = alone
+
+    return launching
+
+
 def drop_faces(adapter: clvoro.Adapter) -> None:
     """Close rows that have lost faces, which roundings hardly ever bring about."""
     from clvoro.torus import Torus
@@ -160,8 +183,8 @@ def polygon(adapter: clvoro.Adapter) -> None:
             diagram = adapter.diagram(domain, x[domain.contains(x)][:n])
             assert abs(diagram.volumes.sum() - domain.measure) < 1e-3 * domain.measure
             assert len(diagram.vertices) > 3
-    adapter.run(domain, 0.25, method="exact", effort="fast", max_steps=12, seed=911)
-    layers = clvoro.Layers(0.05, count=2, edges=[0])
+    adapter.run(domain, 0.3, method="exact", effort="fast", max_steps=8, seed=911)
+    layers = clvoro.Layers(0.05, count=2, spacing=0.2, edges=[0])
     # As many steps as it takes until cells come and go, but not those of layers.
     adapter.run(
         domain, 0.4, layers=layers, method="exact", levels=0, effort="fast", max_steps=22, seed=911
@@ -334,12 +357,12 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,
-    "coupled": method("coupled", max_steps=2),
+    "coupled": in_many_launches(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
     "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
     "best": method("adaptive", levels=0, n_cells=320, effort="best", max_steps=31),
-    "exact": method("exact", levels=0, effort="fast", max_steps=75),
+    "exact": in_many_launches(method("exact", levels=0, effort="fast", max_steps=75)),
     "solid-run": method("exact", CUBE, SOLID, effort="fast", max_steps=14),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **{

@@ -136,6 +136,7 @@ def test_what_cannot_be_is_refused(make, words):
         (lambda: Layers(0.01, count=3, growth=1e200), InputError),
         (lambda: Layers(1e308, count=2, growth=1e308), InputError),
         (lambda: Layers(0.01, spacing=1e308), InputError),
+        (lambda: Layers(0.1, edges=3), InputTypeError),
         (lambda: 5, InputTypeError),
         (lambda: None, InputTypeError),
         (lambda: ["thin"], InputTypeError),
