@@ -1,5 +1,4 @@
 #include "common/corner.h"
-#include "common/graph.h"
 #include "common/measures.h"
 #include "common/widening.h"
 #if IN_LANES

@@ -309,8 +309,10 @@ class Cells:
         engine, corners = self.engine, box.device_corners(self.engine.real)
         self._reserve_faces(n, m)
         new, faces = self._views, self._of_faces
-        # The previous graph is read meanwhile, and stays if this call is broken off.
-        neighbours = engine.scratch(m, np.int32)
+        # The previous graph is read meanwhile, or stays if this call is broken off: unless no row is from there, and
+        # nothing can go wrong any more.
+        direct = old_starts is rows.places and not flags & DOUBT
+        neighbours = faces["neighbours"] if direct else engine.scratch(m, np.int32)
         engine.run(
             self._kernels.measure_cells, -(-n // self.lanes), np.int32(n), rows.places, rows.slots,
             rows.counts, old_starts, old_neighbours, rows.keep, starts, points, *corners,
@@ -326,9 +328,11 @@ class Cells:
             flags, generator, _ = self._read_flags()
             if flags & ~DOUBT:
                 return None, flags, generator
-        engine.run_each(
-            self._kernels.put_graph, n, starts, neighbours, new["starts"], faces["neighbours"]
-        )
+        copied = [(starts, new["starts"])]
+        if not direct:
+            copied.append((neighbours, faces["neighbours"]))
+        for array, to in copied:
+            cl.enqueue_copy(engine.queue, to.data, array.data, byte_count=array.nbytes)
         return Tessellation(n=n, points=points, **new, **faces), flags, generator
 
     def _share(self, exact: bool) -> np.floating:

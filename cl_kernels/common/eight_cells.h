@@ -3,56 +3,73 @@
 #include "common/eight_corners.h"
 #include "common/measures.h"
 
+#define FACE8 CLVORO_JOIN(FACE, 8)
+#define FACE16 CLVORO_JOIN(FACE, 16)
+#define CONVERT_FACE8 CLVORO_JOIN(convert_, FACE8)
+
+/* Do the bits in `words` keep all of n faces? */
+inline bool keeps_all(global const uint *words, int n)
+{
+    bool all = true;
+    for (; n > 0; n -= 32, ++words)
+        all &= *words == (n < 32 ? (1u << n) - 1 : ~0u);
+    return all;
+}
+
 /* Measure the cells of LANES generators from number `first` on. */
 inline void measure_eight(const measures_t *to, int first, int size, const face_rows_t *rows, global const uint *keep,
                           global const double *points, const double *lower, const double *upper)
 {
-    int faces[LANES][ROW_CAPACITY];
     double2 behind[(ROW_CAPACITY + 1) * LANES];
     double xs[LANES], ys[LANES];
-    long counts[LANES], inside[LANES];
+    long counts[LANES];
+    bool inside[LANES];
     int most = 0;
     for (int lane = 0; lane < LANES; ++lane) {
-        const int i = min(first + lane, size - 1);
-        const int place = rows->places[i];
-        global const uint *words = keep + max(place, 0) * KEEP_WORDS;
-        int listed, n = 0, least = INT_MAX;
-        global const int *row = face_row(rows, i, &listed);
-        behind[ROW_PLACE(0, lane)] = vload2(i, points);
-        for (int k = 0; k < listed; ++k) {
-            const int face = row[k];
-            const bool kept = place < 0 || ((words[k / 32] >> (k % 32)) & 1u);
-            faces[lane][n] = face;
-            behind[ROW_PLACE(n, lane)] = vload2(max(face, 0), points);
-            least = kept ? min(least, face) : least;
-            n += kept;
-        }
-        counts[lane] = n;
-        inside[lane] = n >= 3 && least >= 0 ? -1 : 0;
-        most = max(most, n);
+        const int i = min(first + lane, size - 1), place = rows->places[i];
+        int n;
+        face_row(rows, i, &n);
+        /* A row that has lost a face is left to `measure_cell`, too. */
+        counts[lane] = n >= 3 && (place < 0 || keeps_all(keep + place * KEEP_WORDS, n)) ? n : 0;
+        most = max(most, (int)counts[lane]);
         xs[lane] = points[2 * i];
         ys[lane] = points[2 * i + 1];
     }
-    /* Outlines of fewer faces begin again. */
-    for (int lane = 0; lane < LANES; ++lane)
-        for (int k = max((int)counts[lane], 1); k <= most; ++k)
-            behind[ROW_PLACE(k, lane)] = behind[ROW_PLACE(k - max((int)counts[lane], 1), lane)];
+    /* All rows are read and written as far as the longest, as counts that differ from lane to lane would be guessed
+       wrong: behind its last face each begins again, and stays there; what it leaves in the next lane's place is
+       overwritten. */
+    const int end = to->starts[min(first + LANES, size)];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const int i = min(first + lane, size - 1), n = counts[lane];
+        const int start = first + lane < size ? to->starts[i] : end;
+        int least = INT_MAX, listed;
+        global const int *row = face_row(rows, i, &listed);
+        for (int k = 0; k <= most; ++k) {
+            const int face = n > 0 ? row[k < n ? k : 0] : -1;
+            least = min(least, face);
+            behind[ROW_PLACE(k, lane)] = vload2(max(face, 0), points);
+            if (start + k < end)
+                to->neighbours[start + k] = face;
+        }
+        inside[lane] = least >= 0;
+    }
     outlines_t corners;
     find_corners(&corners, behind, most, vload8(0, xs), vload8(0, ys));
 
-    outlines_t middles;
-    double8 lengths[ROW_CAPACITY];
+    FACE8 lengths[ROW_CAPACITY];
+    FACE16 middles[ROW_CAPACITY];
     double8 area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
     const long8 ends = vload8(0, counts), last = max(ends - 1, (long8)(0));
     double8 vx = pick(corners.x, last), vy = pick(corners.y, last);
     for (int k = 0; k < most; ++k) {
-        const double8 wx = corners.x[k], wy = corners.y[k];
+        const long8 here = k < ends;
+        const double8 wx = here ? corners.x[k] : 0, wy = here ? corners.y[k] : 0;
         const double8 ex = wx - vx, ey = wy - vy, sx = vx + wx, sy = vy + wy;
-        lengths[k] = sqrt(ex * ex + ey * ey);
-        middles.x[k] = sx / 2;
-        middles.y[k] = sy / 2;
+        lengths[k] = CONVERT_FACE8(sqrt(ex * ex + ey * ey));
+        middles[k].even = CONVERT_FACE8(sx / 2);
+        middles[k].odd = CONVERT_FACE8(sy / 2);
         /* As `add_triangle` has it. */
-        const double8 cross = k < ends ? cross8(vx, wy, vy, wx) : 0;
+        const double8 cross = here ? cross8(vx, wy, vy, wx) : 0;
         area += cross;
         cx += cross * sx;
         cy += cross * sy;
@@ -75,12 +92,15 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
     for (int lane = 0; lane < LANES && first + lane < size; ++lane) {
         const int i = first + lane, start = to->starts[i];
         if (!inside[lane]) {
-            measure_cell(to, i, faces[lane], counts[lane], points, lower, upper);
+            int faces[ROW_CAPACITY];
+            const int n = kept_faces(faces, rows, keep, i);
+            measure_cell(to, i, faces, n, points, lower, upper);
             continue;
         }
-        for (int k = 0; k < counts[lane]; ++k)
-            put_face(to, start + k, faces[lane][k], LANE((const double *)lengths, k, lane),
-                     LANE((const double *)middles.x, k, lane), LANE((const double *)middles.y, k, lane));
+        for (int k = 0; k < min(most, end - start); ++k) {
+            to->face_measures[start + k] = LANE((const FACE *)lengths, k, lane);
+            vstore2(vload2(k * LANES + lane, (const FACE *)middles), start + k, to->face_centroids);
+        }
         to->volumes[i] = LANE(results, 0, lane);
         for (int a = 0; a < 2; ++a)
             to->offsets[2 * i + a] = LANE(results, 1 + a, lane);
