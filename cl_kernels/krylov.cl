@@ -3,18 +3,23 @@
        u = M^-1 r    gamma = (r, u)    beta = gamma / gamma_old    p = u + beta p
        q = A p       alpha = gamma / (p, q)    x += alpha p    r -= alpha q
 
-   A work-group owns a block of the vectors and leaves one partial sum per quantity; in the next kernel all groups add the
-   same partial sums, so the scalars never leave the device and no kernel of one work-item is needed.
-   Vectors are scaled by a power of two to max |b| ~ 1, lest squares of a small right side underflow. Those of the iteration are
-   in STORE, which may be single where REAL is double: memory traffic is the cost. Solution, right side and sums are in REAL.
+   A work-group owns a block of the vectors and leaves one partial sum per quantity; in the next kernel all groups add
+   the same partial sums, so the scalars never leave the device and no kernel of one work-item is needed. Vectors are
+   scaled by a power of two to max |b| ~ 1, lest squares of a small right side underflow. Those of the iteration are in
+   STORE, which may be single where REAL is double: memory traffic is the cost. Solution, right side and sums are in
+   REAL.
 
-   With `centre` the null space is the constants: whatever rounding puts into the mean of r is taken out one iteration later,
-   or the residual could not fall below it.
+   With `centre` the null space is the constants: whatever rounding puts into the mean of r is taken out one iteration
+   later, or the residual could not fall below it.
 
-   partial: 11 rows of one value per group, see the names below; residual norms and gammas and sums of r alternate between two rows. */
+   partial: 11 rows of one value per group, see the names below; residual norms and gammas and sums of r alternate
+   between two rows.
+
+   Each step is a kernel; with Jacobi's preconditioner and few unknowns one group takes them all alone. */
 #include "common/real.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
+#include "common/rows.h"
 
 #if IS_DOUBLE
 #define EXPONENT_LIMIT (DBL_MAX_EXP - 4)
@@ -22,14 +27,14 @@
 #define EXPONENT_LIMIT (FLT_MAX_EXP - 4)
 #endif
 
-#define ROW(q) (partial + (q) * get_num_groups(0))
+#define ROW(q) (partial + (q)*get_num_groups(0))
 #define SUM_B 0
 #define MAX_B 1
 #define NORM_B 2
 #define CURVATURE 3
-#define NORM_R(k) (4 + ((k) & 1))
-#define GAMMA(k) (6 + ((k) & 1))
-#define SUM_R(k) (8 + ((k) & 1))
+#define NORM_R(k) (4 + ((k)&1))
+#define GAMMA(k) (6 + ((k)&1))
+#define SUM_R(k) (8 + ((k)&1))
 #define START 10
 
 /* One row of the record per iteration. */
@@ -38,17 +43,17 @@
 #define RECORD_RUNNING 2
 #define RECORD_CURVATURE 3
 
-#define PUT(q, sum)                                              \
-    {                                                            \
-        const REAL put_ = group_sum((sum), scratch);             \
-        if (get_local_id(0) == 0) ROW(q)[get_group_id(0)] = put_; \
+#define PUT(q, sum)                                                                                                    \
+    {                                                                                                                  \
+        const REAL put_ = group_sum((sum), scratch);                                                                   \
+        if (get_local_id(0) == 0)                                                                                      \
+            ROW(q)[get_group_id(0)] = put_;                                                                            \
     }
 
 /* What is needed to centre and scale r = b - w (b, where the start is `zero`). */
-kernel void residual(
-    int n, int zero, global const REAL *b, global const STORE *w, global REAL *partial)
+inline void add_residual(int n, int zero, global const REAL *b, global const STORE *w, global REAL *partial,
+                         local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
     Sum sum_b = SUM_ZERO, sum_r = SUM_ZERO;
     REAL max_b = 0;
     for (BLOCK_LOOP(i, n)) {
@@ -60,16 +65,22 @@ kernel void residual(
     PUT(SUM_B, sum_b.value);
     PUT(START, sum_r.value);
     max_b = group_max(max_b, scratch);
-    if (get_local_id(0) == 0) ROW(MAX_B)[get_group_id(0)] = max_b;
+    if (get_local_id(0) == 0)
+        ROW(MAX_B)[get_group_id(0)] = max_b;
 }
 
-/* r = 2^e (r - mean r) if `centre`, else 2^e r; norms of r and of the right side treated alike; p = 0, and x where it starts from `zero`.
-   state[1] = 2^-e, state[2] = the part of the squared norm of b that was taken away. */
-kernel void begin(
-    int n, int zero, int centre, global const REAL *b, global const STORE *w, global REAL *x, global STORE *r, global STORE *p,
-    global REAL *partial, global REAL *state)
+kernel void residual(int n, int zero, global const REAL *b, global const STORE *w, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
+    add_residual(n, zero, b, w, partial, scratch);
+}
+
+/* r = 2^e (r - mean r) if `centre`, else 2^e r; norms of r and of the right side treated alike; p = 0, and x where it
+   starts from `zero`. state[1] = 2^-e, state[2] = the part of the squared norm of b that was taken away. */
+inline void set_residual(int n, int zero, int centre, global const REAL *b, global const STORE *w, global REAL *x,
+                         global STORE *r, global STORE *p, global REAL *partial, global REAL *state,
+                         local REAL *scratch)
+{
     const REAL mean_b = centre ? total_sum(ROW(SUM_B), scratch) / n : 0;
     const REAL mean_r = centre ? total_sum(ROW(START), scratch) / n : 0;
     const REAL max_b = total_max(ROW(MAX_B), scratch);
@@ -80,7 +91,8 @@ kernel void begin(
         const STORE ri = ldexp((zero ? b[i] : b[i] - w[i]) - mean_r, exponent);
         r[i] = ri;
         p[i] = 0;
-        if (zero) x[i] = 0;
+        if (zero)
+            x[i] = 0;
         sum_add(&norm_b, bi * bi);
         sum_add(&norm_r, (REAL)ri * ri);
         sum_add(&sum_r, ri);
@@ -93,6 +105,13 @@ kernel void begin(
         state[1] = ldexp(R(1), -exponent);
         state[2] = n * taken * taken;
     }
+}
+
+kernel void begin(int n, int zero, int centre, global const REAL *b, global const STORE *w, global REAL *x,
+                  global STORE *r, global STORE *p, global REAL *partial, global REAL *state)
+{
+    local REAL scratch[GROUP_SIZE];
+    set_residual(n, zero, centre, b, w, x, r, p, partial, state, scratch);
 }
 
 /* One group: state[4], state[5] = the squared norms of b and r, for the host to read. */
@@ -113,10 +132,9 @@ kernel void sum_norms(global const REAL *partial, global REAL *state, const int 
 }
 
 /* u = D^-1 r and gamma: Jacobi's method, for the first iteration. */
-kernel void jacobi(
-    int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u, global REAL *partial)
+inline void precondition(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
+                         global REAL *partial, local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
     Sum gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
         const STORE ui = inverse_diagonal[i] * r[i];
@@ -126,22 +144,28 @@ kernel void jacobi(
     PUT(GAMMA(0), gamma.value);
 }
 
+kernel void jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
+                   global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    precondition(n, inverse_diagonal, r, u, partial, scratch);
+}
+
 /* partial row q = (a, b). */
 kernel void dot_product(int n, int q, global const STORE *a, global const STORE *b, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) sum_add(&sum, (REAL)a[i] * b[i]);
+    for (BLOCK_LOOP(i, n))
+        sum_add(&sum, (REAL)a[i] * b[i]);
     PUT(q, sum.value);
 }
 
 /* p = u + beta p. From the iteration on that finds the residual at its target (or anything out of order, NaN included)
    record[k].running is 0 and nothing changes any more, so that the host may run ahead without changing the result. */
-kernel void direction(
-    int k, int n, REAL tolerance, global const STORE *u, global STORE *p, global const REAL *partial, global REAL *state,
-    global REAL *record)
+inline void turn(int k, int n, REAL tolerance, global const STORE *u, global STORE *p, global const REAL *partial,
+                 global REAL *state, global REAL *record, local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
     const int first = get_global_id(0) == 0;
     global REAL *now = record + 4 * k;
     global const REAL *last = now - 4;
@@ -150,21 +174,30 @@ kernel void direction(
     const REAL norm_b = total_sum(ROW(NORM_B), scratch);
     const REAL target = k > 0 ? state[0] : tolerance * tolerance * norm_b;
     const int running = !over && norm > target && norm <= REAL_MAX && gamma > 0;
-    if (first) now[RECORD_RUNNING] = running;
+    if (first)
+        now[RECORD_RUNNING] = running;
     if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
-        if (k == 0) state[3] = target;
+        if (k == 0)
+            state[3] = target;
     }
-    if (!running) return;
     const REAL beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
-    for (BLOCK_LOOP(i, n)) p[i] = u[i] + beta * p[i];
+    const int end = running ? n : 0;
+    for (BLOCK_LOOP(i, end))
+        p[i] = u[i] + beta * p[i];
+}
+
+kernel void direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p, global const REAL *partial,
+                      global REAL *state, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    turn(k, n, tolerance, u, p, partial, state, record, scratch);
 }
 
 /* x += alpha p, r -= alpha q. */
-kernel void update(
-    int k, int n, int centre, global const STORE *p, global const STORE *q, global REAL *x, global STORE *r,
-    global REAL *partial, global REAL *state, global REAL *record)
+kernel void update(int k, int n, int centre, global const STORE *p, global const STORE *q, global REAL *x,
+                   global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
@@ -172,7 +205,8 @@ kernel void update(
     const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
     if (running && get_global_id(0) == 0) {
         now[RECORD_CURVATURE] = curvature;
-        if (k == 0) state[0] = state[3];
+        if (k == 0)
+            state[0] = state[3];
     }
     const int end = running && curvature > 0 ? n : 0;
     const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
@@ -189,17 +223,17 @@ kernel void update(
 }
 
 /* The same with u = D^-1 r and gamma for the next iteration. */
-kernel void update_jacobi(
-    int k, int n, int centre, global const STORE *inverse_diagonal, global const STORE *p, global const STORE *q,
-    global REAL *x, global STORE *r, global STORE *u, global REAL *partial, global REAL *state, global REAL *record)
+inline void advance(int k, int n, int centre, global const STORE *inverse_diagonal, global const STORE *p,
+                    global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
+                    global REAL *state, global REAL *record, local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
     if (running && get_global_id(0) == 0) {
         now[RECORD_CURVATURE] = curvature;
-        if (k == 0) state[0] = state[3];
+        if (k == 0)
+            state[0] = state[3];
     }
     const int end = running && curvature > 0 ? n : 0;
     const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
@@ -218,12 +252,21 @@ kernel void update_jacobi(
     PUT(GAMMA(k + 1), gamma.value);
 }
 
+kernel void update_jacobi(int k, int n, int centre, global const STORE *inverse_diagonal, global const STORE *p,
+                          global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
+                          global REAL *state, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    advance(k, n, centre, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+}
+
 /* Leave the partial sums of x, then (next kernel) take its mean away. */
 kernel void add_up(int n, global const REAL *x, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, n)) sum_add(&sum, x[i]);
+    for (BLOCK_LOOP(i, n))
+        sum_add(&sum, x[i]);
     PUT(SUM_B, sum.value);
 }
 
@@ -231,5 +274,65 @@ kernel void remove_mean(int n, global REAL *x, global const REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     const REAL mean = total_sum(ROW(SUM_B), scratch) / n;
-    for (BLOCK_LOOP(i, n)) x[i] -= mean;
+    for (BLOCK_LOOP(i, n))
+        x[i] -= mean;
+}
+
+/* One group, where unknowns are few: all of it for A of rows (see common/rows.h) and Jacobi's preconditioner. It begins
+   by taking the residual from x, and goes on if that is above `enough` and not above `most` of b; b without its mean is
+   nothing if that leaves no more than rounding. The record is behind the state. */
+#define STATE 8
+kernel void solve_alone(int n, int zero, int centre, int turns, REAL tolerance, REAL enough, REAL most,
+                        global const int *starts, global const int *columns, global const STORE *weights,
+                        global const STORE *inverse_diagonal, global const REAL *b, global REAL *x, global STORE *r,
+                        global STORE *u, global STORE *p, global STORE *q, global REAL *partial, global REAL *state)
+{
+    local REAL scratch[GROUP_SIZE];
+    global REAL *record = state + STATE;
+    const int begun = zero ? 0 : n;
+    for (BLOCK_LOOP(i, begun)) {
+        REAL sum = 0;
+        for (int k = starts[i]; k < starts[i + 1]; ++k)
+            if (columns[k] >= 0)
+                sum += weights[k] * (x[i] - x[columns[k]]);
+        q[i] = sum;
+    }
+    add_residual(n, zero, b, q, partial, scratch);
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    set_residual(n, zero, centre, b, q, x, r, p, partial, state, scratch);
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    const REAL norm_b = partial[NORM_B], norm_r = partial[NORM_R(0)], least = 8 * REAL_EPS;
+    bool running = turns > 0 && norm_b > least * least * state[2] && norm_r > enough * enough * norm_b &&
+                   norm_r <= most * most * norm_b;
+    if (get_local_id(0) == 0) {
+        state[4] = norm_b;
+        state[5] = norm_r;
+        record[RECORD_RUNNING] = 0;
+        record[RECORD_NORM] = norm_r;
+    }
+    precondition(running ? n : 0, inverse_diagonal, r, u, partial, scratch);
+    for (int k = 0; running; ++k) {
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        turn(k, n, tolerance, u, p, partial, state, record, scratch);
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        const int end = record[4 * k + RECORD_RUNNING] != 0 ? n : 0;
+        Sum product = SUM_ZERO;
+        for (BLOCK_LOOP(i, end)) {
+            const STORE qi = row_difference(i, n, starts, columns, weights, p);
+            q[i] = qi;
+            sum_add(&product, (REAL)p[i] * qi);
+        }
+        PUT(CURVATURE, product.value);
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        advance(k, n, centre, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+        running = end > 0 && partial[CURVATURE] > 0 && k + 1 < turns;
+    }
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    const int centred = centre ? n : 0;
+    Sum sum = SUM_ZERO;
+    for (BLOCK_LOOP(i, centred))
+        sum_add(&sum, x[i]);
+    const REAL mean = group_sum(sum.value, scratch) / n;
+    for (BLOCK_LOOP(j, centred))
+        x[j] -= mean;
 }

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.array as cla
 
-from ._program import Engine, Kernels, bind
+from ._launch import Launch, most_alone
+from ._program import Engine, Kernels
 from ._workspace import framed
 from .errors import SolverError
 
@@ -20,6 +20,9 @@ Precondition = Callable[[cla.Array, cla.Array, cla.Array], object]
 # Rows of the array of partial sums, and columns of the record: as in cl_kernels/krylov.cl.
 CURVATURE, _GAMMA, _ROWS = 3, 6, 11
 _NORM, _RUNNING, _CURVATURE = 0, 2, 3
+_STATE = 8
+_FIRST_READ = 32
+"""Iterations whose record is read together with the state that `solve_alone` leaves."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,8 @@ class ConjugateGradient:
         """Partial sums; a fused operator leaves those of (x, A x) in row `CURVATURE`."""
         self._state = engine.zeros(6)
         self._record_capacity = 0
+        self._alone = engine.zeros(_STATE + 4)
+        self._most_alone = most_alone(engine)
 
     def _kernels_in(self, store: np.dtype) -> Kernels:
         if store not in self._kernels:
@@ -106,6 +111,7 @@ class ConjugateGradient:
         from_zero: bool = False,
         verify: bool = True,
         store: np.dtype | None = None,
+        rows: tuple[cla.Array, ...] | None = None,
     ) -> Solution:
         """Solve A x = b from the start `x`, in place.
 
@@ -134,6 +140,9 @@ class ConjugateGradient:
             Evaluate the true residual at the end; else trust the recurrence's that it is within the tolerance.
         store : numpy.dtype, optional
             Of the iteration's vectors: the engine's precision or, where few digits are asked for, float32.
+        rows : tuple of device arrays, optional
+            Starts, columns and weights (see cl_kernels/common/rows.h) where the operator has them: where unknowns are
+            few and the preconditioner is a diagonal, one work-group then solves alone.
 
         Returns
         -------
@@ -151,10 +160,15 @@ class ConjugateGradient:
         if max_iterations > self._record_capacity:
             self._record_capacity = max_iterations
             self._record = self.engine.zeros(4 * max_iterations)
+            self._alone = self.engine.zeros(_STATE + 4 * (max_iterations + 1))
+        diagonal = isinstance(precondition, cla.Array)
+        if rows is not None and diagonal and n <= self._most_alone:
+            return self._solve_alone(
+                store, rows, rhs, x, precondition, tolerance, max_iterations, centre, from_zero, verify
+            )  # fmt: skip
         kernels, launch = self._kernels_in(store), self.engine.run_blocks
         r, u, p, q = (self.engine.scratch(n, store) for _ in range(4))
         size, zero, mean = np.int32(n), np.int32(0), np.int32(centre)
-        diagonal = isinstance(precondition, cla.Array)
         # The recurrence stops a little lower, so that the true residual is within the tolerance.
         limit = self.engine.real.type(0.95 * tolerance)
         tail = (self.partial, self._state, self._record)
@@ -190,17 +204,7 @@ class ConjugateGradient:
                 kernels.sum_norms, self.engine.group_size, self.partial, self._state,
                 np.int32(self.engine.groups), group=self.engine.group_size,
             )  # fmt: skip
-            taken, _, norm_b, norm_r = (float(v) for v in self._state.get()[2:])
-            if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
-                raise SolverError(
-                    f"the linear solve got a right side, start or operator that is not finite: "
-                    f"|b|^2 = {norm_b}, |b - A x|^2 = {norm_r} after scaling; check the input"
-                )
-            # What is left of a constant right side is rounding.
-            if norm_b <= (8 * np.finfo(self.engine.real).eps) ** 2 * taken:
-                return -1.0
-            self._norm_b = norm_b
-            return math.sqrt(norm_r / norm_b)
+            return self._relate(*self._state.get()[2:])
 
         def iterate(k: int) -> None:
             if not diagonal:
@@ -243,6 +247,65 @@ class ConjugateGradient:
         residuals = np.array([*history, residual])
         return Solution(iterations, residual, residuals, residual <= tolerance, reason)
 
+    def _solve_alone(
+        self,
+        store: np.dtype,
+        rows: tuple[cla.Array, ...],
+        rhs: cla.Array,
+        x: cla.Array,
+        inverse_diagonal: cla.Array,
+        tolerance: float,
+        max_iterations: int,
+        centre: bool,
+        from_zero: bool,
+        verify: bool,
+    ) -> Solution:
+        """Have one work-group solve, in a launch for each time that the recurrence is begun."""
+        engine, real, n = self.engine, self.engine.real.type, len(rhs)
+        vectors = (engine.scratch(n, store) for _ in range(4))
+        given = (*rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._alone)
+        kernel, done, history, most = self._kernels_in(store).solve_alone, 0, [], math.inf
+        while True:
+            left = max_iterations - done
+            Launch(
+                engine, kernel, np.int32(n), np.int32(from_zero), np.int32(centre),
+                np.int32(left), real(0.95 * tolerance), real(tolerance),
+                real(min(most, float(np.finfo(real).max))), *given, groups=1,
+            )()  # fmt: skip
+            host = self._alone[: _STATE + 4 * min(left, _FIRST_READ)].get()
+            residual = self._relate(*host[2:6])
+            if residual < 0:
+                x.fill(0)
+                return Solution(0, 0.0, np.zeros(1), True, "zero right side")
+            converged = residual <= tolerance
+            if converged or left == 0 or residual > most:
+                reason = "converged" if converged else "stagnated" if left else "max_iterations"
+                break
+            taken = self._follow(host[_STATE:], 0, tolerance, history)
+            if taken is None and left > _FIRST_READ:
+                host = self._alone[_STATE : _STATE + 4 * left].get()
+                taken = self._follow(host[4 * _FIRST_READ :], _FIRST_READ, tolerance, history)
+            done += left if taken is None else taken
+            if not verify and self._left <= tolerance:
+                residual, converged, reason = self._left, True, "converged"
+                break
+            # As in `solve`.
+            from_zero, most = False, max(tolerance, 0.5 * residual)
+        return Solution(done, residual, np.array([*history, residual]), converged, reason)
+
+    def _relate(self, taken: float, _: float, norm_b: float, norm_r: float) -> float:
+        """Return the relative residual by the state of the device; negative: b is zero."""
+        if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
+            raise SolverError(
+                f"the linear solve got a right side, start or operator that is not finite: "
+                f"|b|^2 = {norm_b}, |b - A x|^2 = {norm_r} after scaling; check the input"
+            )
+        # What is left of a constant right side is rounding.
+        if norm_b <= (8 * np.finfo(self.engine.real).eps) ** 2 * taken:
+            return -1.0
+        self._norm_b = float(norm_b)
+        return math.sqrt(norm_r / norm_b)
+
     def _cycle(
         self,
         iterate: Callable[[int], None],
@@ -254,24 +317,33 @@ class ConjugateGradient:
     ) -> int:
         """Iterate from the residual in place until it stops, or `most` times; return how often."""
         done, ahead, first = 0, min(8, lookahead), residual
-        self._left = math.inf
         while done < most:
             end = min(done + ahead, most)
             for k in range(done, end):
                 iterate(k)
-            rows = self._record[4 * done : 4 * end].get().reshape(-1, 4).astype(np.float64)
-            for k, row in enumerate(rows, start=done):
-                residual = math.sqrt(row[_NORM] / self._norm_b)
-                if row[_RUNNING] == 0 or not row[_CURVATURE] > 0:
-                    self._left = residual
-                    self._judge(k, row, residual, tolerance, history)
-                    return k
-                history.append(residual)
+            stop = self._follow(self._record[4 * done : 4 * end].get(), done, tolerance, history)
+            if stop is not None:
+                return stop
+            residual = history[-1]
             done = end
             rate = math.log(first / residual) / done if residual < first else 0.0
             left = math.log(residual / tolerance) / rate if rate > 0 else lookahead
             ahead = min(max(math.ceil(left), 1), lookahead)
         return done
+
+    def _follow(
+        self, record: np.ndarray, begin: int, tolerance: float, history: list[float]
+    ) -> int | None:
+        """Take over the record from iteration `begin` on; return the iteration that stopped, if one did."""
+        self._left = math.inf
+        for k, row in enumerate(record.reshape(-1, 4).astype(np.float64), start=begin):
+            residual = math.sqrt(row[_NORM] / self._norm_b)
+            if row[_RUNNING] == 0 or not row[_CURVATURE] > 0:
+                self._left = residual
+                self._judge(k, row, residual, tolerance, history)
+                return k
+            history.append(residual)
+        return None
 
     def _judge(
         self, k: int, row: np.ndarray, residual: float, tolerance: float, history: list[float]
@@ -290,38 +362,3 @@ class ConjugateGradient:
             "positive definite",
             [*history, residual],
         )
-
-
-def most_alone(engine: Engine) -> int:
-    """Return up to how many unknowns one work-group is through an iteration before others could be of help.
-
-    On a CPU the launches of an iteration cost some 20 us, as much as a core takes for 500 unknowns; with two cores at
-    work, half of the unknowns would be its own in any case.
-    """
-    return 2000 if engine.group_size == 1 else 4 * engine.group_size
-
-
-class Launch:
-    """A block-wise kernel with its arguments set: calling it costs no more than the enqueueing.
-
-    It is enqueued over as many `groups`, by default the engine's. The kernel must not be used elsewhere meanwhile, as
-    it has but one set of arguments.
-    """
-
-    def __init__(
-        self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None
-    ) -> None:
-        self._args = bind(kernel, args)
-        self._kernel = kernel
-        self._queue = engine.queue
-        self._size = ((engine.groups if groups is None else groups) * engine.group_size,)
-        self._group = (engine.group_size,)
-
-    def set_first(self, value: int) -> None:
-        """Set the kernel's first argument, an int."""
-        self._args[0] = np.int32(value)
-        bind(self._kernel, self._args)
-
-    def __call__(self) -> None:
-        """Enqueue the kernel."""
-        cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, self._group)

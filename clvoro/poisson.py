@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
+from ._launch import Launch
 from ._program import Engine, Kernels
 from .errors import InputError
 from .krylov import (
     CURVATURE,
     BreakdownError,
     ConjugateGradient,
-    Launch,
     Precondition,
     Solution,
 )
@@ -294,6 +294,7 @@ class Poisson:
                 from_zero=from_zero,
                 verify=tolerance < ROUGH,
                 store=laplacian.weights.dtype,
+                rows=(laplacian.starts, laplacian.neighbours, laplacian.weights),
             )
 
         def run_jacobi(most: int) -> Solution:

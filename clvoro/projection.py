@@ -10,11 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pyopencl.array as cla
 
+from ._launch import Launch, most_alone
 from ._program import Engine
 from ._workspace import framed
 from .cells import Tessellation
 from .errors import SolverError
-from .krylov import Launch, Solution, most_alone
+from .krylov import Solution
 
 SINGLE = 1e-4
 """Tolerance from which on the iteration's vectors are in single precision."""

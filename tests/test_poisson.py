@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 
-from clvoro import create_context
+from clvoro import create_context, krylov
 from clvoro._program import Engine
 from clvoro.errors import InputError, SolverError
 from clvoro.krylov import ConjugateGradient
@@ -16,12 +16,14 @@ from clvoro.poisson import Poisson, expected_costs
 REALS = [np.float64, np.float32]
 
 
-@pytest.fixture(scope="module")
-def make():
-    """Engines of the default device, by dimension and precision."""
+@pytest.fixture(scope="module", params=[0, 3000], ids=["launches", "alone"])
+def make(request):
+    """Engines of the default device, by dimension and precision; one group solves alone, or none does."""
     ctx = create_context()
     queue = cl.CommandQueue(ctx)
-    return lambda dim=2, real=np.float64: Engine(ctx, queue, dim, np.dtype(real))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(krylov, "most_alone", lambda engine: request.param)
+        yield lambda dim=2, real=np.float64: Engine(ctx, queue, dim, np.dtype(real))
 
 
 def assembled(engine, graph, density=None, tolerance=0.0):
@@ -315,6 +317,33 @@ def test_result_does_not_depend_on_when_the_host_looks(make):
         results.append((solution.iterations, x.get()))
     assert len({iterations for iterations, _ in results}) == 1
     assert all(np.array_equal(x, results[0][1]) for _, x in results)
+
+
+@pytest.mark.parametrize(
+    ("n", "group_size"),
+    [
+        (1500, None),
+        pytest.param(15, 4, marks=pytest.mark.slow),
+    ],  # barriers in loops take long to compile
+    ids=["cpu", "gpu"],
+)
+def test_group_alone(n, group_size, monkeypatch):
+    """It does what many launches do, but for the order of sums; also of many work-items."""
+    ctx, results = create_context(), []
+    b = np.random.default_rng(59).standard_normal(n)
+    for few in (0, n):
+        monkeypatch.setattr(krylov, "most_alone", lambda engine, few=few: few)
+        engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
+        if group_size is not None:
+            object.__setattr__(engine, "group_size", group_size)
+        poisson, laplacian = assembled(engine, graphs.random_graph(n, seed=58))
+        x = engine.zeros(n)
+        solution = poisson.solve(laplacian, engine.upload(b), x, preconditioner="jacobi")
+        assert solution.converged
+        results.append((solution, x.get()))
+    (one, x), (other, y) = results
+    assert abs(one.iterations - other.iterations) <= 2
+    assert np.abs(x - y).max() <= 1e-7 * np.abs(x).max()
 
 
 def test_callable_preconditioner(make):
