@@ -76,7 +76,7 @@ def test_launches_of_every_kind_are_seen(run):
     assert calls["cells", "measure_cells"] >= tessellations
     assert calls["motion", "move_generators"] == 5
     # The solver enqueues its kernels itself: one a solve, or two, where cells are so few.
-    assert 5 <= calls["krylov", "solve_alone"] <= 10
+    assert tessellations <= calls["krylov", "solve_alone"] <= 2 * tessellations
     assert ("poisson", "apply") not in calls
     assert calls[_hooks.MEMORY, "read"] > 0
     assert calls[_hooks.MEMORY, "write"] > 0
