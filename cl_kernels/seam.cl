@@ -47,14 +47,16 @@ inline int block_place(int a, int side, int first, int second)
     return (2 * a + side) * (DIM == 2 ? BLOCKS : BLOCKS * BLOCKS) + along;
 }
 
-/* The image y of x that has the code; is it within the margins? */
-inline bool make_image(const REAL *x, int code, global const float *margins, REAL4 lower, REAL4 edge, REAL *y)
+/* The image y of x that has the code; is it within the margins? widest are the largest along each axis, as bits. */
+inline bool make_image(const REAL *x, int code, global const float *margins, global const int *widest, REAL4 lower,
+                       REAL4 edge, REAL *y)
 {
     EACH_AXIS(a)
     {
-        y[a] = x[a] + step_of(code, a) * PERIOD(a);
-        if (step_of(code, a) != 0 && !(PERIOD(a) > 0))
-            return false;
+        const int step = step_of(code, a);
+        y[a] = x[a] + step * PERIOD(a);
+        if (step != 0 && !(PERIOD(a) > 0 && (step < 0 ? -y[a] : y[a] - PERIOD(a)) <= as_float(widest[a])))
+            return false; /* as most are */
     }
     EACH_AXIS(a)
     {
@@ -71,9 +73,9 @@ inline bool make_image(const REAL *x, int code, global const float *margins, REA
 }
 
 /* Per block: the margin that images are taken from next. needed is what cells needed, there and in the blocks around
-   it, as cells move; it grows by `factor`. With `grow`, to no less than before. widest[a] collects the largest along
-   axis a, as bits of a float, which are in the order of floats >= 0. */
-kernel void next_margins(const int size, global const float *needed, const float factor, const int grow,
+   it, as cells move; it is to be `factor` times as wide, and no less than the share `keep` of what it was. widest[a]
+   collects the largest along axis a, as bits of a float, which are in the order of floats >= 0. */
+kernel void next_margins(const int size, global const float *needed, const float factor, const float keep,
                          global float *margins, global int *widest)
 {
     WORK_ITEM(k);
@@ -85,8 +87,7 @@ kernel void next_margins(const int size, global const float *needed, const float
     for (int i = max(first - 1, 0); i <= min(first + 1, BLOCKS - 1); ++i)
         for (int j = max(second - 1, 0); j <= min(second + 1, DIM == 2 ? 0 : BLOCKS - 1); ++j)
             margin = fmax(margin, factor * needed[block_place(seam / 2, seam % 2, i, j)]);
-    if (grow)
-        margin = fmax(margin, margins[k]);
+    margin = fmax(margin, keep * fmin(margins[k], (float)period));
     if (margin > 0.99f * (float)period)
         margin = WHOLE; /* at least as deep as any image, whatever rounds */
     margins[k] = margin;
@@ -95,8 +96,8 @@ kernel void next_margins(const int size, global const float *needed, const float
 }
 
 /* Per generator i: how many images it has. */
-kernel void count_images(const int size, global const REAL *points, global const float *margins, const REAL4 lower,
-                         const REAL4 edge, global int *counts)
+kernel void count_images(const int size, global const REAL *points, global const float *margins,
+                         global const int *widest, const REAL4 lower, const REAL4 edge, global int *counts)
 {
     WORK_ITEM(i);
     REAL x[DIM], y[DIM];
@@ -104,15 +105,15 @@ kernel void count_images(const int size, global const REAL *points, global const
     x[a] = points[DIM * i + a];
     int count = 0;
     for (int code = 0; code < CODES; ++code)
-        count += code != CENTRE && make_image(x, code, margins, lower, edge, y);
+        count += code != CENTRE && make_image(x, code, margins, widest, lower, edge, y);
     counts[i] = count;
 }
 
 /* Per generator i: its row of `extended`, and those of its images behind row n, in the order of owners and codes,
    whatever the margins; firsts are the prefix sums of the counts. */
-kernel void place_images(const int size, global const REAL *points, global const float *margins, const REAL4 lower,
-                         const REAL4 edge, global const int *firsts, global REAL *extended, global int *owners,
-                         global int *codes)
+kernel void place_images(const int size, global const REAL *points, global const float *margins,
+                         global const int *widest, const REAL4 lower, const REAL4 edge, global const int *firsts,
+                         global REAL *extended, global int *owners, global int *codes)
 {
     WORK_ITEM(i);
     REAL x[DIM], y[DIM];
@@ -120,7 +121,7 @@ kernel void place_images(const int size, global const REAL *points, global const
     extended[DIM * i + a] = x[a] = points[DIM * i + a];
     int g = firsts[i];
     for (int code = 0; code < CODES; ++code)
-        if (code != CENTRE && make_image(x, code, margins, lower, edge, y)) {
+        if (code != CENTRE && make_image(x, code, margins, widest, lower, edge, y)) {
             EACH_AXIS(a)
             extended[DIM * (size + g) + a] = y[a];
             owners[g] = i;
@@ -259,8 +260,8 @@ kernel void close_rows(const int size, global const int *starts, global const uc
    owners, where they are nearest now, -1 for whom there is no image. Where to begin with the cells: nobody is relied
    on. */
 kernel void unfold_rows(const int size, global const int *starts, global const int *neighbours,
-                        global const REAL *points, global const float *margins, const REAL4 lower, const REAL4 edge,
-                        global const int *firsts, global int *unfolded)
+                        global const REAL *points, global const float *margins, global const int *widest,
+                        const REAL4 lower, const REAL4 edge, global const int *firsts, global int *unfolded)
 {
     WORK_ITEM(i);
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -278,10 +279,10 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
             }
             if (wanted == CENTRE) {
                 label = j;
-            } else if (make_image(x, wanted, margins, lower, edge, y)) {
+            } else if (make_image(x, wanted, margins, widest, lower, edge, y)) {
                 label = size + firsts[j];
                 for (int code = 0; code < wanted; ++code)
-                    label += code != CENTRE && make_image(x, code, margins, lower, edge, y);
+                    label += code != CENTRE && make_image(x, code, margins, widest, lower, edge, y);
             }
         }
         unfolded[k] = label;

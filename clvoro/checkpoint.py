@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .cells import Tessellation
+from .cells import Cells, Tessellation
 from .errors import InputError
 from .mesh import SUMMARIES, Mesh, Stages
 from .plans import Action, Step
@@ -37,6 +37,7 @@ _PER_FACE = ("neighbours", "face_measures", "face_centroids")
 _DIAGRAM = (
     "starts", "neighbours", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
 )  # fmt: skip
+_SEAMS = ("needed", "widths")
 _COUNTS = (
     "position",
     "level",
@@ -134,7 +135,8 @@ class Checkpointer:
         torus = mesh.tessellator.torus
         if torus is not None:
             # Within what images are taken: in 3D, sums of a cell depend on it in their last bits.
-            arrays["seam.needed"] = torus.margins.needed.get()
+            for name in _SEAMS:
+                arrays[f"seam.{name}"] = getattr(torus.margins, name).get()
         if loop.initial is not None:
             for field in dataclasses.fields(Displacements):
                 arrays[f"initial.{field.name}"] = getattr(loop.initial, field.name)
@@ -239,11 +241,12 @@ class Saved:
 
     def _check_seams(self, d: int) -> None:
         """Check what a periodic box of `d` dimensions has beside."""
-        needed = self.arrays["seam.needed"]
-        if needed.shape != (block_count(d),) or needed.dtype != np.float32:
-            raise ValueError("seam.needed")
-        if not (np.isfinite(needed).all() and needed.min() >= 0):
-            raise ValueError("seam.needed")
+        for name in _SEAMS:
+            margins = self.arrays[f"seam.{name}"]
+            if margins.shape != (block_count(d),) or margins.dtype != np.float32:
+                raise ValueError(f"seam.{name}")
+            if not (np.isfinite(margins).all() and margins.min() >= 0):
+                raise ValueError(f"seam.{name}")
 
     def fit(self, made_by: dict) -> None:
         """Refuse a checkpoint of another domain or of other settings, naming the first that differs.
@@ -317,7 +320,8 @@ class Saved:
         mesh.next_label = state["next_label"]
         torus = mesh.tessellator.torus
         if torus is not None:
-            torus.margins.needed.set(a["seam.needed"])
+            for name in _SEAMS:
+                getattr(torus.margins, name).set(a[f"seam.{name}"])
             torus.margins.cells = state["seam_cells"]
         mesh._evaluate_metric()
         mesh.summaries.values.set(a["summaries"])
@@ -380,13 +384,12 @@ def _state_of(method: Any) -> dict[str, float | int]:
 def _capacities(stages: Stages) -> list[int]:
     """Return the room for faces that the cells' kernels were built with: whether a repair finds it too small."""
     cells = stages.cells
-    names = ("cell_capacity", "row_capacity")
-    return [getattr(cells, name) for name in names] if stages.engine.dim == 2 else []
+    return [cells.cell_capacity, cells.row_capacity] if isinstance(cells, Cells) else []
 
 
 def _set_capacities(stages: Stages, capacities: object) -> None:
-    known = _capacities(stages)
-    if isinstance(capacities, list) and len(capacities) == len(known) and known:
+    cells, known = stages.cells, _capacities(stages)
+    if isinstance(cells, Cells) and isinstance(capacities, list) and len(capacities) == len(known):
         wanted = [int(c) for c in capacities]
         if wanted != known and all(0 < c <= 2048 for c in wanted):
-            stages.cells._build(*wanted)
+            cells._build(*wanted)

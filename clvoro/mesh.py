@@ -172,12 +172,13 @@ class Mesh:
         coarsening: float,
         free: Domain | None,
         fixed: int,
+        coarser: Tessellator | None = None,
     ) -> None:
         """Make the mesh of generators in `rows`, which is used up: its points and labels."""
         self.engine, self.fixed = stages.engine, fixed
         self.free = domain if free is None else free
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
-        self.tessellator = Tessellator(stages, domain, self._spacing)
+        self.tessellator = Tessellator(stages, domain, self._spacing, coarser)
         self.summaries = Summaries(self.engine, SUMMARIES)
         self._ordered: cla.Array | None = None
         n = self.next_label = len(rows["points"])
@@ -388,8 +389,9 @@ class Mesh:
         # Not by its constructor, whose caller would hold on to the arrays.
         mesh = Mesh.__new__(Mesh)
         mesh._set_up(
-            self.stages, self.domain, self.sizing, rows, self.coarsening / 2, self.free, self.fixed
-        )
+            self.stages, self.domain, self.sizing, rows, self.coarsening / 2, self.free, self.fixed,
+            self.tessellator,
+        )  # fmt: skip
         mesh.next_label = self.next_label + n - self.n
         return mesh
 

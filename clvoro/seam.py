@@ -35,6 +35,8 @@ class Margins:
         How deep balls around the cells of the latest diagram went.
     cells : int
         Generators of that diagram; 0 before the first one.
+    widths : (blocks,) float32, device
+        Within which its images were taken, if it had any.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -150,7 +152,7 @@ class Seam:
         self._turn = 0
 
     def extend(
-        self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
+        self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, keep: float
     ) -> Images:
         """Return the first `n` of `points` (n, d) with their images beyond the seams.
 
@@ -158,8 +160,8 @@ class Seam:
         ----------
         margins : Margins
             They become what was needed, times `factor`.
-        grow : bool
-            But nowhere less than they were.
+        keep : float
+            But nowhere less than this share of what they were.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
@@ -168,11 +170,11 @@ class Seam:
         blocks = blocks.astype(engine.real)
         margins.widest.fill(0)
         engine.run_each(
-            k.next_margins, block_count(d), margins.needed, np.float32(factor), np.int32(grow),
+            k.next_margins, block_count(d), margins.needed, np.float32(factor), np.float32(keep),
             margins.widths, margins.widest,
         )  # fmt: skip
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
-        engine.run_each(k.count_images, n, points, margins.widths, *blocks, firsts)
+        engine.run_each(k.count_images, n, points, margins.widths, margins.widest, *blocks, firsts)
         self._scan.exclusive(firsts, firsts, n)
         ghosts = int(firsts[n].get())
         count = n + ghosts
@@ -180,7 +182,16 @@ class Seam:
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
-            k.place_images, n, points, margins.widths, *blocks, firsts, extended, owners, codes
+            k.place_images,
+            n,
+            points,
+            margins.widths,
+            margins.widest,
+            *blocks,
+            firsts,
+            extended,
+            owners,
+            codes,
         )
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
         # On a coarse grid, so that the corners of the extended box are exact.
@@ -195,7 +206,7 @@ class Seam:
         neighbours = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
             self._kernels.unfold_rows, images.n, previous.starts, previous.neighbours,
-            images.points, images.margins.widths, *images.blocks, images.firsts, neighbours,
+            images.points, images.margins.widths, images.margins.widest, *images.blocks, images.firsts, neighbours,
         )  # fmt: skip
         return Rows(images.n, previous.starts, neighbours)
 

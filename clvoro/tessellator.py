@@ -26,6 +26,8 @@ class Tessellator:
     ----------
     spacing : callable, optional
         Of a polygonal domain: distance of generators near points (k, 2) of its boundary, (k,); see `place_sentinels`.
+    coarser : Tessellator, optional
+        Of the same domain, for fewer generators: what it knows of their distances is a good guess to begin with.
     """
 
     def __init__(
@@ -33,9 +35,13 @@ class Tessellator:
         stages: DiagramStages,
         domain: Domain,
         spacing: Callable[[np.ndarray], np.ndarray] | None = None,
+        coarser: Tessellator | None = None,
     ) -> None:
         self.stages, self.domain = stages, domain
-        self.torus = Torus(stages, domain) if any(domain.periodic) else None
+        self.torus: Torus | None = None
+        if any(domain.periodic):
+            known = None if coarser is None or coarser.torus is None else coarser.torus.margins
+            self.torus = Torus(stages, domain, known)
         self._polygon = (
             PolygonTessellator(stages, domain, spacing) if isinstance(domain, Polygon) else None
         )

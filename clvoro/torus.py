@@ -18,10 +18,12 @@ from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images, Margins
 if TYPE_CHECKING:
     from .stages import DiagramStages
 
-FIRST_MARGIN = 4.0
-"""Mean spacings within which images are taken at first."""
-SLACK = 1.15
-"""Margins of the next diagram over what this one needed."""
+FIRST_MARGIN = 2.7
+"""What cells are thought to need before the first diagram, in mean spacings."""
+SLACK = 1.5
+"""Margins of the next diagram over what this one needed. Less, and in early steps diagrams have to be made again."""
+KEEP = 0.9
+"""Share of a diagram's margins that the next one has at least: what is needed goes up and down."""
 
 
 class FewCellsError(InputError):
@@ -56,7 +58,7 @@ class Torus:
         Of the latest diagram, if that was a whole one.
     """
 
-    def __init__(self, stages: DiagramStages, domain: Box) -> None:
+    def __init__(self, stages: DiagramStages, domain: Box, margins: Margins | None = None) -> None:
         self.stages, self.domain = stages, domain
         self.periods = domain.periods(stages.engine.real)
         lower, upper = (
@@ -67,7 +69,7 @@ class Torus:
         # Wide enough for every cell, from wherever its generator is.
         self._wide = ExtendedBox(lower - self.periods, upper + self.periods)
         self._sums = Summaries(stages.engine, ("volumes",))
-        self.margins = Margins(stages.engine)
+        self.margins = Margins(stages.engine) if margins is None else margins
         self.latest: Unfolded | None = None
 
     def tessellate(
@@ -105,10 +107,10 @@ class Torus:
         if margins.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             margins.fill(FIRST_MARGIN * (volume / n) ** (1 / dim), n)
-        grow = False
+        finer = (margins.cells / n) ** (1 / dim)
+        factor, keep = SLACK * finer, KEEP * finer
         while True:
-            factor = SLACK * (margins.cells / n) ** (1 / dim)
-            images = seam.extend(self.domain, points, n, margins, factor, grow)
+            images = seam.extend(self.domain, points, n, margins, factor, keep)
             binned = stages.bins.build(images.box, images.points, images.count)
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
@@ -120,7 +122,9 @@ class Torus:
             folded, enough, flags, generator = seam.fold(images, binned, t, points, share, nearest)
             if enough:
                 break
-            grow = True
+            factor, keep = SLACK, 1.0
+            # Room for what is made anew.
+            del images, binned, args, t, folded
         if flags & COLLAPSED:
             raise InputError(
                 f"generator {generator} is too close to others in {stages.engine.real}; expected distinct generators: "
