@@ -133,7 +133,9 @@ class Boxes:
         step = _HALVED[self.level][:, None]
         out = np.concatenate([s * e for s in (-1, 1) for e in np.eye(self.dim)[:, None, :]])
         places = (self.corner + 0.5 * step + 0.5001 * step * out[:, None, :]).reshape(-1, self.dim)
-        inside = ((places > 0) & (places < self.end)).all(axis=1)
+        inside = np.ones(len(places), bool)
+        for x, end in zip(places.T, self.end, strict=True):  # faster than along the short axis
+            inside &= (x > 0) & (x < end)
         i = np.tile(np.arange(len(self)), 2 * self.dim)[inside]
         return i, self.find(places[inside])
 

@@ -55,7 +55,6 @@ class Loop:
     ) -> None:
         self.mesh, self.plan, self.level, self.levels = mesh, plan, levels, levels
         self.n_start = mesh.n
-        self.done = work_of(plan, levels, mesh.engine.dim)
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.rows: list[np.ndarray] = []
         self.steps, self.inserted, self.deleted = 0, 0, 0
@@ -75,7 +74,8 @@ class Loop:
         converged, reason = False, "plan completed"
         try:
             stop = not self.rows and self.record(0.0)
-            ahead = list(zip(self.plan, [*self.done[1:], 1.0], strict=False))
+            done = work_of(self.plan, self.levels, self.mesh.engine.dim, asked)
+            ahead = list(zip(self.plan, [*done[1:], 1.0], strict=False))
             for action, progress in ahead[self.position :]:
                 if stop or (self.max_steps is not None and self.steps >= self.max_steps):
                     reason = "stopped by the callback" if stop else "max_steps reached"

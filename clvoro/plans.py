@@ -34,8 +34,14 @@ from dataclasses import dataclass, replace
 from .methods import Method, ProjectedMethod, WeightedMethod
 from .population import THETA
 
-COARSEST = {2: 700, 3: 1500}
-"""Cells of the coarsest level, roughly, by dimension: enough to feel the field, few enough to be free."""
+COARSEST = {2: 1400, 3: 1500}
+"""Cells of the coarsest level, roughly, by dimension.
+
+A step on fewer costs hardly less (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) from 23,000 to 100,000
+cells, half as many, and a level more, make a mesh no better.
+"""
+STEP_CELLS = 3000
+"""Cells on which a step works as long as its launches take the host."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +91,9 @@ class Effort:
 
 
 EFFORTS = {
-    "fast": Effort(40, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
+    "fast": Effort(20, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
     "default": Effort(
-        60, 5, 3, (4, 18, 20, 20), glide=7, polish=21, aim=0.0025, lenience=0.02,
+        30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, aim=0.0025, lenience=0.02,
         bound=11.0,
     ),
     "best": Effort(
@@ -253,7 +259,7 @@ def _adaptive_2d(
         elif warm:
             couple = effort.couple_finest
         else:
-            couple = effort.start if level else effort.start // 2
+            couple = effort.start
         tolerance = COUPLE_TOLERANCE if level < levels else START_TOLERANCE
         if levels == 0:
             tolerance = WeightedMethod.tolerance
@@ -347,13 +353,16 @@ def _finish_3d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[
         yield from [Step(newton)] * 2
 
 
-def work_of(plan: list[Action], levels: int, dim: int) -> list[float]:
-    """Return the work done before each action, as a share of the whole: a step costs as its level has cells."""
+def work_of(plan: list[Action], levels: int, dim: int, cells: float) -> list[float]:
+    """Return the work done before each action, as a share of the whole, for `cells` on the finest level.
+
+    A step costs as its level has cells, and `STEP_CELLS` more.
+    """
     done, total, level = [], 0.0, levels
     for action in plan:
         done.append(total)
         if isinstance(action, Refine):
             level -= 1
         elif isinstance(action, Step):
-            total += 2.0 ** (-dim * level)
+            total += cells * 2.0 ** (-dim * level) + STEP_CELLS
     return [w / max(total, 1e-300) for w in done]

@@ -17,8 +17,9 @@ from .mesh import Mesh, Stages
 from .methods import PUBLISHED, Relaxation, make_method
 from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
 from .precision import check_precision
+from .quadrature import DensityTree
 from .sizing import Sizing, as_field
-from .start import count_cells, sample_density, sample_uniform
+from .start import density_tree, sample_density, sample_uniform
 
 METHODS = ("adaptive", "exact", *PUBLISHED)
 STARTS = ("density", "uniform")
@@ -151,10 +152,12 @@ class Preparation:
             )
             size = bounded(size, domain, options.layers)
         self.sizing = Sizing(stages.engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
+        self._tree: DensityTree | None = None
         if points is not None and given:
             asked = float(len(points))
         else:
-            asked = count_cells(self.sizing, self.free) + len(self.rows)
+            self._tree = density_tree(self.sizing, self.free)
+            asked = self._tree.integral + len(self.rows)
         self.target = n_cells if n_cells is not None else max(1, round(asked))
         if n_cells is None and asked < 0.5:
             message = (
@@ -206,7 +209,8 @@ class Preparation:
             if options.start == "uniform":
                 host = sample_uniform(self.free, n, options.seed, real)
             else:
-                host = sample_density(self.sizing, self.free, n, options.seed, real)
+                host = sample_density(self.sizing, self.free, n, options.seed, real, self._tree)
+        self._tree = None
         check_precision(self.sizing, self.domain, host, self.factor)
         if len(self.rows):
             host = np.concatenate([self.rows, apart_from(host, self.rows, self.free)])

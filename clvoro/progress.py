@@ -32,6 +32,8 @@ class Progress:
         self.title, self.max_steps = title, max_steps
         self.stream = sys.stderr if stream is None else stream
         self.steps, self._cells = -1, 0
+        # Seconds and share that were done when the first step was: before, and in it, kernels may have been built.
+        self._first: tuple[float, float] | None = None
         self._shown, self._began = 0.0, time.monotonic()
         self._status = _rich_status(self.stream)
         self._live = self._status is not None or self.stream.isatty()
@@ -52,8 +54,10 @@ class Progress:
     def __call__(self, row: np.void) -> None:
         """Show `row`, a row of `HISTORY_DTYPE`, if the last one was shown long enough ago."""
         self.steps += 1
-        if self.steps:
+        if self.steps > 1:
             self._cells += int(row["cells"])
+        elif self.steps == 1:
+            self._first = float(row["seconds"]), self._done(row)
         now = time.monotonic()
         if now - self._shown < (REFRESH if self._live else EVERY):
             return
@@ -72,22 +76,26 @@ class Progress:
 
     def line(self, row: np.void) -> str:
         """Return the text for `row`: step, errors, quality, cells per second, time left."""
-        seconds, done = float(row["seconds"]), float(row["progress"])
         level = f" level {row['level']}" if row["level"] else ""
-        of = f" ({done:.0%})" if self.max_steps is None else f"/{self.max_steps}"
-        if self.max_steps:
-            done = max(done, self.steps / self.max_steps)
+        of = f" ({row['progress']:.0%})" if self.max_steps is None else f"/{self.max_steps}"
         # Short enough for 80 columns with a title of some 15.
         parts = [
             f"{self.title}{level} {self.steps}{of}",
             f"|e| {row['mean_error']:.4f} max {row['max_error']:.2g}",
             f"Q {row['mean_quality']:.3f} min {row['min_quality']:.2f}",
         ]
-        if self.steps > 0 and seconds > 0:
-            parts.append(f"{_short(self._cells / seconds)} cells/s")
-            if done > 0:
-                parts.append(f"{_duration(seconds * (1 / done - 1))} left")
+        if self._first is not None:
+            # The pace is that since the first step.
+            seconds, done = float(row["seconds"]) - self._first[0], self._done(row)
+            if seconds > 0:
+                parts.append(f"{_short(self._cells / seconds)} cells/s")
+            if seconds > 0 and done > self._first[1]:
+                parts.append(f"{_duration(seconds * (1 - done) / (done - self._first[1]))} left")
         return "  ".join(parts)
+
+    def _done(self, row: np.void) -> float:
+        """Share of the work that is done, at least."""
+        return max(float(row["progress"]), self.steps / self.max_steps if self.max_steps else 0.0)
 
 
 class _Status:

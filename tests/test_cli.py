@@ -313,22 +313,35 @@ def row(step, seconds, cells=1000, progress=0.1):
 
 def test_line_holds_the_numbers():
     shown = progress.Progress("paper lloyd", 10, io.StringIO())
-    shown(row(0, 0.0))
-    shown(row(1, 0.5))
-    line = shown.line(row(1, 0.5))
+    for step in range(3):
+        shown(row(step, 0.5 * step))
+    line = shown.line(row(2, 1.0))
     assert len(line) < 80
-    for part in ["lloyd 1/10", "|e| 0.1250", "max 1.5", "min 0.50", "2k cells/s", "4 s left"]:
+    for part in ["lloyd 2/10", "|e| 0.1250", "max 1.5", "min 0.50", "2k cells/s", "4 s left"]:
         assert part in line
 
 
 def test_line_of_a_run_of_unknown_length():
     shown = progress.Progress("paper", None, io.StringIO())
-    for step, cells in enumerate([10, 10, 40]):
+    for step, cells in enumerate([10, 10, 10, 40]):
         shown(row(step, float(step), cells, progress=step / 8))
-    line = shown.line(row(2, 2.0, 40, progress=0.25))
-    assert line.startswith("paper 2 (25%)")
+    line = shown.line(row(3, 3.0, 40, progress=0.375))
+    assert line.startswith("paper 3 (38%)")
     assert "25 cells/s" in line  # 10 + 40 in two seconds
-    assert line.endswith("6 s left")
+    assert line.endswith("5 s left")
+
+
+def test_the_pace_is_that_since_the_first_step():
+    """Which may have taken long: kernels are built in it, and before."""
+    shown = progress.Progress("paper", None, io.StringIO())
+    first, second = row(1, 100.0, progress=0.1), row(2, 101.0, progress=0.2)
+    shown(row(0, 90.0, progress=0.0))
+    shown(first)
+    assert "left" not in shown.line(first)
+    assert "cells/s" not in shown.line(first)
+    shown(second)
+    assert "1k cells/s" in shown.line(second)
+    assert shown.line(second).endswith("8 s left")
 
 
 def test_terminal_without_rich_gets_one_changing_line(monkeypatch):

