@@ -1,9 +1,6 @@
 /* Generators near a rectangle, as places in the order of bins. */
-#include "common/bins.h"
+#include "common/descent.h"
 
-#ifndef MAX_DEPTH
-#error "build with -DMAX_DEPTH=levels that the bins may have"
-#endif
 #define NEAR_CAPACITY 512
 #define NEAR_STEP 16
 /* What holds no more than WHOLE generators is taken whole: looking into divided bins costs more than testing a few that
@@ -32,20 +29,19 @@ inline bool add_run(near_t *near, int first, int end)
 inline bool collect_near(near_t *near, double2 lower, double2 upper, global const int2 *bins,
                          global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
-    /* The grids that are open, from the root down, and the row and bin at which each was left. */
-    int grids[MAX_DEPTH], rows[MAX_DEPTH], nexts[MAX_DEPTH];
-    int depth = 0;
+    descent_t way; /* through rows and bins */
     near->count = 0;
-    grids[0] = 0;
-    rows[0] = -1;
-    while (depth >= 0) {
-        const FRAME frame = grid_frames[grids[depth]];
-        const int4 shape = grid_shapes[grids[depth]];
+    begin_descent(&way, (int4)(-1));
+    while (way.depth >= 0) {
+        const int grid = way.grids[way.depth];
+        const int4 place = way.places[way.depth];
+        const FRAME frame = grid_frames[grid];
+        const int4 shape = grid_shapes[grid];
         const double inverse = FRAME_INVERSE(frame);
         const int left = axis_bin(lower.s0, frame.s0, inverse, shape.s1);
         const int right = axis_bin(upper.s0, frame.s0, inverse, shape.s1);
         const int top = axis_bin(upper.s1, frame.s1, inverse, shape.s2);
-        int row = rows[depth], next = nexts[depth], child = -1;
+        int row = place.s0, next = place.s1, child = -1;
         if (row < 0) {
             row = axis_bin(lower.s1, frame.s1, inverse, shape.s2);
             next = left;
@@ -73,15 +69,7 @@ inline bool collect_near(near_t *near, double2 lower, double2 upper, global cons
                 next = left;
             }
         }
-        if (child >= 0) {
-            rows[depth] = row;
-            nexts[depth] = next;
-            ++depth;
-            grids[depth] = child;
-            rows[depth] = -1;
-        } else {
-            --depth;
-        }
+        leave_grid(&way, child, (int4)(row, next, 0, 0), (int4)(-1));
     }
     return true;
 }

@@ -1,9 +1,6 @@
 /* Runs of generators near a few others in 3D, from the bins that a box about these covers, in double precision. */
-#include "common/bins.h"
+#include "common/descent.h"
 
-#ifndef MAX_DEPTH
-#error "build with -DMAX_DEPTH=levels that the bins may have"
-#endif
 #define RUN_CAPACITY 256
 #define RUN_LENGTH 64 /* a bit of a word for each */
 
@@ -46,20 +43,19 @@ inline double gap_to_row(double lower, double upper, double origin, double edge,
 inline bool collect_runs(runs_t *runs, double4 lower, double4 upper, double r, global const int2 *bins,
                          global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
-    /* The grids that are open, from the root down, and the layer, row and bin at which each was left. */
-    int grids[MAX_DEPTH], layers[MAX_DEPTH], rows[MAX_DEPTH], nexts[MAX_DEPTH];
-    int depth = 0;
+    descent_t way; /* through layers, rows and bins */
     runs->n = runs->total = 0;
-    grids[0] = 0;
-    layers[0] = rows[0] = nexts[0] = -1;
-    while (depth >= 0) {
-        const FRAME frame = grid_frames[grids[depth]];
-        const int4 shape = grid_shapes[grids[depth]];
+    begin_descent(&way, (int4)(-1));
+    while (way.depth >= 0) {
+        const int grid = way.grids[way.depth];
+        const int4 place = way.places[way.depth];
+        const FRAME frame = grid_frames[grid];
+        const int4 shape = grid_shapes[grid];
         const double inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
         const int low_y = axis_bin(lower.s1 - r, frame.s1, inverse, shape.s2);
         const int high_y = axis_bin(upper.s1 + r, frame.s1, inverse, shape.s2);
         const int high_z = axis_bin(upper.s2 + r, frame.s2, inverse, shape.s3);
-        int layer = layers[depth], row = rows[depth], next = nexts[depth], child = -1;
+        int layer = place.s0, row = place.s1, next = place.s2, child = -1;
         if (layer < 0)
             layer = axis_bin(lower.s2 - r, frame.s2, inverse, shape.s3);
         for (; layer <= high_z && child < 0; ++layer, row = -1) {
@@ -96,16 +92,7 @@ inline bool collect_runs(runs_t *runs, double4 lower, double4 upper, double r, g
             if (child >= 0)
                 break;
         }
-        if (child >= 0) {
-            layers[depth] = layer;
-            rows[depth] = row;
-            nexts[depth] = next;
-            ++depth;
-            grids[depth] = child;
-            layers[depth] = rows[depth] = nexts[depth] = -1;
-        } else {
-            --depth;
-        }
+        leave_grid(&way, child, (int4)(layer, row, next, 0), (int4)(-1));
     }
     return true;
 }

@@ -1,10 +1,6 @@
 /* The search for generators that may cut a cell of the plane, through the bins around it. */
-#include "common/bins.h"
+#include "common/descent.h"
 #include "common/face_rows.h"
-
-#ifndef MAX_DEPTH
-#error "build with -DMAX_DEPTH=levels that the bins may have"
-#endif
 
 /* A search over more than WIDE bins to each side is worth a look at where it may end in each row. */
 #define WIDE 4
@@ -42,17 +38,15 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
                         global const REAL *binned, global const int *items, global const int2 *bins,
                         global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
-    /* The grids that are open, from the root down, and where each was left: row in outward order, part of the row, bin.
-     */
-    int grids[MAX_DEPTH], turns[MAX_DEPTH], parts[MAX_DEPTH], places[MAX_DEPTH];
-    bool inside[MAX_DEPTH]; /* was the grid's own bin opened for the inner square? */
-    int depth = 0;
-    grids[0] = turns[0] = parts[0] = 0;
-    places[0] = -1;
-    inside[0] = inner >= 0;
-    while (depth >= 0) {
-        const FRAME frame = grid_frames[grids[depth]];
-        const int4 shape = grid_shapes[grids[depth]];
+    /* Through rows in outward order, parts of rows, bins; and whether the grid's own bin was opened for the inner
+     * square. */
+    descent_t way;
+    begin_descent(&way, (int4)(0, 0, -1, inner >= 0));
+    while (way.depth >= 0) {
+        const int grid = way.grids[way.depth];
+        const int4 place = way.places[way.depth];
+        const FRAME frame = grid_frames[grid];
+        const int4 shape = grid_shapes[grid];
         const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
         const int left = axis_bin(x[0] - w, frame.s0, inverse, shape.s1);
         const int right = axis_bin(x[0] + w, frame.s0, inverse, shape.s1);
@@ -61,14 +55,15 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
         const int middle = axis_bin(x[1], frame.s1, inverse, shape.s2);
         /* The places and rows that the inner square has taken. */
         int4 done = (int4)(0, -1, 0, -1);
-        if (inside[depth])
+        if (place.s3)
             done = (int4)(axis_bin(x[0] - inner, frame.s0, inverse, shape.s1),
                           axis_bin(x[0] + inner, frame.s0, inverse, shape.s1),
                           axis_bin(x[1] - inner, frame.s1, inverse, shape.s2),
                           axis_bin(x[1] + inner, frame.s1, inverse, shape.s2));
         const int last_turn = 2 * max(middle - bottom, top - middle);
-        int turn = turns[depth], part = parts[depth], ix = places[depth];
+        int turn = place.s0, part = place.s1, ix = place.s2;
         int child = -1;
+        bool inside = false; /* is that in a bin which was opened? */
         while (turn <= last_turn) {
             const int row = turn & 1 ? middle + (turn + 1) / 2 : middle - turn / 2;
             const REAL away = row_distance(x[1], frame.s1, edge, row);
@@ -106,7 +101,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
                     ix = bin + 1;
                     if (first.s1 != end.s1) {
                         child = first.s1;
-                        inside[depth + 1] = part == 1 && row_done;
+                        inside = part == 1 && row_done;
                         end.s0 = first.s0;
                     }
                 }
@@ -129,17 +124,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
             part = 0;
             ix = -1;
         }
-        if (child >= 0) {
-            turns[depth] = turn;
-            parts[depth] = part;
-            places[depth] = ix;
-            ++depth;
-            grids[depth] = child;
-            turns[depth] = parts[depth] = 0;
-            places[depth] = -1;
-        } else {
-            --depth;
-        }
+        leave_grid(&way, child, (int4)(turn, part, ix, place.s3), (int4)(0, 0, -1, inside));
     }
     return 0;
 }
