@@ -137,9 +137,10 @@ class Checkpointer:
             # Within what images are taken: in 3D, sums of a cell depend on it in their last bits.
             for name in _SEAMS:
                 arrays[f"seam.{name}"] = getattr(torus.margins, name).get()
-        if loop.initial is not None:
-            for field in dataclasses.fields(Displacements):
-                arrays[f"initial.{field.name}"] = getattr(loop.initial, field.name)
+        for part in ("initial", "final"):
+            if getattr(loop, part) is not None:
+                for field in dataclasses.fields(Displacements):
+                    arrays[f"{part}.{field.name}"] = getattr(getattr(loop, part), field.name)
         arrays["history"] = np.concatenate(loop.rows)
         state = {
             "position": loop.position, "level": loop.level, "n_start": loop.n_start,
@@ -362,9 +363,10 @@ class Saved:
         steps = [action for action in loop.plan[: loop.position] if isinstance(action, Step)]
         if steps:
             loop.last = steps[-1].method
-        initial = [self.arrays.get(f"initial.{f.name}") for f in dataclasses.fields(Displacements)]
-        if all(array is not None for array in initial):
-            loop.initial = Displacements(*initial)  # type: ignore[arg-type]
+        for part in ("initial", "final"):
+            saved = [self.arrays.get(f"{part}.{f.name}") for f in dataclasses.fields(Displacements)]
+            if all(array is not None for array in saved):
+                setattr(loop, part, Displacements(*saved))  # type: ignore[arg-type]
         loop.began = time.perf_counter() - self.elapsed
 
 

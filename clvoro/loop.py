@@ -60,6 +60,10 @@ class Loop:
         self.steps, self.inserted, self.deleted = 0, 0, 0
         self.solution: Solution | None = None
         self.initial: Displacements | None = None
+        # Of a plan's last step; where no plan tells which that will be, they are evaluated once more in the end.
+        self.final: Displacements | None = None
+        steps = [position for position, action in enumerate(plan) if isinstance(action, Step)]
+        self.last_step = steps[-1] if steps and tol is None else None
         self.began = time.perf_counter()
         self.position = 0
         self.checkpoint: Checkpointer | None = None
@@ -127,6 +131,8 @@ class Loop:
             self.solution = action.method.displace(self.mesh)
             if self.initial is None:
                 self.initial = self.displacements()
+            if self.position == self.last_step:
+                self.final = self.displacements()
             action.method.move(self.mesh)
         self.mesh.update()
         if self.held is not None:
@@ -242,9 +248,9 @@ class Loop:
 
     def result(self, converged: bool, reason: str, settings: dict[str, Any]) -> Result:
         """Fetch what the run has come to."""
-        mesh = self.mesh
-        final = None
-        if self.steps:
+        mesh, final = self.mesh, self.final
+        if self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
+            # No step was known to be the last, or generators have been inserted or deleted since.
             with mesh.engine.workspace.frame():
                 self.last.displace(mesh)
                 final = self.displacements()

@@ -223,7 +223,8 @@ class Result:
     converged : bool
     stop_reason : str
     initial, final : Displacements or None
-        Lloyd and Poisson displacements of the first and of the last step.
+        Lloyd and Poisson displacements of the first and of the last step; where a run may end after any step (methods
+        that repeat one kind, a callback that stops it), those of the step that would come next are the last.
     size_factor : float
         Where a count of cells was asked for, `size` is the size field times this common factor, which makes the count
         fit (methods "adaptive" and "exact"); else 1.

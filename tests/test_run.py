@@ -491,6 +491,22 @@ def test_figures_of_adaptive_runs(
     assert q_min >= least
 
 
+def test_last_displacements_of_a_plan_are_those_of_its_last_step(adapter):
+    """And of the step that would come next, where the run was stopped before."""
+    whole = adapter.run(BOX, F1, seed=9, effort="fast")
+    steps = whole.history["step"][-1]
+    stopped = adapter.run(
+        BOX, F1, seed=9, effort="fast", callback=lambda row: row["step"] == steps - 1
+    )
+    for result, other in ((whole, stopped), (stopped, stopped)):
+        assert np.array_equal(result.final.points, other.points)
+        size = F1(result.final.points)
+        for name in ("lloyd", "poisson"):
+            length = np.linalg.norm(getattr(result.final, name), axis=1)
+            assert whole.history[name][-1] == pytest.approx((length / size).mean(), rel=1e-6)
+    assert (np.linalg.norm(whole.points - stopped.points, axis=1) > 0).all()
+
+
 def test_error_target_moves_along_the_front(adapter):
     """The larger the error that is allowed, the better the cells."""
     tight, loose = (
