@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import Any, Self
+from typing import Any, cast
 
 import numpy as np
 import pyopencl as cl
@@ -27,15 +27,21 @@ _LARGEST_FILL = 2**31
 class DeviceArray(cla.Array):
     """A contiguous array on an in-order queue; see `make_array`."""
 
+    def _place(self) -> tuple[cl.CommandQueue, cl.Buffer]:
+        """Return queue and buffer of an array that is not empty; PyOpenCL's need not have them."""
+        return cast("tuple[cl.CommandQueue, cl.Buffer]", (self.queue, self.base_data))
+
     def __getitem__(self, index: Any) -> cla.Array:
         """Return a view: quickly of the first rows, ``[:n]``, and of one number."""
+        if not self.size:
+            return super().__getitem__(index)
         if type(index) is slice and index.start is None and index.step is None:
             if type(index.stop) is int and 0 <= index.stop <= self.shape[0]:
-                shape = (index.stop, *self.shape[1:])
-                return make_array(self.queue, shape, self.dtype, self.base_data, self.offset)
+                shape, (queue, buffer) = (index.stop, *self.shape[1:]), self._place()
+                return make_array(queue, shape, self.dtype, buffer, self.offset)
         elif isinstance(index, int) and len(self.shape) == 1 and 0 <= index < self.shape[0]:
-            offset = self.offset + index * self.dtype.itemsize
-            return make_array(self.queue, (), self.dtype, self.base_data, offset)
+            offset, (queue, buffer) = self.offset + index * self.dtype.itemsize, self._place()
+            return make_array(queue, (), self.dtype, buffer, offset)
         return super().__getitem__(index)
 
     def get(
@@ -45,7 +51,8 @@ class DeviceArray(cla.Array):
         if queue is not None or ary is not None or not self.size:
             return super().get(queue, ary)
         host = np.empty(self.shape, self.dtype)
-        cl.enqueue_copy(self.queue, host, self.base_data, src_offset=self.offset)
+        queue, buffer = self._place()
+        cl.enqueue_copy(queue, host, buffer, src_offset=self.offset)
         return host
 
     def set(self, ary: np.ndarray, *args: Any, **kwargs: Any) -> None:
@@ -54,20 +61,28 @@ class DeviceArray(cla.Array):
         if args or kwargs or not fits:
             super().set(ary, *args, **kwargs)
         elif self.size:
-            cl.enqueue_copy(self.queue, self.base_data, ary, dst_offset=self.offset)
+            queue, buffer = self._place()
+            cl.enqueue_copy(queue, buffer, ary, dst_offset=self.offset)
 
-    def fill(self, value: object, *args: Any, **kwargs: Any) -> Self:
+    def fill(self, value: object, *args: Any, **kwargs: Any) -> DeviceArray:
         """Set all to `value`; return the array."""
         if not self.size:
             return self
         if args or kwargs or self.nbytes >= _LARGEST_FILL:
-            return super().fill(value, *args, **kwargs)
+            super().fill(value, *args, **kwargs)
+            return self
         whole = self.offset | self.nbytes | _PATTERN
         most = whole & -whole
         count = most // self.dtype.itemsize
         pattern = np.full(count, value, self.dtype) if value else _ZEROS[:most]
-        cl.enqueue_fill(self.queue, self.base_data, pattern, self.nbytes, offset=self.offset)
+        queue, buffer = self._place()
+        cl.enqueue_fill(queue, buffer, pattern, self.nbytes, offset=self.offset)
         return self
+
+
+def buffer_of(array: cla.Array) -> cl.Buffer:
+    """Return the buffer that `array` begins, for what PyOpenCL does with buffers; its arrays may lie elsewhere."""
+    return cast("cl.Buffer", array.data)
 
 
 def make_array(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
+from numpy.typing import DTypeLike
 
 from ._program import Engine
 
@@ -129,7 +130,7 @@ class Room:
         # The part of each that was handed out last: to cut one costs as much as a launch.
         self._parts: dict[tuple, cla.Array] = {}
 
-    def __call__(self, *name: object, size: int, dtype: object = None) -> cla.Array:
+    def __call__(self, *name: object, size: int, dtype: DTypeLike | None = None) -> cla.Array:
         """Return the first `size` items of the array called `name`; their content is arbitrary."""
         array = self._arrays.get(name)
         if array is None or len(array) < size:
@@ -148,6 +149,6 @@ class Room:
             del self._arrays[name]
             self._parts.pop(name, None)
 
-    def zeros(self, *name: object, size: int, dtype: object = None) -> cla.Array:
+    def zeros(self, *name: object, size: int, dtype: DTypeLike | None = None) -> cla.Array:
         """Return the same, filled with zeros."""
         return self(*name, size=size, dtype=dtype).fill(0)

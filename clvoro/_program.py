@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl as cl
@@ -23,6 +24,9 @@ import pyopencl.array as cla
 from ._device_array import make_array
 from ._workspace import Workspace
 from .errors import BuildError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
@@ -112,7 +116,7 @@ def bind(kernel: cl.Kernel, args: Iterable[object]) -> list[object]:
     long as the launch. Once it has been told their types it need not; that costs as much as twenty numbers, and is done
     for kernels that are called again and again. An argument is of the same type in every call.
     """
-    given = [a.data if isinstance(a, cla.Array) else a for a in args]
+    given: list[Any] = [a.data if isinstance(a, cla.Array) else a for a in args]
     calls = getattr(kernel, "calls", 0)
     if calls == _UNTYPED_CALLS:
         kernel.set_arg_types([_type_of(a) for a in given])
@@ -265,21 +269,21 @@ class Engine:
         size = (self.groups * self.group_size,)
         return cl.enqueue_nd_range_kernel(self.queue, kernel, size, (self.group_size,))
 
-    def empty(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
+    def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return an uninitialised device array; `dtype` defaults to the engine's precision."""
         return make_array(self.queue, shape, np.dtype(self.real if dtype is None else dtype))
 
-    def scratch(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
+    def scratch(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return the same, but of the workspace, valid to the end of its frame; outside of one, an array of its own."""
-        dtype = np.dtype(self.real if dtype is None else dtype)
-        taken = self.workspace.take(shape, dtype)
-        return self.empty(shape, dtype) if taken is None else taken
+        real = np.dtype(self.real if dtype is None else dtype)
+        taken = self.workspace.take(shape, real)
+        return self.empty(shape, real) if taken is None else taken
 
-    def zeros(self, shape: int | tuple[int, ...], dtype: object = None) -> cla.Array:
+    def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
         """Return a device array of zeros."""
         return self.empty(shape, dtype).fill(0)
 
-    def upload(self, host: object, dtype: object = None) -> cla.Array:
+    def upload(self, host: ArrayLike, dtype: DTypeLike | None = None) -> cla.Array:
         """Copy a host array to the device in the engine's precision (or `dtype`)."""
         given = np.ascontiguousarray(host, self.real if dtype is None else dtype)
         array = self.empty(given.shape, given.dtype)

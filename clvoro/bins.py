@@ -7,16 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
+from numpy.typing import DTypeLike
 
+from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
-from .domain import Box
+from .domain import ClipBox
 
 OCCUPANCY = 2
 """Generators per bin that the grids aim at: fewer bins to open against fewer generators to test."""
 SPLIT_COUNT = {2: 10, 3: 18}
 """A bin that holds more is divided by a grid of its own, in 2D and in 3D, where a division makes more bins. Uniform
 random sets (Poisson, mean 2) stay on one level."""
+_ZERO = np.zeros(1, np.int32)
 MAX_CHILD_SIDE = 64
 MAX_LEVELS = 8
 """Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
@@ -88,7 +91,7 @@ class Bins:
             self._sizes = engine.empty(bins + 1, np.int32)
         self._capacity = (max(n, self._capacity[0]), max(bins, self._capacity[1]))
 
-    def _grown(self, name: str, size: int, dtype: object) -> cla.Array:
+    def _grown(self, name: str, size: int, dtype: DTypeLike) -> cla.Array:
         grown = self.engine.zeros(size, dtype)
         old = getattr(self, name, None)
         if old is not None:
@@ -99,7 +102,7 @@ class Bins:
         """Write zeros: by the queue itself, as a kernel takes several times as long."""
         size = array.dtype.itemsize
         cl.enqueue_fill(
-            self.engine.queue, array.data, np.int32(0), count * size, offset=first * size
+            self.engine.queue, buffer_of(array), _ZERO, count * size, offset=first * size
         )
 
     def clear(self) -> None:
@@ -109,7 +112,7 @@ class Bins:
                 delattr(self, name)
         self._capacity = (0, 0)
 
-    def build(self, box: Box, points: cla.Array, n: int) -> BinnedPoints:
+    def build(self, box: ClipBox, points: cla.Array, n: int) -> BinnedPoints:
         """Sort the first `n` of `points` (n, d; normalised coordinates, within `box`) into bins.
 
         The host reads two integers per level; uniform sets have one level.

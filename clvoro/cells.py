@@ -9,11 +9,12 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
 from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
-from .domain import Box
+from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
 
 if TYPE_CHECKING:
@@ -169,7 +170,7 @@ class Cells:
     @framed
     def tessellate(
         self,
-        box: Box,
+        box: ClipBox,
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
@@ -231,7 +232,7 @@ class Cells:
     def complete(
         self,
         rows: FaceRows,
-        box: Box,
+        box: ClipBox,
         points: cla.Array,
         previous: Tessellation,
         fits: cla.Array,
@@ -247,7 +248,7 @@ class Cells:
             return None
         return self._measure(rows, box, points, n, *old, starts, m, flags, exact=False)[0]
 
-    def measure_faces(self, box: Box, t: Tessellation) -> Tessellation:
+    def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with what is known of faces in full precision, in arrays of its own."""
         if t.face_measures.dtype == self.engine.real:
             return t
@@ -267,7 +268,7 @@ class Cells:
     def _match(
         self,
         rows: FaceRows,
-        box: Box,
+        box: ClipBox,
         points: cla.Array,
         n: int,
         old_starts: cla.Array,
@@ -287,7 +288,7 @@ class Cells:
         # The host reads all at once.
         word = starts.dtype.itemsize
         cl.enqueue_copy(
-            engine.queue, rows.flags.data, starts.data, byte_count=word, src_offset=n * word,
+            engine.queue, buffer_of(rows.flags), buffer_of(starts), byte_count=word, src_offset=n * word,
             dst_offset=3 * word,
         )  # fmt: skip
         return *self._read_flags(), starts
@@ -295,7 +296,7 @@ class Cells:
     def _measure(
         self,
         rows: FaceRows,
-        box: Box,
+        box: ClipBox,
         points: cla.Array,
         n: int,
         old_starts: cla.Array,
@@ -332,8 +333,13 @@ class Cells:
         if not direct:
             copied.append((neighbours, faces["neighbours"]))
         for array, to in copied:
-            cl.enqueue_copy(engine.queue, to.data, array.data, byte_count=array.nbytes)
-        return Tessellation(n=n, points=points, **new, **faces), flags, generator
+            cl.enqueue_copy(engine.queue, buffer_of(to), buffer_of(array), byte_count=array.nbytes)
+        t = Tessellation(
+            n=n, points=points, starts=new["starts"], neighbours=faces["neighbours"],
+            face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
+            offsets=new["offsets"], covariances=new["covariances"],
+        )  # fmt: skip
+        return t, flags, generator
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)

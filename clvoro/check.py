@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .check_polygon import check_cells, check_edges, check_outlines, hidden
 from .faces import face_keys
@@ -209,7 +209,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         f"{d.points[i] + g.centroids[i]}",
     )  # fmt: skip
     if isinstance(domain, Polygon):
-        check_edges(check, g, slack)
+        check_edges(check, domain, g, slack)
         check_cells(check, g, slack)
     _check_nearest(check, g, slack)
 
@@ -287,11 +287,11 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     # A length of 0 is that of no period.
     lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
     last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
-    tree = cKDTree(np.minimum(d.points - lower, last), boxsize=periods)
+    tree = KDTree(np.minimum(d.points - lower, last), boxsize=periods)
     nearest = tree.query(d.vertices - lower)[0][g.corners]
     excess = np.maximum(own - nearest - slack, 0)
     if isinstance(d.domain, Polygon):
-        excess[hidden(d, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
+        excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
     check.note(
         "nearest generators", excess,
         lambda k: f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by "

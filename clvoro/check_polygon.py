@@ -10,9 +10,10 @@ import shapely
 from .outlines import face_ends, next_faces
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     from .findings import Check
+    from .polygon import Polygon
     from .rebuilt import Rebuilt
     from .results import Diagram
 
@@ -49,9 +50,9 @@ def check_outlines(check: Check) -> None:
     )  # fmt: skip
 
 
-def check_edges(check: Check, g: Rebuilt, slack: float) -> None:
+def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
     """Check that the faces on each edge of the polygon cover it, one after the other."""
-    d, domain = check.diagram, check.diagram.domain
+    d = check.diagram
     rows = np.flatnonzero(d.neighbours < 0)
     edge = -1 - d.neighbours[rows]
     begin, end = domain.vertices, domain.vertices[domain.next_vertex]
@@ -98,7 +99,13 @@ def check_cells(check: Check, g: Rebuilt, slack: float) -> None:
 
 
 def hidden(
-    d: Diagram, tree: cKDTree, places: np.ndarray, corners: np.ndarray, slack: float, unit: float
+    d: Diagram,
+    domain: Polygon,
+    tree: KDTree,
+    places: np.ndarray,
+    corners: np.ndarray,
+    slack: float,
+    unit: float,
 ) -> np.ndarray:
     """Return those of `places` in the cells' `corners` from which one of the nearest generators cannot be seen.
 
@@ -106,7 +113,6 @@ def hidden(
     the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
     the domain touch in a point, either side sees both.
     """
-    domain = d.domain
     at = d.vertices[corners[places]]
     distances = tree.query(at - np.array(domain.lower))[0]
     nearest = tree.query_ball_point(at - np.array(domain.lower), distances + 4 * slack)
@@ -119,7 +125,7 @@ def hidden(
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
     once, times = np.unique(domain.vertices, axis=0, return_counts=True)
     if (times > 1).any():
-        touching = shapely.STRtree(shapely.points(once[times > 1]))
+        touching = shapely.STRtree(np.asarray(shapely.points(once[times > 1])))
         rows, _ = touching.query(shapely.points(at), predicate="dwithin", distance=slack)
         away[rows] = True
     return places[away]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
+from numpy.typing import DTypeLike
 
 from ._primitives import Room, Scan
 from ._program import Engine, Kernels
@@ -238,7 +239,7 @@ class Coarsening:
         """Return the graph of `groups`, weights times `factor`: kept for `level`, else in the workspace."""
         run, k, count = self._run, self._kernels, len(groups)
 
-        def array(name: str, size: int, dtype: object = None) -> cla.Array:
+        def array(name: str, size: int, dtype: DTypeLike | None = None) -> cla.Array:
             if level is None:
                 return self.engine.scratch(size, dtype)
             return self._room(level, f"coarse {name}", size=size, dtype=dtype)

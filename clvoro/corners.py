@@ -8,10 +8,11 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Box
+from .domain import ClipBox
 from .errors import MemoryLimitError
 
 FACE_CAPACITY = 64
@@ -62,7 +63,7 @@ class Corners:
         self.engine = engine
         self._scan = Scan(engine)
 
-    def list(self, box: Box, t: Tessellation) -> Views:
+    def list(self, box: ClipBox, t: Tessellation) -> Views:
         """Return what each cell of `t` sees.
 
         Raises
@@ -112,7 +113,7 @@ class Corners:
         engine, changed = self.engine, self.engine.empty(1, np.int32)
         while True:
             changed.fill(0)
-            cl.enqueue_copy(engine.queue, views.labels.data, joined.data)
+            cl.enqueue_copy(engine.queue, buffer_of(views.labels), buffer_of(joined))
             engine.run_each(
                 self._spread, len(joined), views.same, views.twins, views.labels, joined, changed
             )

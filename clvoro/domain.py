@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -16,6 +16,14 @@ if TYPE_CHECKING:
 
 LARGEST_EDGE = 1e50
 """Longest edge, and one over the shortest: fifth powers of lengths must not leave the range of float64."""
+
+
+class ClipBox(Protocol):
+    """The box that cells are clipped by, all that stages know of a domain: a `Domain`, or a box of their own."""
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners in the device's coordinates, padded to four numbers as kernels take them."""
+        ...
 
 
 class Domain(ABC):
@@ -56,6 +64,10 @@ class Domain(ABC):
     @abstractmethod
     def measure(self) -> float:
         """Area or volume."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return what files hold of the domain, as plain values."""
 
     @abstractmethod
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -174,6 +186,10 @@ class Box(Domain):
     def measure(self) -> float:
         """Area or volume."""
         return float(np.prod(self.extent))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments that make this box."""
+        return {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.

@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Domain
+from .domain import Box, Domain
 from .loops import FaceLoops, Loops
 from .polygon import Polygon
 from .results import Diagram
@@ -39,10 +39,10 @@ def fetch_diagram(
     if isinstance(domain, Polygon):
         fetched: _Fetched = _FetchedPolygon(engine, domain, t, labels, copy)
         others.remove("face_vert")
-    elif unfolded is None:
-        fetched = _Fetched(engine, domain, t, labels, copy)
-    else:
+    elif unfolded is not None and isinstance(domain, Box):
         fetched = _FetchedTorus(engine, domain, t, labels, copy, unfolded)
+    else:
+        fetched = _Fetched(engine, domain, t, labels, copy)
     names = (name for name in Diagram._NAMES if not name.startswith(tuple(others)))
     return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
 

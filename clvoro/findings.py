@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .errors import ClvoroError
 
@@ -103,7 +104,7 @@ class Check:
         self.checked: list[str] = []
 
     def note(
-        self, name: str, wrong: np.ndarray, say: Callable[[int], str], stop: bool = False
+        self, name: str, wrong: ArrayLike, say: Callable[[int], str], stop: bool = False
     ) -> None:
         """Record whether `name` holds: `wrong` (k,) is true (or large) where it does not."""
         self.checked.append(name)

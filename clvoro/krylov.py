@@ -207,7 +207,7 @@ class ConjugateGradient:
             return self._relate(*self._state.get()[2:])
 
         def iterate(k: int) -> None:
-            if not diagonal:
+            if not isinstance(precondition, cla.Array):
                 precondition(r, u, q)
                 launch(kernels.dot_product, size, np.int32(_GAMMA + (k & 1)), r, u, self.partial)
             direction.set_first(k)

@@ -9,11 +9,12 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Tessellation
 from .corners import Corners, Views
-from .domain import Box
+from .domain import ClipBox
 from .errors import ClvoroError
 
 MOST_ROUNDS = 200
@@ -48,7 +49,7 @@ class FaceLoops:
         self._scan = Scan(engine)
         self._kernels = engine.kernels("loops")
 
-    def walk(self, box: Box, t: Tessellation) -> Loops:
+    def walk(self, box: ClipBox, t: Tessellation) -> Loops:
         """Return the loops of `t`, vertices numbered in the order of the first cell they belong to.
 
         Raises
@@ -91,10 +92,9 @@ class FaceLoops:
         """
         engine, v, c = self.engine, len(twins), len(views.owners)
         counts, differs = engine.empty(v, np.int32), engine.empty(v, np.uint8)
-        any_, done, levels = engine.empty(1, np.int32), engine.empty(1, np.int32), None
+        any_, done = engine.empty(1, np.int32), engine.empty(1, np.int32)
         reduced = engine.empty(len(views.turns), np.int32)
-        opposites = chains = joined = None
-        chosen = self._chosen(k, views)
+        chosen, snapping = self._chosen(k, views), None
         for _ in range(MOST_ROUNDS):
             engine.run_each(
                 k.reduce_views, v, views.turn_starts, views.turns, views.labels, reduced, counts
@@ -105,15 +105,10 @@ class FaceLoops:
             )
             if not int(any_[0].get()):
                 return reduced, counts, chosen
-            if levels is None:
-                levels, joined = engine.zeros(v, np.uint8), engine.empty(c, np.int32)
-                opposites, chains = (engine.empty(len(views.turns), np.int32) for _ in range(2))
-                engine.run_each(
-                    k.find_opposites, v, views.owners, views.corner_faces, views.starts, views.view_labels,
-                    views.turn_starts, views.turns, opposites, chains,
-                )  # fmt: skip
-                views.corner_faces = engine.empty(1, np.int32)  # the largest of what has served
-            cl.enqueue_copy(engine.queue, joined.data, views.labels.data)
+            if snapping is None:
+                snapping = self._begin_snapping(k, views, v, c)
+            levels, joined, opposites, chains = snapping
+            cl.enqueue_copy(engine.queue, buffer_of(joined), buffer_of(views.labels))
             done.fill(0)
             proposals = engine.empty(len(views.turns), np.int32).fill(-1)
             engine.run_each(
@@ -126,7 +121,7 @@ class FaceLoops:
                 chosen = self._chosen(k, views)
             if what & PUT:
                 del reduced
-                opposites, chains = self._put(k, views, opposites, chains, proposals)
+                snapping = levels, joined, *self._put(k, views, opposites, chains, proposals)
                 reduced = engine.empty(len(views.turns), np.int32)
         raise ClvoroError(
             "the cells' views of their common faces do not come together; perturb generators that are "
@@ -140,6 +135,20 @@ class FaceLoops:
         engine.run_each(k.rate_corners, c, views.labels, views.sharpness, best)
         engine.run_each(k.choose_corners, c, views.labels, views.sharpness, best, chosen)
         return chosen
+
+    def _begin_snapping(
+        self, k: SimpleNamespace, views: Views, v: int, c: int
+    ) -> tuple[cla.Array, cla.Array, cla.Array, cla.Array]:
+        """Return the levels of `v` views, the labels to be of `c` corners, the opposites and the chains of turns."""
+        engine = self.engine
+        levels, joined = engine.zeros(v, np.uint8), engine.empty(c, np.int32)
+        opposites, chains = (engine.empty(len(views.turns), np.int32) for _ in range(2))
+        engine.run_each(
+            k.find_opposites, v, views.owners, views.corner_faces, views.starts, views.view_labels,
+            views.turn_starts, views.turns, opposites, chains,
+        )  # fmt: skip
+        views.corner_faces = engine.empty(1, np.int32)  # the largest of what has served
+        return levels, joined, opposites, chains
 
     def _put(
         self,

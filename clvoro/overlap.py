@@ -105,7 +105,7 @@ def outlines(diagram: Diagram) -> np.ndarray:
     several = np.flatnonzero(usable & ~lone)
     for i in np.unique(of[several]):
         cells[i] = _joined(rings[several[of[several] == i]])
-    cells[np.equal(cells, None)] = shapely.Polygon()
+    cells[[cell is None for cell in cells]] = shapely.Polygon()
     bad = ~shapely.is_valid(cells)  # outlines that cross themselves by a rounding, or touch
     cells[bad] = [_areas(shapely.make_valid(cell)) for cell in cells[bad]]
     return cells
@@ -114,7 +114,7 @@ def outlines(diagram: Diagram) -> np.ndarray:
 def _joined(rings: np.ndarray) -> Any:
     """Return what lies on the left of all `rings`."""
     outer = shapely.is_ccw(rings)
-    parts = [_areas(shapely.make_valid(part)) for part in shapely.polygons(rings)]
+    parts = [_areas(shapely.make_valid(part)) for part in np.asarray(shapely.polygons(rings))]
     whole = shapely.union_all([p for p, o in zip(parts, outer, strict=True) if o])
     return shapely.difference(
         whole, shapely.union_all([p for p, o in zip(parts, outer, strict=True) if not o])

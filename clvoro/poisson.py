@@ -94,7 +94,7 @@ class Poisson:
         key = store, self.engine.face if face is None else face
         if key not in self._kernels:
             names = (self.engine.name_of(real) for real in key)
-            defines = dict(zip(("STORE", "FACE"), names, strict=True))
+            defines: dict[str, object] = dict(zip(("STORE", "FACE"), names, strict=True))
             self._kernels[key] = self.engine.kernels("poisson", defines)
         return self._kernels[key]
 

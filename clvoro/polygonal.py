@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import buffer_of
 from .bins import BinnedPoints
 from .cells import Tessellation
 from .chords import Boundary
@@ -64,8 +65,8 @@ class PolygonTessellator:
                 convex = None
             cl.enqueue_copy(
                 self.engine.queue,
-                self._all.data,
-                points.data,
+                buffer_of(self._all),
+                buffer_of(points),
                 byte_count=2 * n * self.engine.real.itemsize,
             )
             if total > n:

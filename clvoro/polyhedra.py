@@ -8,12 +8,13 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
 from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .cells import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
-from .domain import Box
+from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
 
 FACE_CAPACITY = 64
@@ -90,7 +91,7 @@ class Polyhedra:
     @framed
     def tessellate(
         self,
-        box: Box,
+        box: ClipBox,
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
@@ -138,7 +139,7 @@ class Polyhedra:
         )
         capacity, again = FACE_CAPACITY, False
         first_reach, first = engine.real.type(FIRST_REACH), engine.scratch(n, np.float32)
-        cl.enqueue_copy(engine.queue, first.data, binned.reach.data, byte_count=4 * n)
+        cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
@@ -167,7 +168,9 @@ class Polyhedra:
             if m > self._room:
                 # All anew: what did not fit was not kept. With the radii from before, as the last bits depend on them,
                 # and should not on how much room there was.
-                cl.enqueue_copy(engine.queue, binned.reach.data, first.data, byte_count=4 * n)
+                cl.enqueue_copy(
+                    engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
+                )
                 labels, measures, centroids = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
@@ -201,7 +204,11 @@ class Polyhedra:
             faces["face_centroids"],
         )  # fmt: skip
         engine.run_each(k.put_graph, rows, starts, neighbours, cells["starts"], faces["neighbours"])
-        return Tessellation(n=rows, points=points, **cells, **faces, narrow=bool(flags & NARROW))
+        return Tessellation(
+            n=rows, points=points, starts=cells["starts"], neighbours=faces["neighbours"],
+            face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
+            offsets=cells["offsets"], covariances=cells["covariances"], narrow=bool(flags & NARROW),
+        )  # fmt: skip
 
     def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"

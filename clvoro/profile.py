@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -80,7 +79,7 @@ class Span:
         Of the row that ended it: step 0 is all that comes before the first step. None: what came after the last row.
     wall : float
         Seconds by the clock.
-    stages : Counter
+    stages : dict
         Device time per stage.
     read : int
         Bytes that the host has read from the device.
@@ -91,13 +90,13 @@ class Span:
     level: int | None = None
     cells: int | None = None
     wall: float = 0.0
-    stages: Counter[str] = field(default_factory=Counter)
+    stages: dict[str, float] = field(default_factory=dict)
     read: int = 0
 
     @property
     def host(self) -> float:
         """Seconds that the device did not work."""
-        return self.wall - self.stages.total()
+        return self.wall - sum(self.stages.values())
 
 
 class Profile:
@@ -218,7 +217,7 @@ class Profile:
                 cost.seconds_known += seconds
             elif key[1] == "read":
                 span.read += moved
-        span.stages[key[0]] += seconds
+        span.stages[key[0]] = span.stages.get(key[0], 0.0) + seconds
 
     # What came of it.
 
@@ -317,7 +316,7 @@ class Profile:
         stages = [["stage", "calls", "ms", "share", "GB/s", "of copy", *columns]]
         for name, cost in self.stages().items():
             row = [name, str(cost.calls), *time_of(cost.seconds), *moving(cost)]
-            stages.append([*row, *per_step(lambda s, name=name: s.stages[name])])
+            stages.append([*row, *per_step(lambda s, name=name: s.stages.get(name, 0.0))])
         stages.append(["host", "", *time_of(self.host), "", "", *per_step(lambda s: s.host)])
         whole = ["wall", str(self.launches), *time_of(self.wall), "", ""]
         stages.append([*whole, *per_step(lambda s: s.wall)])
@@ -373,7 +372,9 @@ def copy_bandwidth(ctx: cl.Context, repeat: int = 5) -> float:
     device = queue.device
     size = min(LARGE, device.max_mem_alloc_size // 4, device.global_mem_size // 8) // 4096 * 4096
     source, target = (cl.Buffer(ctx, cl.mem_flags.READ_WRITE, size) for _ in range(2))
-    cl.enqueue_fill(queue, source, np.int8(1), size)  # pages exist once they have been written
+    cl.enqueue_fill(
+        queue, source, np.ones(1, np.int8), size
+    )  # pages exist once they have been written
     kernel = build_program(ctx, "copy.cl", {}, "").all_kernels()[0]
     kernel.set_args(source, target)
     best = float("inf")

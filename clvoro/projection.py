@@ -132,10 +132,10 @@ class Projection:
             Launch(engine, k.iterate, *iteration, groups=1)()
             rows = self._read(max_iterations)
         else:
-            steps = (
+            descend, update = (
                 Launch(engine, kernel, np.int32(0), *iteration) for kernel in (k.descend, k.update)
             )
-            rows = self._iterate(*steps, max_iterations)
+            rows = self._iterate(descend, update, max_iterations)
         solution = self._judge(rows, tolerance)
         if solution.iterations:
             engine.run_each(k.put_correction, n, v.u, h, correction)

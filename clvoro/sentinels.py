@@ -33,7 +33,7 @@ def place_sentinels(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]
     lower, upper = domain.clip_box
     edge = float((upper - lower).max()) / 8
     counts = np.ceil((upper - lower) / edge).astype(int)
-    centres = lower + edge * (np.indices(counts).reshape(2, -1).T + 0.5)
+    centres = lower + edge * (np.indices(counts.tolist()).reshape(2, -1).T + 0.5)
     found: list[np.ndarray] = []
     children = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
     rng = np.random.Generator(np.random.PCG64(0))

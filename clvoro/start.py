@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from numbers import Integral, Real
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -158,9 +159,19 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
     return _distinct(draw, domain, n, np.dtype(real))
 
 
+@runtime_checkable
+class _Evaluator(Protocol):
+    """A field of a precision, as `Sizing` is."""
+
+    @property
+    def real(self) -> np.dtype: ...
+
+    def __call__(self, points: np.ndarray) -> np.ndarray: ...
+
+
 def _evaluator(field: object) -> Callable[[np.ndarray], np.ndarray]:
     """Return `field` if it has a precision of its own (a stage), else as a `Field`."""
-    return field if hasattr(field, "real") and callable(field) else as_field(field)
+    return field if isinstance(field, _Evaluator) else as_field(field)
 
 
 def _checked(n: int, seed: int) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from ._program import Engine
 from .bins import BinnedPoints
-from .domain import Box
+from .domain import ClipBox
 from .errors import ClvoroError, InputError
 
 FACES = {2: 32, 3: 64}
@@ -109,7 +109,7 @@ class Transfer:
         self._build()
 
     def fit_slopes(
-        self, box: Box, graph: Graph, values: cla.Array, centroids: cla.Array, limited: bool
+        self, box: ClipBox, graph: Graph, values: cla.Array, centroids: cla.Array, limited: bool
     ) -> Content:
         """Return the content of cells in which `values` (n, width) are the means of linear functions.
 
@@ -137,7 +137,7 @@ class Transfer:
 
     def transfer(
         self,
-        box: Box,
+        box: ClipBox,
         old: Graph,
         binned: BinnedPoints,
         content: Content,

@@ -10,7 +10,7 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Tessellation
-from .domain import Box
+from .domain import ClipBox
 
 MAX_CELLS_AT_VERTEX = 1024
 
@@ -35,7 +35,7 @@ class VertexNumbering:
         self._scan = Scan(engine)
         self._kernels = engine.kernels("vertices", {"MAX_CELLS_AT_VERTEX": MAX_CELLS_AT_VERTEX})
 
-    def number(self, box: Box, t: Tessellation) -> Vertices:
+    def number(self, box: ClipBox, t: Tessellation) -> Vertices:
         """Return the vertices of `t`, numbered in the order of their least corner."""
         engine, k = self.engine, self._kernels
         m = int(t.starts[t.n].get())

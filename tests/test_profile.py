@@ -49,7 +49,7 @@ def test_numbers_add_up(run):
     assert kernels > 0
     assert taken.device == pytest.approx(kernels, **close)
     assert sum(cost.seconds for cost in stages.values()) == pytest.approx(kernels, **close)
-    assert sum(s.stages.total() for s in taken.spans) == pytest.approx(kernels, **close)
+    assert sum(sum(s.stages.values()) for s in taken.spans) == pytest.approx(kernels, **close)
     assert taken.of(*stages) == pytest.approx(kernels, **close)
     assert taken.device + taken.host == pytest.approx(taken.wall, **close)
     # The device works at one thing at a time, and between opening and closing.

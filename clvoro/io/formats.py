@@ -43,7 +43,7 @@ def write_foreign(result: Result, path: Path) -> None:
     data = cell_data(result) if _POLYGONS[suffix] else {}
     mesh = meshio.Mesh(
         in_space(result.diagram.vertices),
-        blocks,
+        [*blocks],
         cell_data={name: [_known(v)[i] for i in order] for name, v in data.items()},
     )
     # meshio prints to the terminal; what matters of it arrives as an exception.

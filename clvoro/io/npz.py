@@ -56,9 +56,8 @@ def write_npz(result: Result, path: Path) -> None:
     """Write all of `result` to `path`; the same result gives the same bytes."""
     diagram = result.diagram
     domain = diagram.domain
-    plain = domain.describe() if isinstance(domain, Polygon) else dataclasses.asdict(domain)
     about: dict[str, Any] = {
-        "domain": {"kind": type(domain).__name__, **plain},
+        "domain": {"kind": type(domain).__name__, **domain.describe()},
         "settings": result.settings,
         "values": {},
     }

@@ -221,11 +221,11 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         known |= {"face_vertex_starts": face_starts, "face_vertices": corners}
     # What the file does not hold is what its corners give.
     diagram = Diagram(domain, {**known, **rebuild(Diagram(domain, known))})
-    values = {
-        name: arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
-    }
+    size, error, quality = (
+        arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
+    )
     return Result(
-        points=points, diagram=diagram, **values, history=np.zeros(0, HISTORY_DTYPE),
+        points=points, diagram=diagram, size=size, error=error, quality=quality, history=np.zeros(0, HISTORY_DTYPE),
         converged=False, stop_reason="read from a .vtu file",
     )  # fmt: skip
 
@@ -236,7 +236,7 @@ def _periodic_box(arrays: dict[str, np.ndarray], dim: int) -> Box:
     axes = arrays["FieldData.box_periodic"]
     if axes.shape != (dim,):
         raise _FileError("box_periodic has another number of directions")
-    return Box(*corners.tolist(), periodic=[bool(a) for a in axes])
+    return Box(*corners.tolist(), periodic=tuple(bool(a) for a in axes))
 
 
 def _seam(

@@ -167,7 +167,7 @@ class Function(Field):
 
     on_device = False
 
-    def __init__(self, function: Callable[[np.ndarray], np.ndarray]):
+    def __init__(self, function: Callable[[np.ndarray], object]):
         if not callable(function):
             raise InputTypeError(
                 f"Function got {type(function).__name__}, expected a callable "
@@ -239,7 +239,7 @@ class Combined(Field):
     """Two or more fields under one of ``+``, ``*``, ``/``, ``min``, ``max``, from left to right."""
 
     def __init__(self, operation: str, *fields: Field):
-        dims = {f.dim for f in fields} - {None}
+        dims = {f.dim for f in fields if f.dim is not None}
         if len(dims) > 1:
             raise InputError(
                 f"a size field was combined from fields of {sorted(dims)} dimensions, expected "
@@ -329,9 +329,10 @@ def positive(what: str, value: object) -> float:
     """Return `value` as a float, or raise the error that `what` must be positive and finite."""
     if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
         raise InputTypeError(f"{what} is {value!r}, expected a positive number")
-    if not (value > 0 and math.isfinite(value)):
+    number = float(value)
+    if not (number > 0 and math.isfinite(number)):
         raise InputError(f"{what} is {value!r}, expected a positive, finite number")
-    return float(value)
+    return number
 
 
 def slope_of(what: str, growth: object, slope: object) -> float:
@@ -348,6 +349,6 @@ def slope_of(what: str, growth: object, slope: object) -> float:
                 "write slope= for dh/dx"
             )
         return math.log(rate)
-    if not (isinstance(slope, Real) and 0 <= slope < math.inf):
+    if not (isinstance(slope, Real) and 0 <= float(slope) < math.inf):
         raise InputError(f"{what} slope is {slope!r}, expected a finite number >= 0")
     return float(slope)
