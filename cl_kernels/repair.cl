@@ -121,6 +121,7 @@ inline void check_row(int i, global const int *starts, global const int *neighbo
 }
 
 #if IN_LANES
+#include "common/eight_marked.h"
 #include "common/eight_rows.h"
 #endif
 
@@ -172,14 +173,31 @@ inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n
     return 0;
 }
 
-/* Per listed generator: its cell, clipped by its neighbours and theirs, into slot base + w. */
-kernel void clip_marked(const int size, global const int *listed, const int base, global const int *places,
+#if IN_LANES
+/* Per LANES generators that are listed first of all: their cells among a few candidates, into slots from 0 on, or
+   slot_counts[w] = 0 where one is left to be clipped. */
+kernel void wrap_marked(const int size, const int count, global const int *listed, global const int *places,
                         global int *slots, global int *slot_counts, global const int *old_starts,
                         global const int *old_neighbours, global const REAL *points, const REAL4 box_lower,
-                        const REAL4 box_upper, global int *fits, global int *flags)
+                        const REAL4 box_upper)
+{
+    WORK_ITEM(group);
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbours);
+    wrap_eight(group * LANES, count, listed, &rows, points, box_lower, box_upper, slots, slot_counts);
+}
+#endif
+
+/* Per listed generator: its cell, clipped by its neighbours and theirs, into slot base + w. If `wrapped`, rows that
+   have faces are there already. */
+kernel void clip_marked(const int size, global const int *listed, const int base, const int wrapped,
+                        global const int *places, global int *slots, global int *slot_counts,
+                        global const int *old_starts, global const int *old_neighbours, global const REAL *points,
+                        const REAL4 box_lower, const REAL4 box_upper, global int *fits, global int *flags)
 {
     WORK_ITEM(w);
     const int i = listed[w];
+    if (wrapped && slot_counts[base + w] > 0)
+        return;
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
@@ -188,10 +206,6 @@ kernel void clip_marked(const int size, global const int *listed, const int base
     start_cell(&cell, i, x, lower, upper);
     int n, m;
     global const int *row = face_row(&rows, i, &n);
-    /* Clipped once more, it may leave some that have been found to fit it. */
-    for (int k = 0; k < n && places[i] >= 0; ++k)
-        if (row[k] >= 0)
-            atomic_and(fits + row[k], 0);
     int flag = clip_by_row(&cell, x, row, n, points);
     for (int k = 0; k < n && flag == 0; ++k)
         if (row[k] >= 0) {
@@ -205,6 +219,13 @@ kernel void clip_marked(const int size, global const int *listed, const int base
             flag = FLAG_FULL;
 #endif
     store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags);
+    if (places[i] < 0)
+        return;
+    /* Clipped once more, it may leave some that have been found to fit it. */
+    for (int k = 0; k < n; ++k)
+        if (row[k] >= 0 && place_in_row(slots + (base + w) * ROW_CAPACITY, abs(slot_counts[base + w]), row[k]) ==
+                               abs(slot_counts[base + w]))
+            atomic_and(fits + row[k], 0);
 }
 
 /* Per listed generator: put its new row in the place of the old one. It fits until a neighbour says otherwise. */

@@ -11,12 +11,18 @@ import pyopencl.array as cla
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Cells, Tessellation
-from .domain import Box
+from .domain import ClipBox
 
 MAX_ROUNDS = 6
 """Rounds of clipping and checking, beyond which a diagram is made anew."""
 MAX_SHARE = 0.5
-"""Share of the cells that may have to be clipped: a diagram made anew costs less than one that is mostly repaired."""
+"""Share of the cells that may have to be clipped at first: a diagram made anew costs less than one mostly repaired."""
+AGAIN_SHARE = 0.1
+"""The same for cells that are clipped once more, and those found out later, together."""
+
+
+FEW = 256
+"""Cells that are clipped one by one; of more, those that change but once are found eight at a time, on CPUs."""
 
 
 class Repair:
@@ -34,7 +40,7 @@ class Repair:
         self._last: ReferenceType[Tessellation] | None = None
 
     def follow(
-        self, cells: Cells, box: Box, points: cla.Array, previous: Tessellation
+        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
     ) -> Tessellation | None:
         """Tessellate `box` by `points` (n, d), the generators of `previous` where they are now.
 
@@ -46,7 +52,7 @@ class Repair:
         return t
 
     def _follow(
-        self, cells: Cells, box: Box, points: cla.Array, previous: Tessellation
+        self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
     ) -> Tessellation | None:
         engine, n = self.engine, previous.n
         key = tuple(cells.defines.values())
@@ -59,7 +65,7 @@ class Repair:
             self._last = None
         if self._last is None or self._last() is not previous:
             self._fits.fill(0)
-        most = int(MAX_SHARE * n)
+        first_most, most = int(MAX_SHARE * n), int((MAX_SHARE + AGAIN_SHARE) * n)
         rows = cells.take_rows(n, most)
         marks, listed = engine.scratch(n, np.int32), engine.scratch(most, np.int32)
         sums = engine.scratch(n + 1, np.int32)
@@ -76,11 +82,17 @@ class Repair:
             count = int(sums[n].get())
             if count == 0:
                 return cells.complete(rows, box, points, previous, self._fits)
-            if base + count > most:
+            if base + count > (most if base else first_most):
                 return None
             engine.run_each(k.list_marked, n, marks, sums, listed)
+            wrapped = cells.lanes > 1 and base == 0 and count >= FEW
+            if wrapped:
+                engine.run_each(
+                    k.wrap_marked, -(-count // cells.lanes), np.int32(count), listed, rows.places, rows.slots,
+                    rows.counts, *old, points, *corners, group=1,
+                )  # fmt: skip
             engine.run_each(
-                k.clip_marked, count, listed, np.int32(base), rows.places, rows.slots,
+                k.clip_marked, count, listed, np.int32(base), np.int32(wrapped), rows.places, rows.slots,
                 rows.counts, *old, points, *corners, self._fits, rows.flags,
             )  # fmt: skip
             engine.run_each(

@@ -6,6 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from clvoro import repair
+from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
 from clvoro.repair import Repair
@@ -100,8 +102,11 @@ def check(t, eps):
 
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
-def test_is_the_diagram_itself(engine, name, share):
+def test_is_the_diagram_itself(engine, name, share, monkeypatch):
     """Ten small moves; the same bits as a diagram made anew wherever nothing is degenerate."""
+    monkeypatch.setattr(
+        repair, "FEW", 1
+    )  # however small the set, cells are found in lanes where there are any
     rng = np.random.default_rng(40963)
     eps = float(np.finfo(engine.real).eps)
     points = POINTS[name].astype(engine.real)
@@ -166,6 +171,38 @@ def test_rows_that_are_known_to_fit_do(engine, name, share):
             assert fits.mean() > 0.7
     if name == "random" and share > 0:
         assert changed > 3
+
+
+def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
+    """The others, at walls, in doubt or with more than one change, are clipped: rightly, but at ten times the cost."""
+    engine, rng = patch.make_engine(ctx), np.random.default_rng(40968)
+    if engine.group_size > 1:
+        pytest.skip("lanes are for CPUs")
+    points = patch.random_points(4000, 40969)
+    carried, rounds, found = Carried(engine, points), [], []
+    run = Engine.run_each
+
+    def watched(self, kernel, size, *args, **kwargs):
+        event = run(self, kernel, size, *args, **kwargs)
+        if kernel.function_name == "wrap_marked":
+            count, listed, counts = args[0], args[1], args[4]
+            found.append((listed.get()[:count], counts.get()[:count]))
+        elif kernel.function_name == "clip_marked":
+            rounds.append(size)
+        return event
+
+    monkeypatch.setattr(Engine, "run_each", watched)
+    move = 0.2 * spacing(points) * (rng.random(points.shape) - 0.5)
+    points = np.clip(points + move, 0, [1, 0.75])
+    _, was = carried.move(points)
+    assert was
+    assert rounds[0] > 500
+    (listed, counts), *others = found
+    assert not others
+    # Within some spacings of .014 a cell may reach a wall.
+    inner = (abs(points[listed] - [0.5, 0.375]) < [0.44, 0.315]).all(axis=1)
+    assert (counts[inner] > 0).mean() > 0.95
+    assert sum(rounds[1:]) < 0.1 * rounds[0]
 
 
 def test_many_changes_are_made_anew(engine):

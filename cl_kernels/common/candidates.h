@@ -1,46 +1,10 @@
-/* Lists of candidates for eight generators at a time, one in each lane of vectors; see `hulls.cl`. */
-#include "common/lanes.h"
+/* Candidates of eight generators at a time from all that are near; see `hulls.cl`. */
+#include "common/lists.h"
 #include "common/near.h"
 
-#if !IS_DOUBLE
-#error "single precision has too few digits to tell which decisions are certain"
-#endif
-#define LANES 8
-/* One lane of vector k of an array. */
-#define LANE(vectors, k, lane) ((vectors)[(k)*LANES + (lane)])
-
-/* Candidates of one generator. */
-#define LIST_CAPACITY 48
 /* A list that begins with more candidates than MANY is cut to about ENOUGH of the nearest. */
 #define MANY 36
 #define ENOUGH 28
-/* Candidates are compared in CHAINS that do not wait for each other, as a comparison takes a dozen cycles: lists end
-   with none up to a multiple. */
-#define CHAINS 4
-
-/* Per lane a list of candidates: relative positions inverted, NaN where there is none; place, or -1 - wall. The nearest
-   has p^2 = largest2. */
-typedef struct {
-    int length;
-    double8 x[LIST_CAPACITY + CHAINS], y[LIST_CAPACITY + CHAINS];
-    int8 places[LIST_CAPACITY];
-    double8 largest2;
-    long8 nearest;
-} list_t;
-
-/* Append one candidate per lane, at (dx, dy), NaN where there is none; their places are the caller's to write. The
-   generator itself is none: 0 times infinity is NaN. */
-inline void put_candidates(list_t *list, double8 dx, double8 dy)
-{
-    const double8 square = fma(dx, dx, dy * dy);
-    const double8 scale = 1 / square;
-    const int k = list->length++;
-    list->x[k] = dx * scale;
-    list->y[k] = dy * scale;
-    const long8 nearer = (scale > list->largest2) & (square > 0);
-    list->largest2 = nearer ? scale : list->largest2;
-    list->nearest = nearer ? (long8)k : list->nearest;
-}
 
 /* Append to the lists what `bits` say of the generators that are near, at most `most` each. */
 inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most, global const double *binned,
@@ -142,11 +106,4 @@ inline void add_walls(list_t *list, double8 x, double8 y, long8 lanes, double4 b
         list->places[list->length] = -1 - wall;
         put_candidates(list, lanes ? (wall < 2 ? across : 0) : NAN, wall < 2 ? 0 : across);
     }
-}
-
-/* Fill the lists up to a multiple of CHAINS. */
-inline void pad_list(list_t *list)
-{
-    for (; list->length % CHAINS; ++list->length)
-        list->x[list->length] = list->y[list->length] = NAN;
 }
