@@ -211,6 +211,15 @@ SELECT(int, 8, int)
 SELECT(long, 2, long)
 SELECT(long, 4, long)
 SELECT(long, 8, long)
+/* Of scalars any number but 0 chooses. */
+OVERLOADED int select(int a, int b, int c)
+{
+    return c ? b : a;
+}
+OVERLOADED float select(float a, float b, int c)
+{
+    return c ? b : a;
+}
 
 #define INTEGER(T)                                                                                                     \
     OVERLOADED T min(T a, T b)                                                                                         \
@@ -319,6 +328,18 @@ CONVERT(double, float)
 CONVERT(double, double)
 CONVERT(float, int)
 CONVERT(float, float)
+CONVERT(float, double)
+
+#define CONVERT_ONE(T, S)                                                                                              \
+    OVERLOADED T convert_##T(S a)                                                                                      \
+    {                                                                                                                  \
+        return (T)a;                                                                                                   \
+    }
+CONVERT_ONE(float, float)
+CONVERT_ONE(float, double)
+CONVERT_ONE(double, float)
+CONVERT_ONE(double, double)
+
 OVERLOADED int convert_int_rte(float a)
 {
     return (int)rint(a);
