@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from .bins import BinnedPoints
 from .cells import Tessellation
-from .domain import Domain
+from .domain import Box, Domain
 from .polygon import Polygon
 from .polygonal import PolygonTessellator
 from .polyhedra import Polyhedra
@@ -39,7 +39,7 @@ class Tessellator:
     ) -> None:
         self.stages, self.domain = stages, domain
         self.torus: Torus | None = None
-        if any(domain.periodic):
+        if isinstance(domain, Box) and any(domain.periodic):
             known = None if coarser is None or coarser.torus is None else coarser.torus.margins
             self.torus = Torus(stages, domain, known)
         self._polygon = (
