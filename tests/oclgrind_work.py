@@ -20,6 +20,7 @@ import clvoro
 from clvoro import _program
 from clvoro._primitives import Scan
 from clvoro.mesh import Stages
+from clvoro.population import Population, PopulationControl
 from clvoro.sizing import (
     Circle,
     Distance,
@@ -33,6 +34,8 @@ from clvoro.sizing import (
     minimum,
 )
 from tests.gpu_like import use_groups
+from tests.patch import BOX as PATCH
+from tests.patch import hexagons, tessellate
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -291,6 +294,24 @@ def multigrid(adapter: clvoro.Adapter) -> None:
     assert stage.solve(rough, rhs, engine.upload(points(n)[:, 1]), tolerance=ROUGH).converged
 
 
+def nuclei(adapter: clvoro.Adapter) -> None:
+    """Pairs of dislocations that are made where the lattice is strained: runs get there late."""
+    engine, stretch = stages_of(adapter).engine, 1.15
+    x = hexagons(0.08, clvoro.Box((-1, -1), (2, 2))) * (stretch, 1 / stretch) + 0.1
+    t = tessellate(engine, x := x[PATCH.contains(x)])
+    n, h = len(x), 0.08 * (3**0.5 / 2) ** 0.5
+    rows = Population(
+        t.points, engine.upload(np.arange(n), np.int32), engine.zeros((n, 2)), engine.zeros(n, np.uint64),
+        engine.zeros(n),
+    )  # fmt: skip
+    sizes, excess = engine.upload(np.full(n, h)), engine.zeros(n)
+    found = PopulationControl(engine).reorganise(
+        PATCH, t, sizes, sizes, excess, rows, 0.0, n, nuclei=2
+    )
+    assert found is not None
+    assert found.inserted + found.deleted >= 2
+
+
 def scan(adapter: clvoro.Adapter) -> None:
     """Prefix sums of an array of no round length that is too long for one work-item."""
     engine, n = stages_of(adapter).engine, 8219
@@ -349,8 +370,9 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "hulls": hulls,
     "solid": solid,
     "fields": fields,
-    "multigrid": multigrid,
+    "multigrid": in_many_launches(multigrid),
     "scan": scan,
+    "nuclei": nuclei,
     "transfer": transfer,
     "gradation": gradation,
     "copy": copy,
@@ -361,7 +383,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
     "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
-    "best": method("adaptive", levels=0, n_cells=320, effort="best", max_steps=31),
+    "best": method("adaptive", levels=0, n_cells=150, effort="best", max_steps=20),
     "exact": in_many_launches(method("exact", levels=0, effort="fast", max_steps=75)),
     "solid-run": method("exact", CUBE, SOLID, effort="fast", max_steps=14),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
