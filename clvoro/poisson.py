@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ._launch import Launch
+from ._launch import Launch, most_alone
 from ._program import Engine, Kernels
 from .errors import InputError
 from .krylov import (
@@ -32,15 +32,17 @@ _MOST_LOST = 5
 _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
 
 
-def expected_costs(n: int, dim: int, tolerance: float) -> tuple[float, float]:
+def expected_costs(n: int, dim: int, tolerance: float, alone: bool = False) -> tuple[float, float]:
     """Return the expected cost of a solve with Jacobi's method and with multigrid, its set-up included.
 
     In milliseconds of processor time with PoCL on two cores, from fits to random and adapted
     meshes of 500 to 10^6 cells; on other devices the parts (enqueueing, cells) are larger or
-    smaller alike. Jacobi's iterations grow with the mesh's width in cells, multigrid's do not.
+    smaller alike. Jacobi's iterations grow with the mesh's width in cells, multigrid's do not; they cost next to
+    nothing but the cells where one work-group goes through them `alone`.
     """
     digits, thousands = max(-math.log10(tolerance), 0.0), n / 1000
-    jacobi = n ** (1 / dim) * (1.2 + 0.7 * digits) * (0.04 + 0.0085 * thousands)
+    iteration = 0.001 + 0.0105 * thousands if alone else 0.04 + 0.0085 * thousands
+    jacobi = n ** (1 / dim) * (1.2 + 0.7 * digits) * iteration
     multigrid = 6 + 0.5 * thousands + (2 + 1.8 * digits) * (0.3 + 0.05 * thousands)
     return jacobi, multigrid
 
@@ -303,7 +305,8 @@ class Poisson:
 
         default = 500 + 30 * math.isqrt(n)
         if preconditioner == "auto":
-            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance)
+            alone = n <= most_alone(self.engine)
+            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, alone)
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":
             most = default if max_iterations is None else max_iterations

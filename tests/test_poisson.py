@@ -267,6 +267,8 @@ def test_auto_takes_what_costs_less(make):
             assert [jacobi < multigrid for jacobi, multigrid in costs] == [True, False, False]
     assert np.argmin(expected_costs(3000, 2, 1e-1)) == 0
     assert np.argmin(expected_costs(3000, 2, 1e-8)) == 1
+    # One work-group alone is through with a thousand cells sooner than many launches are.
+    assert expected_costs(1000, 2, 1e-2, alone=True)[0] < 0.5 * expected_costs(1000, 2, 1e-2)[0]
     for n, jacobi in ((600, True), (8000, False)):
         engine = make()
         poisson, laplacian = assembled(engine, graphs.random_graph(n, seed=14))
