@@ -109,22 +109,27 @@ kernel void place_items(const int size, global const int *keys, global const int
     items[bins[keys[i]].s0 + ranks[i]] = i;
 }
 
-/* The edge that a bin would have if it held OCCUPANCY generators where a block of up to 3 bins each way of its grid
-   holds as many as it does: a leaf's own few generators tell less of how far neighbours are. */
+/* The edge that a bin would have if it held OCCUPANCY generators where a block of bins about it in its grid, 3 each way
+   or as many more as hold SPACING_COUNT, holds as many as it does: a leaf's own few generators tell less of how far neighbours
+   are. */
 inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
     const int place = b - shape.s0, rows = place / shape.s1, column = place - rows * shape.s1;
     const int layer = DIM == 2 ? 0 : rows / shape.s2, row = rows - layer * shape.s2;
-    const int left = max(column - 1, 0), right = min(column + 1, shape.s1 - 1);
-    const int front = max(row - 1, 0), back = min(row + 1, shape.s2 - 1);
-    const int bottom = max(layer - 1, 0), top = min(layer + 1, shape.s3 - 1);
-    int count = 0;
-    for (int l = bottom; l <= top; ++l)
-        for (int r = front; r <= back; ++r) {
-            global const int2 *row_bins = bins + shape.s0 + (l * shape.s2 + r) * shape.s1;
-            count += row_bins[right + 1].s0 - row_bins[left].s0;
-        }
-    const int held = (right - left + 1) * (back - front + 1) * (top - bottom + 1);
+    int count = 0, held = 1, before = 0;
+    for (int width = 1; count < SPACING_COUNT && held > before; ++width) {
+        const int left = max(column - width, 0), right = min(column + width, shape.s1 - 1);
+        const int front = max(row - width, 0), back = min(row + width, shape.s2 - 1);
+        const int bottom = max(layer - width, 0), top = min(layer + width, shape.s3 - 1);
+        count = 0;
+        for (int l = bottom; l <= top; ++l)
+            for (int r = front; r <= back; ++r) {
+                global const int2 *row_bins = bins + shape.s0 + (l * shape.s2 + r) * shape.s1;
+                count += row_bins[right + 1].s0 - row_bins[left].s0;
+            }
+        before = held;
+        held = (right - left + 1) * (back - front + 1) * (top - bottom + 1);
+    }
     const REAL share = (REAL)(OCCUPANCY * held) / count;
     return edge * (DIM == 2 ? sqrt(share) : cbrt(share));
 }

@@ -1,3 +1,4 @@
+#include "common/morton.h"
 #include "common/row_counts.h"
 #include "common/walk.h"
 
@@ -16,13 +17,19 @@
 #define MAX_ROUNDS 20
 /* Where hardly any of the first cells of a stretch are certain, as in lattices that are off by little, it is left. */
 #define TRIALS 24
-#define GROWTH 1.4 /* of the radius where lists were too short */
+#define GROWTH 1.4     /* of the radius where lists were too short */
+#define THINNEST 1.001 /* ratio of the radii of a shell that still holds too much */
+#define MOST_SHELLS 64 /* that are looked at about one cell where some hold too much */
+#ifndef CUBE
+#error "build with -DCUBE=bins each way of the cubes of grid 0 that are gone through one by one, a power of 2"
+#endif
 #ifndef STRETCH
-#error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8"
+#error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8 up to 256"
 #endif
 
 /* What is certain: least ratio of squares of the distances of the nearest generator and of the farthest vertex; least
-   ratio of a face's area and the latter. */
+   ratio of a face's area and the square of the distance of its own farthest vertex, as far as which vertices round:
+   that distance is the same from both sides of the face. */
 #define CERTAIN_NEAREST2 1e-7
 #define CERTAIN_AREA 1e-7
 
@@ -86,7 +93,7 @@ inline int write_cells(const cells_t *cells, const moments_t *m, long8 done, con
 /* Lanes in which the cell, walked among all that is nearer than `reach`, is certain. */
 inline long8 certain_cells(const cells_t *cells, const moments_t *m, const list_t *list)
 {
-    return (list->nearest2 > CERTAIN_NEAREST2 * cells->reach2) & (m->least > CERTAIN_AREA * cells->reach2);
+    return (list->nearest2 > CERTAIN_NEAREST2 * cells->reach2) & (m->least > CERTAIN_AREA);
 }
 
 /* Cells to be walked once more, among their faces and what else may cut them. */
@@ -99,8 +106,82 @@ typedef struct {
     walk_t walk;
 } later_t;
 
+/* Of eight generators at places first, first + 1, ... those less than `end` that are from `from` to `to` away from x
+   and cut off one of the vertices, `far` of them, are added to list entries `k` on. Returns the next entry; no more
+   than LIST_CAPACITY are written. */
+inline int add_cutters(list_t *list, int k, int slot, global const double *binned, int first, int end, double4 x,
+                       double from2, double to2, int far, const double *far_x, const double *far_y, const double *far_z)
+{
+    int places[LANES];
+    for (int c = 0; c < LANES; ++c)
+        places[c] = min(first + c, end - 1);
+#define COORDINATES(axis)                                                                                              \
+    (double8)(binned[3 * places[0] + axis], binned[3 * places[1] + axis], binned[3 * places[2] + axis],                \
+              binned[3 * places[3] + axis], binned[3 * places[4] + axis], binned[3 * places[5] + axis],                \
+              binned[3 * places[6] + axis], binned[3 * places[7] + axis])
+    const double8 dx = COORDINATES(0) - x.s0, dy = COORDINATES(1) - x.s1, dz = COORDINATES(2) - x.s2;
+    const double8 d2 = fma(dx, dx, fma(dy, dy, dz * dz));
+    const long8 number = {0, 1, 2, 3, 4, 5, 6, 7}, inside = (d2 < to2) & (d2 >= from2) & (number < (long)(end - first));
+    if (!any(inside))
+        return k;
+    const double8 level = d2 * (0.5 + BIAS);
+    long8 cuts = 0;
+    for (int v = 0; v < far; ++v)
+        cuts |= fma(dx, far_x[v], fma(dy, far_y[v], dz * far_z[v])) > level;
+    cuts &= inside;
+    if (!any(cuts))
+        return k;
+    const double8 scale = 1 / d2, px = dx * scale, py = dy * scale, pz = dz * scale;
+    long cut[LANES];
+    vstore8(cuts, 0, cut);
+    for (int c = 0; c < LANES; ++c)
+        if (cut[c] && k < LIST_CAPACITY) {
+            put_plane(list, k, slot, LANE((const double *)&px, 0, c), LANE((const double *)&py, 0, c),
+                      LANE((const double *)&pz, 0, c), places[c]);
+            PLANE_LANE(list->planes, k++, 3, slot) = LANE((const double *)&d2, 0, c);
+        }
+    return k;
+}
+
+/* Balls that hold what is farther than `from` from x and nearer to one of the vertices than x. Vertices that follow
+   each other, as a rule near each other, share one where they are many. */
+inline balls_t balls_about(double4 x, double from, int far, const double *far_x, const double *far_y,
+                           const double *far_z)
+{
+    double4 centres[CORNER_CAPACITY];
+    double radii[CORNER_CAPACITY], xs[LANES], ys[LANES], zs[LANES], rs[LANES];
+    for (int v = 0; v < far; ++v) {
+        const double4 y = (double4)(far_x[v], far_y[v], far_z[v], 0);
+        /* The spheres about x and about the vertex cross at this share of the way to it. */
+        const double y2 = dot(y, y), share = from * from / (2 * y2);
+        centres[v] = fmax(share, 1.0) * y;
+        radii[v] = share > 1 ? sqrt(fmax(from * from - share * share * y2, 0.0)) + 1e-9 * from : sqrt(y2) * (1 + 1e-9);
+    }
+    for (int ball = 0; ball < LANES; ++ball) {
+        const int first = ball * far / LANES, end = max((ball + 1) * far / LANES, first + 1);
+        double4 centre = 0;
+        for (int v = first; v < end; ++v)
+            centre += centres[v];
+        centre /= end - first;
+        double r = 0;
+        for (int v = first; v < end; ++v) {
+            const double4 off = centres[v] - centre;
+            r = fmax(r, radii[v] + sqrt(dot(off, off)));
+        }
+        xs[ball] = x.s0 + centre.s0;
+        ys[ball] = x.s1 + centre.s1;
+        zs[ball] = x.s2 + centre.s2;
+        rs[ball] = r;
+    }
+    const balls_t balls = {vload8(0, xs), vload8(0, ys), vload8(0, zs), vload8(0, rs)};
+    return balls;
+}
+
 /* Look for generators farther than `from`, and walls, that cut off vertices of one lane's cell, in shell after shell up
-   to `need`. If there are any, put the cell among those for later. Returns how many; -1 if they are too many. */
+   to `need`. If there are any, put the cell among those for later. Returns how many; -1 if they are too many.
+
+   What cuts a vertex off is nearer to it than x is: of a cell that is long and thin no more than what is about its ends
+   is looked at. */
 inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const walk_t *walk, int lane, int place,
                      double from, double need, const search_t *in)
 {
@@ -111,12 +192,13 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
     int far = 0;
     for (int v = 0; v < cells->corners[lane]; ++v) {
         const double4 y = corner_at(walk, v, lane);
+        lower = fmin(lower, y);
+        upper = fmax(upper, y);
         far_x[far] = y.s0;
         far_y[far] = y.s1;
         far_z[far] = y.s2;
-        lower = fmin(lower, y);
-        upper = fmax(upper, y);
-        far += !(4 * dot(y, y) < from * from);
+        far +=
+            !(4 * dot(y, y) * (1 + 64 * DBL_EPSILON) < from * from); /* the farthest, at least, whatever is rounded */
     }
     list_t *list = &later->list;
     const int slot = later->n, faces = cells->faces[lane];
@@ -134,29 +216,31 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
             PLANE_LANE(list->planes, k, wall >> 1, slot) = 0.5 / walls[wall];
             PLANE_LANE(list->planes, k++, 3, slot) = 4 * walls[wall] * walls[wall];
         }
-    double to = from;
-    do {
-        const double begin2 = to * to;
+    const int known_faces = k;
+    const balls_t balls = balls_about(x, from, far, far_x, far_y, far_z);
+    double seen = from, to = fmin(need, GROWTH * from);
+    for (int trial = 0;; ++trial) {
+        const double from2 = seen * seen, to2 = to * to;
+        bool fits = collect_runs(runs, &balls, x - to, x + to, INT_MAX, in->bins, in->grid_frames, in->grid_shapes);
+        for (int run = 0; run < runs->n && fits; ++run) {
+            const int end = runs->firsts[run] + runs->counts[run];
+            for (int first = runs->firsts[run]; first < end; first += LANES)
+                k = add_cutters(list, k, slot, binned, first, end, x, from2, to2, far, far_x, far_y, far_z);
+            fits = k < LIST_CAPACITY - 1;
+        }
+        if (!fits) {
+            /* A thinner shell. */
+            k = known_faces;
+            to = sqrt(seen * to);
+            if (!(to > THINNEST * seen) || trial >= MOST_SHELLS)
+                return -1;
+            continue;
+        }
+        seen = to;
+        if (k > known_faces || !(to < need))
+            break;
         to = fmin(need, GROWTH * to);
-        if (!collect_runs(runs, x, x, to, in->bins, in->grid_frames, in->grid_shapes))
-            return -1;
-        for (int run = 0; run < runs->n; ++run)
-            for (int q = runs->firsts[run]; q < runs->firsts[run] + runs->counts[run]; ++q) {
-                const double dx = binned[3 * q] - x.s0, dy = binned[3 * q + 1] - x.s1, dz = binned[3 * q + 2] - x.s2;
-                const double d2 = fma(dx, dx, fma(dy, dy, dz * dz));
-                if (!(d2 < to * to) || d2 < begin2)
-                    continue;
-                bool cuts = false;
-                for (int v = 0; v < far; ++v)
-                    cuts |= fma(dx, far_x[v], fma(dy, far_y[v], dz * far_z[v])) > d2 * (0.5 + BIAS);
-                if (!cuts)
-                    continue;
-                if (k == LIST_CAPACITY - 1)
-                    return -1;
-                put_plane(list, k, slot, dx / d2, dy / d2, dz / d2, q);
-                PLANE_LANE(list->planes, k++, 3, slot) = d2;
-            }
-    } while (to < need && k == faces);
+    }
     if (k == faces)
         return 0;
     for (int f = 0; f < faces; ++f) {
@@ -166,7 +250,7 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
     }
     later->places[slot] = place;
     later->counts[slot] = k;
-    later->seen[slot] = to;
+    later->seen[slot] = seen;
     ++later->n;
     return k - faces;
 }
@@ -214,16 +298,70 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
     write_cells(cells, &m, vload8(0, whole) & certain, places, need, out);
 }
 
+/* The first bin, along each axis, of a cube of grid 0; cubes are counted along x first. */
+inline int4 first_of_cube(int cube, int4 shape)
+{
+    const int across = (shape.s1 + CUBE - 1) / CUBE, deep = (shape.s2 + CUBE - 1) / CUBE;
+    return CUBE * (int4)(cube % across, cube / across % deep, cube / across / deep, 0);
+}
+
+/* Per cube: the number of generators there. */
+kernel void count_cubes(const int size, global const int2 *bins, global const int4 *grid_shapes, global int *counts)
+{
+    WORK_ITEM(cube);
+    const int4 shape = grid_shapes[0], first = first_of_cube(cube, shape);
+    const int end_x = min(first.s0 + CUBE, shape.s1), end_y = min(first.s1 + CUBE, shape.s2);
+    const int end_z = min(first.s2 + CUBE, shape.s3);
+    int count = 0;
+    for (int z = first.s2; z < end_z; ++z)
+        for (int y = first.s1; y < end_y; ++y) {
+            global const int2 *row = bins + (z * shape.s2 + y) * shape.s1;
+            count += row[end_x].s0 - row[first.s0].s0;
+        }
+    counts[cube] = count;
+}
+
+/* Per cube: the places of its generators, from order[starts[cube]] on, so that those which follow each other are near
+   each other: along Morton's curve through its bins, and through those of a divided bin before the next. Rows of bins,
+   in whose order places are, are long where generators are sparse. */
+kernel void order_places(const int size, global const int2 *bins, global const int4 *grid_shapes,
+                         global const int *starts, global int *order)
+{
+    WORK_ITEM(cube);
+    int n = starts[cube];
+    descent_t way; /* along the curve */
+    begin_descent(&way, (int4)(0));
+    while (way.depth >= 0) {
+        const int4 shape = grid_shapes[way.grids[way.depth]];
+        const int4 first = way.depth > 0 ? (int4)(0) : first_of_cube(cube, shape);
+        const int side = way.depth > 0 ? shape.s1 : CUBE, end = side * side * side;
+        int code = way.places[way.depth].s0, child = -1;
+        for (; code < end && child < 0; ++code) {
+            const int x = first.s0 + gather_bits(code), y = first.s1 + gather_bits(code >> 1);
+            const int z = first.s2 + gather_bits(code >> 2);
+            if (x >= shape.s1 || y >= shape.s2 || z >= shape.s3)
+                continue;
+            global const int2 *bin = bins + shape.s0 + (z * shape.s2 + y) * shape.s1 + x;
+            const int2 from = bin[0], to = bin[1];
+            if (from.s1 != to.s1)
+                child = from.s1;
+            for (int place = from.s0; place < to.s0 && child < 0; ++place)
+                order[n++] = place;
+        }
+        leave_grid(&way, child, (int4)(code, 0, 0, 0), (int4)(0));
+    }
+}
+
 /* Per stretch of places in bin order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
    UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in units of
    `spacing`. Only the first `rows` generators get cells. */
-kernel void wrap_cells(const int size, const int n, const int rows, global const double *binned,
-                       global const int *items, global const float *spacing, global float *reach,
-                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
-                       global int *row_places, global int *row_counts, global int *labels, global double *measures,
-                       global double *centroids, global double *volumes, global double *offsets,
-                       global double *covariances, global int *report)
+kernel void wrap_cells(const int size, const int n, const int rows, global const int *order,
+                       global const double *binned, global const int *items, global const float *spacing,
+                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                       global const int4 *grid_shapes, const double4 box_lower, const double4 box_upper,
+                       const double first_reach, const int room, global int *row_places, global int *row_counts,
+                       global int *labels, global double *measures, global double *centroids, global double *volumes,
+                       global double *offsets, global double *covariances, global int *report)
 {
     WORK_ITEM(stretch);
     const output_t out = {room,   items,    reach,     row_places, row_counts, labels,
@@ -239,11 +377,11 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
     const int end = min(n, (stretch + 1) * STRETCH);
     int next = stretch * STRETCH, tried = 0, made = 0;
     double xs[LANES], ys[LANES], zs[LANES], rs[LANES];
-    int places[LANES], rounds[LANES];
-    long wanted[LANES], guessed[LANES];
+    int places[LANES], ranks[LANES], rounds[LANES];
+    long wanted[LANES], guessed[LANES], open[LANES];
     for (int lane = 0; lane < LANES; ++lane) {
-        wanted[lane] = guessed[lane] = 0;
-        places[lane] = rounds[lane] = 0;
+        wanted[lane] = guessed[lane] = open[lane] = 0;
+        places[lane] = ranks[lane] = rounds[lane] = 0;
         xs[lane] = ys[lane] = zs[lane] = rs[lane] = 0;
     }
     for (;;) {
@@ -251,19 +389,21 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
         for (int lane = 0; lane < LANES; ++lane) {
             if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
                 continue;
-            while (next < end && items[next] >= rows)
+            while (next < end && items[order[next]] >= rows)
                 ++next;
             wanted[lane] = guessed[lane] = next < end ? -1 : 0;
             if (next < end) {
-                row_counts[items[next]] = UNFINISHED;
-                places[lane] = next;
+                const int place = order[next];
+                row_counts[items[place]] = UNFINISHED;
+                places[lane] = place;
+                ranks[lane] = next++;
                 rounds[lane] = 0;
+                open[lane] = 0;
                 ++tried;
-                xs[lane] = binned[3 * next];
-                ys[lane] = binned[3 * next + 1];
-                zs[lane] = binned[3 * next + 2];
-                rs[lane] = first_reach * spacing[next];
-                ++next;
+                xs[lane] = binned[3 * place];
+                ys[lane] = binned[3 * place + 1];
+                zs[lane] = binned[3 * place + 2];
+                rs[lane] = first_reach * spacing[place];
             }
         }
         long8 todo = vload8(0, wanted), fresh = vload8(0, guessed), chosen;
@@ -273,11 +413,18 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
         double widest;
         double8 r = vload8(0, rs);
         const bool fits =
-            see_enough(&near, &list, &runs, todo, fresh, places, xs, ys, zs, &r, &chosen, &lower, &upper, &widest, &in);
+            see_enough(&near, &list, &runs, todo, fresh, ranks, xs, ys, zs, &r, &chosen, &lower, &upper, &widest, &in);
         vstore8(todo & ~chosen, 0, wanted);
         if (!fits)
             continue;
-        chosen &= ~list_near(&list, &near, binned, places, xs, ys, zs, lower, upper, widest, box_lower, box_upper);
+        /* A cell that is open among what is near is closed by walls, to begin with. */
+        const bool walled = any(chosen & vload8(0, open));
+        const long8 full = chosen & list_near(&list, &near, binned, places, xs, ys, zs, lower, upper,
+                                              walled ? INFINITY : widest, box_lower, box_upper);
+        r = full ? 0.8 * r : r;
+        vstore8(vload8(0, wanted) | full, 0, wanted);
+        vstore8(r, 0, rs);
+        chosen &= ~full;
         if (!any(chosen))
             continue;
         walk_cells(&cells, &walk, &list, chosen);
@@ -289,7 +436,6 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
         vstore8(closed & ~(need <= r), 0, far);
         vstore8(closed, 0, whole);
         vstore8(need, 0, needs);
-        vstore8(r, 0, rs);
         for (int lane = 0; lane < LANES; ++lane)
             if (far[lane] &&
                 find_more(&later, &runs, &cells, &walk, lane, places[lane], rs[lane], needs[lane], &in) != 0) {
@@ -299,13 +445,13 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
                     walk_later(&later, &runs, &in, &out);
             }
         made += write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
-        vstore8(vload8(0, wanted) | lost, 0, wanted);
+        vstore8(vload8(0, wanted) | (lost & ~vload8(0, open)), 0, wanted);
+        vstore8(vload8(0, open) | lost, 0, open);
         vstore8(fresh & ~chosen, 0, guessed);
-        vstore8(lost ? GROWTH * r : r, 0, rs);
     }
     for (; next < end; ++next)
-        if (items[next] < rows)
-            row_counts[items[next]] = UNFINISHED;
+        if (items[order[next]] < rows)
+            row_counts[items[order[next]]] = UNFINISHED;
     while (later.n > 0)
         walk_later(&later, &runs, &in, &out);
 }

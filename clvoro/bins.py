@@ -19,6 +19,8 @@ OCCUPANCY = 2
 SPLIT_COUNT = {2: 10, 3: 18}
 """A bin that holds more is divided by a grid of its own, in 2D and in 3D, where a division makes more bins. Uniform
 random sets (Poisson, mean 2) stay on one level."""
+SPACING_COUNT = 8
+"""Generators at least, where a grid has them, from whose number the spacing about a leaf is told."""
 _ZERO = np.zeros(1, np.int32)
 MAX_CHILD_SIDE = 64
 MAX_LEVELS = 8
@@ -42,6 +44,8 @@ class BinnedPoints:
     bins : (b, 2) int32
     grid_frames : (g, 4) real
     grid_shapes : (g, 4) int32
+    sides : d integers, on the host
+        Bins of the first grid along each axis.
     """
 
     items: cla.Array
@@ -51,6 +55,7 @@ class BinnedPoints:
     bins: cla.Array
     grid_frames: cla.Array
     grid_shapes: cla.Array
+    sides: tuple[int, ...]
 
 
 class Bins:
@@ -65,6 +70,7 @@ class Bins:
                 "SPLIT_COUNT": SPLIT_COUNT[engine.dim],
                 "MAX_CHILD_SIDE": MAX_CHILD_SIDE,
                 "OCCUPANCY": OCCUPANCY,
+                "SPACING_COUNT": SPACING_COUNT,
             },
         )
         self._capacity: tuple[int, int] = (0, 0)
@@ -171,8 +177,9 @@ class Bins:
         )  # fmt: skip
         engine.run_each(k.gather_items, n, self._items, points, self._points)
         return BinnedPoints(
-            self._items, self._points, self._reach, spacing, self._bins, self._frames, self._shapes
-        )
+            self._items, self._points, self._reach, spacing, self._bins, self._frames, self._shapes,
+            tuple(int(side) for side in sides),
+        )  # fmt: skip
 
     def renumber(self, binned: BinnedPoints, n: int) -> None:
         """Make of `binned` what `build` would make of its `n` generators in the order that they have there.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,6 +25,8 @@ FACES_PER_CELL = 16.5
 """Room for faces at first: random cells have 15.54 of them on average; walls add some."""
 STRETCH = 128
 """Generators whose cells a CPU's work-item makes, eight at a time (`walks.cl`)."""
+CUBE = 8
+"""Bins each way of the cubes through which it goes from one to the next."""
 FIRST_REACH = 2.0
 """How far it looks for neighbours at first, in units of the spacing that the bins know."""
 
@@ -41,8 +44,9 @@ class Polyhedra:
         self._kernels(FACE_CAPACITY)
         self._wrap = None
         if engine.group_size == 1 and engine.real == np.float64:
-            defines = {"STRETCH": STRETCH, "MAX_DEPTH": MAX_LEVELS}
-            self._wrap = engine.kernels("walks", defines).wrap_cells
+            defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS}
+            self._walks = engine.kernels("walks", defines)
+            self._wrap = self._walks.wrap_cells
         self._report = engine.empty(3, np.int32)
         self._capacity = self._room = self._n = 0
 
@@ -150,11 +154,13 @@ class Polyhedra:
                 cells["offsets"], cells["covariances"], self._report,
             )  # fmt: skip
             if self._wrap is not None and not again:
-                engine.run_each(
-                    self._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), binned.points,
-                    binned.items, binned.spacing, *search, lower, upper, first_reach, room,
-                    *written, group=1,
-                )  # fmt: skip
+                with engine.workspace.frame():
+                    order = self._ordered(binned, n)
+                    engine.run_each(
+                        self._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), order,
+                        binned.points, binned.items, binned.spacing, *search, lower, upper,
+                        first_reach, room, *written, group=1,
+                    )  # fmt: skip
             some = np.int32(again or self._wrap is not None)
             engine.run_each(
                 self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items,
@@ -209,6 +215,17 @@ class Polyhedra:
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
             offsets=cells["offsets"], covariances=cells["covariances"], narrow=bool(flags & NARROW),
         )  # fmt: skip
+
+    def _ordered(self, binned: BinnedPoints, n: int) -> cla.Array:
+        """Return the places of `n` generators so that those which follow each other are near each other."""
+        engine, k = self.engine, self._walks
+        cubes = math.prod(-(-side // CUBE) for side in binned.sides)
+        starts, order = engine.scratch(cubes + 1, np.int32), engine.scratch(n, np.int32)
+        bins = binned.bins, binned.grid_shapes
+        engine.run_each(k.count_cubes, cubes, *bins, starts, group=1)
+        self._scan.exclusive(starts, starts, cubes)
+        engine.run_each(k.order_places, cubes, *bins, starts, order, group=1)
+        return order
 
     def _refuse(self, flags: int, generator: int) -> None:
         what = "coincides with another" if flags & COINCIDE else "is too close to others"

@@ -7,6 +7,7 @@ import reference3d
 import clvoro
 from clvoro._program import Engine
 from clvoro.bins import Bins
+from clvoro.polyhedra import CUBE as CUBE_SIDE
 from clvoro.polyhedra import FIRST_REACH, STRETCH, Polyhedra
 
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -38,10 +39,13 @@ def point_sets():
     bcc = lattice([[0, 0, 0], [0.5, 0.5, 0.5]], 6)
     spot = np.array([0.4, 0.3, 0.6])
     shell = np.exp(-6 * rng.random((2000, 1)))
+    hollow = 0.02 * np.exp(3.2 * rng.random((3000, 1)))
     return {
         **{f"{n} random": random[:n] for n in (1, 2, 3, 7, 8, 9, 100, STRETCH + 1)},
         "random": random,
         "cubed": rng.random((2000, 3)) ** 3,
+        # Those about the empty ball have long cells, down to its centre.
+        "hollow": np.clip(0.5 + hollow * directions(rng, 3000), 0, 1),
         "radial": np.clip(spot + 0.6 * shell * directions(rng, 2000), 0, 1),
         "clusters": np.concatenate(
             [spot + s * (rng.random((300, 3)) - 0.5) for s in (1e-2, 1e-4, 1e-6)] + [random[:50]]
@@ -79,8 +83,8 @@ def walked(engine, points, rows=None):
     sizes = [(40 * n,), (40 * n, 3), (rows,), (rows, 3), (rows, 6)]
     report = engine.upload(np.array([0, 2**31 - 1, 0]), np.int32)
     engine.run_each(
-        cells._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), b.points, b.items, b.spacing, b.reach,
-        b.bins, b.grid_frames, b.grid_shapes, *CUBE.device_corners(engine.real),
+        cells._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), cells._ordered(b, n), b.points, b.items,
+        b.spacing, b.reach, b.bins, b.grid_frames, b.grid_shapes, *CUBE.device_corners(engine.real),
         engine.real.type(FIRST_REACH), np.int32(40 * n), places, counts, labels,
         *(engine.empty(size) for size in sizes), report, group=1,
     )  # fmt: skip
@@ -151,6 +155,40 @@ def test_most_cells_are_walked(engine, name, share):
     """Else the kernel would be right but useless; lattices, where every decision is near to rounding, are left."""
     counts = walked(engine, POINTS[name])
     assert np.count_nonzero(counts > 0) >= share * len(counts)
+
+
+def morton(side):
+    """Return the bins (x, y, z) of a cube of `side` bins each way, a power of two, in the order of Morton's curve."""
+    if side == 1:
+        return np.zeros((1, 3), int)
+    half = morton(side // 2)
+    return np.concatenate(
+        [half + side // 2 * np.array([x, y, z]) for z, y, x in np.ndindex(2, 2, 2)]
+    )
+
+
+@pytest.mark.parametrize("name", ["1 random", "random", "cubed", "clusters", "to the walls"])
+@pytest.mark.parametrize("box", [CUBE, clvoro.Box((0, 0, 0), (1, 0.2, 0.05))])
+def test_order(engine, name, box):
+    """Cubes of bins of the first grid, along x first; in them and in divided bins along Morton's curve."""
+    points = POINTS[name] * box.extent
+    n = len(points)
+    b = Bins(engine).build(box, engine.upload(points), n)
+    bins, shapes = b.bins.get().reshape(-1, 2), b.grid_shapes.get().reshape(-1, 4)
+    expected = []
+
+    def follow(grid, places):
+        first, *sides = shapes[grid]
+        for x, y, z in places[(places < sides).all(axis=1)]:
+            (start, own), (end, following) = bins[first + (z * sides[1] + y) * sides[0] + x :][:2]
+            if own == following:
+                expected.extend(range(start, end))
+            else:
+                follow(own, morton(shapes[own, 1]))
+
+    for cube in np.ndindex(*(-(-side // CUBE_SIDE) for side in b.sides[::-1])):
+        follow(0, CUBE_SIDE * np.array(cube[::-1]) + morton(CUBE_SIDE))
+    assert np.array_equal(Polyhedra(engine)._ordered(b, n).get()[:n], expected)
 
 
 def test_against_qhull(engine):

@@ -26,7 +26,7 @@ constant const double SHELL_ENDS[SHELLS] = {0.86, 1};
 /* Lists of more than MANY or fewer than FEW, before the walls, are made to hold about ENOUGH. */
 #define MANY 92
 #define ENOUGH 66
-#define FEW 40
+#define FEW 24
 /* What may be near the generators of all lanes. */
 #define NEAR_CAPACITY 1024
 #define NEAR_WORDS (NEAR_CAPACITY / 64)
@@ -52,7 +52,7 @@ inline void put_plane(list_t *list, int k, int lane, double x, double y, double 
 /* Which of the generators that may be near are so: bits for each shell; how many, with those of the shells before. */
 typedef struct {
     int length;
-    int places[NEAR_CAPACITY];
+    int places[NEAR_CAPACITY + LANES];
     long8 bits[SHELLS][NEAR_WORDS], totals[SHELLS];
 } near_t;
 
@@ -78,6 +78,41 @@ inline void see_near(near_t *near, list_t *list, global const double *binned, do
         for (int shell = 0; shell < SHELLS; ++shell) {
             near->bits[shell][word] = shell > 0 ? seen[shell] & ~seen[shell - 1] : seen[0];
             near->totals[shell] += popcount(seen[shell]);
+        }
+    }
+}
+
+/* See to it that about ENOUGH are near one lane's generator, of those that are. */
+inline void see_less(near_t *near, list_t *list, global const double *binned, int lane, const double *xs,
+                     const double *ys, const double *zs, double *radii)
+{
+    long *totals[SHELLS], *bits[SHELLS];
+    double ends2[SHELLS];
+    radii[lane] *= fmax(cbrt(ENOUGH / (double)LANE((long *)&near->totals[SHELLS - 1], 0, lane)), 0.5);
+    for (int shell = 0; shell < SHELLS; ++shell) {
+        totals[shell] = (long *)&near->totals[shell] + lane;
+        bits[shell] = (long *)near->bits[shell] + lane;
+        ends2[shell] = radii[lane] * radii[lane] * (SHELL_ENDS[shell] * SHELL_ENDS[shell]);
+        LANE((double *)&list->radii2[shell], 0, lane) = ends2[shell];
+        *totals[shell] = 0;
+    }
+    for (int word = 0; 64 * word < near->length; ++word) {
+        ulong left = 0, seen[SHELLS];
+        for (int shell = 0; shell < SHELLS; ++shell) {
+            left |= bits[shell][word * LANES];
+            seen[shell] = 0;
+        }
+        for (; left; left &= left - 1) {
+            const ulong bit = left & -left;
+            global const double *at = binned + 3 * near->places[64 * word + (int)popcount(bit - 1)];
+            const double dx = at[0] - xs[lane], dy = at[1] - ys[lane], dz = at[2] - zs[lane];
+            const double d2 = fma(dx, dx, fma(dy, dy, dz * dz));
+            for (int shell = 0; shell < SHELLS; ++shell)
+                seen[shell] |= d2 < ends2[shell] ? bit : 0;
+        }
+        for (int shell = 0; shell < SHELLS; ++shell) {
+            bits[shell][word * LANES] = shell > 0 ? seen[shell] & ~seen[shell - 1] : seen[0];
+            *totals[shell] += popcount(seen[shell]);
         }
     }
 }
@@ -186,8 +221,8 @@ typedef struct {
     double4 box_lower, box_upper;
 } search_t;
 
-/* Choose from the lanes to do those near that of the first place; the box holds them, r is their greatest radius. */
-inline long8 choose_lanes(long8 todo, const int *places, const double *xs, const double *ys, const double *zs,
+/* Choose from the lanes to do those near that of the least rank; the box holds them, r is their greatest radius. */
+inline long8 choose_lanes(long8 todo, const int *ranks, const double *xs, const double *ys, const double *zs,
                           double8 radii, double spread, double4 *lower, double4 *upper, double *r)
 {
     long wanted[LANES], chosen[LANES];
@@ -196,7 +231,7 @@ inline long8 choose_lanes(long8 todo, const int *places, const double *xs, const
     vstore8(radii, 0, rs);
     int first = -1;
     for (int lane = 0; lane < LANES; ++lane)
-        first = wanted[lane] && (first < 0 || places[lane] < places[first]) ? lane : first;
+        first = wanted[lane] && (first < 0 || ranks[lane] < ranks[first]) ? lane : first;
     const double4 centre = (double4)(xs[first], ys[first], zs[first], 0);
     *lower = *upper = centre;
     *r = rs[first];
@@ -213,16 +248,20 @@ inline long8 choose_lanes(long8 todo, const int *places, const double *xs, const
 
 /* Choose lanes, and see what is near them. Radii that were guessed are changed where they hold too many or too few.
    False if too much is near the chosen ones. */
-inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *places,
+inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *ranks,
                        const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen, double4 *lower,
                        double4 *upper, double *widest, const search_t *in)
 {
     const double8 x = vload8(0, xs), y = vload8(0, ys), z = vload8(0, zs);
     double spread = SPREAD;
+    int guesses = 0;
     for (int attempt = 0;; ++attempt) {
-        *chosen = choose_lanes(todo, places, xs, ys, zs, *r, spread, lower, upper, widest);
-        const bool fits = collect_runs(runs, *lower, *upper, *widest, in->bins, in->grid_frames, in->grid_shapes);
-        if (!fits || runs->total > NEAR_CAPACITY) {
+        *chosen = choose_lanes(todo, ranks, xs, ys, zs, *r, spread, lower, upper, widest);
+        const double8 collected = *chosen ? *r : -1;
+        const balls_t balls = {x, y, z, collected};
+        const bool fits = collect_runs(runs, &balls, (double4)(-INFINITY), (double4)(INFINITY), NEAR_CAPACITY, in->bins,
+                                       in->grid_frames, in->grid_shapes);
+        if (!fits) {
             if (attempt == 12)
                 return false;
             /* Fewer lanes, then less about one. */
@@ -230,19 +269,31 @@ inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, lon
             spread = spread < SPREAD / 4.0 ? 0 : spread / 2;
             continue;
         }
-        near->length = 0;
-        for (int run = 0; run < runs->n; ++run)
-            for (int c = 0; c < runs->counts[run]; ++c)
-                near->places[near->length++] = runs->firsts[run] + c;
-        for (;; ++attempt) {
-            see_near(near, list, in->binned, x, y, z, *chosen ? *r * *r : 0);
-            const double8 total = convert_double8(near->totals[SHELLS - 1]);
-            const long8 guessed = *chosen & fresh & ((total > MANY) | (total < FEW));
-            if (attempt >= 4 || !any(guessed))
-                return true;
-            *r = guessed ? *r * clamp(cbrt(ENOUGH / total), 0.5, 1.6) : *r;
-            if (any(guessed & (*r > *widest)))
-                break;
+        int length = 0;
+        for (int run = 0; run < runs->n; ++run) {
+            const int first = runs->firsts[run], count = runs->counts[run];
+            for (int c = 0; c < count; c += LANES)
+                vstore8(first + c + (int8)(0, 1, 2, 3, 4, 5, 6, 7), 0, near->places + length + c);
+            length += count;
         }
+        near->length = length;
+        see_near(near, list, in->binned, x, y, z, *chosen ? *r * *r : 0);
+        const double8 total = convert_double8(near->totals[SHELLS - 1]);
+        const long8 few = *chosen & fresh & (total < FEW);
+        if (guesses < 4 && any(few)) {
+            ++guesses;
+            *r = few ? *r * clamp(cbrt(ENOUGH / total), 1.0, 1.6) : *r;
+            continue;
+        }
+        long many[LANES];
+        double radii[LANES];
+        vstore8(*chosen & fresh & (total > MANY), 0, many);
+        vstore8(*r, 0, radii);
+        for (int lane = 0; lane < LANES; ++lane)
+            for (int trial = 0; trial < 4 && many[lane] && LANE((long *)&near->totals[SHELLS - 1], 0, lane) > MANY;
+                 ++trial)
+                see_less(near, list, in->binned, lane, xs, ys, zs, radii);
+        *r = vload8(0, radii);
+        return true;
     }
 }

@@ -139,7 +139,8 @@ inline void add_corner(cells_t *cells, long8 some, const long *at_a, const long 
         some ? fma(zx, y.y, zy * y.x) + fma(uu_ab, ab.x * ab.y, fma(uu_bc, bc.x * bc.y, uu_ca * ca.x * ca.y)) : 0;
 }
 
-/* Of the cells, but for factors: volumes, their first and second moments; the least area of a face. */
+/* Of the cells, but for factors: volumes, their first and second moments; the least area of a face, in units of the
+   square of the distance of its farthest vertex, if that is small. */
 typedef struct {
     double8 volume, x, y, z, xx, yy, zz, yz, zx, xy, least;
 } moments_t;
@@ -151,8 +152,8 @@ inline double4 corner_at(const walk_t *walk, int v, int lane)
 }
 
 /* Area and centroid of a lane's face from triangles about its first vertex: to the digits of the vertices, also of
-   small ones. `normal` has length 1. */
-inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, int lane, double4 normal)
+   small ones. `normal` has length 1; `far2` becomes the square of the distance of the farthest vertex. */
+inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, int lane, double4 normal, double *far2)
 {
     /* At each of its vertices, the faces before and after it. */
     uchar ins[HULL_CAPACITY], outs[HULL_CAPACITY], at[HULL_CAPACITY];
@@ -167,11 +168,13 @@ inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, in
     const double4 first = corner_at(walk, at[0], lane);
     double4 before = 0, sum = 0;
     double twice = 0;
+    *far2 = dot(first, first);
     for (int k = 0, steps = 1; steps < n; ++steps) {
         int next = 0;
         while (next < n - 1 && ins[next] != outs[k])
             ++next;
-        const double4 after = corner_at(walk, at[next], lane) - first;
+        const double4 y = corner_at(walk, at[next], lane), after = y - first;
+        *far2 = fmax(*far2, dot(y, y));
         const double weight = dot(normal, cross(before, after));
         twice += weight;
         sum += weight * (before + after);
@@ -225,9 +228,9 @@ inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
         cx = fma(off, foot_x, cx);
         cy = fma(off, foot_y, cy);
         cz = fma(off, foot_z, cz);
-        double areas[LANES];
+        double shares[LANES];
         long small[LANES];
-        vstore8(area, 0, areas);
+        vstore8((double8)1, 0, shares);
         vstore8(closed & there & ~(area > SMALL_AREA * cells->reach2), 0, small);
 #define PUT_FACE(lane) LANE(cells->sums, f, lane) = ACROSS(area, cx, cy, cz, lane)
         PUT_FACE(0);
@@ -243,11 +246,12 @@ inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
                 const double scale = LANE((const double *)&length, 0, lane);
                 const double4 normal = scale * (double4)(PLANE_LANE(p, 0, 0, lane), PLANE_LANE(p, 0, 1, lane),
                                                          PLANE_LANE(p, 0, 2, lane), 0);
-                const double4 face = measure_small(cells, walk, f, lane, normal);
+                double far2;
+                const double4 face = measure_small(cells, walk, f, lane, normal, &far2);
                 LANE(cells->sums, f, lane) = face;
-                areas[lane] = face.s0;
+                shares[lane] = face.s0 / far2;
             }
-        m.least = there ? fmin(m.least, vload8(0, areas)) : m.least;
+        m.least = there ? fmin(m.least, vload8(0, shares)) : m.least;
         const double8 x = d2 * fma(sum, foot_x, sum_x), y = d2 * fma(sum, foot_y, sum_y);
         const double8 z = d2 * fma(sum, foot_z, sum_z);
         m.volume += d2 * sum;
