@@ -11,13 +11,15 @@ import collections
 import json
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
+from unittest import mock
 
 import numpy as np
 import pyopencl as cl
 from scipy.spatial import ConvexHull
 
 import clvoro
-from clvoro import _program
+from clvoro import _program, repair
 from clvoro._primitives import Scan
 from clvoro.mesh import Stages
 from clvoro.population import Population, PopulationControl
@@ -115,27 +117,20 @@ def method(
     return work
 
 
-def in_many_launches(
+def as_for_many(
     work: Callable[[clvoro.Adapter], None],
 ) -> Callable[[clvoro.Adapter], None]:
-    """Have iterations take their launches, as for large meshes, where one work-group would do it all alone."""
+    """Have done what is done for large meshes: iterations take their launches, repaired cells are found in lanes."""
 
-    def launching(adapter: clvoro.Adapter) -> None:
-        modules = [
-            m
-            for k, m in sys.modules.items()
-            if k.startswith("clvoro.") and hasattr(m, "most_alone")
-        ]
-        alone = modules[0].most_alone
-        for module in modules:
-            module.most_alone = lambda engine: 0
-        try:
+    def large(adapter: clvoro.Adapter) -> None:
+        with ExitStack() as patches:
+            for name, module in list(sys.modules.items()):
+                if name.startswith("clvoro.") and hasattr(module, "most_alone"):
+                    patches.enter_context(mock.patch.object(module, "most_alone", return_value=0))
+            patches.enter_context(mock.patch.object(repair, "FEW", 8))
             work(adapter)
-        finally:
-            for module in modules:
-                module.most_alone = alone
 
-    return launching
+    return large
 
 
 def drop_faces(adapter: clvoro.Adapter) -> None:
@@ -370,7 +365,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "hulls": hulls,
     "solid": solid,
     "fields": fields,
-    "multigrid": in_many_launches(multigrid),
+    "multigrid": as_for_many(multigrid),
     "scan": scan,
     "nuclei": nuclei,
     "transfer": transfer,
@@ -379,12 +374,12 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,
-    "coupled": in_many_launches(method("coupled", max_steps=2)),
+    "coupled": as_for_many(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
     "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
     "best": method("adaptive", levels=0, n_cells=150, effort="best", max_steps=20),
-    "exact": in_many_launches(method("exact", levels=0, effort="fast", max_steps=75)),
+    "exact": as_for_many(method("exact", levels=0, effort="fast", max_steps=75)),
     "solid-run": method("exact", CUBE, SOLID, effort="fast", max_steps=14),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **{

@@ -33,7 +33,7 @@ TRAPS = {
 }
 USEFUL = [name for name in WORK if not name.startswith("broken")]
 VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
-LANES = {"hulls.wrap_cells", "walks.wrap_cells"}
+LANES = {"hulls.wrap_cells", "repair.wrap_marked", "walks.wrap_cells"}
 """Kernels that find eight cells at a time in the vector lanes of a CPU, in float64."""
 NOT_IN = {
     "float64": set(),
