@@ -535,6 +535,7 @@ NASTY = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize("name", NASTY)
 def test_nasty_fields(adapter, name):
     result = adapter.run(BOX, NASTY[name], effort="fast", seed=20)
@@ -549,6 +550,7 @@ def test_nasty_fields(adapter, name):
         assert np.abs(result.error).mean() < 0.05
 
 
+@pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize(
     "name", ["ratio 100 across a line", "spike narrower than its own h", "larger than the domain"]
 )

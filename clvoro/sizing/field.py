@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from ..domain import Domain
     from .bind import Binder
 
+_MOST_GROWTH = 10  # more is meant as a percentage
+
 
 class Field:
     """A size field h(x): called with points it gives sizes.
@@ -343,10 +345,10 @@ def slope_of(what: str, growth: object, slope: object) -> float:
         )
     if growth is not None:
         rate = positive(f"{what} growth", growth)
-        if rate < 1:
+        if not 1 <= rate <= _MOST_GROWTH:
             raise InputError(
-                f"{what} growth is {growth}, expected at least 1: the ratio of neighbouring cells, such as 1.2; "
-                "write slope= for dh/dx"
+                f"{what} growth is {growth}, expected 1 to {_MOST_GROWTH}: the ratio of neighbouring cells, such as "
+                "1.2 where each is a fifth larger; write slope= for dh/dx"
             )
         return math.log(rate)
     if not (isinstance(slope, Real) and 0 <= float(slope) < math.inf):
