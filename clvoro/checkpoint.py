@@ -99,6 +99,8 @@ class Checkpointer:
     ) -> None:
         from .io import check_writable
 
+        if Path(path).is_dir():
+            raise InputError(f"checkpoint is {str(path)!r}, a folder, expected the name of a file")
         check_writable(path)
         self.path, self.every, self.made_by = Path(path), every, made_by
         self.plan = fingerprint(plan)

@@ -172,6 +172,8 @@ def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
         clvoro.Adapter(ctx).run(BOX, 1.0001 * SIZE, resume=path, **options)
     with pytest.raises(InputError, match="checkpoint_every is -1"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=-1, **options)
+    with pytest.raises(InputError, match=r"checkpoint is .*, a folder"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path.parent, **options)
     with pytest.raises(InputError, match="no folder"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path / "none" / "state", **options)
 
