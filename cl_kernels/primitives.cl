@@ -125,18 +125,20 @@ inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
 }
 #endif
 
-/* Block-wise: partials[groups * a + group] = summary of the group's items of array a, of the first `count` of eight. */
+/* Block-wise: partials[groups * slot + group] = summary of the group's items of an array, of the first `count` of eight
+   arrays; slots has the slot of each. */
 kernel void summarise_blocks(global const REAL *a0, global const REAL *a1, global const REAL *a2, global const REAL *a3,
                              global const REAL *a4, global const REAL *a5, global const REAL *a6, global const REAL *a7,
-                             const int count, const int n, global summary_t *partials)
+                             const int count, const int n, const int8 slots, global summary_t *partials)
 {
+    const int slot_of[8] = {slots.s0, slots.s1, slots.s2, slots.s3, slots.s4, slots.s5, slots.s6, slots.s7};
 #if GROUP_SIZE > 1
     local summary_t shares[GROUP_SIZE];
 #endif
     for (int a = 0; a < count; ++a) {
         global const REAL *values = a < 4 ? (a < 2 ? (a < 1 ? a0 : a1) : (a < 3 ? a2 : a3))
                                           : (a < 6 ? (a < 5 ? a4 : a5) : (a < 7 ? a6 : a7));
-        global summary_t *out = partials + get_num_groups(0) * a + get_group_id(0);
+        global summary_t *out = partials + get_num_groups(0) * slot_of[a] + get_group_id(0);
         summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
 #if GROUP_SIZE == 1
         add_run(&mine, values, block_begin(n), block_end(n));
@@ -157,16 +159,17 @@ kernel void summarise_blocks(global const REAL *a0, global const REAL *a1, globa
     }
 }
 
-/* One work-item per array: out[4 slots[a] ...] = sum, sum of magnitudes, least, largest. */
-kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int8 slots,
+/* One work-item per slot whose bit is set in `which`: out[4 slot ...] = sum, sum of magnitudes, least, largest. */
+kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int which,
                            global REAL *out)
 {
-    WORK_ITEM(a);
-    const int slot_of[8] = {slots.s0, slots.s1, slots.s2, slots.s3, slots.s4, slots.s5, slots.s6, slots.s7};
-    summary_t all = partials[groups * a];
+    WORK_ITEM(slot);
+    if (!(which >> slot & 1))
+        return;
+    summary_t all = partials[groups * slot];
     for (int g = 1; g < groups; ++g)
-        merge_summary(&all, partials[groups * a + g]);
-    global REAL *put = out + 4 * slot_of[a];
+        merge_summary(&all, partials[groups * slot + g]);
+    global REAL *put = out + 4 * slot;
     put[0] = all.sum + all.sum_low;
     put[1] = all.magnitude + all.magnitude_low;
     put[2] = all.least;

@@ -14,8 +14,9 @@ inline void note_bad(REAL h, int i, global int *bad)
         atomic_min(bad, i);
 }
 
+/* h is noted as it is, and written times a factor. */
 kernel void evaluate(const int size, global const REAL *restrict points, global const REAL *restrict data,
-                     global REAL *restrict h_out, global int *bad)
+                     const REAL factor, global REAL *restrict h_out, global int *bad)
 {
     WORK_ITEM(i);
     REAL x[DIM];
@@ -23,7 +24,7 @@ kernel void evaluate(const int size, global const REAL *restrict points, global 
         x[a] = points[i * DIM + a];
     const REAL h = size_at(x, data);
     note_bad(h, i, bad);
-    h_out[i] = h;
+    h_out[i] = factor * h;
 }
 
 /* grad_a log h = (h(x + s e_a) - h(x - s e_a)) / (2 s h), s = GRADIENT_STEP * h. Both sample points are kept inside

@@ -14,6 +14,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
+from ._device_array import make_array
 from ._program import Engine
 
 AT_ONCE = 8
@@ -68,15 +69,20 @@ class Summaries:
     Parameters
     ----------
     names : sequence of str
-        One slot each, in the order of the device array `values` (len(names), 4): sum, magnitude, least, largest.
+        At most 31: one slot each, in their order.
     """
 
     def __init__(self, engine: Engine, names: Sequence[str]) -> None:
         self.engine = engine
         self.slots = {name: slot for slot, name in enumerate(names)}
         self._kernels = engine.kernels("primitives")
-        self._partials = engine.empty(6 * engine.groups * AT_ONCE)
-        self.values = engine.zeros((len(names), 4))
+        self._partials = engine.empty(6 * engine.groups * len(names))
+        self._pending = 0
+        # Behind the figures there is room for an integer that the host reads with them.
+        size = 4 * len(names) * engine.real.itemsize
+        self._record = engine.zeros(size + np.dtype(np.int32).itemsize, np.uint8)
+        shape = (len(names), 4)
+        self._values = make_array(engine.queue, shape, engine.real, self._record.data)
 
     def collect(self, name: str, array: cla.Array, n: int) -> None:
         """Summarise the first `n` of `array` into the slot `name`."""
@@ -84,25 +90,55 @@ class Summaries:
 
     def collect_all(self, arrays: Mapping[str, cla.Array], n: int) -> None:
         """Summarise the first `n` of each of `AT_ONCE` arrays at most into the slot of its name."""
-        k, engine = self._kernels, self.engine
         given, count = list(arrays.values()), np.int32(len(arrays))
         spare = given[:1] * (AT_ONCE - len(given))
         slots = np.zeros(AT_ONCE, np.int32)
         slots[: len(given)] = [self.slots[name] for name in arrays]
-        engine.run_blocks(k.summarise_blocks, *given, *spare, count, np.int32(n), self._partials)
-        engine.run_each(
-            k.combine_blocks, len(given), self._partials, np.int32(engine.groups), slots,
-            self.values, group=1,
-        )  # fmt: skip
+        self.engine.run_blocks(
+            self._kernels.summarise_blocks,
+            *given,
+            *spare,
+            count,
+            np.int32(n),
+            slots,
+            self._partials,
+        )
+        for name in arrays:
+            self._pending |= 1 << self.slots[name]
+
+    @property
+    def values(self) -> cla.Array:
+        """What there is on the device: a row for each name of sum, sum of magnitudes, least, largest."""
+        if self._pending:
+            self.engine.run_each(
+                self._kernels.combine_blocks, len(self.slots), self._partials,
+                np.int32(self.engine.groups), np.int32(self._pending), self._values, group=1,
+            )  # fmt: skip
+            self._pending = 0
+        return self._values
 
     def read_one(self, name: str) -> Summary:
         """Fetch one slot."""
-        return Summary(*map(float, self.values[self.slots[name]].get()))
+        slot = self.slots[name]
+        return Summary(*map(float, self.values[slot : slot + 1].get()[0]))
 
     def read(self) -> dict[str, Summary]:
         """Fetch every slot, in one transfer."""
-        host = self.values.get()
-        return {name: Summary(*map(float, host[slot])) for name, slot in self.slots.items()}
+        return self.read_with(None)[0]
+
+    def read_with(self, other: cla.Array | None) -> tuple[dict[str, Summary], int]:
+        """Fetch every slot, and the first of `other`, int32, in the same transfer (0 if there is none)."""
+        self.values  # noqa: B018  brought up to date
+        size = self._values.nbytes
+        if other is not None:
+            cl.enqueue_copy(
+                self.engine.queue, self._record.data, other.data, dst_offset=size,
+                byte_count=other.dtype.itemsize,
+            )  # fmt: skip
+        host = self._record.get()
+        rows = host[:size].view(self.engine.real).reshape(-1, 4).tolist()
+        summaries = {name: Summary(*rows[slot]) for name, slot in self.slots.items()}
+        return summaries, int(host[size:].view(np.int32)[0])
 
 
 class Gather:

@@ -134,7 +134,8 @@ class Loop:
             if self.position == self.last_step:
                 self.final = self.displacements()
             action.method.move(self.mesh)
-        self.mesh.update()
+        # The row that follows tells of bad sizes, too, unless they are scaled before.
+        self.mesh.update(check=self.held is not None)
         if self.held is not None:
             self.mesh.match_size()
         self.last = action.method

@@ -220,7 +220,9 @@ class Mesh:
         """Make the arrays that there are not, of what follows from the generators."""
         for name in _DERIVED:
             if getattr(self, name) is None:
-                setattr(self, name, self.engine.zeros(self.n))
+                # Only the potential is looked at before it is written.
+                make = self.engine.zeros if name == "potential" else self.engine.empty
+                setattr(self, name, make(self.n))
 
     def begin_step(self) -> None:
         """Take room for what generators are displaced by, to the end of the workspace's frame."""
@@ -245,10 +247,12 @@ class Mesh:
         assert self.tessellation is not None
         return self.tessellation
 
-    def update(self, first: bool = False, binned: BinnedPoints | None = None) -> None:
+    def update(
+        self, first: bool = False, binned: BinnedPoints | None = None, *, check: bool = True
+    ) -> None:
         """Tessellate the generators where they are now, and evaluate size, error and quality.
 
-        `binned` has them in their bins, where the caller does.
+        `binned` has them in their bins, where the caller does. Without `check` the next `assess` looks at the sizes.
 
         Raises
         ------
@@ -265,9 +269,7 @@ class Mesh:
         if self.engine.dim == 2:
             # The next diagrams are repaired from this one, most likely.
             stages.bins.clear()
-        self.sizing.evaluate(self.points, self.n, self.h)
-        if self.coarsening != 1:
-            stages.metric.scale_sizes(self.coarsening, self.h)
+        self.sizing.evaluate(self.points, self.n, self.h, self.coarsening)
         with self.engine.workspace.frame():
             changed = self.engine.scratch(self.n)
             stages.metric.compare_neighbours(
@@ -275,7 +277,8 @@ class Mesh:
             )
             self._evaluate_metric({"changed": changed, "ever": self.ever})
         # Before anything is done with a bad size: the solver, say, would complain of something else.
-        self.sizing.check(self.points, self.h, self.coarsening)
+        if check:
+            self.sizing.check(self.points, self.h, self.coarsening)
 
     def _evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
         """Evaluate error and quality, and summarise them, and `others` by name."""
@@ -366,8 +369,16 @@ class Mesh:
         return inserted, deleted
 
     def assess(self) -> dict[str, Summary]:
-        """Fetch the summaries of the mesh and of the latest step: the scalars that the host sees of it."""
-        return self.summaries.read()
+        """Fetch the summaries of the mesh and of the latest step: the scalars that the host sees of it.
+
+        Raises
+        ------
+        SizeFieldError
+            If the size of a generator is not positive and finite, and `update` has not looked.
+        """
+        summaries, first = self.summaries.read_with(self.sizing.noted)
+        self.sizing.check(self.points, self.h, self.coarsening, first)
+        return summaries
 
     def refined_count(self) -> int:
         """Return how many generators `refine` would make."""

@@ -220,6 +220,22 @@ def test_a_bad_size_is_named_as_the_field_has_it(stages, value):
         )
 
 
+def test_a_bad_size_that_no_update_looked_at_is_found_by_the_next_assessment(stages):
+    engine, good = stages.engine, np.array([[0.2, 0.3], [0.6, 0.6], [0.5, 0.1]])
+    size = Sizing(engine, patch.BOX, sizing.Expression("x > 0.7 ? 0.0/0.0 : 0.05"))
+    mesh = Mesh(stages, patch.BOX, size, engine.upload(good), coarsening=4)
+    assert mesh.assess()["error"].magnitude > 0
+    mesh.points.set(np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]]))
+    with pytest.raises(SizeFieldError, match=r"nan at \(0\.8, 0\.6\)"):
+        mesh.update()
+    mesh.update(check=False)
+    with pytest.raises(SizeFieldError, match=r"nan at \(0\.8, 0\.6\)"):
+        mesh.assess()
+    mesh.points.set(good)
+    mesh.update(check=False)
+    assert mesh.assess()["error"].magnitude > 0
+
+
 def test_names():
     for name in PUBLISHED:
         method = make_method(name, Relaxation(k=0.7))

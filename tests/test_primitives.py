@@ -77,6 +77,29 @@ def test_summaries_together_are_those_alone(engine, count):
     assert len({expected[name].sum for name in arrays}) == count
 
 
+def test_summaries_are_read_together_with_an_integer(engine):
+    """Also those that were collected, or read, before; a slot that never was holds zeros."""
+    rng, n = np.random.default_rng(8), 500
+    arrays = {name: rng.normal(size=n).astype(engine.real) for name in "abc"}
+    summaries, note = Summaries(engine, "zabc"), engine.upload([-7, 5], np.int32)
+    for name, array in arrays.items():
+        summaries.collect(name, engine.upload(array), n)
+        assert summaries.read_one(name).largest == array.max()
+    summaries.collect("b", engine.upload(2 * arrays["b"]), n)
+    values = summaries.values.get()
+    found, first = summaries.read_with(note)
+    assert first == -7
+    assert vars(found["z"]) == dict.fromkeys(("sum", "magnitude", "least", "largest"), 0)
+    for name, factor in (("a", 1), ("b", 2), ("c", 1)):
+        assert found[name].least == factor * arrays[name].min()
+        assert found[name].largest == factor * arrays[name].max()
+    assert np.array_equal(values, [list(vars(found[name]).values()) for name in "zabc"])
+    # Put back, they are what they were, whatever has been collected since.
+    summaries.collect("c", engine.upload(np.full(n, 9.0)), n)
+    summaries.values.set(values)
+    assert summaries.read() == found
+
+
 def test_summaries_are_compensated(engine):
     """Large terms that cancel: a plain sum would lose the small ones altogether."""
     n = 200001

@@ -133,7 +133,13 @@ def test_calls_and_bytes_of_known_launches(engine):
 def test_times_are_those_of_the_events(engine):
     x = engine.zeros(200_000)
     kernel = engine.kernels("primitives").summarise_blocks
-    args = *[x] * 8, np.int32(1), np.int32(len(x)), engine.empty(6 * engine.groups)
+    args = (
+        *[x] * 8,
+        np.int32(1),
+        np.int32(len(x)),
+        np.zeros(8, np.int32),
+        engine.empty(6 * engine.groups),
+    )
     with Profile(engine.queue) as taken:
         events = [engine.run_blocks(kernel, *args) for _ in range(9)]
     seconds = sum(1e-9 * (e.profile.end - e.profile.start) for e in events)
@@ -144,7 +150,13 @@ def test_times_are_those_of_the_events(engine):
 def test_few_events_are_kept(engine, monkeypatch):
     monkeypatch.setattr(profile, "PENDING", 10)
     x, kernel = engine.zeros(64), engine.kernels("primitives").summarise_blocks
-    args = *[x] * 8, np.int32(1), np.int32(64), engine.empty(6 * engine.groups)
+    args = (
+        *[x] * 8,
+        np.int32(1),
+        np.int32(64),
+        np.zeros(8, np.int32),
+        engine.empty(6 * engine.groups),
+    )
     most = 0
     with Profile(engine.queue) as taken:
         for _ in range(57):

@@ -499,6 +499,18 @@ BAD_VALUES = {
 }
 
 
+@pytest.mark.parametrize("field", [sizing.Expression("0.1 + x / 3"), lambda p: 0.1 + p[:, 0] / 3])
+def test_sizes_times_a_factor(make_engine, field):
+    """To the last bit the product of both, on the device and on the host."""
+    engine, domain = make_engine(2), Box((0, 0), (2, 1))
+    stage = sizing.Sizing(engine, domain, field)
+    x = _device_points(engine, domain, _within(domain, N))
+    h, scaled = engine.empty(N), engine.empty(N)
+    stage.evaluate(x, N, h)
+    stage.evaluate(x, N, scaled, 1.7)
+    assert np.array_equal(scaled.get(), engine.real.type(1.7) * h.get())
+
+
 @pytest.mark.parametrize("case", BAD_VALUES)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_bad_values_are_named(make_engine, case, gradient):

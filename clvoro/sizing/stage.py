@@ -93,17 +93,20 @@ class Sizing:
         """Return the field's landmarks (see `Field.landmarks`)."""
         return self.field.landmarks(domain)
 
-    def evaluate(self, points: cla.Array, n: int, h_out: cla.Array) -> None:
-        """Write h' at the first `n` of `points` (>= n, d) into `h_out` (>= n,).
+    def evaluate(self, points: cla.Array, n: int, h_out: cla.Array, factor: float = 1.0) -> None:
+        """Write `factor` h' at the first `n` of `points` (>= n, d) into `h_out` (>= n,).
 
-        A value that is not positive and finite is noted, and raised by the next `check`; on the
+        A value of h that is not positive and finite is noted, and raised by the next `check`; on the
         host at once.
         """
+        real = self.engine.real.type
         if self._kernels is None:
             h = self._on_host(self._physical(points[:n].get())) / self._scale
-            h_out[:n].set(h.astype(self.engine.real))
+            h_out[:n].set(real(factor) * h.astype(self.engine.real))
             return
-        self.engine.run_each(self._kernels.evaluate, n, points, self.data, h_out, self._bad)
+        self.engine.run_each(
+            self._kernels.evaluate, n, points, self.data, real(factor), h_out, self._bad
+        )
 
     def evaluate_with_gradient(
         self, points: cla.Array, n: int, h_out: cla.Array, grad_out: cla.Array
@@ -137,11 +140,18 @@ class Sizing:
             *self.domain.device_args(self.engine), h_out, grad_out, self._bad,
         )  # fmt: skip
 
-    def check(self, points: cla.Array, h: cla.Array, factor: float = 1.0) -> None:
+    @property
+    def noted(self) -> cla.Array | None:
+        """What `check` reads, one integer, if there is anything to read."""
+        return None if self._kernels is None else self._bad
+
+    def check(
+        self, points: cla.Array, h: cla.Array, factor: float = 1.0, first: int | None = None
+    ) -> None:
         """Raise if an evaluation since the last check met a value that is not positive and finite.
 
-        Reads one integer from the device. `points` and `h` are those of the last evaluation; `h` may have been scaled
-        by `factor` since.
+        Reads one integer from the device, unless the caller has: `first`, from `noted`. `points` and `h` are those of
+        the last evaluation, `h` times `factor`.
 
         Raises
         ------
@@ -150,7 +160,7 @@ class Sizing:
         """
         if self._kernels is None:
             return
-        first = int(self._bad.get()[0])
+        first = int(self._bad.get()[0]) if first is None else first
         if first == _NONE_BAD:
             return
         self._bad.fill(np.int32(_NONE_BAD))
