@@ -1,4 +1,6 @@
 #include "common/domain.h"
+#include "common/blocks.h"
+#include "common/at_once.h"
 
 /* The size field as a density of generators, rho = h^-d, and what follows from it. */
 
@@ -39,27 +41,38 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
                          global const REAL *log_h, global REAL *gradient)
 {
     WORK_ITEM(i);
+    MANY(REAL) sums[DIM][DIM], rises[DIM];
     REAL m[DIM][DIM], b[DIM], g[DIM];
     EACH_AXIS(p) {
-        b[p] = g[p] = 0;
+        rises[p] = 0;
         EACH_AXIS(q)
-            m[p][q] = 0;
+            sums[p][q] = 0;
     }
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int j = neighbours[k];
-        if (j < 0)
-            continue;
-        REAL d[DIM], d2 = 0;
+    const int faces = starts[size], end = starts[i + 1];
+    for (int k = starts[i]; k < end; k += AT_ONCE) {
+        const MANY(int) facing = TAKE(int, neighbours, k, faces), counts = INSIDE(k, end) & (facing >= 0);
+        const MANY(int) j = CHOOSE(int, counts, facing, i);
+        MANY(REAL) d[DIM], d2 = 0;
         EACH_AXIS(a) {
-            d[a] = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
+            d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
             d2 += d[a] * d[a];
         }
-        const REAL rise = log_h[j] - log_h[i];
+        /* What does not count is at no distance. */
+        const MANY(REAL) weight = 1 / CHOOSE(REAL, counts, d2, 1), rise = PICK(REAL, log_h, j, 1, 0) - log_h[i];
         EACH_AXIS(p) {
-            b[p] += d[p] * rise / d2;
+            const MANY(REAL) weighted = d[p] * weight;
+            rises[p] += weighted * rise;
             EACH_AXIS(q)
-                m[p][q] += d[p] * d[q] / d2;
+                if (q >= p)
+                    sums[p][q] += weighted * d[q];
         }
+    }
+    EACH_AXIS(p) {
+        b[p] = SUM(REAL, rises[p]);
+        g[p] = 0;
+        EACH_AXIS(q)
+            if (q >= p)
+                m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
     /* Too few or collinear neighbours leave the gradient undetermined: take none. */
     const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);

@@ -12,9 +12,14 @@ from clvoro.density import Density
 N = 250
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
+@pytest.fixture(
+    scope="module",
+    params=[("float64", None), ("float32", None), ("float64", 16)],
+    ids=["float64", "float32", "gpu"],
+)
 def engine(ctx, request):
-    return patch.make_engine(ctx, request.param)
+    real, group_size = request.param
+    return patch.make_engine(ctx, real, group_size=group_size)
 
 
 def test_excess(engine):

@@ -45,6 +45,12 @@ AT_ONCE_FOR(float)
 AT_ONCE_FOR(double)
 #endif
 
+#define mask_int(lanes) (lanes)
+#define mask_float(lanes) (lanes)
+#define mask_double(lanes) convert_long8(lanes)
+/* `x` in the lanes that are `chosen`, else `other`. */
+#define CHOOSE(TYPE, chosen, x, other) select((MANY(TYPE))(other), x, CLVORO_JOIN(mask_, TYPE)(chosen))
+
 inline float least_float(float8 x)
 {
     const float4 x4 = fmin(x.lo, x.hi);
@@ -87,6 +93,7 @@ inline MANY(REAL) nearest_images(MANY(REAL) d, REAL period)
 #define take_rows_double(array, a, k, size) ((array)[(k)*DIM + (a)])
 #define sum_float(x) (x)
 #define sum_double(x) (x)
+#define CHOOSE(TYPE, chosen, x, other) ((chosen) ? (x) : (TYPE)(other))
 #define least_float(x) (x)
 #define put_float(x, array, k, end, until) ((array)[k] = (x))
 #define nearest_images(d, period) nearest_image(d, period)
