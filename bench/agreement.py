@@ -1,12 +1,12 @@
 """Two devices, the same input: by how much the results differ.
 
-    python bench/agreement.py [--devices pocl,intel] [--cells 2e4] [--dtype float32] [--json]
+    python bench/agreement.py [--devices pocl,Intel(R) OpenCL] [--cells 2e4] [--dtype float32] [--no-runs] [--json]
 
-A diagram of random generators must have the same graph and volumes to rounding ("off": largest difference over
-the mean volume, in units of eps). So must some steps of a run, "off" then being how far generators are apart over
-h. Rounding decides, in the end, which of two equal things is done (a defect climbs this way or that), so whole runs
-drift apart: of them the figures are compared. Exits with 1 where the first two differ by more than 1e-6 (float32:
-1e-2), or a whole run's mean error by more than 1e-3 or mean Q by more than 5e-3.
+A diagram of random generators must have the same graph and volumes to rounding ("off": largest difference over the
+mean volume, in units of eps). So must some steps of a run, "off" then being how far generators are apart over h.
+Rounding decides, in the end, which of two equal things is done (a defect climbs this way or that), so whole runs
+drift apart: of them the figures are compared. Exits with 1 where a difference is larger than `ROUNDINGS`, `STEPPED`,
+`COUNTS` or `FIGURES` allow, which say why.
 """
 
 from __future__ import annotations
@@ -33,6 +33,18 @@ import clvoro
 from clvoro.start import count_cells
 
 STEPS = 3
+ROUNDINGS = 1e4
+"""Of a volume over the mean volume: corners are quotients of differences of squares, and random generators come as near
+to each other as 1e-2 of a cell."""
+STEPPED = {"float64": 1e-6, "float32": 1e-2}
+"""Generators after the steps, over h. Rough solves have their vectors in float32: in float64 that is what differs,
+16 roundings of it for a displacement of up to h. In float32 a residual that rounds to the other side of the solve's
+tolerance, 1e-2, takes an iteration more."""
+COUNTS = 3e-3
+"""Number of cells of a whole run, relative: some inserted and deleted ones, of thousands."""
+FIGURES = {"mean_error": 1e-3, "mean_quality": 5e-3}
+"""Of whole runs. The default aims at a mean error of 2.5e-3; a cell with a defect has Q lower by 0.05 to 0.1, and one
+cell in twenty may have it here and not there."""
 
 
 def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
@@ -62,7 +74,7 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
     records.append({**same, "what": f"{STEPS} steps", "cells": len(a.points), "graph": graph, "off": off,
                     "in_eps": off / eps})  # fmt: skip
 
-    for effort in ("fast", "default"):
+    for effort in () if options.no_runs else ("fast", "default"):
         found = []
         for adapter in (one, other):
             result = adapter.run(box, field, effort=effort, seed=FIRST_SEED)
@@ -78,18 +90,25 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
 
 def good(record: dict[str, Any]) -> bool:
     """Tell whether the devices agree."""
+    real = record["dtype"]
+    if record["what"] == "diagram":
+        return record["graph"] and record["off"] <= ROUNDINGS * np.finfo(real).eps
     if "off" in record:
-        return record["off"] <= (1e-2 if record["dtype"] == "float32" else 1e-6)
-    error, quality = record["mean_error"], record["mean_quality"]
-    return bool(abs(error[0] - error[1]) <= 1e-3 and abs(quality[0] - quality[1]) <= 5e-3)
+        return record["off"] <= STEPPED[real]
+    apart = all(abs(np.subtract(*record[name])) <= most for name, most in FIGURES.items())
+    return bool(apart and record["cells_off"] <= max(2, COUNTS * record["cells"]))
 
 
-def main() -> int:
+def main() -> int | str:
     options_of = parser(__doc__)
-    options_of.add_argument("--devices", type=names, default=["pocl", "intel"])
+    options_of.add_argument("--devices", type=names, default=["pocl", "Intel(R) OpenCL"])
     options_of.add_argument("--cells", type=counts, default=[20_000])
     options_of.add_argument("--fields", type=names, default=["F2", "S1"])
+    options_of.add_argument("--no-runs", action="store_true", help="diagrams and steps only")
     options = options_of.parse_args()
+    devices = [make_adapter(Namespace(device=d, dtype=options.dtype)) for d in options.devices]
+    if len({adapter.ctx.devices[0] for adapter in devices}) < len(devices):
+        return f"{options.devices} name the same device: {device_name(devices[0])}"
 
     def either(key: str, text: Any) -> Any:
         return lambda r: text(r[key]) if key in r else "-"
@@ -114,7 +133,6 @@ def main() -> int:
             for record in compare(options, name, n):
                 report.add(record)
                 agree &= good(record)
-    devices = (make_adapter(Namespace(device=d, dtype=options.dtype)) for d in options.devices)
     report.finish(
         f"{' and '.join(map(device_name, devices))}, clvoro {clvoro.__version__}, {options.dtype}."
     )
