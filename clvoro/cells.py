@@ -114,6 +114,8 @@ class Cells:
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
         self._flags = engine.empty(4, np.int32)
+        # Copied on the device: the host would have to wait for a transfer.
+        self._no_flags = engine.upload([0, 2**31 - 1, 0, 0], np.int32)
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -354,7 +356,7 @@ class Cells:
                 "fewer than 2^31, which 32-bit indices can tell apart; use fewer cells, or perturb "
                 "generators that lie on a common circle"
             )
-        self._flags.set(np.array([0, 2**31 - 1, 0, 0], np.int32))
+        cl.enqueue_copy(engine.queue, self._flags.data, self._no_flags.data)
         return FaceRows(
             engine.scratch(entries, np.int32), engine.scratch(slots, np.int32),
             engine.scratch(slots * ((self.row_capacity + 31) // 32), np.uint32),
