@@ -31,7 +31,7 @@
    ratio of a face's area and the square of the distance of its own farthest vertex, as far as which vertices round:
    that distance is the same from both sides of the face. */
 #define CERTAIN_NEAREST2 1e-7
-#define CERTAIN_AREA 1e-7
+#define CERTAIN_AREA 1e-8
 
 /* Where cells are written to, in the layout of `clip_cells` (polyhedra.cl). */
 typedef struct {

@@ -1,7 +1,7 @@
 /* Runs of generators near a few others in 3D, from the bins that a box about these covers, in double precision. */
 #include "common/descent.h"
 
-#define RUN_CAPACITY 256
+#define RUN_CAPACITY 2048
 #define RUN_LENGTH 64 /* a bit of a word for each */
 #define WHOLE 64      /* generators in divided bins that are taken as they are: to open grids costs more */
 
