@@ -6,6 +6,7 @@ import inspect
 import json
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -116,8 +117,9 @@ class Job:
             if self.case.frames > 1 and not self.interrupted:
                 *_, last = results.values()
                 frames = run_frames(
-                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report
-                )
+                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report,
+                    self._now_and_then(),
+                )  # fmt: skip
         self._summarise(results, where, profiles)
         if frames and not self.quiet and not self.as_json:
             print(frames_line(frames))
@@ -144,6 +146,20 @@ class Job:
         if result.stop_reason == "interrupted":
             self.interrupted = True
         return replace(result, stop_reason="interrupted") if self.interrupted else result
+
+    def _now_and_then(self) -> Callable[[str], None]:
+        """Return what prints a text for people, if the last one was long enough ago."""
+        from .progress import EVERY
+
+        shown = time.monotonic()
+
+        def tell(text: str) -> None:
+            nonlocal shown
+            if not self.quiet and time.monotonic() - shown >= EVERY:
+                print(f"{self.case.name}: {text}", file=sys.stderr, flush=True)
+                shown = time.monotonic()
+
+        return tell
 
     def _refuse_unknown(self, arguments: dict[str, Any], run: Callable[..., Any]) -> None:
         known = inspect.signature(run).parameters

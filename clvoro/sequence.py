@@ -32,12 +32,18 @@ PICTURED = 6
 
 
 def run_frames(
-    case: Case, adapter: Any, first: Result, out: Path, stop: Callable[[], bool], pictures: bool
+    case: Case,
+    adapter: Any,
+    first: Result,
+    out: Path,
+    stop: Callable[[], bool],
+    pictures: bool,
+    tell: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Adapt `first`, the mesh of frame 0, to the later ones in turn, and write them into `out`.
 
     Frame k of n has the time k / n. Written are ``frames/mesh-KKK.vtu``, ``frames.csv`` with `COLUMNS`, and with
-    `pictures` ``pictures/frames.png``. It ends early where `stop` returns True.
+    `pictures` ``pictures/frames.png``. It ends early where `stop` returns True, and has `tell` say how far it has come.
 
     Returns
     -------
@@ -56,6 +62,7 @@ def run_frames(
         if frame:
             if stop():
                 break
+            tell(f"frame {frame + 1} of {case.frames}")
             result = adapter.run(
                 case.domain, case.size_field(time), points=result.points,
                 callback=lambda _: stop(), **arguments,
@@ -85,6 +92,8 @@ def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
 def _draw(shown: Mapping[float, Result], path: Path) -> None:
     """Draw frames side by side, coloured by target size."""
     from .report import plot_cells
+    from .report.cells import add_key
+    from .report.colours import colouring
     from .report.style import WIDTH, grid_height, new_figure, styled
 
     results = list(shown.values())
@@ -95,7 +104,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
     limits = (float(sizes.min()), float(sizes.max()))
     with styled():
         figure = new_figure(
-            WIDTH, grid_height(domain.lower, domain.upper, lines, columns, 0.1, 0.3)
+            WIDTH, grid_height(domain.lower, domain.upper, lines, columns, 0.65, 0.3)
         )
         axes = figure.subplots(lines, columns, squeeze=False).ravel()
         for ax, (time, result) in zip(axes, shown.items(), strict=False):
@@ -103,6 +112,8 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
             plot_cells(result, "size", ax, limits=limits, key=False, title=title)
         for ax in axes[len(results) :]:
             ax.set_axis_off()
+        cells, scheme = axes[0].collections[0], colouring("size")
+        add_key(cells, list(axes), scheme, sizes, limits, below=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:
             figure.savefig(file, format="png", dpi=170)

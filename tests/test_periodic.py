@@ -486,7 +486,7 @@ def test_pictures_are_filled_up_to_the_seams(double):
     assert len(cells.get_paths()) > len(result.points)
 
 
-def test_a_case_with_frames(tmp_path):
+def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
     from clvoro.cases import Case, load_case
     from clvoro.cli import main
 
@@ -507,7 +507,9 @@ def test_a_case_with_frames(tmp_path):
     """.replace("0.1 + 0.1", "0.12 + 0.03")
     (tmp_path / "wave.toml").write_text(text)
     out = tmp_path / "out"
-    assert main(["run", str(tmp_path / "wave.toml"), "--out", str(out), "--quiet"]) == 0
+    monkeypatch.setattr("clvoro.progress.EVERY", 0.0)
+    assert main(["run", str(tmp_path / "wave.toml"), "--out", str(out)]) == 0
+    assert "wave: frame 2 of 3\nwave: frame 3 of 3\n" in capsys.readouterr().err
     table = np.genfromtxt(out / "frames.csv", delimiter=",", names=True)
     assert table["time"].tolist() == pytest.approx([0, 1 / 3, 2 / 3])
     assert (table["mean_error"] < 0.02).all()
