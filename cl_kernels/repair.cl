@@ -60,8 +60,8 @@ inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, glo
     return w2 > R(1e-3) * u2 ? circumcentre(u, v, u2, dot(v, v)) : corner(i, x, a, b, points, lower, upper);
 }
 
-/* Check the row of generator i; see `check_rows`. */
-inline void check_row(int i, global const int *starts, global const int *neighbours, global const REAL *points,
+/* Check the row of generator i; see `check_rows`. Is it not as it should be? */
+inline bool check_row(int i, global const int *starts, global const int *neighbours, global const REAL *points,
                       const REAL *lower, const REAL *upper, global int *fits, global int *marks)
 {
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
@@ -69,7 +69,7 @@ inline void check_row(int i, global const int *starts, global const int *neighbo
     global const int *row = neighbours + start;
     if (n < 3 || n > CHECKED_FACES) {
         atomic_or(marks + i, 1);
-        return;
+        return true;
     }
     /* Face k, its direction, and the corners u before it and v behind it; face `before` lies before it. */
     int before = row[n - 1], face = row[0];
@@ -114,10 +114,12 @@ inline void check_row(int i, global const int *starts, global const int *neighbo
         d = d_after;
         u = v;
     }
-    if (bad || turns != 1 || least2 < sqrt(REAL_EPS) * reach2)
+    bad |= turns != 1 || least2 < sqrt(REAL_EPS) * reach2;
+    if (bad)
         atomic_or(marks + i, 1);
     if (!known)
         fits[i] = fit;
+    return bad;
 }
 
 #if IN_LANES
@@ -129,21 +131,27 @@ inline void check_row(int i, global const int *starts, global const int *neighbo
    longer enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; many may
    write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up.
 
-   In LANES a work-item takes so many generators, and there are so many fewer work-items. */
-kernel void check_rows(const int size, global const int *starts, global const int *neighbours,
-                       global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *fits,
-                       global int *marks)
+   In LANES a work-item takes so many generators, and there are so many fewer work-items. Of these only every one in
+   `stride` is done, and what is not as it should be counted in flags[3]; or, as the `rest`, the others. */
+kernel void check_rows(const int size, const int stride, const int rest, global const int *starts,
+                       global const int *neighbours, global const REAL *points, const REAL4 box_lower,
+                       const REAL4 box_upper, global int *fits, global int *marks, global int *flags)
 {
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int id = get_global_id(0);
+    const int item = rest ? id + id / (stride - 1) + 1 : id * stride;
 #if IN_LANES
-    const int first = (int)get_global_id(0) * LANES;
-    if (first < size)
-        check_eight(first, size, starts, neighbours, points, lower, upper, fits, marks);
+    if (item * LANES >= size)
+        return;
+    const int found = check_eight(item * LANES, size, starts, neighbours, points, lower, upper, fits, marks);
 #else
-    WORK_ITEM(i);
-    check_row(i, starts, neighbours, points, lower, upper, fits, marks);
+    if (item >= size)
+        return;
+    const int found = check_row(item, starts, neighbours, points, lower, upper, fits, marks);
 #endif
+    if (found && stride > 1 && !rest)
+        atomic_add(flags + 3, found);
 }
 
 /* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */

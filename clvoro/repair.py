@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from weakref import ReferenceType, ref
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Scan
@@ -15,12 +16,14 @@ from .domain import ClipBox
 
 MAX_ROUNDS = 6
 """Rounds of clipping and checking, beyond which a diagram is made anew."""
-MAX_SHARE = 0.5
+MAX_SHARE = 0.4
 """Share of the cells that may have to be clipped at first: a diagram made anew costs less than one mostly repaired."""
 AGAIN_SHARE = 0.1
 """The same for cells that are clipped once more, and those found out later, together."""
-
-
+SAMPLE, SAMPLED_FROM = 8, 200_000
+"""Of so many work-items one is done first, where cells are so many: to know soon whether too much has changed."""
+WRONG_SHARE = 0.23
+"""Share of cells in this sample that may be wrong: with the neighbours concerned they come to `MAX_SHARE`."""
 FEW = 256
 """Cells that are clipped one by one; of more, those that change but once are found eight at a time, on CPUs."""
 
@@ -73,9 +76,9 @@ class Repair:
         old = (previous.starts, previous.neighbours)
         marks.fill(0)
         rows.places.fill(-1)
-        engine.run(
-            k.check_rows, -(-n // cells.lanes), np.int32(n), *old, points, *corners, self._fits, marks
-        )  # fmt: skip
+        check = *old, points, *corners, self._fits, marks, rows.flags
+        if not self._check(k.check_rows, -(-n // cells.lanes), n, check, rows.flags):
+            return None
         base = 0
         for _ in range(MAX_ROUNDS):
             self._scan.exclusive(marks, sums, n)
@@ -105,3 +108,18 @@ class Repair:
             )  # fmt: skip
             base += count
         return None
+
+    def _check(
+        self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...], flags: cla.Array
+    ) -> bool:
+        """Check all rows, by so many work-items; of many, stop where a sample tells that too much has changed."""
+        one, part = np.int32(1), -(-items // SAMPLE)
+        if n < SAMPLED_FROM:
+            self.engine.run(kernel, items, np.int32(n), one, np.int32(0), *args)
+            return True
+        stride = np.int32(SAMPLE)
+        self.engine.run(kernel, part, np.int32(n), stride, np.int32(0), *args)
+        if int(flags.get()[3]) > WRONG_SHARE * n / SAMPLE:
+            return False
+        self.engine.run(kernel, items - part, np.int32(n), stride, one, *args)
+        return True

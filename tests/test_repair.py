@@ -150,7 +150,7 @@ def fitting(t):
 
 
 @pytest.mark.parametrize("name", POINTS)
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.2])
 def test_rows_that_are_known_to_fit_do(engine, name, share):
     """What the next repair takes for granted, against the graph; it would not notice a row that does not fit."""
     rng = np.random.default_rng(40967)
@@ -203,6 +203,35 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
     inner = (abs(points[listed] - [0.5, 0.375]) < [0.44, 0.315]).all(axis=1)
     assert (counts[inner] > 0).mean() > 0.95
     assert sum(rounds[1:]) < 0.1 * rounds[0]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 2.0])
+def test_sample_first(engine, share, monkeypatch):
+    """Checked in two parts rows lead to the same bits; where the sample is mostly wrong, the rest is not looked at."""
+    points = POINTS["random"].astype(engine.real)
+    rng = np.random.default_rng(40970)
+    step = share * spacing(points) * (rng.random(points.shape) - 0.5)
+    moved = np.clip(points + step, 0, [1, 0.75]).astype(engine.real)
+    launched, run = [], Engine.run
+
+    def watched(self, kernel, size, *args, **kwargs):
+        if kernel.function_name == "check_rows":
+            launched.append(args[1:3])
+        return run(self, kernel, size, *args, **kwargs)
+
+    monkeypatch.setattr(Engine, "run", watched)
+    found = []
+    for least in (N + 1, N):
+        monkeypatch.setattr(repair, "SAMPLED_FROM", least)
+        carried = Carried(engine, points)
+        found.append((*carried.move(moved), carried.repair._fits.get()))
+    (a, was_a, fits_a), (b, was_b, fits_b) = found
+    assert launched == [(1, 0), (repair.SAMPLE, 0), (repair.SAMPLE, 1)][: 3 if share < 1 else 2]
+    assert was_a == was_b == (share < 1)
+    assert np.array_equal(a.neighbours, b.neighbours)
+    assert np.array_equal(a.volumes, b.volumes)
+    if was_a:
+        assert np.array_equal(fits_a, fits_b)
 
 
 def test_many_changes_are_made_anew(engine):

@@ -17,10 +17,11 @@ inline bool fits_exactly(int i, global const int *row, int n, global const int *
     return fit;
 }
 
-/* Check the rows of LANES generators from number `first` on; see `check_rows`. */
-inline void check_eight(int first, int size, global const int *starts, global const int *neighbours,
-                        global const double *points, const double *lower, const double *upper, global int *fits,
-                        global int *marks)
+/* Check the rows of LANES generators from number `first` on; see `check_rows`. Returns how many are not as they should
+ * be. */
+inline int check_eight(int first, int size, global const int *starts, global const int *neighbours,
+                       global const double *points, const double *lower, const double *upper, global int *fits,
+                       global int *marks)
 {
     double2 behind[(CHECKED_FACES + 1) * LANES];
     double xs[LANES], ys[LANES];
@@ -79,17 +80,19 @@ inline void check_eight(int first, int size, global const int *starts, global co
     }
     vstore8(bad, 0, bits);
     vstore8((bad != 0) | (turns != 1) | (least2 < sqrt(DBL_EPSILON) * reach2), 0, wrong);
+    int found = 0;
     for (int lane = 0; lane < LANES && first + lane < size; ++lane) {
         const int i = first + lane, n = counts[lane];
         global const int *row = neighbours + starts[i];
         const bool fit = n > 0 && !walled[lane] && (fits[i] || fits_exactly(i, row, n, starts, neighbours));
         if (!fit) {
-            check_row(i, starts, neighbours, points, lower, upper, fits, marks);
+            found += check_row(i, starts, neighbours, points, lower, upper, fits, marks);
             continue;
         }
         fits[i] = 1;
         if (!wrong[lane])
             continue;
+        ++found;
         atomic_or(marks + i, 1);
         for (int k = 0; k < n; ++k)
             if ((bits[lane] >> k) & 1) {
@@ -98,4 +101,5 @@ inline void check_eight(int first, int size, global const int *starts, global co
                 atomic_or(marks + row[k == n - 1 ? 0 : k + 1], 1);
             }
     }
+    return found;
 }
