@@ -1,6 +1,7 @@
 """The scripts of bench/ that show what the README says, each on small meshes."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,17 @@ def records(script, *options, code=0):
     )
     assert done.returncode == code, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", sorted(p.name for p in BENCH.glob("[a-z]*.py")))
+def test_every_script_runs_from_a_checkout(script, tmp_path):
+    """From any folder, with nothing but the script's own way to the package."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    command = [sys.executable, str(BENCH / script), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert script in done.stdout.splitlines()[0]
 
 
 def test_interpolation():
