@@ -139,8 +139,16 @@ def simulate(name, *options):
 @pytest.fixture(scope="module")
 def simulator(request):
     """The simulator, at work on all that is asked for: the traps first, then the rest in the order of the tests."""
-    reporter = request.config.pluginmanager.getplugin("terminalreporter")
-    made = Simulator(reporter.write_line if reporter else lambda line: None)
+    plugins = request.config.pluginmanager
+    reporter, capture = map(plugins.getplugin, ("terminalreporter", "capturemanager"))
+
+    def say(line):
+        if reporter is not None:
+            with capture.global_and_fixture_disabled():
+                reporter.ensure_newline()
+                reporter.write_line(line)
+
+    made = Simulator(say)
     for trap in TRAPS:
         made.start(f"broken-{trap}")
     for item in request.session.items:
