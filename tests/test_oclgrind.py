@@ -33,8 +33,10 @@ TRAPS = {
 }
 USEFUL = [name for name in WORK if not name.startswith("broken")]
 VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
-LANES = {"hulls.wrap_cells", "repair.wrap_marked", "walks.wrap_cells"}
-"""Kernels that find eight cells at a time in the vector lanes of a CPU, in float64."""
+LANES = {
+    "hulls.wrap_cells", "repair.wrap_marked", "walks.count_cubes", "walks.order_places", "walks.wrap_cells",
+}  # fmt: skip
+"""Kernels that find eight cells at a time in the vector lanes of a CPU, in float64, or choose the eight."""
 NOT_IN = {
     "float64": set(),
     # These are between float32 and the precision of the mesh.
