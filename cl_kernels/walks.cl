@@ -5,11 +5,11 @@
 /* The cells in 3D of eight generators at a time, one in each lane of vectors: for CPUs, whose compilers make no vectors
    of work-items that branch as clipping does.
 
-   Cells are walked among the nearest generators (common/walk.h). What is farther than twice the farthest vertex cannot
-   cut; what is nearer and was not among them is looked for where it may cut off one of the vertices, and such a cell is
-   walked once more, with others of its kind. A cell is left to be clipped (`polyhedra.cl`) where its triangles do not
-   make a closed surface, or a face is so small, or bisectors so nearly parallel, that rounding may decide what there
-   is. */
+   Cells are walked among the nearest generators (common/walk.h), and the walls where these leave them open. What is
+   farther than twice the farthest vertex cannot cut; what is nearer and was not among them is looked for where it may
+   cut off one of the vertices, and such a cell is walked once more, with others of its kind. A cell is left to be
+   clipped (`polyhedra.cl`) where its triangles do not make a closed surface, or a face is so small, or bisectors so
+   nearly parallel, that rounding may decide what there is. */
 
 #if !IS_DOUBLE
 #error "single precision has too few digits to tell which decisions are certain"
@@ -17,14 +17,14 @@
 #define MAX_ROUNDS 20
 /* Where hardly any of the first cells of a stretch are certain, as in lattices that are off by little, it is left. */
 #define TRIALS 24
-#define GROWTH 1.4     /* of the radius where lists were too short */
+#define GROWTH 1.4     /* of the radius from shell to shell */
 #define THINNEST 1.001 /* ratio of the radii of a shell that still holds too much */
 #define MOST_SHELLS 64 /* that are looked at about one cell where some hold too much */
 #ifndef CUBE
 #error "build with -DCUBE=bins each way of the cubes of grid 0 that are gone through one by one, a power of 2"
 #endif
 #ifndef STRETCH
-#error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8 up to 256"
+#error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8"
 #endif
 
 /* What is certain: least ratio of squares of the distances of the nearest generator and of the farthest vertex; least

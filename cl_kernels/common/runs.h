@@ -1,4 +1,4 @@
-/* Runs of generators near a few others in 3D, from the bins that a box about these covers, in double precision. */
+/* Runs of generators in a few balls in 3D, from the bins that these touch, in double precision. */
 #include "common/descent.h"
 
 #define RUN_CAPACITY 2048
