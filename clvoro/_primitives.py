@@ -14,7 +14,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
-from ._device_array import make_array
+from ._device_array import buffer_of, make_array
 from ._program import Engine
 
 AT_ONCE = 8
@@ -82,7 +82,7 @@ class Summaries:
         size = 4 * len(names) * engine.real.itemsize
         self._record = engine.zeros(size + np.dtype(np.int32).itemsize, np.uint8)
         shape = (len(names), 4)
-        self._values = make_array(engine.queue, shape, engine.real, self._record.data)
+        self._values = make_array(engine.queue, shape, engine.real, buffer_of(self._record))
 
     def collect(self, name: str, array: cla.Array, n: int) -> None:
         """Summarise the first `n` of `array` into the slot `name`."""
@@ -132,7 +132,7 @@ class Summaries:
         size = self._values.nbytes
         if other is not None:
             cl.enqueue_copy(
-                self.engine.queue, self._record.data, other.data, dst_offset=size,
+                self.engine.queue, buffer_of(self._record), buffer_of(other), dst_offset=size,
                 byte_count=other.dtype.itemsize,
             )  # fmt: skip
         host = self._record.get()

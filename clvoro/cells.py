@@ -356,7 +356,7 @@ class Cells:
                 "fewer than 2^31, which 32-bit indices can tell apart; use fewer cells, or perturb "
                 "generators that lie on a common circle"
             )
-        cl.enqueue_copy(engine.queue, self._flags.data, self._no_flags.data)
+        cl.enqueue_copy(engine.queue, buffer_of(self._flags), buffer_of(self._no_flags))
         return FaceRows(
             engine.scratch(entries, np.int32), engine.scratch(slots, np.int32),
             engine.scratch(slots * ((self.row_capacity + 31) // 32), np.uint32),
