@@ -110,8 +110,8 @@ kernel void place_items(const int size, global const int *keys, global const int
 }
 
 /* The edge that a bin would have if it held OCCUPANCY generators where a block of bins about it in its grid, 3 each way
-   or as many more as hold SPACING_COUNT, holds as many as it does: a leaf's own few generators tell less of how far neighbours
-   are. */
+   or as many more as hold SPACING_COUNT, holds as many as it does: a leaf's own few generators tell less of how far
+   neighbours are. */
 inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
     const int place = b - shape.s0, rows = place / shape.s1, column = place - rows * shape.s1;
