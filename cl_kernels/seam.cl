@@ -73,9 +73,9 @@ inline bool make_image(const REAL *x, int code, global const float *margins, glo
 }
 
 /* Per block: the margin that images are taken from next. needed is what cells needed, there and in the blocks around
-   it, as cells move; it is to be `factor` times as wide, and no less than the share `keep` of what it was. widest[a]
+   it, as cells move; it is to be `factor` times as wide and, with `grow`, no less than it was. widest[a]
    collects the largest along axis a, as bits of a float, which are in the order of floats >= 0. */
-kernel void next_margins(const int size, global const float *needed, const float factor, const float keep,
+kernel void next_margins(const int size, global const float *needed, const float factor, const int grow,
                          global float *margins, global int *widest)
 {
     WORK_ITEM(k);
@@ -87,7 +87,8 @@ kernel void next_margins(const int size, global const float *needed, const float
     for (int i = max(first - 1, 0); i <= min(first + 1, BLOCKS - 1); ++i)
         for (int j = max(second - 1, 0); j <= min(second + 1, DIM == 2 ? 0 : BLOCKS - 1); ++j)
             margin = fmax(margin, factor * needed[block_place(seam / 2, seam % 2, i, j)]);
-    margin = fmax(margin, keep * fmin(margins[k], (float)period));
+    if (grow)
+        margin = fmax(margin, margins[k]);
     if (margin > 0.99f * (float)period)
         margin = WHOLE; /* at least as deep as any image, whatever rounds */
     margins[k] = margin;

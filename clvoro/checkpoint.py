@@ -37,7 +37,6 @@ _PER_FACE = ("neighbours", "face_measures", "face_centroids")
 _DIAGRAM = (
     "starts", "neighbours", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
 )  # fmt: skip
-_SEAMS = ("needed", "widths")
 _COUNTS = (
     "position",
     "level",
@@ -137,8 +136,7 @@ class Checkpointer:
         torus = mesh.tessellator.torus
         if torus is not None:
             # Within what images are taken: in 3D, sums of a cell depend on it in their last bits.
-            for name in _SEAMS:
-                arrays[f"seam.{name}"] = getattr(torus.margins, name).get()
+            arrays["seam.needed"] = torus.margins.needed.get()
         for part in ("initial", "final"):
             if getattr(loop, part) is not None:
                 for field in dataclasses.fields(Displacements):
@@ -244,12 +242,11 @@ class Saved:
 
     def _check_seams(self, d: int) -> None:
         """Check what a periodic box of `d` dimensions has beside."""
-        for name in _SEAMS:
-            margins = self.arrays[f"seam.{name}"]
-            if margins.shape != (block_count(d),) or margins.dtype != np.float32:
-                raise ValueError(f"seam.{name}")
-            if not (np.isfinite(margins).all() and margins.min() >= 0):
-                raise ValueError(f"seam.{name}")
+        needed = self.arrays["seam.needed"]
+        if needed.shape != (block_count(d),) or needed.dtype != np.float32:
+            raise ValueError("seam.needed")
+        if not (np.isfinite(needed).all() and needed.min() >= 0):
+            raise ValueError("seam.needed")
 
     def fit(self, made_by: dict) -> None:
         """Refuse a checkpoint of another domain or of other settings, naming the first that differs.
@@ -323,8 +320,7 @@ class Saved:
         mesh.next_label = state["next_label"]
         torus = mesh.tessellator.torus
         if torus is not None:
-            for name in _SEAMS:
-                getattr(torus.margins, name).set(a[f"seam.{name}"])
+            torus.margins.needed.set(a["seam.needed"])
             torus.margins.cells = state["seam_cells"]
         mesh._evaluate_metric()
         mesh.summaries.values.set(a["summaries"])

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from ._program import Engine
 from .domain import Domain
 from .errors import MemoryLimitError
+from .seam import BLOCKS, SLACK
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
@@ -16,18 +20,61 @@ OUTPUT = {2: (30, 25), 3: (13, 950)}
 """The same while the finished diagram is read, corners, loops and all."""
 FOLDED = {2: (40, 21), 3: (69, 30)}
 """What comes to the peak of a run in a periodic box, where graphs are folded: per cell, but not per image."""
-IMAGE_MARGIN = 1.9
-"""Mean spacings from the seams within which such boxes take images of generators, which count as cells (seam.py)."""
+IMAGE_REACH = 1.65
+"""Sizes of a cell that its neighbours and those who could be lie within, for most of the largest cells around."""
 
 
-def memory_needed(engine: Engine, n: float, domain: Domain | None = None) -> float:
-    """Return the bytes that a run of `n` cells, or reading its diagram, takes on the device at most."""
+def images_expected(
+    domain: Domain, size: Callable[[np.ndarray], np.ndarray], n: float, integral: float
+) -> float:
+    """Return how many images of generators a periodic box of `n` cells takes, per generator.
+
+    These are the cells beyond each block of the seams, as deep as balls around cells at the seam go there (`seam.py`).
+
+    Parameters
+    ----------
+    size : callable
+        h(points (k, d)) -> (k,), which sizes of cells are in proportion to.
+    integral : float
+        Of h^-d over the domain.
+    """
+    d, count = domain.dim, BLOCKS[domain.dim]
+    factor, share = (integral / n) ** (1 / d), 1.0
+    places = (np.arange(count) + 0.5) / count
+    for axis in np.flatnonzero(domain.periodic):
+        along = [a for a in range(d) if a != axis]
+        unit = np.stack(np.meshgrid(*[places] * (d - 1), indexing="ij"), axis=-1).reshape(-1, d - 1)
+        # Of block from block, squared.
+        apart = np.zeros((len(unit), len(unit)))
+        for column, a in zip(unit.T, along, strict=True):
+            away = np.abs(column[:, None] - column)
+            if domain.periodic[a]:
+                away = np.minimum(away, 1 - away)
+            apart += (away * domain.extent[a]) ** 2
+        images = 0.0
+        for end in (0.0, 1.0):
+            points = np.array(domain.lower) + np.insert(unit, axis, end, axis=1) * domain.extent
+            h = factor * size(points)
+            deep = np.sqrt(((IMAGE_REACH * h) ** 2 - apart).max(axis=1).clip(0))
+            deep = SLACK * maximum_filter(deep.reshape([count] * (d - 1)), 3).reshape(-1)
+            deep = np.minimum(deep, domain.extent[axis])
+            images += float((deep * h**-d).mean()) * domain.measure / domain.extent[axis]
+        share *= 1 + images / n
+    return share - 1
+
+
+def memory_needed(
+    engine: Engine, n: float, domain: Domain | None = None, images: float | None = None
+) -> float:
+    """Return the bytes that a run of `n` cells, or reading its diagram, takes on the device at most.
+
+    `images` per generator are what periodic boxes take (`images_expected`); None: as of cells that are all alike.
+    """
     cells, folded = n, 0.0
     if domain is not None and any(domain.periodic):
-        margin = IMAGE_MARGIN * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
-        edges = domain.extent[list(domain.periodic)]
-        # Images are taken from one period away at most.
-        cells, folded = n * float(np.prod(1 + 2 * np.minimum(margin / edges, 1))), n
+        if images is None:
+            images = images_expected(domain, lambda x: np.ones(len(x)), max(n, 1.0), domain.measure)
+        cells, folded = n * (1 + images), n
 
     def bytes_of(figures: tuple[int, int]) -> int:
         return figures[0] * engine.real.itemsize + figures[1] * 4
@@ -37,15 +84,17 @@ def memory_needed(engine: Engine, n: float, domain: Domain | None = None) -> flo
     return max(run, cells * bytes_of(OUTPUT[d]))
 
 
-def check_memory(engine: Engine, n: float, domain: Domain | None = None) -> None:
-    """Refuse a mesh of `n` cells of `domain` that would not fit, before anything is allocated.
+def check_memory(
+    engine: Engine, n: float, domain: Domain | None = None, images: float | None = None
+) -> None:
+    """Refuse a mesh of `n` cells of `domain` that would not fit, before anything is allocated; see `memory_needed`.
 
     Raises
     ------
     MemoryLimitError
         Saying how many cells were asked for, how much memory they need and how much there is.
     """
-    needed = memory_needed(engine, n, domain)
+    needed = memory_needed(engine, n, domain, images)
     available = engine.queue.device.global_mem_size
     if n > MOST_CELLS:
         raise MemoryLimitError(

@@ -12,7 +12,7 @@ from ._arrays import Naming, check_choice, check_integer, check_number
 from .domain import Domain
 from .errors import CoarseSizeWarning, InputError, InputTypeError
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
-from .memory import check_memory
+from .memory import check_memory, images_expected
 from .mesh import Mesh, Stages
 from .methods import PUBLISHED, Relaxation, make_method
 from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
@@ -165,7 +165,10 @@ class Preparation:
                 "one, too small; are h and the domain in the same unit of length?"
             )
             warnings.warn(message, CoarseSizeWarning, stacklevel=4)
-        check_memory(stages.engine, max(self.target, 0 if points is None else len(points)), domain)
+        most, images = max(self.target, 0 if points is None else len(points)), None
+        if any(domain.periodic) and not given:
+            images = images_expected(domain, self.sizing, most, asked)
+        check_memory(stages.engine, most, domain, images)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0

@@ -18,6 +18,9 @@ DROPPED, FAR, COLLAPSED = 1, 2, 4
 BLOCKS = {2: 128, 3: 32}
 """Blocks per axis along a seam by dimension."""
 
+SLACK = 1.5
+"""Margins of a diagram over what the one before needed. Less, and in early steps diagrams have to be made again."""
+
 
 def block_count(dim: int) -> int:
     """Return the number of blocks of all seams, those across axes with walls included."""
@@ -152,7 +155,7 @@ class Seam:
         self._turn = 0
 
     def extend(
-        self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, keep: float
+        self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
     ) -> Images:
         """Return the first `n` of `points` (n, d) with their images beyond the seams.
 
@@ -160,8 +163,8 @@ class Seam:
         ----------
         margins : Margins
             They become what was needed, times `factor`.
-        keep : float
-            But nowhere less than this share of what they were.
+        grow : bool
+            But nowhere less than they were.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
@@ -170,7 +173,7 @@ class Seam:
         blocks = blocks.astype(engine.real)
         margins.widest.fill(0)
         engine.run_each(
-            k.next_margins, block_count(d), margins.needed, np.float32(factor), np.float32(keep),
+            k.next_margins, block_count(d), margins.needed, np.float32(factor), np.int32(grow),
             margins.widths, margins.widest,
         )  # fmt: skip
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)

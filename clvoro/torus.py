@@ -13,17 +13,13 @@ from .cells import EXACT_SHARE, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import InputError
 from .polyhedra import Polyhedra
-from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images, Margins
+from .seam import COLLAPSED, FAR, SLACK, ExtendedBox, Folded, Images, Margins
 
 if TYPE_CHECKING:
     from .stages import DiagramStages
 
 FIRST_MARGIN = 2.7
 """What cells are thought to need before the first diagram, in mean spacings."""
-SLACK = 1.5
-"""Margins of the next diagram over what this one needed. Less, and in early steps diagrams have to be made again."""
-KEEP = 0.9
-"""Share of a diagram's margins that the next one has at least: what is needed goes up and down."""
 
 
 class FewCellsError(InputError):
@@ -107,10 +103,9 @@ class Torus:
         if margins.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             margins.fill(FIRST_MARGIN * (volume / n) ** (1 / dim), n)
-        finer = (margins.cells / n) ** (1 / dim)
-        factor, keep = SLACK * finer, KEEP * finer
+        factor, grow = SLACK * (margins.cells / n) ** (1 / dim), False
         while True:
-            images = seam.extend(self.domain, points, n, margins, factor, keep)
+            images = seam.extend(self.domain, points, n, margins, factor, grow)
             binned = stages.bins.build(images.box, images.points, images.count)
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
@@ -122,7 +117,7 @@ class Torus:
             folded, enough, flags, generator = seam.fold(images, binned, t, points, share, nearest)
             if enough:
                 break
-            factor, keep = SLACK, 1.0
+            factor, grow = SLACK, True
             # Room for what is made anew.
             del images, binned, args, t, folded
         if flags & COLLAPSED:

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.spatial import Voronoi
+from scipy.spatial import Voronoi, cKDTree
 
 import clvoro
 from clvoro import sizing
@@ -200,6 +200,47 @@ def test_clusters_need_wide_margins(adapter):
         volumes = torus_voronoi(UNIT, UNIT.wrap(points))[1]
         assert np.abs(d.volumes - volumes).max() < ROUNDING[adapter.dtype.name]
         assert d.check()
+
+
+@pytest.mark.parametrize("box", [CHANNEL, SLAB], ids=["channel", "slab"])
+def test_images_are_all_that_cells_need(adapter, box):
+    """All of them within twice the reach of every cell, by the corners of the diagram; few where cells are small."""
+    from clvoro.torus import Torus
+
+    rng = np.random.default_rng(11)
+    n = {2: 600, 3: 1200}[box.dim]
+    unit = rng.random((n, box.dim)) ** 3
+    points = np.array(box.lower) + box.extent * unit
+    stages = adapter._stages_for(box)
+    x = stages.engine.upload(box.place(points, adapter.dtype))
+    torus = Torus(stages, box)
+    torus.tessellate(x, n, whole=True)
+    latest = torus.latest
+    taken = latest.images.points.get()[: latest.images.count].astype(float)
+    diagram, scale = adapter.diagram(box, points), box.frame[1]
+    owner = face_owners(diagram)
+    if box.dim == 2:
+        corners = diagram.vertices[diagram.cell_vertices]
+    else:
+        owner = np.repeat(owner, np.diff(diagram.face_vertex_starts))
+        corners = diagram.vertices[diagram.face_vertices]
+    reach = np.zeros(n)
+    np.maximum.at(reach, owner, np.linalg.norm(corners - diagram.points[owner], axis=1))
+    steps = [(-1, 0, 1) if p else (0,) for p in box.periodic]
+    all_images = np.concatenate(
+        [
+            x.get() + np.array(step) * box.periods(adapter.dtype)
+            for step in itertools.product(*steps)
+            if any(step)
+        ]
+    )
+    near = cKDTree(all_images).query_ball_point(x.get(), 2 * reach / scale * (1 - 1e-5))
+    needed = np.unique(np.concatenate([np.array(found, int) for found in near]))
+    distance, _ = cKDTree(taken).query(all_images[needed])
+    assert len(needed) > n / 20
+    assert distance.max() < 1e-6
+    # One margin for all seams would take nearly all images: some cells are as long as half the box.
+    assert len(taken) - n < 0.7 * len(all_images)
 
 
 def test_cells_lie_around_their_generators(double):
