@@ -130,11 +130,11 @@ static double real_number(const char *at, int64_t bytes)
 }
 
 /* The largest difference of real numbers of so many bytes over the largest number that is expected; infinity where one
-   is no number and the other is. */
+   is no number and the other is. What stands in for an array that is not used may end within a number. */
 static double difference(const char *expected, const char *found, int64_t size, int64_t bytes)
 {
     double most = 0, largest = 0;
-    for (int64_t k = 0; k < size; k += bytes) {
+    for (int64_t k = 0; k + bytes <= size; k += bytes) {
         const double x = real_number(expected + k, bytes), y = real_number(found + k, bytes);
         if (isfinite(x))
             largest = fmax(largest, fabs(x));
