@@ -286,7 +286,7 @@ def test_resolution_is_chosen_and_capped(make_engine):
     ("make", "error", "message"),
     [
         (lambda: sizing.Graded(1.0), InputError, "exactly one"),
-        (lambda: sizing.Graded(1.0, 0.9), InputError, "at least 1"),
+        (lambda: sizing.Graded(1.0, 0.9), InputError, "expected 1 to 10"),
         (lambda: sizing.Graded(1.0, slope=-1), InputError, "slope"),
         (lambda: sizing.Graded("x", 1.2), InputTypeError, "Expression"),
         (lambda: sizing.Graded(1.0, 1.2, box=(0, 1)), InputTypeError, "clvoro.Box"),
