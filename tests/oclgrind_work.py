@@ -35,6 +35,7 @@ from clvoro.sizing import (
     Surface,
     minimum,
 )
+from clvoro.tessellator import Tessellator
 from tests.gpu_like import use_groups
 from tests.patch import BOX as PATCH
 from tests.patch import hexagons, tessellate
@@ -131,6 +132,21 @@ def as_for_many(
             work(adapter)
 
     return large
+
+
+def repaired(adapter: clvoro.Adapter) -> None:
+    """Generators that move a little: a fifth of the cells change."""
+    square, n = clvoro.Box((0, 0), (1, 1)), 120
+    stages = adapter._stages_for(square)
+    tessellator, where = Tessellator(stages, square), points(n)
+    t = tessellator.tessellate(stages.engine.upload(where), n)
+    for seed in range(2):
+        where = np.clip(where + 0.008 * (points(n, seed=seed) - 0.5), 0, 1)
+        x = stages.engine.upload(where)
+        again = stages.repair.follow(stages.cells, square, x, t)
+        assert again is not None
+        t = again
+        assert abs(t.volumes.get().sum() - 1) < 1e-4
 
 
 def drop_faces(adapter: clvoro.Adapter) -> None:
@@ -374,6 +390,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,
+    "repaired": as_for_many(repaired),
     "coupled": as_for_many(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
