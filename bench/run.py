@@ -5,7 +5,7 @@
 
 The field is F2, h = 0.002 + 0.08 d (d the distance to a circle), times the factor that makes the
 count; sizes over 1 : 40 or so. A run counts the cells, samples the start, adapts it over all
-levels and fetches the diagram. Kernels are built before, by a small run of each kind.
+levels and fetches the diagram. Kernels are built before, by a smaller run of each kind.
 
 "work" is in steps of the finest level; "s per step" is the run's time over it. The shares are of
 the device time of all kernels, by its events, in a second run ("s profiled"): "solve" all linear
@@ -48,6 +48,10 @@ TESSELLATION = ("bins", "cells", "repair", "primitives")
 
 CELLS_OF_F2 = 22972
 """Integral of h^-2 of F2."""
+
+
+BEFORE = 40_000
+"""Cells of the run before: enough for levels, multigrid and whatever else larger runs have."""
 
 
 def run_once(
@@ -164,7 +168,7 @@ def main() -> None:
     report = Report(options.json, COLUMNS)
     for method in options.methods:
         for effort in options.efforts:
-            run_once(adapter, 3000, effort, method)
+            run_once(adapter, BEFORE, effort, method)
             for n in options.sizes:
                 try:
                     record = measure(adapter, options.profile, n, effort, method)
