@@ -25,7 +25,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
 {
     double2 behind[(CHECKED_FACES + 1) * LANES];
     double xs[LANES], ys[LANES];
-    long counts[LANES], bits[LANES], wrong[LANES];
+    long counts[LANES], bits[LANES], turned[LANES], close[LANES];
     bool walled[LANES];
     int most = 0;
     for (int lane = 0; lane < LANES; ++lane) {
@@ -58,6 +58,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
     dx -= x;
     dy -= y;
     double8 reach2 = 0, least2 = DBL_MAX;
+    /* Bits of faces: where the row is not convex, and where it turns round. */
     long8 bad = 0, turns = 0;
     for (int k = 0; k < most; ++k) {
         double8 after_x, after_y;
@@ -69,8 +70,8 @@ inline int check_eight(int first, int size, global const int *starts, global con
         const long8 here = k < ends;
         const long8 good =
             (dx * after_y - dy * after_x > 0) & (dx * ey - dy * ex > 0) & (ex * ex + ey * ey >= DBL_EPSILON * d2);
-        bad |= here & ~good & (1L << k);
-        turns -= here & (dy < 0) & (after_y >= 0);
+        bad = here ? (good ? bad : bad | (1L << k)) : bad;
+        turns = here & (dy < 0) & (after_y >= 0) ? turns | (1L << k) : turns;
         reach2 = here ? max(reach2, vx * vx + vy * vy) : reach2;
         least2 = here ? min(least2, d2) : least2;
         ux = vx;
@@ -79,7 +80,8 @@ inline int check_eight(int first, int size, global const int *starts, global con
         dy = after_y;
     }
     vstore8(bad, 0, bits);
-    vstore8((bad != 0) | (turns != 1) | (least2 < sqrt(DBL_EPSILON) * reach2), 0, wrong);
+    vstore8(turns, 0, turned);
+    vstore8(least2 < sqrt(DBL_EPSILON) * reach2, 0, close);
     int found = 0;
     for (int lane = 0; lane < LANES && first + lane < size; ++lane) {
         const int i = first + lane, n = counts[lane];
@@ -90,7 +92,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
             continue;
         }
         fits[i] = 1;
-        if (!wrong[lane])
+        if (bits[lane] == 0 && popcount(turned[lane]) == 1 && !close[lane])
             continue;
         ++found;
         atomic_or(marks + i, 1);
