@@ -13,11 +13,13 @@
 #ifndef PERIODIC
 #error "build with -DPERIODIC -DPERIOD_0=... -DPERIOD_1=... -DPERIOD_2=..."
 #endif
+#ifndef BLOCKS
+#error "build with -DBLOCKS=number per axis along a seam"
+#endif
 
 #define CODES (DIM == 2 ? 9 : 27) /* sum over the axes of (c + 1) 3^a */
 #define CENTRE (CODES / 2)
-#define BLOCKS (DIM == 2 ? 128 : 32) /* per axis along a seam */
-#define WHOLE 4.0f                   /* more than any depth: positions lie in the unit box */
+#define WHOLE 4.0f /* more than any depth: positions lie in the unit box */
 
 /* Bits of report[1]. */
 #define FLAG_DROPPED 1   /* a face that only one of its cells sees, of no size, is to be dropped */

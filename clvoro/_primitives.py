@@ -95,14 +95,9 @@ class Summaries:
         slots = np.zeros(AT_ONCE, np.int32)
         slots[: len(given)] = [self.slots[name] for name in arrays]
         self.engine.run_blocks(
-            self._kernels.summarise_blocks,
-            *given,
-            *spare,
-            count,
-            np.int32(n),
-            slots,
+            self._kernels.summarise_blocks, *given, *spare, count, np.int32(n), slots,
             self._partials,
-        )
+        )  # fmt: skip
         for name in arrays:
             self._pending |= 1 << self.slots[name]
 

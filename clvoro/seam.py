@@ -150,7 +150,7 @@ class Seam:
         self.engine = engine
         self._scan = Scan(engine)
         self._room = Room(engine, spare=1 / 16)  # sizes change a little from step to step
-        self._kernels = engine.kernels("seam")
+        self._kernels = engine.kernels("seam", {"BLOCKS": BLOCKS[engine.dim]})
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
@@ -185,17 +185,9 @@ class Seam:
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
-            k.place_images,
-            n,
-            points,
-            margins.widths,
-            margins.widest,
-            *blocks,
-            firsts,
-            extended,
-            owners,
-            codes,
-        )
+            k.place_images, n, points, margins.widths, margins.widest, *blocks, firsts, extended,
+            owners, codes,
+        )  # fmt: skip
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
         # On a coarse grid, so that the corners of the extended box are exact.
         widest = np.ceil(margins.widest.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
