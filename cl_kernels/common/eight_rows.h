@@ -71,7 +71,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
         const long8 good =
             (dx * after_y - dy * after_x > 0) & (dx * ey - dy * ex > 0) & (ex * ex + ey * ey >= DBL_EPSILON * d2);
         bad = here ? (good ? bad : bad | (1L << k)) : bad;
-        turns = here & (dy < 0) & (after_y >= 0) ? turns | (1L << k) : turns;
+        turns = (here & (dy < 0) & (after_y >= 0)) ? turns | (1L << k) : turns;
         reach2 = here ? max(reach2, vx * vx + vy * vy) : reach2;
         least2 = here ? min(least2, d2) : least2;
         ux = vx;
