@@ -29,7 +29,8 @@ def walk(binned, n, dim, eps):
             (start, grid), (end, next_grid) = bins[first + place : first + place + 2]
             count = end - start
             if grid == next_grid:
-                for width in range(1, max(sides) + 1):
+                # What lies about an empty leaf nobody asks.
+                for width in range(1, max(sides) + 1 if count else 2):
                     block = counts[
                         tuple(slice(max(i - width, 0), i + width + 1) for i in index[::-1])
                     ]
