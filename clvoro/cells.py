@@ -108,6 +108,8 @@ class Cells:
 
     lanes = 1
     """Cells that a work-item measures, or checks."""
+    searches = True
+    """Whether neighbours are searched for in bins."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -124,7 +126,7 @@ class Cells:
         self.lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
         self._kernels = engine.kernels("cells", {**defines, "IN_LANES": int(self.lanes > 1)})
         self._wrap = None
-        if self.lanes > 1:
+        if self.lanes > 1 and self.searches:
             self._wrap = engine.kernels("hulls", {**defines, "EIGHTS": EIGHTS}).wrap_cells
 
     @property

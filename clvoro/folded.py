@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from ._program import Engine
-from .bins import MAX_LEVELS
 from .cells import Cells
 
 
 class FoldedCells(Cells):
     """The rows and measures of such cells: what `Repair` works on in a periodic box."""
 
+    searches = False
+
     def __init__(self, engine: Engine) -> None:
         periods = dict(engine.domain_defines)
         self._folds = {f"FOLD_{a}": periods[f"PERIOD_{a}"] for a in range(2)}
         super().__init__(engine)
-
-    def _build(self, cell_capacity: int, row_capacity: int) -> None:
-        self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
-        # Nothing is searched for here.
-        self._kernels = self.engine.kernels("cells", {**self.defines, "MAX_DEPTH": MAX_LEVELS})
 
     @property
     def defines(self) -> dict[str, object]:

@@ -10,9 +10,13 @@ inline REAL fold_period(REAL d, REAL period)
     return d > period / 2 ? d - period : (d < -period / 2 ? d + period : d);
 }
 #define BETWEEN(a, from, to) (FOLD(a) > 0 ? fold_period((to) - (from), FOLD(a)) : (to) - (from))
+/* From one neighbour to another, which may lie more than half a period from each other: by the directions to them,
+   whose differences are exact along a period (see common/domain.h). */
+#define APART(a, to_one, to_other, one, other) (FOLD(a) > 0 ? (to_other) - (to_one) : (other) - (one))
 #else
 #define FOLD(a) 0
 #define BETWEEN(a, from, to) ((to) - (from))
+#define APART(a, to_one, to_other, one, other) ((other) - (one))
 #endif
 
 /* From a place x to generator j. */
@@ -31,12 +35,12 @@ inline REAL2 circumcentre(REAL2 u, REAL2 v, REAL u2, REAL v2)
 
 /* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators themselves: the
    cells that share the corner agree on it to a rounding. */
-inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower,
-                    const REAL *upper)
+inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower, const REAL *upper)
 {
     if (a >= 0 && b >= 0) {
-        const REAL xa[2] = {points[2 * a], points[2 * a + 1]};
-        const REAL2 u = direction_of(x, a, points), v = direction_of(x, b, points), w = direction_of(xa, b, points);
+        const REAL2 u = direction_of(x, a, points), v = direction_of(x, b, points);
+        const REAL2 w = (REAL2)(APART(0, u.s0, v.s0, points[2 * a], points[2 * b]),
+                                APART(1, u.s1, v.s1, points[2 * a + 1], points[2 * b + 1]));
         const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
         /* The circumcentre of the triangle, relative to x_i; where the other two are near each other its squares would
            cancel, and it is taken relative to one of those. */
@@ -64,8 +68,8 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 }
 
-/* Squared distance between a corner of cell i, relative to x_i, and what cell j takes for the same corner, between its faces
-   p and q. */
+/* Squared distance between a corner of cell i, relative to x_i, and what cell j takes for the same corner, between its
+   faces p and q. */
 inline REAL corner_gap2(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
                         const REAL *upper)
 {

@@ -54,7 +54,9 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
         inside[lane] = least >= 0;
     }
     outlines_t corners;
-    find_corners(&corners, behind, most, vload8(0, xs), vload8(0, ys));
+    const double8 x = vload8(0, xs), y = vload8(0, ys);
+    fold_rows(behind, most, x, y);
+    find_corners(&corners, behind, most, x, y);
 
     FACE8 lengths[ROW_CAPACITY];
     FACE16 middles[ROW_CAPACITY];

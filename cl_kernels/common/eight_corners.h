@@ -9,6 +9,27 @@ inline double8 cross8(double8 a, double8 b, double8 c, double8 d)
     return fma(a, b, -cd) + fma(-c, d, cd);
 }
 
+#ifdef FOLD_0
+/* Have rows of points, up to number `most`, as the images of them that are nearest to the points (x, y): there all
+   differences are as `corner` takes them. */
+inline void fold_rows(double2 *behind, int most, double8 x, double8 y)
+{
+    const double8 even = (double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6);
+    const double8 odd = (double8)(x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
+    const double8 periods =
+        (double8)((double4)(FOLD(0), FOLD(1), FOLD(0), FOLD(1)), (double4)(FOLD(0), FOLD(1), FOLD(0), FOLD(1)));
+    const double8 half_way = periods > 0 ? periods / 2 : INFINITY;
+    for (int k = 0; k <= most; ++k)
+        for (int side = 0; side < 2; ++side) {
+            const double8 at = vload8(2 * k + side, (const double *)behind), d = at - (side ? odd : even);
+            const double8 nearer = d > half_way ? at - periods : at;
+            vstore8(d < -half_way ? at + periods : nearer, 2 * k + side, (double *)behind);
+        }
+}
+#else
+#define fold_rows(behind, most, x, y)
+#endif
+
 /* Points along outlines, relative to the generators. */
 typedef struct {
     double8 x[ROW_CAPACITY], y[ROW_CAPACITY];
