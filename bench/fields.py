@@ -117,8 +117,9 @@ def examples() -> list[Example]:
 def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
     from matplotlib import patheffects
 
-    from clvoro.report.cells import add_colour_bar, plot_cells
+    from clvoro.report.cells import plot_cells
     from clvoro.report.colours import colouring
+    from clvoro.report.keys import add_colour_bar
     from clvoro.report.style import new_figure, styled
 
     scheme = colouring("size")

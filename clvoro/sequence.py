@@ -92,8 +92,9 @@ def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
 def _draw(shown: Mapping[float, Result], path: Path) -> None:
     """Draw frames side by side, coloured by target size."""
     from .report import plot_cells
-    from .report.cells import add_key
     from .report.colours import colouring
+    from .report.keys import add_key
+    from .report.pictures import render
     from .report.style import WIDTH, grid_height, new_figure, styled
 
     results = list(shown.values())
@@ -110,13 +111,14 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
         for ax, (time, result) in zip(axes, shown.items(), strict=False):
             title = f"t = {time:.2f}, {len(result.points)} cells"
             plot_cells(result, "size", ax, limits=limits, key=False, title=title)
+            ax.set(xticks=[], yticks=[])
         for ax in axes[len(results) :]:
             ax.set_axis_off()
         cells, scheme = axes[0].collections[0], colouring("size")
         add_key(cells, list(axes), scheme, sizes, limits, below=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:
-            figure.savefig(file, format="png", dpi=170)
+            file.write(render(figure))
 
 
 def frames_line(rows: list[dict[str, Any]]) -> str:

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import itertools
 import re
 
 import numpy as np
@@ -19,7 +20,8 @@ from clvoro.report import (
     plot_size,
     write_report,
 )
-from clvoro.report.curves import MOST_ARROWS
+from clvoro.report.curves import MOST_ARROWS, _magnifications
+from clvoro.report.keys import short
 from clvoro.report.pictures import pictures_of, render
 from clvoro.report.style import nice, window_around_smallest
 
@@ -100,6 +102,68 @@ def test_error_scale_is_the_same_on_both_sides_of_zero(result):
     low, high = cells.get_clim()
     assert low == -high
     assert high >= np.quantile(np.abs(result.error), 0.99)
+
+
+@pytest.mark.parametrize("shape", [(3.0, 1.0), (1.0, 1.0), (0.6, 2.0)])
+@pytest.mark.parametrize("colour", ["error", "quality", "size"])
+def test_colour_bar_is_as_high_as_the_picture_and_readable(adapter, shape, colour):
+    domain = clvoro.Box((0, 0), shape)
+    result = adapter.run(domain, lambda x: 0.05 + 0.1 * x[:, 1], method="lloyd", max_steps=1)
+    figure = plot_cells(result, colour)
+    figure.canvas.draw()
+    renderer = figure.canvas.get_renderer()
+    (ax,) = figure.axes
+    (bar,) = ax.child_axes
+    picture = ax.get_window_extent(renderer)
+    long_axis = bar.get_window_extent(renderer)
+    arrows = 1.2  # those at the ends belong to the bar's height, not to its axes
+    assert picture.height / arrows < long_axis.height <= picture.height * 1.001
+    assert bar.get_tightbbox(renderer).x1 <= figure.bbox.x1 + 1  # the label is not cut off
+    boxes = [
+        t.get_window_extent(renderer)
+        for t in bar.get_yticklabels()
+        if long_axis.y0 - 1 <= t.get_window_extent(renderer).y1 and t.get_text()
+    ]
+    assert len(boxes) >= 2
+    boxes.sort(key=lambda b: b.y0)
+    for lower, upper in itertools.pairwise(boxes):
+        assert lower.y1 < upper.y0  # numbers do not touch
+
+
+def test_colour_bar_of_a_flat_picture_is_below_it(adapter):
+    domain = clvoro.Box((0, 0), (8, 0.8))
+    figure = adapter.run(domain, 0.2, method="lloyd", max_steps=1).plot("size")
+    figure.canvas.draw()
+    ax, bar = figure.axes
+    assert bar.get_window_extent().y1 < ax.get_window_extent().y0
+    assert ax.get_window_extent().width > 0.8 * figure.bbox.width
+    assert bar.get_tightbbox().y0 >= -1
+
+
+def test_axes_of_a_plain_figure_make_room_for_the_colour_bar(result):
+    figure = Figure(figsize=(6, 4))
+    plot_cells(result, "quality", figure.add_subplot())
+    assert len(figure.axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0024, "0.0024"), (12345.0, "12000"), (3e-7, "3e−07"), (-0.05, "−0.05"), (2.0, "2")],
+)
+def test_numbers_of_a_scale_are_short(value, text):
+    assert short(value) == text
+
+
+def test_arrows_are_about_a_spacing_long(result):
+    """Long displacements are reduced, short ones magnified, and generators that are held do not count."""
+    grid = np.stack(np.meshgrid(*2 * [np.arange(10.0)]), axis=-1).reshape(-1, 2)
+    held = np.arange(100) % 4 > 0
+    arrows = np.where(held[:, None], 0, [1.0, 0.0])
+    for length, factor in ((30.0, 0.02), (0.9, 1.0), (0.013, 50.0)):
+        field = clvoro.Displacements(grid, length * arrows, length * arrows)
+        # Six nearest: between one and the root of two away, at the edge a little more.
+        assert 0.5 <= length * _magnifications(field)[0] <= 2
+        assert _magnifications(field) == (factor, factor)
 
 
 def test_limits_and_window_are_taken(result):

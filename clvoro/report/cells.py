@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import LogNorm
-from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import ArrayLike
 
 from ..domain import Domain
@@ -21,7 +18,8 @@ from ..polygon import Polygon
 from ..results import Diagram, Result
 from .boundary import clip_to_domain, frame_part
 from .colours import COLOURINGS, Colouring, cell_norm, colouring, without_ends
-from .style import WIDTH, grid_height, interactive_figure, styled
+from .keys import add_colour_bar, add_key, round_numbers
+from .style import WIDTH, interactive_figure, single_height, styled
 
 
 def require_plane(diagram: Diagram) -> None:
@@ -78,7 +76,7 @@ def plot_cells(
     lower, upper = (np.asarray(corner, float) for corner in corners)
     with styled():
         if ax is None:
-            height = grid_height(lower, upper, 1, 1, 0.55, 0.25 * (title is not None))
+            height = single_height(lower, upper, bool(scheme.classes), title is not None)
             ax = interactive_figure(WIDTH, height).add_subplot()
         shown, offsets = _cells_in(diagram, lower, upper)
         values = scheme.values(result)
@@ -170,56 +168,6 @@ def edge_style(ax: Any, lengths: np.ndarray, extent: np.ndarray) -> tuple[np.nda
     return widths, colours
 
 
-def add_key(
-    cells: Any,
-    axes: Any,
-    scheme: Colouring,
-    values: np.ndarray,
-    limits: tuple[float, float],
-    below: bool = False,
-) -> None:
-    """Say what the colours mean, beside or below `axes` (one or several): a colour bar, or the classes' shares."""
-    if scheme.classes:
-        _add_classes(axes, scheme, values, limits)
-    else:
-        options = {"location": "bottom", "shrink": 0.6, "aspect": 45} if below else {}
-        add_colour_bar(cells, axes, scheme, values, limits, **options)
-
-
-def add_colour_bar(
-    cells: Any,
-    axes: Any,
-    scheme: Colouring,
-    values: np.ndarray,
-    limits: tuple[float, float],
-    **options: Any,
-) -> None:
-    """Add the scale beside `axes` (one or several), with arrows where values lie beyond it."""
-    low, high = limits
-    below, above = (
-        bool((values < low * (1 - 1e-9 * np.sign(low))).any()),
-        bool((values > high).any()),
-    )
-    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
-    figure = (axes[0] if isinstance(axes, (list, np.ndarray)) else axes).figure
-    bar = figure.colorbar(
-        cells, ax=axes, **{"extend": extend, "shrink": 0.9, "aspect": 28, "pad": 0.02, **options}
-    )
-    bar.set_label(scheme.label)
-    bar.outline.set_linewidth(0.4)  # type: ignore[operator]
-    if scheme.logarithmic and isinstance(cells.norm, LogNorm):
-        # Ticks at the ends themselves make them readable; a round number too near would collide.
-        inner = [t for t in _round_numbers(low, high) if low * 1.12 < t < high / 1.12]
-        bar.set_ticks([low, *inner, high])
-        bar.minorlocator = NullLocator()
-        bar.formatter = FuncFormatter(lambda t, _: f"{t:.2g}")
-        bar.update_ticks()
-    elif options.get("location") == "bottom":
-        # Numbers side by side: with a sign and many digits more of them would run into each other.
-        bar.locator = MaxNLocator(5)
-        bar.update_ticks()
-
-
 def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = None) -> Any:
     """Draw a size field h(x) on a 2D domain, with contour lines: the paper's Figure 2.
 
@@ -259,7 +207,7 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     values = np.ma.masked_invalid(values).reshape(len(y), len(x))
     with styled():
         if ax is None:
-            height = grid_height(domain.lower, domain.upper, 1, 1, 0.55, 0)
+            height = single_height(domain.lower, domain.upper)
             ax = interactive_figure(WIDTH, height).add_subplot()
         image = ax.imshow(
             values,
@@ -269,7 +217,7 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
             cmap=scheme.colour_map,
             norm=cell_norm(scheme, (low, high)),
         )
-        levels = [t for t in _round_numbers(low, high) if low * 1.02 < t < high * 0.98]
+        levels = [t for t in round_numbers(low, high) if low * 1.02 < t < high * 0.98]
         if levels:
             lines = ax.contour(x, y, values, levels=levels, colors="white", linewidths=0.6)
             ax.clabel(lines, fmt="%g", fontsize=7)
@@ -291,42 +239,6 @@ def _inside(domain: Domain, points: np.ndarray, reach: float) -> tuple[np.ndarra
         shown[rest] = domain.boundary_distance(points[rest]) <= reach
         return shown, domain.nearest(points[shown])
     return shown, points[shown]
-
-
-def _round_numbers(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten from `low` to `high`, both ends a little widened."""
-    numbers = [float(f"{m}e{p}") for p in range(-12, 13) for m in (1, 2, 5)]
-    return [t for t in numbers if low * 0.999 <= t <= high * 1.001]
-
-
-def _add_classes(
-    axes: Any, scheme: Colouring, values: np.ndarray, limits: tuple[float, float]
-) -> None:
-    """Put the classes with their shares of all cells under the picture."""
-    first = round(limits[0] + 0.5)
-    handles = [
-        Patch(
-            facecolor=colour,
-            edgecolor="#1A1A1A",
-            linewidth=0.4,
-            label=f"{label}: {np.mean(values == number):.1%}",
-        )
-        for number, (colour, label) in enumerate(
-            zip(scheme.colour_map.colors, scheme.classes, strict=True), start=first
-        )
-        if (values == number).any()
-    ]
-    options: dict[str, Any] = {
-        "handles": handles,
-        "ncols": len(handles),
-        "frameon": False,
-        "handlelength": 1.2,
-        "columnspacing": 1.4,
-    }
-    if isinstance(axes, (list, np.ndarray)):
-        axes[0].figure.legend(loc="outside lower center", **options)
-    else:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), **options)
 
 
 def _cells_in(

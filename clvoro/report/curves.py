@@ -26,6 +26,7 @@ _PANELS = {
     "error": ("metric error $|e|$ [–]", ("mean_error", "mean"), ("max_error", "largest")),
     "quality": ("cell quality $Q$ [–]", ("mean_quality", "mean"), ("min_quality", "worst cell")),
 }
+_LONG = 0.97  # share of the arrows that are to be no longer than a spacing
 MOST_ARROWS = 2500
 """Of a mesh with more generators, the displacements are shown where the cells are smallest."""
 
@@ -56,6 +57,8 @@ def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
             Line2D([], [], color="#444444", label="mean"),
             Line2D([], [], color="#444444", lw=0.9, ls=(0, (4, 2)), label="worst cell"),
         ]
+        if any(np.diff(result.history["level"]).any() for result in results.values()):
+            handles.append(Line2D([], [], color="#444444", lw=0.7, ls=":", label="finer level"))
         figure.legend(
             handles=handles, loc="outside upper center", ncols=len(handles), frameon=False
         )
@@ -129,7 +132,8 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
                 ("Poisson", field.poisson, "#B34700"),
             )
             for ax, factor, (name, arrows, colour) in zip(axes_row, factors, halves, strict=True):
-                note = "to scale" if factor == 1 else f"magnified × {factor:g}"
+                word = "magnified" if factor > 1 else "reduced"
+                note = "to scale" if factor == 1 else f"{word} × {factor:g}"
                 step = "coarse step" if coarse and when == "first" else "step"
                 ax.set_title(f"{name}, {when} {step} ({note})")
                 _draw_arrows(ax, field.points, arrows * factor, colour)
@@ -143,7 +147,8 @@ def displacements_height(result: Result) -> float:
     """Height in inches that suits `plot_displacements`."""
     extent = np.subtract(*_shown_part(result)[::-1])
     rows = (result.initial is not None) + (result.final is not None)
-    return rows * (WIDTH / 2 * float(extent[1] / extent[0]) + 0.22)
+    ticks = 0.5 if len(result.points) > MOST_ARROWS else 0.0
+    return rows * ((WIDTH / 2 - ticks) * float(extent[1] / extent[0]) + 0.25 + 0.4 * ticks)
 
 
 def _shown_part(result: Result) -> tuple[np.ndarray, np.ndarray]:
@@ -171,9 +176,10 @@ def _magnifications(field: Displacements) -> tuple[float, float]:
     spacing = KDTree(field.points).query(field.points, k=nearest)[0][:, 1:].mean(axis=1)
     factors = []
     for arrows in (field.lloyd, field.poisson):
-        reach = float(np.quantile(np.hypot(*arrows.T) / spacing, 0.9))
-        # Rounding noise of a half that vanishes is not worth showing.
-        factors.append(max(1.0, nice(1.0 / reach, up=False)) if reach > 1e-6 else 1.0)
+        reaches = np.hypot(*arrows.T) / spacing
+        # Generators that are held, and rounding noise of a half that vanishes, are not worth showing.
+        moving = reaches[reaches > 1e-6]
+        factors.append(nice(1.0 / np.quantile(moving, _LONG), up=False) if moving.size else 1.0)
     if max(factors) <= 2.5 * min(factors):
         factors = [min(factors)] * 2
     return factors[0], factors[1]

@@ -177,7 +177,7 @@ def _label_axes(
             outwards = -outwards
         angle = 90 - (90 - math.degrees(math.atan2(edge[1], edge[0]))) % 180  # in (-90, 90]
         ax.annotate(
-            f"${name}$ from {box[0, axis]:g} to {box[1, axis]:g}",
+            f"${name}$ from {box[0, axis]:g} to {box[1, axis]:g}".replace("-", "−"),
             place + gap * outwards,
             rotation=angle,
             rotation_mode="default",

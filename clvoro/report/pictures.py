@@ -13,9 +13,17 @@ from ..results import Result
 from . import cells as draw
 from .colours import colouring, shared_limits
 from .curves import displacements_height, plot_displacements, plot_history
+from .keys import add_colour_bar
 from .slices import focus, new_slices, plot_slice
 from .solids import cutaway_height, plot_cutaway, plot_distributions
-from .style import WIDTH, grid_height, new_figure, styled, window_around_smallest
+from .style import (
+    WIDTH,
+    grid_height,
+    new_figure,
+    single_height,
+    styled,
+    window_around_smallest,
+)
 
 Picture = tuple[str, str, Callable[[], Any]]
 """Name of its file, caption, and the function that draws it."""
@@ -71,9 +79,7 @@ def pictures_of(
                 lambda: plot_displacements(main, new_figure(WIDTH, height)),
             )
         )
-    pictures.append(
-        ("sides", f"Cells by number of sides ({name}).", lambda: _one(main, "sides", extra=0.5))
-    )
+    pictures.append(("sides", f"Cells by number of sides ({name}).", lambda: _one(main, "sides")))
     if len(main.points) > 3000:
         pictures.append(
             ("closer", f"Where the cells are smallest ({name}).", lambda: _closer(main))
@@ -110,7 +116,7 @@ def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
             "distributions",
             f"Cells ({name}) by metric error, quality and number of faces; faces by skewness. "
             "Dashed: the mean.",
-            lambda: plot_distributions(main, new_figure(WIDTH, 3.9)),
+            lambda: plot_distributions(main, new_figure(WIDTH, 4.2)),
         ),
         ("sides", f"Cells by number of faces ({name}).", slices("sides")),
     ]
@@ -184,11 +190,11 @@ def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
         return buffer.getvalue()
 
 
-def _one(result: Result, colour: str, extra: float = 0.25, **options: Any) -> Any:
+def _one(result: Result, colour: str, **options: Any) -> Any:
     """Draw one large picture of the whole domain."""
     with styled():
-        box = result.diagram.domain
-        figure = new_figure(WIDTH, grid_height(box.lower, box.upper, 1, 1, extra, 0) * 0.92)
+        box, legend = result.diagram.domain, bool(colouring(colour).classes)
+        figure = new_figure(WIDTH, single_height(box.lower, box.upper, legend))
         return draw.plot_cells(result, colour, figure.add_subplot(), **options)
 
 
@@ -198,7 +204,7 @@ def _size(result: Result, size: Callable[[np.ndarray], np.ndarray] | None) -> An
         return _one(result, "size", edges=False)
     with styled():
         box = result.diagram.domain
-        figure = new_figure(WIDTH, grid_height(box.lower, box.upper, 1, 1, 0.25, 0) * 0.92)
+        figure = new_figure(WIDTH, single_height(box.lower, box.upper))
         return draw.plot_size(size, box, figure.add_subplot())
 
 
@@ -231,7 +237,7 @@ def _grid(panels: Mapping[str, Result], colour: str) -> Any:
             ax.set_axis_off()
         values = np.concatenate([scheme.values(r) for r in results])
         collection = next(c for c in axes[0].collections if c.get_array() is not None)
-        draw.add_colour_bar(
+        add_colour_bar(
             collection, axes, scheme, values, limits, location="bottom", shrink=0.6, aspect=45
         )
     return figure
@@ -249,7 +255,7 @@ def _closer(result: Result) -> Any:
             ax.locator_params(nbins=4)
             ax.set_title(f"{across} $h_\\mathrm{{min}}$ across, where $h$ is smallest")
         scheme = colouring("quality")
-        draw.add_colour_bar(
+        add_colour_bar(
             axes[0].collections[0], axes, scheme, result.quality, limits,
             location="bottom", shrink=0.6, aspect=45,
         )  # fmt: skip

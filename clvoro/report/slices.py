@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from ..faces import face_owners
 from ..results import Diagram, Result
-from .cells import add_key, edge_style
+from .cells import edge_style
 from .colours import Colouring, cell_norm, colouring, without_ends
 from .cutaway import draw_cutaway
+from .keys import add_key
 from .section import Section, cut_cells, plane_axes
-from .style import WIDTH, frame_domain, interactive_figure, new_figure, styled
+from .style import WIDTH, frame_domain, interactive_figure, new_figure, nice, styled
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -35,7 +36,10 @@ def focus(result: Result) -> np.ndarray:
     lower, extent = np.array(box.lower), box.extent
     if len(smallest) > 0.5 * len(result.points):  # all alike
         return lower + 0.5 * extent
-    return np.clip(smallest.mean(axis=0), lower + 0.25 * extent, lower + 0.75 * extent)
+    # A round place, as titles name it; half a cell makes no difference.
+    step = nice(0.5 * float(result.size.min()), up=False)
+    centre = np.round(smallest.mean(axis=0) / step) * step + 0.0
+    return np.clip(centre, lower + 0.25 * extent, lower + 0.75 * extent)
 
 
 def as_normal(normal: str | ArrayLike) -> np.ndarray:

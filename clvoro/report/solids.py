@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..results import Result
-from .cells import add_key, plot_cells
+from .cells import plot_cells
 from .colours import cell_norm, colouring
 from .cutaway import VIEW, draw_cutaway, view_axes
+from .keys import add_key
 from .slices import as_normal, focus, plot_slice, plot_slices, require_space
 from .style import WIDTH, interactive_figure, styled
 
@@ -149,8 +150,10 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
     matplotlib.figure.Figure
     """
     with styled():
-        figure = interactive_figure(WIDTH, 3.9) if figure is None else figure
+        figure = interactive_figure(WIDTH, 4.2) if figure is None else figure
         panels = figure.subplots(2, 2).ravel()
+        if figure.get_layout_engine() is not None:  # titles stand clear of the numbers above
+            figure.get_layout_engine().set(hspace=0.08)
         dim = result.diagram.domain.dim
         for ax, name in zip(panels, ("error", "quality", "sides", "skewness"), strict=True):
             scheme = colouring(name, dim)
@@ -186,7 +189,8 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
             ax.set_xlim(edges[0], edges[-1])
             mean = float(values.mean())
             ax.axvline(mean, color="#1A1A1A", lw=0.9, ls=(0, (4, 2)))
-            ax.set_title(f"mean {mean:.3g}, from {values.min():.3g} to {values.max():.3g}")
+            title = f"mean {mean:.3g}, from {values.min():.3g} to {values.max():.3g}"
+            ax.set_title(title.replace("-", "−"))
     return figure
 
 

@@ -91,6 +91,21 @@ def grid_height(
     return float(rows * (WIDTH / columns * extent[1] / extent[0] * 0.96 + each) + extra)
 
 
+def is_flat(lower: Any, upper: Any) -> bool:
+    """Tell whether a picture is too flat for a colour bar beside it."""
+    extent = np.subtract(upper, lower)
+    return bool(extent[1] < 0.3 * extent[0])
+
+
+def single_height(lower: Any, upper: Any, legend: bool = False, title: bool = False) -> float:
+    """Height of a picture of one domain, with a colour bar (below if flat) or a legend below, inches."""
+    extent = np.subtract(upper, lower)
+    flat = is_flat(lower, upper) and not legend
+    width = WIDTH - (0.55 if legend or flat else 1.5)
+    below = 0.35 * legend + 0.65 * flat
+    return float(width * extent[1] / extent[0] + 0.4 + below + 0.25 * title)
+
+
 def window_around_smallest(result: Result, across: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of a window `across` times as wide as the smallest target size.
 
