@@ -4,11 +4,11 @@
                          [--processor-time] [--device NAME] [--dtype float32] [--json]
 
 A mesh of F2 scaled to the count (see `convergence.py`) is made by a fast run, and given a few steps
-of each kind: "weighted" couples weighted centroids and Poisson, "glide" and "polish" project onto
-the cells' sizes. Times are medians over `--repeat` further steps, from an idle queue to an idle
-queue, in milliseconds: "displace" finds the displacement ("solve" is the device's time of its
-linear solver), "diagram" repairs the tessellation, "rest" moves, evaluates h, error, quality and
-their sums. "diagram M/s" is cells per second of the repaired diagram with all its measures,
+of each kind, as a default run takes them: "weighted" couples weighted centroids and Poisson, "glide"
+and "polish" project onto the cells' sizes. Times are medians over `--repeat` further steps, from an
+idle queue to an idle queue, in milliseconds: "displace" finds the displacement ("solve" is the
+device's time of its linear solver), "diagram" repairs the tessellation, "rest" moves, evaluates h,
+error, quality and their sums. "diagram M/s" is cells per second of the repaired diagram with all its measures,
 "to host" the bytes that the host reads. "cold" makes the same diagram anew, from binning on.
 
 The second table holds kernels against the machine: bytes that must move per cell (each array that
@@ -23,6 +23,8 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +35,7 @@ import clvoro
 from clvoro._program import Engine
 from clvoro.mesh import Mesh, Stages
 from clvoro.methods import Method, ProjectedMethod, WeightedMethod
+from clvoro.plans import Step, plan_adaptive
 from clvoro.profile import Profile, profiled_queue
 from clvoro.sizing import Sizing
 
@@ -40,13 +43,17 @@ CELLS_OF_F2 = 22972
 SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
 WARM_UP = 4
 
-KINDS: dict[str, Callable[[], Method]] = {
-    "weighted": lambda: WeightedMethod(cautious=True),
-    "glide": lambda: ProjectedMethod("lloyd", 1.3, 0.7, eps=0.1),
-    "polish": lambda: ProjectedMethod(
-        "shape", eps=0.3, lenience=0.03, bound=0.03, k=0.3, aim=0.0025
-    ),
-}
+
+def kinds() -> dict[str, Callable[[], Method]]:
+    """Return what makes a method anew, for the kinds of steps that a default run takes on its finest level."""
+    steps = [a.method for a in plan_adaptive(2, "default", 1, exact=False) if isinstance(a, Step)]
+    projected = {m.descent: m for m in steps if isinstance(m, ProjectedMethod)}
+    coupled = [m for m in steps if isinstance(m, WeightedMethod)]
+    last = {"weighted": coupled[-1], "glide": projected["lloyd"], "polish": projected["shape"]}
+    return {name: partial(replace, method) for name, method in last.items()}
+
+
+KINDS = kinds()
 
 NEEDS = {
     # kernel: (reals, integers, operations) per cell of six faces

@@ -14,9 +14,11 @@
      z = D^-1 r    p = z + beta p    s = B^T p = B^T z + beta s    beta = (r, z) / (r, z)_before
      q = B s + eps p    alpha = (r, z) / (p, q)    r -= alpha q    u -= alpha s
 
-   with (p, q) = |s|^2 + (p, eps p), which is known before q is: an iteration takes two kernels, `descend` and `update`,
-   and y itself is never needed. Each group leaves its part of a sum, and all groups add the same parts in the next
-   kernel.
+   with (p, q) = |s|^2 + (p, eps p), which is known before q is: an iteration takes two kernels, `descend` and `update`.
+   Each group leaves its part of a sum, and all groups add the same parts in the next kernel.
+
+   From a start y_0, such as the last step's solution, the first direction is p = y_0, and the second begins anew with
+   beta = 0: as alpha is what suits best along it, a start that is poor, or of another scale, does no harm.
 
    Derivatives across faces are in single precision, in which the two cells of a face agree well enough; vectors in
    STORE, which is single too where the tolerance allows it: memory traffic is the cost. Sums are in REAL. */
@@ -56,8 +58,9 @@ inline float penalty_of(float penalty, float lenience, float worst, float bound,
 
 /* Per generator i: own[i] = dr_i/dx_i h_i; for each face the derivatives across it, rows[k] = dr_i/dx_j h_j and
    columns[k] = dr_j/dx_i h_i, axis by axis in arrays of `room`; eps; the inverse of the diagonal of B B^T + eps; and
-   the start of the iteration from u = 0, r = b = excess + J displacement. Walls have derivatives of 0. Generators of
-   labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any size is in range.
+   r = b = excess + J displacement with the first direction, z = start if `warm`, else D^-1 r. Walls have derivatives of
+   0. Generators of labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any
+   size is in range.
  */
 kernel void assemble(int n, const int room, global const int *starts, global const int *neighbours,
                      global const FACE *face_measures, global const FACE *face_centroids, global const REAL *volumes,
@@ -65,7 +68,8 @@ kernel void assemble(int n, const int room, global const int *starts, global con
                      global const REAL *quality, global const REAL *excess, global const REAL *displacement,
                      const REAL penalty, const REAL lenience, const REAL bound, global float *rows,
                      global float *columns, global STORE *own, global STORE *eps, global STORE *inverse_diagonal,
-                     global STORE *r, global STORE *z, global REAL *partial, global const int *labels, const int fixed)
+                     global STORE *r, global STORE *z, global REAL *partial, global const int *labels, const int fixed,
+                     const int warm, global const float *start)
 {
     local REAL scratch[GROUP_SIZE];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
@@ -78,7 +82,8 @@ kernel void assemble(int n, const int room, global const int *starts, global con
         const float shrink = content / volumes[i];
         float diagonal = 0, worst = quality[i];
         const bool still = fixed > 0 && labels[i] < fixed;
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             x[a] = points[DIM * i + a];
             self[a] = 0;
         }
@@ -87,7 +92,8 @@ kernel void assemble(int n, const int room, global const int *starts, global con
             const MANY(int) facing = TAKE(int, neighbours, k, faces), counts = INSIDE(k, end) & (facing >= 0);
             const MANY(int) j = select((MANY(int))(i), facing, counts);
             MANY(float) d[DIM], d2 = 0, square = 0, changed = 0;
-            EACH_AXIS(a) {
+            EACH_AXIS(a)
+            {
                 d[a] = CONVERT(float, nearest_images(PICK(REAL, points, j, DIM, a) - x[a], PERIOD(a)) * unit);
                 d2 += d[a] * d[a];
             }
@@ -99,7 +105,8 @@ kernel void assemble(int n, const int room, global const int *starts, global con
             MANY(int) stands = 0;
             if (fixed > 0)
                 stands = PICK(int, labels, j, 1, 0) < fixed;
-            EACH_AXIS(a) {
+            EACH_AXIS(a)
+            {
                 const MANY(float) m =
                     CONVERT(float, CONVERT(REAL, TAKE_ROWS(FACE, face_centroids, a, k, faces)) * unit);
                 const MANY(float) middle = select((MANY(float))(0), m, counts), other = here * (d[a] - middle);
@@ -114,7 +121,8 @@ kernel void assemble(int n, const int room, global const int *starts, global con
             if (lenience > 0)
                 worst = fmin(worst, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             /* The size of a cell whose generator does not move does not change by its motion. */
             const float t = still ? 0 : self[a] - DIM * (float)(gradient[DIM * i + a] * hi);
             moved += t * (float)(displacement[DIM * i + a] * unit);
@@ -125,10 +133,11 @@ kernel void assemble(int n, const int room, global const int *starts, global con
         const REAL inverse = 1 / (diagonal + e), b = excess[i] + moved;
         eps[i] = e;
         inverse_diagonal[i] = inverse;
+        const REAL first = warm ? start[i] : inverse * b;
         r[i] = b;
-        z[i] = inverse * b;
+        z[i] = first;
         sum_add(&norm, b * b);
-        sum_add(&gamma, inverse * b * b);
+        sum_add(&gamma, first * b);
     }
     PUT(NORM(0), norm.value);
     PUT(GAMMA(0), gamma.value);
@@ -142,24 +151,24 @@ kernel void assemble(int n, const int room, global const int *starts, global con
 
 /* What the iteration works on. */
 typedef struct {
-    int n, most, room;
+    int n, most, room, warm;
     REAL tolerance;
     global const int *starts, *neighbours;
     global const float *rows, *columns;
     global const STORE *own, *eps, *inverse_diagonal;
-    global STORE *p, *s, *u, *r, *z;
+    global STORE *p, *s, *u, *y, *r, *z;
     global REAL *partial, *record;
 } iteration_t;
 
 #define ITERATION_ARGS                                                                                                 \
-    const int n, const int most, const int room, const REAL tolerance, global const int *starts,                       \
+    const int n, const int most, const int room, const int warm, const REAL tolerance, global const int *starts,       \
         global const int *neighbours, global const float *rows, global const float *columns, global const STORE *own,  \
         global const STORE *eps, global const STORE *inverse_diagonal, global STORE *p, global STORE *s,               \
-        global STORE *u, global STORE *r, global STORE *z, global REAL *partial, global REAL *record
+        global STORE *u, global STORE *y, global STORE *r, global STORE *z, global REAL *partial, global REAL *record
 #define ITERATION                                                                                                      \
     {                                                                                                                  \
-        n, most, room, tolerance, starts, neighbours, rows, columns, own, eps, inverse_diagonal, p, s, u, r, z,        \
-            partial, record                                                                                            \
+        n, most, room, warm, tolerance, starts, neighbours, rows, columns, own, eps, inverse_diagonal, p, s, u, y, r,  \
+            z, partial, record                                                                                         \
     }
 
 /* p = z + beta p and s = B^T z + beta s. From the iteration on that finds the residual at its target, or is the last
@@ -170,34 +179,36 @@ inline void go_down(int k, const iteration_t *it, local REAL *scratch)
     global REAL *partial = it->partial, *now = it->record + 4 * k;
     global const REAL *last = now - 4;
     const int first = get_global_id(0) == 0;
-    const int over = k > 0 && !(last[RECORD_RUNNING] != 0 && last[RECORD_CURVATURE] > 0);
+    const int start = it->warm != 0;
+    const int over = k > 0 && !(last[RECORD_RUNNING] != 0 && (last[RECORD_CURVATURE] > 0 || k == start));
     const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
     const REAL target = it->tolerance * it->tolerance * (k > 0 ? it->record[RECORD_NORM] : norm);
-    const int running = !over && k < it->most && norm > target && norm <= REAL_MAX && gamma > 0;
+    const int running = !over && k < it->most && norm > target && norm <= REAL_MAX && (gamma > 0 || k < start);
     if (first)
         now[RECORD_RUNNING] = running;
     if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
     }
-    const STORE beta = k > 0 ? gamma / last[RECORD_GAMMA] : 0;
+    const STORE beta = k > start ? gamma / last[RECORD_GAMMA] : 0;
     const int end = running ? it->n : 0, faces = it->starts[it->n];
     Sum curvature = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
-        const STORE zi = it->z[i], pi = k > 0 ? zi + beta * it->p[i] : zi;
+        const STORE zi = it->z[i], pi = k > start ? zi + beta * it->p[i] : zi;
         STORE sum[DIM];
         EACH_AXIS(a)
-            sum[a] = it->own[DIM * i + a] * zi + (k > 0 ? beta * it->s[DIM * i + a] : 0);
+        sum[a] = it->own[DIM * i + a] * zi + (k > start ? beta * it->s[DIM * i + a] : 0);
         const int end_of_row = it->starts[i + 1];
         for (int f = it->starts[i]; f < end_of_row; f += AT_ONCE) {
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             const MANY(STORE) zj = PICK(STORE, it->z, j, 1, 0);
             EACH_AXIS(a)
-                sum[a] += SUM(STORE, DERIVATIVE(it->columns, f, a) * zj);
+            sum[a] += SUM(STORE, DERIVATIVE(it->columns, f, a) * zj);
         }
         it->p[i] = pi;
         REAL product = (REAL)it->eps[i] * pi * pi;
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             it->s[DIM * i + a] = sum[a];
             product += (REAL)sum[a] * sum[a];
         }
@@ -206,7 +217,7 @@ inline void go_down(int k, const iteration_t *it, local REAL *scratch)
     PUT(CURVATURE, curvature.value);
 }
 
-/* u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
+/* y += alpha p, u -= alpha s, r -= alpha (B s + eps p), z = D^-1 r. */
 inline void go_up(int k, const iteration_t *it, local REAL *scratch)
 {
     global REAL *partial = it->partial, *now = it->record + 4 * k;
@@ -214,12 +225,17 @@ inline void go_up(int k, const iteration_t *it, local REAL *scratch)
     const REAL curvature = total_sum(ROW(CURVATURE), scratch);
     if (running && get_global_id(0) == 0)
         now[RECORD_CURVATURE] = curvature;
-    const STORE alpha = now[RECORD_GAMMA] / curvature;
-    const int end = running && curvature > 0 ? it->n : 0, faces = it->starts[it->n];
+    /* A start of zero has no curvature. */
+    const int ahead = curvature > 0, started = k < it->warm;
+    const STORE alpha = ahead ? now[RECORD_GAMMA] / curvature : 0;
+    const int end = running && (ahead || started) ? it->n : 0, faces = it->starts[it->n];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;
     for (BLOCK_LOOP(i, end)) {
-        STORE q = it->eps[i] * it->p[i];
-        EACH_AXIS(a) {
+        const STORE pi = it->p[i];
+        STORE q = it->eps[i] * pi;
+        it->y[i] = (k > 0 ? it->y[i] : 0) + alpha * pi;
+        EACH_AXIS(a)
+        {
             const STORE si = it->s[DIM * i + a];
             q += it->own[DIM * i + a] * si;
             it->u[DIM * i + a] = (k > 0 ? it->u[DIM * i + a] : 0) - alpha * si;
@@ -229,7 +245,7 @@ inline void go_up(int k, const iteration_t *it, local REAL *scratch)
             const MANY(int) inside = INSIDE(f, end_of_row), j = FACING(f);
             MANY(STORE) sum = 0;
             EACH_AXIS(a)
-                sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, DIM, a);
+            sum += DERIVATIVE(it->rows, f, a) * PICK(STORE, it->s, j, DIM, a);
             q += SUM(STORE, sum);
         }
         const STORE ri = it->r[i] - alpha * q, zi = it->inverse_diagonal[i] * ri;
@@ -271,10 +287,12 @@ kernel void iterate(ITERATION_ARGS)
     }
 }
 
-/* Per generator i: what the projection takes from the displacement, correction = h u. */
-kernel void put_correction(const int size, global const STORE *u, global const REAL *h, global REAL *correction)
+/* Per generator i: what the projection takes from the displacement, correction = h u, and the next start. */
+kernel void put_correction(const int size, global const STORE *u, global const STORE *y, global const REAL *h,
+                           global REAL *correction, global float *start)
 {
     WORK_ITEM(i);
+    start[i] = y[i];
     EACH_AXIS(a)
-        correction[DIM * i + a] = h[i] * u[DIM * i + a];
+    correction[DIM * i + a] = h[i] * u[DIM * i + a];
 }

@@ -1,7 +1,7 @@
 """Checkpoints: a run's whole state in one file, from which it goes on to the same end, bit for bit.
 
 What a step leaves for the next one is saved as it is: generators in the device's order, their diagram (the next one is
-repaired from it), sizes, velocities, the potential, the multigrid's coarse levels (which last for several steps), and
+repaired from it), sizes, velocities, the solvers' starts, the multigrid's coarse levels (which last for several steps), and
 the few numbers that the host keeps. What is computed anew from
 these (the size field, the plan) is compared with what the file says, so that a run does not go on from another's state.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .loop import Loop
     from .sizing import Sizing
 
-FORMAT, VERSION = "clvoro-checkpoint", 3
+FORMAT, VERSION = "clvoro-checkpoint", 4
 _MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
 _PER_FACE = ("neighbours", "face_measures", "face_centroids")
 _DIAGRAM = (
@@ -125,6 +125,8 @@ class Checkpointer:
         arrays: dict[str, np.ndarray] = {
             f"mesh.{name}": getattr(mesh, name).get() for name in _MESH
         }
+        if mesh.multipliers is not None:
+            arrays["multipliers"] = mesh.multipliers.get()
         arrays["summaries"] = mesh.summaries.values.get()
         starts = t.starts.get()
         m = int(starts[-1])
@@ -221,6 +223,8 @@ class Saved:
             "summaries": ((len(SUMMARIES), 4), real),
             "history": ((len(a["history"]),), HISTORY_DTYPE),
         }  # fmt: skip
+        if "multipliers" in a:
+            shapes["multipliers"] = ((n,), np.float32)
         for name, (shape, dtype) in shapes.items():
             if a[name].shape != shape or a[name].dtype != dtype:
                 raise ValueError(f"{name} is {a[name].dtype} {a[name].shape}, expected {shape}")
@@ -300,6 +304,8 @@ class Saved:
         for name in _MESH:
             array = a[f"mesh.{name}"]
             setattr(mesh, name, engine.upload(array, array.dtype))
+        if "multipliers" in a:
+            mesh.multipliers = engine.upload(a["multipliers"], np.float32)
         t = {}
         for name in _DIAGRAM:
             array = a[f"diagram.{name}"]

@@ -34,6 +34,8 @@ from .trim import Trim
 
 _DERIVED = ("h", "error", "quality", "reach", "potential")
 """Arrays of a mesh that follow from its generators."""
+_UNKNOWN = {"tessellation": None, "multipliers": None}
+"""What there is not after generators have come or gone."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
 )  # fmt: skip
@@ -117,8 +119,10 @@ class Mesh:
         `reach` is the lesser of h and L, by which motion is limited.
     potential : (n,) real
         Solution of the latest Poisson solve: the next one's start.
+    multipliers : (n,) float32 or None
+        Solution of the latest projection, likewise; None: there has been none.
     source : (n,) real
-        Its right side; this and what follows is of the workspace, and of a step alone.
+        The Poisson equation's right side; this and what follows is of the workspace, and of a step alone.
     lloyd, correction : (n, d) real
         The two halves of the latest step. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
     velocity : (n, d) real
@@ -141,6 +145,7 @@ class Mesh:
     reach: cla.Array
     source: cla.Array
     potential: cla.Array
+    multipliers: cla.Array | None
     lloyd: cla.Array
     correction: cla.Array
     lloyd_speed: cla.Array
@@ -209,7 +214,7 @@ class Mesh:
         # One after the other, so that each is let go of when it has been sorted.
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
         # At one stroke: whoever interrupts the run finds arrays that fit each other, or none, which `update` makes.
-        self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, "tessellation": None})
+        self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, **_UNKNOWN})
         del new, items
         stages.bins.renumber(binned, n)
         self.update(first, binned)
@@ -396,7 +401,7 @@ class Mesh:
         rows["labels"] = self.engine.upload(self.next_label + np.arange(n) - self.n, np.int32)
         rows["labels"][: self.n] = self.labels
         # Should the run be interrupted, `update` makes again what follows from the generators.
-        self.__dict__.update({**dict.fromkeys(_DERIVED), "tessellation": None})
+        self.__dict__.update({**dict.fromkeys(_DERIVED), **_UNKNOWN})
         # Not by its constructor, whose caller would hold on to the arrays.
         mesh = Mesh.__new__(Mesh)
         mesh._set_up(

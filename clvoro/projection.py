@@ -30,7 +30,8 @@ class Projection:
     vanish to first order; eps > 0 is a penalty that trades it for a shorter displacement, and damps the modes which J
     hardly sees.
 
-    Conjugate gradients with the diagonal as a preconditioner, from y = 0, in two kernels an iteration. The host
+    Conjugate gradients with the diagonal as a preconditioner, from y = 0 or along the last solution first, in two
+    kernels an iteration. The host
     enqueues as many as the last solve took and then reads their record; the iterate is frozen on the device when the
     tolerance is met, so the result does not depend on when the host looks. Where cells are few, one kernel of one
     work-group does all of that alone.
@@ -58,7 +59,7 @@ class Projection:
         return SimpleNamespace(
             **{name: engine.scratch((d, m), np.float32) for name in ("rows", "columns")},
             **{name: engine.scratch((n, d), store) for name in ("own", "s", "u")},
-            **{name: engine.scratch(n, store) for name in ("eps", "inverse", "r", "z", "p")},
+            **{name: engine.scratch(n, store) for name in ("eps", "inverse", "y", "r", "z", "p")},
         )
 
     @framed
@@ -79,6 +80,8 @@ class Projection:
         tolerance: float = 1e-6,
         labels: cla.Array | None = None,
         fixed: int = 0,
+        start: cla.Array | None = None,
+        warm: bool = False,
     ) -> Solution:
         """Write the correction of `displacement` (n, d) to `correction` (n, d).
 
@@ -98,6 +101,10 @@ class Projection:
         labels : (n,) int32, optional
         fixed : int
             Generators with smaller labels do not move.
+        start : (n,) float32, optional
+            Where the solution y goes, if there is a need of one.
+        warm : bool
+            Begin from what `start` holds: a solution of a similar system.
 
         Returns
         -------
@@ -118,15 +125,17 @@ class Projection:
         number, _, room = sizes
         faces, partial, record = (t.starts, t.neighbours), self._partial, self._record
         groups = 1 if n <= self._most_alone else engine.groups
+        start = engine.scratch(n, np.float32) if start is None else start
         Launch(
             engine, k.assemble, number, room, *faces, t.face_measures, t.face_centroids, t.volumes,
             t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
             real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, partial,
-            t.starts if labels is None else labels, np.int32(fixed), groups=groups,
+            t.starts if labels is None else labels, np.int32(fixed), np.int32(warm), start,
+            groups=groups,
         )()  # fmt: skip
         iteration = (
-            *sizes, real(tolerance), *faces, v.rows, v.columns, v.own, v.eps, v.inverse, v.p, v.s,
-            v.u, v.r, v.z, partial, record,
+            *sizes, np.int32(warm), real(tolerance), *faces, v.rows, v.columns, v.own, v.eps, v.inverse,
+            v.p, v.s, v.u, v.y, v.r, v.z, partial, record,
         )  # fmt: skip
         if groups == 1:
             Launch(engine, k.iterate, *iteration, groups=1)()
@@ -138,7 +147,7 @@ class Projection:
             rows = self._iterate(descend, update, max_iterations)
         solution = self._judge(rows, tolerance)
         if solution.iterations:
-            engine.run_each(k.put_correction, n, v.u, h, correction)
+            engine.run_each(k.put_correction, n, v.u, v.y, h, correction, start)
         else:
             correction.fill(0)
         return solution

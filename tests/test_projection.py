@@ -203,6 +203,41 @@ def test_result_does_not_depend_on_when_the_host_looks(engine, points):
         assert np.array_equal(residuals, results[0][1])
 
 
+@pytest.mark.parametrize("of", ["solution", "scaled", "turned", "other", "zero"])
+def test_start(engine, points, of):
+    """From any start the solution is the same, and what it leaves is the next start; a good one saves iterations."""
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    made = Assembled(engine, *given, eps=0.05)
+    B = made.B.reshape(N, -1)
+    y = np.linalg.solve(B @ B.T + np.diag(made.eps), made.rhs)
+    start = {
+        "solution": y, "scaled": 1e6 * y, "turned": -y, "zero": 0 * y,
+        "other": np.random.default_rng(31).normal(size=N),
+    }[of]  # fmt: skip
+    options = {"eps": 0.05, "max_iterations": 1000, "tolerance": 1e-12}
+    _, cold = project(engine, *given, **options)
+    on_device = engine.upload(start, np.float32)
+    u, solution = project(engine, *given, **options, start=on_device, warm=True)
+    assert solution.converged
+    assert len(solution.residuals) == solution.iterations + 1
+    # As in `test_projection`.
+    expected = made.correction(made.rhs)
+    assert u == pytest.approx(expected, abs=3e-5 * np.abs(expected).max())
+    assert on_device.get() == pytest.approx(y, abs=3e-5 * np.abs(y).max())
+    # A start in single precision leaves the residual at some 1e-7 of the right side.
+    good = of in ("solution", "scaled", "turned")
+    assert (solution.residuals[1] < 1e-5) == good
+    assert (
+        solution.iterations < cold.iterations
+        if good
+        else solution.iterations <= cold.iterations + 5
+    )
+    # A projection from a start that is at its target needs no more.
+    rough = {**options, "tolerance": 1e-5}
+    _, again = project(engine, *given, **rough, start=on_device, warm=True)
+    assert again.iterations == 1
+
+
 def test_not_finite(engine, points):
     r = excess(points)
     r[7] = np.nan
