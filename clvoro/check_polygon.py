@@ -111,7 +111,7 @@ def hidden(
 
     A corner belongs to the cell of the generator nearest to it if the way between them is all in the domain. Otherwise
     the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
-    the domain touch in a point, either side sees both.
+    the domain touch in a point, either side sees both; a generator in that point belongs to one side alone.
     """
     at = d.vertices[corners[places]]
     distances = tree.query(at - np.array(domain.lower))[0]
@@ -128,4 +128,7 @@ def hidden(
         touching = shapely.STRtree(np.asarray(shapely.points(once[times > 1])))
         rows, _ = touching.query(shapely.points(at), predicate="dwithin", distance=slack)
         away[rows] = True
+        # Nor is anything seen through a point, or from one.
+        rows, _ = touching.query(lines, predicate="dwithin", distance=slack)
+        away[place[rows]] = True
     return places[away]

@@ -130,7 +130,9 @@ class Rebuilt:
         across = np.where(inner, self.spacings, 0.0)
         off = np.abs((self.middles * self.directions).sum(axis=1) - across / 2)
         far = np.linalg.norm(self.middles, axis=1)
-        noise = ADOPTED * self.unit * (1 + far / np.maximum(across, 1e-300))
+        # Nearer than that, shares would overflow.
+        least = np.maximum(1e-200 * far, np.finfo(float).tiny)
+        noise = ADOPTED * self.unit * (1 + far / np.maximum(across, least))
         self.adopted = inner & (off > noise) & (self.measures > 0)
         normals = self.areas / np.maximum(self.measures, 1e-300)[:, None]
         self.directions[self.adopted] = normals[self.adopted]

@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..faces import face_corners, face_owners
-from ..outlines import count_sides
+from ..outlines import count_sides, next_faces
 from ..polygon import Polygon
 from ..results import Diagram, Result
 from .atomic import atomic_file
@@ -97,6 +97,29 @@ def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
         "domain_ring_starts": domain.ring_starts,
         "domain_piece_of_ring": domain.piece_of_ring,
         "domain_edge_numbers": domain.edge_numbers,
+        **_polygon_graph(diagram),
+    }
+
+
+def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return which ways from corner to corner are bridges between loops, and the edges behind faces on the boundary.
+
+    Corners alone do not tell a bridge from the two sides of a slit that has no width in single precision.
+    """
+    starts, following = diagram.neighbour_starts, next_faces(diagram)
+    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
+    ends = following != np.arange(1, len(following) + 1)
+    loop = np.concatenate([[0], np.cumsum(ends)[:-1]])
+    earlier = loop - loop[starts[:-1]][cell]
+    # A way to the second loop stands before it, ways back and on before each later one.
+    place = np.arange(len(following)) - starts[cell] + np.maximum(2 * earlier - 1, 0)
+    bridge = np.ones(len(diagram.cell_vertices), bool)
+    bridge[diagram.cell_vertex_starts[cell] + place] = False
+    walls = np.flatnonzero(diagram.neighbours < 0)
+    return {
+        "bridges": np.flatnonzero(bridge).astype(np.int32),
+        "wall_faces": walls.astype(np.int32),
+        "wall_edges": (-1 - diagram.neighbours[walls]).astype(np.int32),
     }
 
 

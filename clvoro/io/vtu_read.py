@@ -22,6 +22,7 @@ from ..errors import InputError
 from ..polygon import Polygon
 from ..rebuilt import rebuild
 from ..results import HISTORY_DTYPE, Diagram, Result
+from ..walls import wall_count
 
 _LONGEST_HEAD = 1 << 22
 _MARK = b'<AppendedData encoding="raw">\n_'
@@ -197,7 +198,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         following[cell_starts[1:] - 1] = cell_starts[:-1]
         loops = np.stack([corners, corners[following]], axis=1)
         if polygon is not None:
-            faces = ~_bridges(owner, loops)
+            faces = ~_bridges(arrays, owner, loops)
             owner, loops = owner[faces], loops[faces]
         face = np.repeat(np.arange(len(loops)), 2)
         flat, starts = loops.ravel(), 2 * np.arange(len(loops) + 1)
@@ -205,6 +206,8 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         flat, starts = corners, face_starts
         face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     neighbours = _neighbours(owner, face, flat, starts, x, domain)
+    if "FieldData.wall_faces" in arrays:
+        _set_walls(arrays, neighbours, domain)
     across = _seam(arrays, neighbours, dim, len(kinds)) if periodic else {}
     known = {
         "points": points, "volumes": arrays["CellData.volume"].astype(float),
@@ -265,8 +268,24 @@ def _polygon(arrays: dict[str, np.ndarray]) -> Polygon | None:
     return Polygon.described(**values)
 
 
-def _bridges(owner: np.ndarray, loops: np.ndarray) -> np.ndarray:
-    """Tell which ways from corner to corner (m, 2) their cell also goes back: they join its loops, and are no faces."""
+def _set_walls(arrays: dict[str, np.ndarray], neighbours: np.ndarray, domain: Domain) -> None:
+    """Put in the edges behind faces on the boundary, as the file has them."""
+    faces = _indices(arrays["FieldData.wall_faces"], len(neighbours), "wall_faces")
+    edges = _indices(arrays["FieldData.wall_edges"], wall_count(domain), "wall_edges")
+    if len(faces) != len(edges):
+        raise _FileError("its faces on walls do not fit each other")
+    neighbours[faces] = -1 - edges
+
+
+def _bridges(arrays: dict[str, np.ndarray], owner: np.ndarray, loops: np.ndarray) -> np.ndarray:
+    """Tell which ways from corner to corner (m, 2) join loops of a cell, and are no faces.
+
+    Where the file does not say it, those that their cell also goes back.
+    """
+    if "FieldData.bridges" in arrays:
+        found = np.zeros(len(loops), bool)
+        found[_indices(arrays["FieldData.bridges"], len(loops), "bridges")] = True
+        return found
     low, high = loops.min(axis=1), loops.max(axis=1)
     order = np.lexsort((high, low, owner))
     same = np.all([np.diff(key[order]) == 0 for key in (owner, low, high)], axis=0)
