@@ -261,6 +261,13 @@ class Adapter:
             If the run would need more memory than the device has.
         SolverError
             If a linear solve breaks down.
+
+        Warns
+        -----
+        MisfitWarning, CoarseSizeWarning
+            If a part of the input hardly meets the domain, as in another unit of length.
+        PrecisionWarning
+            If `dtype` is too coarse for the sizes.
         """
         options = check_options(
             method=method, start=start, effort=effort, levels=levels, seed=seed, tol=tol, k=k, alpha=alpha,

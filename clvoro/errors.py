@@ -41,5 +41,9 @@ class CoarseSizeWarning(UserWarning):
     """A size field asks for less than half a cell in the whole domain: units that do not agree, most likely."""
 
 
+class MisfitWarning(UserWarning):
+    """A part of the input hardly meets the domain or the sizes: units or places that do not agree, most likely."""
+
+
 class PrecisionWarning(UserWarning):
     """A run cannot meet its size field as well as usual in the precision asked for; says what limits it."""

@@ -273,6 +273,15 @@ def _counts(chain: Chain, width: float, thickness: float) -> tuple[int, int]:
     return max(1, round(min(count, _MOST))), round(min(fan, _MOST))
 
 
+def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
+    """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
+    polygon, number = as_polygon(domain)
+    chains = _chains(polygon, _chosen(polygon, number, layer))
+    made = [_columns(chain, layer.width, layer.thickness) for chain in chains]
+    feet, normals = zip(*made, strict=True)
+    return np.concatenate(feet), np.concatenate(normals)
+
+
 def _columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the wall and unit normals (c, 2) into the domain of columns about `width` apart."""
     corners = chain.corners

@@ -100,11 +100,12 @@ def check_memory(
         raise MemoryLimitError(
             f"the run asks for {n:.3g} cells, expected at most {MOST_CELLS:.3g}, which the device's 32-bit "
             f"indices can tell apart (and they would need {needed / 2**30:.3g} GiB of "
-            f"{available / 2**30:.3g} GiB). Use a larger size or n_cells"
+            f"{available / 2**30:.3g} GiB). Are h and the domain in the same unit of length? Otherwise use a larger "
+            "size or n_cells"
         )
     if needed > available:
         raise MemoryLimitError(
             f"the size field asks for {n:.3g} cells, which need {needed / 2**30:.3g} GiB on the device; "
-            f"{engine.queue.device.name.strip()} has {available / 2**30:.3g} GiB. Use a larger size, "
-            "n_cells, dtype='float32' or another device"
+            f"{engine.queue.device.name.strip()} has {available / 2**30:.3g} GiB. Are h and the domain in the same "
+            "unit of length? Otherwise use a larger size, n_cells, dtype='float32' or another device"
         )

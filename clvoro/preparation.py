@@ -15,9 +15,12 @@ from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_
 from .memory import check_memory, images_expected
 from .mesh import Mesh, Stages
 from .methods import PUBLISHED, Relaxation, make_method
+from .misfits import warn_of_misfits
 from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
+from .polygon import Polygon
 from .precision import check_precision
 from .quadrature import DensityTree
+from .rings import may_be_degrees
 from .sizing import Sizing, as_field
 from .start import density_tree, sample_density, sample_uniform
 
@@ -144,26 +147,32 @@ class Preparation:
                 "keeps their number; leave n_cells out, or use method='adaptive'"
             )
         self.rows, self.free = np.empty((0, d)), domain
+        field = given_field = as_field(size)
         if options.layers:
             check_memory(stages.engine, count_rows(domain, options.layers), domain)
             self.rows, self.free = (
                 place_layers(domain, options.layers),
                 free_domain(domain, options.layers),
             )
-            size = bounded(size, domain, options.layers)
-        self.sizing = Sizing(stages.engine, domain, as_field(size), gradient_step=GRADIENT_STEP)
+            field = bounded(given_field, domain, options.layers)
+        self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
         self._tree: DensityTree | None = None
         if points is not None and given:
             asked = float(len(points))
         else:
             self._tree = density_tree(self.sizing, self.free)
             asked = self._tree.integral + len(self.rows)
+        warn_of_misfits(given_field, domain, options.layers, stacklevel=4)
         self.target = n_cells if n_cells is not None else max(1, round(asked))
         if n_cells is None and asked < 0.5:
             message = (
                 f"the size field asks for {asked:.2g} cells in a domain of {domain.measure:.6g}, so that there will be "
                 "one, too small; are h and the domain in the same unit of length?"
             )
+            if isinstance(domain, Polygon) and may_be_degrees(domain.lower, domain.upper):
+                message += (
+                    " (Coordinates that are longitudes and latitudes have to be projected first.)"
+                )
             warnings.warn(message, CoarseSizeWarning, stacklevel=4)
         most, images = max(self.target, 0 if points is None else len(points)), None
         if any(domain.periodic) and not given:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -15,12 +16,14 @@ import numpy as np
 import shapely
 
 from .domain import LARGEST_EDGE
-from .errors import InputError, InputTypeError
+from .errors import InputError, InputTypeError, MisfitWarning
 
 SHORTEST_EDGE = 1e-12
 """Least length of an edge, of the bounding box's longest edge."""
 _RESOLUTION = 2.0**-40  # least extent, of the largest coordinate: what is left of float64's digits
 _SPLIT = 2.0**27 + 1
+_GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
+_ALIKE = 0.95  # a degree of longitude over one of latitude, from which on they count as the same
 
 
 @dataclass(frozen=True)
@@ -272,7 +275,37 @@ def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[l
     pieces = list(_pieces(found, name))
     if not pieces:
         raise InputError(f"{name} holds no Polygon, expected at least one")
+    _warn_of_degrees(found, pieces, name)
     return pieces
+
+
+def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:
+    """Tell whether a bounding box may be one of longitudes and latitudes."""
+    return min(lower[0], -upper[0]) >= -180 and min(lower[1], -upper[1]) >= -90
+
+
+def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
+    """Warn if GeoJSON says that its coordinates are longitudes and latitudes, and a degree of both is not as long."""
+    crs = node.get("crs")
+    properties = crs.get("properties") if isinstance(crs, Mapping) else None
+    system = properties.get("name") if isinstance(properties, Mapping) else None
+    if not isinstance(system, str) or not _GEOGRAPHIC.search(system):
+        return
+    try:
+        x = np.concatenate([np.asarray(ring, float).reshape(-1, 2) for p in pieces for ring in p])
+    except (ValueError, TypeError):  # for others to refuse
+        return
+    if not len(x) or not may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist()):
+        return
+    latitude = float(np.abs(x[:, 1]).max())
+    if math.cos(math.radians(latitude)) < _ALIKE:
+        warnings.warn(
+            f"{name} is in longitudes and latitudes ({system}), which are taken as lengths in the plane: at latitude "
+            f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
+            "coordinates first, and leave out its crs if they are projected",
+            MisfitWarning,
+            stacklevel=4,
+        )
 
 
 _MEMBERS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}

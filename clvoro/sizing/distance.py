@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _FEW = 8  # up to so many items are faster looked at one by one than through a tree
 _LANDMARKS = 1 << 14  # about so many landmarks at most, beside one per piece
+_FAR = 100  # diagonals of the domain, from which on a shape is in another place or unit
 # Kinds of items that the device knows: see size_item_distance2.
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
@@ -126,6 +127,46 @@ class Distance(Field):
             flat = np.sqrt(1 - z**2)
             offset = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
         return np.concatenate([points + radius[item, None] * offset, self._end])
+
+    def misfits(self, domain: Domain) -> list[str]:
+        """Return what is to be said of shapes that change nothing on `domain`, and of surfaces that are specks."""
+        found, same = [], "are shapes and domain in the same unit and place?"
+        away, diagonal = self._away(domain), float(np.linalg.norm(domain.extent))
+        reach = (self.h_max - self.h_min) / self.slope if self.slope > 0 else math.inf
+        if 0 < reach <= away:
+            found.append(
+                f"the shapes of {self!r} are {away:.3g} or more away from the domain, and from {reach:.3g} on h is "
+                f"h_max: they change nothing; {same}"
+            )
+        elif away > _FAR * diagonal:
+            found.append(
+                f"the shapes of {self!r} are {away:.3g} or more away from the domain, {away / diagonal:.3g} times its "
+                f"diagonal; {same}"
+            )
+        for surface in self.surfaces:
+            across = float(np.ptp(surface.vertices, axis=0).max())
+            if across < self.h_min and self.slope > 0:
+                found.append(
+                    f"{surface.name} is {across:.3g} across, less than a cell of h_min = {self.h_min:.6g}; {same}"
+                )
+        return found
+
+    def _away(self, domain: Domain) -> float:
+        """Return a lower bound of the distance from the domain to the shapes, by the boxes that hold them."""
+        low, high = np.array(domain.lower), np.array(domain.upper)
+
+        def gap(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+            return np.linalg.norm(np.maximum(np.maximum(low - end, begin - high), 0), axis=1)
+
+        least = [gap(s.corners.min(axis=1), s.corners.max(axis=1)).min() for s in self.surfaces]
+        if len(self._begin):
+            begin, end, radius = self._begin, self._end, self._radius
+            outside = gap(np.minimum(begin, end), np.maximum(begin, end)) - radius
+            # A circle may also lie all around the domain.
+            farthest = np.linalg.norm(np.maximum(high - begin, begin - low), axis=1)
+            inside = np.where((begin == end).all(axis=1), radius - farthest, 0)
+            least.append(np.maximum(outside, inside).min())
+        return max(0.0, float(min(least)))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of `points` (n, d) to the nearest shape, (n,) float64."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import InputError, InputTypeError
 from ..polygon import Polygon
+from .covering import covered_share
 from .distance import Distance
 from .field import Constant, Field, positive, slope_of
 from .gaps import gaps, radii_of_curvature
@@ -141,6 +142,14 @@ class FeatureSize(Field):
         least = np.argsort(size, kind="stable")[:_MOST_LANDMARKS]
         points = np.concatenate([begin[least], 0.5 * (begin[least] + end[least]), end[least]])
         return points if len(points) else np.zeros((0, domain.dim))
+
+    def misfits(self, domain: Domain) -> list[str]:
+        """Return what is to be said if the polygon lies beside `domain`."""
+        if covered_share(domain, self.domain.lower, self.domain.upper) > 0:
+            return []
+        return [
+            f"{self!r} lies beside the domain {domain!r}; expected the size of the domain that is meshed"
+        ]
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self._field._evaluate(points)

@@ -91,6 +91,10 @@ class Field:
         """
         return np.zeros((0, domain.dim))
 
+    def misfits(self, domain: Domain) -> list[str]:
+        """Return what in the field is a mistake on `domain`, most likely: sentences, each with a remedy."""
+        return []
+
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         raise NotImplementedError
 
@@ -216,6 +220,9 @@ class Scaled(Field):
     def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return self.field.landmarks(domain)
 
+    def misfits(self, domain: Domain) -> list[str]:  # noqa: D102
+        return self.field.misfits(domain)
+
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self.factor * self.field._evaluate(points)
 
@@ -260,6 +267,9 @@ class Combined(Field):
 
     def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return np.concatenate([f.landmarks(domain) for f in self.fields])
+
+    def misfits(self, domain: Domain) -> list[str]:  # noqa: D102
+        return [text for f in self.fields for text in f.misfits(domain)]
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         combine = _COMBINE[self.operation][0]

@@ -103,6 +103,11 @@ def scattered_values(
             f"Scattered covers {low.tolist()} to {high.tolist()}, expected {d} coordinates each "
             "with lower < upper; pass lower and upper"
         )
+    if ((x.max(axis=0) < low) | (x.min(axis=0) > high)).any():
+        raise InputError(
+            f"Scattered got points from {x.min(axis=0).tolist()} to {x.max(axis=0).tolist()}, all beside the box from "
+            f"{low.tolist()} to {high.tolist()}; are units and the order of the coordinates (x, y) the same?"
+        )
     extent = high - low
     if resolution is None:
         spacing = max(

@@ -12,6 +12,7 @@ import numpy as np
 from ..domain import Domain
 from ..errors import InputError, InputTypeError
 from ..polygon import Polygon
+from .covering import uncovered
 from .field import Field, as_field, slope_of
 from .raster import Raster
 
@@ -122,6 +123,14 @@ class Graded(Field):
 
     def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return self.raster(domain).landmarks(domain)
+
+    def misfits(self, domain: Domain) -> list[str]:  # noqa: D102
+        found = self.field.misfits(domain if self.box is None else self.box)
+        if self.box is not None:
+            found += uncovered(
+                repr(self), domain, self.box.lower, self.box.upper, "give a larger box"
+            )
+        return found
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self.raster()._evaluate(points)

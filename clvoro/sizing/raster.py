@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..polygon import Polygon
+from .covering import uncovered
 from .field import Field
 from .filling import filled, scattered_values
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from ..domain import Domain
     from .bind import Binder
 
+_MANY, _WITHIN = 8, 0.1
+# A raster of so many values along each axis shows a domain of more than that share of their spacing.
+_ENOUGH = 16  # scattered points, whose box covers most of what they are scattered over
 _ROUNDINGS = 16  # of a coordinate, by which a place may lie beyond a raster
 
 
@@ -41,9 +45,10 @@ class Raster(Field):
     missing : "error" or "nearest"
         Whether values that are missing (NaN, or under a NumPy mask) are refused, or filled with the
         nearest one that is there.
-    outside : "nearest" or "error"
+    outside : "nearest" or "error", optional
         Whether a domain that reaches beyond the box is served with the value of the nearest edge of the array, or
         refused with the place. (With "centres", the nearest value holds within half a pixel of the sides anyway.)
+        By default the nearest, and a run warns (`MisfitWarning`) if less than half of the domain is covered.
 
     Raises
     ------
@@ -59,9 +64,9 @@ class Raster(Field):
         upper: ArrayLike,
         at: str = "nodes",
         missing: str = "error",
-        outside: str = "nearest",
+        outside: str | None = None,
     ):
-        if outside not in ("nearest", "error"):
+        if outside not in (None, "nearest", "error"):
             raise InputError(f"Raster got outside={outside!r}, expected 'nearest' or 'error'")
         self.outside = outside
         low, high = check_corners("Raster", np.shape(values), lower, upper, at)
@@ -103,9 +108,26 @@ class Raster(Field):
         points = origin + np.divide(index, gain, out=np.zeros(index.shape), where=gain > 0)
         return np.clip(points, self.lower, self.upper)
 
+    def misfits(self, domain: Domain) -> list[str]:
+        """Return what is to be said if the array covers little of `domain`, or all of that lies between two values."""
+        if self.outside is not None:
+            return []
+        many = self._counts >= _MANY
+        spacing = (self.upper - self.lower) / np.maximum(self._counts - (self.at == "nodes"), 1)
+        if many.all() and (domain.extent < _WITHIN * spacing).all():
+            return [
+                f"the domain, {domain.extent.tolist()} across, lies between two values of {self!r}, which are "
+                f"{spacing.tolist()} apart: sizes hardly vary; are units of raster and domain the same?"
+            ]
+        return self._uncovered(domain)
+
+    def _uncovered(self, domain: Domain) -> list[str]:
+        remedy = "give a larger raster, or outside='nearest' if that is meant"
+        return uncovered(repr(self), domain, self.lower, self.upper, remedy)
+
     def _refuse_outside(self, points: np.ndarray) -> None:
         """Raise if one of `points` (n, d) lies beyond the box, but for roundings of it, and that is not wanted."""
-        if self.outside == "nearest":
+        if self.outside != "error":
             return
         far = max(np.abs(self.lower).max(), np.abs(self.upper).max())
         slack = _ROUNDINGS * float(np.finfo(float).eps) * far
@@ -172,8 +194,8 @@ class Scattered(Raster):
     Raises
     ------
     InputError, InputTypeError
-        If shapes do not fit, a number is not finite, or (linear) the points cannot be triangulated
-        or two of them at the same place disagree.
+        If shapes do not fit, a number is not finite, all points lie beside the box, or (linear) they
+        cannot be triangulated or two of them at the same place disagree.
 
     Examples
     --------
@@ -193,6 +215,15 @@ class Scattered(Raster):
     ):
         found, low, high = scattered_values(points, values, lower, upper, resolution, method)
         super().__init__(found, low, high)
+        x = np.asarray(points, float)
+        self._known = x.min(axis=0), x.max(axis=0), len(x)
+
+    def _uncovered(self, domain: Domain) -> list[str]:
+        low, high, count = self._known
+        if count < _ENOUGH:
+            return []
+        remedy = "give points all over the domain"
+        return uncovered(f"Scattered of {count} points", domain, low, high, remedy)
 
 
 def check_corners(
