@@ -1,4 +1,4 @@
-"""What `fuzz.py` throws: generators, boxes, polygons, layers and size fields of all kinds, absurd ones among them."""
+"""What `fuzz.py` throws: boxes, polygons, generators and layers of all kinds, absurd ones among them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import numpy as np
 import shapely
 
 import clvoro
-from clvoro import sizing
 from tests import shores
 
 
-def some_box(rng: np.random.Generator, dim: int = 2) -> clvoro.Box:
+def some_box(rng: np.random.Generator, dim: int = 2, wild: bool = True) -> clvoro.Box:
+    """A box of any place and unit; `wild`: also long, thin, huge or far away."""
+    if not wild:
+        extent = 10 ** rng.uniform(-0.4, 0.4, dim) * 2.0 ** rng.integers(-30, 30)
+        lower = rng.choice([0, -0.5, 3]) * extent
+        return clvoro.Box(tuple(lower), tuple(lower + extent))
     extent = np.ones(dim) if rng.random() < 0.3 else 10 ** rng.uniform(-1, 1, dim)
     if rng.random() < 0.1:
         extent *= 10.0 ** rng.uniform(-4, 4, dim)
@@ -22,10 +26,26 @@ def some_box(rng: np.random.Generator, dim: int = 2) -> clvoro.Box:
         return clvoro.Box(tuple(lower), tuple(lower + extent))
 
 
-def some_periodic_box(rng: np.random.Generator, dim: int) -> clvoro.Box:
-    box, periodic = some_box(rng, dim), rng.random(dim) < 0.6
+SHAPES = {
+    2: [(1, 1), (1, 0.75), (0.625, 1), (1, 0.3125)],
+    3: [(1, 1, 1), (1, 0.75, 0.75), (0.6875, 1, 0.5625)],
+}
+"""Extents of most periodic boxes: kernels are built for each shape, and exact in binary whatever the unit."""
+
+
+def some_periodic_box(rng: np.random.Generator, dim: int, wild: bool = True) -> clvoro.Box:
+    periodic = rng.random(dim) < 0.6
     periodic[rng.integers(dim)] = True
-    return clvoro.Box(box.lower, box.upper, periodic=tuple(periodic.tolist()))
+    if wild or rng.random() < 0.1:
+        box = some_box(rng, dim, wild)
+        lower, upper = box.lower, box.upper
+    else:
+        extent = np.array(SHAPES[dim][rng.integers(len(SHAPES[dim]))]) * 2.0 ** rng.integers(
+            -30, 30
+        )
+        lower = float(rng.choice([0, -0.5, 3])) * extent
+        upper = lower + extent
+    return clvoro.Box(tuple(lower), tuple(upper), periodic=tuple(periodic.tolist()))
 
 
 def some_points(rng: np.random.Generator, dim: int = 2) -> np.ndarray:
@@ -115,19 +135,28 @@ KINDS = {
 }
 
 
-def placed(rng: np.random.Generator, box: clvoro.Box) -> np.ndarray:
-    """Some points in `box`; now and then what are no points."""
-    if rng.random() < 0.03:
+def placed(
+    rng: np.random.Generator, box: clvoro.Box, real: str = "float64", wild: bool = True
+) -> np.ndarray:
+    """Some points in `box`, apart from each other in the precision `real`; `wild`: also some that are not."""
+    if wild and rng.random() < 0.1:
         return NONSENSE[rng.integers(len(NONSENSE))]
     x = some_points(rng, box.dim) * box.extent + np.array(box.lower)
-    if rng.random() < 0.7:
-        _, first = np.unique(x, axis=0, return_index=True)
-        x = x[np.sort(first)]
     if any(box.periodic) and rng.random() < 0.2:
         x = x + rng.integers(-3, 4, x.shape) * np.where(box.periodic, box.extent, 0.0)
-    elif rng.random() < 0.98:
-        x = np.clip(x, box.lower, box.upper)
-    return x.astype(np.float32) if rng.random() < 0.03 else x
+    elif not wild or rng.random() < 0.95:
+        x = np.clip(
+            x,
+            *(
+                np.where(box.periodic, (-np.inf, np.inf)[k], c)
+                for k, c in enumerate((box.lower, box.upper))
+            ),
+        )
+    x = x.astype(np.float32) if wild and rng.random() < 0.1 else x
+    if wild and rng.random() < 0.6:
+        return x
+    _, first = np.unique(box.place(x, np.dtype(real)), axis=0, return_index=True)
+    return x[np.sort(first)]
 
 
 NONSENSE = [
@@ -135,82 +164,6 @@ NONSENSE = [
     np.full((2, 2), np.nan), np.array([[np.inf, 0.0]]), np.zeros((2, 2), complex), np.zeros((4, 2), object),
     np.zeros((2, 2, 2)), {"x": 1},
 ]  # fmt: skip
-
-
-def some_size(rng: np.random.Generator, box: clvoro.Box):
-    """A size field of up to a few thousand cells; sometimes an absurd one."""
-    with np.errstate(all="ignore"):
-        h = float((box.measure / 10 ** rng.uniform(0, 3)) ** (1 / box.dim))
-    length = float(box.extent.max())
-    kind = rng.integers(0, 11)
-    low, high = np.array(box.lower), np.array(box.upper)
-    if kind == 0:
-        return h
-    if kind == 1:
-        where = rng.uniform(low, high)
-        return sizing.Distance(
-            [sizing.Circle(where, 0.2 * length)], h / 2, slope=rng.uniform(0.05, 2)
-        )
-    if kind == 2:
-        values = h * 10 ** rng.uniform(-0.5, 0.5, (rng.integers(1, 9), rng.integers(1, 9)))
-        return sizing.Raster(values, low, high, at=rng.choice(["nodes", "centres"]))
-    if kind == 3:
-        return sizing.Expression(
-            f"{h!r} * (1 + {rng.uniform(0, 0.95)!r}*sin({9 / length!r}*(x+y)))"
-        )
-    if kind == 4:
-        return lambda x: h * (1 + rng.uniform(0, 1) * (x[:, 0] > x[:, 0].mean()))
-    if kind == 5:
-        steps, middle = float(rng.choice([0.3, 3.0, 10.0])), (box.lower[0] + box.upper[0]) / 2
-        return sizing.Expression(f"x < {middle!r} ? {h!r} : {h * steps!r}")
-    if kind == 6:
-        return ABSURD[rng.integers(len(ABSURD))]
-    if kind == 7:
-        # Too many cells for any device, or one; what lies between is a benchmark, not a test.
-        return h * 10.0 ** (rng.uniform(-12, -6) if rng.random() < 0.5 else rng.uniform(0, 12))
-    if kind >= 9:
-        return some_graded(rng, box, some_size(rng, box))
-    return sizing.minimum(h, sizing.Expression(f"{h / 3!r} + 0.3*fabs(x-{box.lower[0]!r})"))
-
-
-class OwnError(Exception):
-    """Raised by a caller's size field: it is the caller's to see."""
-
-
-def fail():
-    raise OwnError
-
-
-ABSURD = [
-    0, -1.0, np.nan, np.inf, 1e-300, 1e300, "0.1", None, [1, 2], lambda x: x, lambda x: None,
-    lambda x: np.full(len(x), np.nan), lambda x: -np.ones(len(x)), lambda x: "abc", lambda x: fail(),
-    lambda x: np.ones(len(x) + 1), lambda x: np.where(x[:, 0] > x[:, 0].mean(), 1.0, 0.0),
-    sizing.Expression("x"), sizing.Expression("log(x - y)"), sizing.Expression("1e300*exp(x)*exp(y)"),
-]  # fmt: skip
-
-
-def some_size_3d(rng: np.random.Generator, box: clvoro.Box):
-    """A size field of up to a hundred cells or so; sometimes an absurd one."""
-    with np.errstate(all="ignore"):
-        h = float((box.measure / 10 ** rng.uniform(0, 2)) ** (1 / 3))
-    length, low = float(box.extent.max()), np.array(box.lower)
-    kind = rng.integers(0, 7)
-    if kind == 0:
-        where = rng.uniform(box.lower, box.upper)
-        sphere = sizing.Circle(where, 0.2 * length)
-        return sizing.Distance([sphere], h / 1.5, slope=rng.uniform(0.05, 2))
-    if kind == 1:
-        values = h * 10 ** rng.uniform(-0.2, 0.3, rng.integers(1, 6, 3))
-        return sizing.Raster(values, low, np.array(box.upper), at=rng.choice(["nodes", "centres"]))
-    if kind == 2:
-        return sizing.Expression(f"{h!r} * (1 + {rng.uniform(0, 0.5)!r}*sin({9 / length!r}*(x+z)))")
-    if kind == 3:
-        return lambda x: h * (1 + rng.uniform(0, 1) * (x[:, 2] > x[:, 2].mean()))
-    if kind == 6:
-        return some_graded(rng, box, some_size_3d(rng, box))
-    if kind == 4 and rng.random() < 0.5:
-        return ABSURD[rng.integers(len(ABSURD))]
-    return h
 
 
 def some_polygon(rng: np.random.Generator) -> clvoro.Polygon:
@@ -272,46 +225,29 @@ def placed_in_polygon(rng: np.random.Generator, domain: clvoro.Polygon) -> np.nd
     return np.unique(inside, axis=0) if len(inside) else domain.inner_point(0)[None]
 
 
-def some_graded(
-    rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, field
-) -> sizing.Field:
-    """`field` with its growth limited, strictly, loosely, or not at all; on grids of all kinds."""
-    options = {}
-    if rng.random() < 0.5:
-        options["growth"] = rng.choice([1.0, 1 + 1e-12, 1.05, 1.3, 5.0, 1e9, 0.9, np.inf, np.nan])
-    if not options or rng.random() < 0.05:
-        options["slope"] = rng.choice([0.0, 1e-9, 0.1, 0.5, 3.0, 1e9, 1e300, -1.0, np.nan])
-    if rng.random() < 0.5:
-        # More nodes than any grid may have, or a few; what lies between is a benchmark, not a test.
-        each = rng.choice([1, 2, 3, 10**7], domain.dim, p=[0.05, 0.4, 0.5, 0.05])
-        options["resolution"] = [2, 3, 17, 90, 10**7, tuple(each.tolist()), 2.5][rng.integers(7)]
-    if rng.random() < 0.3:
-        with np.errstate(all="ignore"):
-            low = np.array(domain.lower) + rng.choice([-1, 0, 0.4, 3]) * domain.extent
-            options["box"] = clvoro.Box(low, low + rng.choice([1e-3, 0.5, 1, 4]) * domain.extent)
-    return sizing.Graded(field, **options)
-
-
 def some_layers(
-    rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon
+    rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, wild: bool = True
 ) -> list[clvoro.Layers]:
-    """One to three layers, as a rule of up to some thousand generators; also too thick, far too thin, or nowhere."""
+    """One to three layers, as a rule of up to some thousand generators; `wild`: also too thick or thin, or nowhere."""
     number = len(domain.vertices) if isinstance(domain, clvoro.Polygon) else 4
     edges = shapely.boundary(domain.geometry).length if number != 4 else 2 * domain.extent.sum()
     room, made = domain.measure / edges, []
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
-        width = edges / 10 ** rng.uniform(1, 3)
+        width = min(edges / 10 ** rng.uniform(1, 3), np.inf if wild else 0.3 * room)
+        count, growth = int(rng.integers(1, 6)), float(rng.choice([1.0, 1.1, 1.2, 1.5, 3.0]))
         options = {
-            "height": min(width, 0.5 * room) * 10 ** rng.uniform(-2, 0), "count": int(rng.integers(1, 6)),
-            "growth": rng.choice([1.0, 1.1, 1.2, 1.5, 3.0]), "spacing": width if rng.random() < 0.7 else None,
+            "height": min(width, 0.5 * room) * 10 ** rng.uniform(-2, 0), "count": count, "growth": growth,
+            "spacing": width if rng.random() < 0.7 else None,
         }  # fmt: skip
+        if not wild:
+            thickness = min(width, 0.2 * room) * 10 ** rng.uniform(-1, 0)
+            options["height"] = thickness / (growth ** np.arange(count)).sum()
         if rng.random() < 0.8:
             first = int(rng.integers(number))
             some = range(first, min(number, first + int(rng.integers(1, 30))))
-            options["edges"] = (
-                some if rng.random() < 0.5 else np.flatnonzero(rng.random(number) < 0.5)
-            )
-        if rng.random() < 0.15:
+            chosen = np.flatnonzero(rng.random(number) < 0.5)
+            options["edges"] = some if rng.random() < 0.5 or not (wild or len(chosen)) else chosen
+        if wild and rng.random() < 0.4:
             strange = {
                 "height": lambda: edges * 10.0 ** rng.uniform(-300, 300),
                 "count": lambda: int(rng.choice([0, 50, 10**6, 10**18])),

@@ -1,0 +1,414 @@
+"""What `fuzz.py` does with its inputs: meshes of every kind, made, made again, carried on, written and read."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+import clvoro
+from clvoro.cases import Case, toml
+from clvoro.checkpoint import Saved
+from clvoro.errors import InputError
+from clvoro.io.vtu_read import load_vtu
+from clvoro.jobs import Job
+from clvoro.layers import count_rows, free_domain, place_layers
+from tests import fuzz_files as files
+from tests.fuzz_inputs import (
+    placed,
+    placed_in_polygon,
+    some_box,
+    some_layers,
+    some_periodic_box,
+    some_polygon,
+)
+from tests.fuzz_sizes import fine_size, some_size
+from tests.reference_polygon import faults
+
+WILD = 0.25
+"""Share of inputs that need not end in a mesh, of kinds where most should."""
+_adapters: dict[str, clvoro.Adapter] = {}
+_files: dict[str, bytes] = {}
+
+
+class Wrong(Exception):  # noqa: N818
+    """An input led to something other than a right mesh or a clear error."""
+
+
+def adapter(dtype: str) -> clvoro.Adapter:
+    if dtype not in _adapters:
+        _adapters[dtype] = clvoro.Adapter(dtype=dtype)
+    return _adapters[dtype]
+
+
+def some_real(rng: np.random.Generator) -> str:
+    return str(rng.choice(["float64", "float64", "float32"]))
+
+
+def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
+    """Raise unless `mesh` is right."""
+    report = mesh.check()
+    if not report:
+        raise Wrong(str(report))
+    diagram = mesh.diagram if isinstance(mesh, clvoro.Result) else mesh
+    if isinstance(diagram.domain, clvoro.Polygon):
+        found, outside = faults(diagram, real), ~diagram.domain.contains(mesh.points)
+        if found or outside.any():
+            raise Wrong("; ".join([*found, f"{outside.sum()} outside"]))
+
+
+# Diagrams.
+
+
+def try_diagram(rng: np.random.Generator) -> str:
+    return diagram_of(rng, lambda wild: some_box(rng, 2, wild))
+
+
+def try_solid(rng: np.random.Generator) -> str:
+    return diagram_of(rng, lambda wild: some_box(rng, 3, wild))
+
+
+def try_periodic(rng: np.random.Generator) -> str:
+    return diagram_of(rng, lambda wild: some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild))
+
+
+def diagram_of(rng: np.random.Generator, domain: Callable[[bool], clvoro.Box]) -> str:
+    wild, real = rng.random() < 2 * WILD, some_real(rng)
+    box = domain(wild)
+    diagram = adapter(real).diagram(box, placed(rng, box, real, wild))
+    demand(diagram, real)
+    if rng.random() < 0.1 and len(adapter(real).diagram(box, diagram.points)) != len(diagram):
+        raise Wrong("another number of cells")
+    return "mesh"
+
+
+def try_polygon(rng: np.random.Generator) -> str:
+    domain, real = some_polygon(rng), some_real(rng)
+    points = placed_in_polygon(rng, domain)
+    # Boxes show what becomes of generators that coincide.
+    first = np.unique(domain.place(points, np.dtype(real)), axis=0, return_index=True)[1]
+    demand(adapter(real).diagram(domain, points[np.sort(first)]), real)
+    return "mesh"
+
+
+# Runs.
+
+
+def try_run(rng: np.random.Generator) -> str:
+    return try_box(rng, lambda wild: some_box(rng, 2, wild))
+
+
+def try_solid_run(rng: np.random.Generator) -> str:
+    return try_box(rng, lambda wild: some_box(rng, 3, wild))
+
+
+def try_periodic_run(rng: np.random.Generator) -> str:
+    return try_box(rng, lambda wild: some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild))
+
+
+def try_box(rng: np.random.Generator, domain: Callable[[bool], clvoro.Box]) -> str:
+    wild = rng.random() < WILD
+    return run(rng, domain(wild), wild)
+
+
+def try_polygon_run(rng: np.random.Generator) -> str:
+    return run(rng, some_polygon(rng), rng.random() < WILD)
+
+
+def run(rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, wild: bool) -> str:
+    real = some_real(rng)
+    options = some_options(rng, domain, real, wild)
+    result = adapter(real).run(domain, some_size(rng, domain, wild), **options)
+    demand(result, real)
+    if rng.random() < 0.1:
+        written_and_read(result, real)
+    return "mesh"
+
+
+def written_and_read(result: clvoro.Result, real: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix, reader in ((".npz", clvoro.load), (".vtu", load_vtu)):
+            result.save(Path(folder) / f"m{suffix}")
+            demand(reader(Path(folder) / f"m{suffix}"), real)
+        with contextlib.suppress(InputError):  # which has no room for cells around holes
+            result.save(Path(folder) / "polyMesh")
+
+
+def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> dict[str, Any]:
+    """Options of a run; `wild`: such as are refused, or mean little."""
+    d = domain.dim
+    methods = ["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted", "weighted-lloyd"]
+    options: dict[str, Any] = {
+        "method": str(rng.choice(methods, p=[0.35, 0.2, 0.13, 0.08, 0.08, 0.1, 0.06])),
+        "effort": str(rng.choice(["fast", "default", "best"], p=[0.6, 0.3, 0.1])),
+        "seed": int(rng.integers(0, 2**31)), "start": str(rng.choice(["density", "uniform"])),
+    }  # fmt: skip
+    if rng.random() < 0.7:
+        options["max_steps"] = int(rng.integers(0, 15 if d == 2 else 6))
+    periods = domain.extent[list(domain.periodic)]
+    most = domain.measure / fine_size(rng, domain) ** d  # cells that fit into periods, too
+    optional = {
+        "n_cells": lambda: int(most * rng.uniform(1, 1.5)) + (1 if periods.size else 12),
+        "k": lambda: float(rng.choice([0.1, 1.0, 2.0])),
+        "alpha": lambda: float(rng.choice([0.3, 1.0, 3.0])),
+        "tol": lambda: float(rng.choice([0.0, 0.5])),
+        "levels": lambda: 0 if periods.size else int(rng.integers(0, 2)),
+        "error_target": lambda: float(rng.choice([1e-4, 0.01, 0.1])),
+        "points": lambda: some_generators(rng, domain, real, wild),
+    }
+    if wild:
+        optional |= {
+            "method": lambda: "nonsense",
+            "n_cells": lambda: int(rng.choice([1, 2, 3, 17, 40, 10**9, -1])),
+            "k": lambda: rng.choice([1e-9, 100.0, -1.0, np.nan]),
+            "alpha": lambda: rng.choice([1e-9, 100.0, np.inf]),
+            "tol": lambda: rng.choice([1e9, -1.0]),
+            "levels": lambda: rng.choice([np.int64(2), 50, -1]),
+            "error_target": lambda: rng.choice([1e-9, 10.0, 0.0]),
+        }
+    options |= {name: make() for name, make in optional.items() if rng.random() < 0.12}
+    if "points" in options and not wild:
+        if options["method"] not in ("adaptive", "exact"):
+            options.pop("n_cells", None)  # which these methods keep
+        elif periods.size:  # few generators are too few across a period, and many levels below
+            options.pop("points")
+    return options
+
+
+def some_generators(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> np.ndarray:
+    if isinstance(domain, clvoro.Polygon):
+        return placed_in_polygon(rng, domain)
+    if not any(domain.periodic) or wild:
+        return placed(rng, domain, real, wild)
+    # As dense as the periods want it.
+    counts = np.maximum(np.ceil(domain.extent / fine_size(rng, domain)).astype(int), 1)
+    x = np.stack(np.meshgrid(*[(np.arange(c) + 0.5) / c for c in counts], indexing="ij"), axis=-1)
+    x = x.reshape(-1, domain.dim) + rng.uniform(-0.3, 0.3, (counts.prod(), domain.dim)) / counts
+    return domain.lower + x * domain.extent
+
+
+def try_layers(rng: np.random.Generator) -> str:
+    wild = rng.random() < WILD
+    domain = some_polygon(rng) if rng.random() < 0.6 else some_box(rng, 2, wild)
+    layers, real = some_layers(rng, domain, wild), some_real(rng)
+    if 5000 < count_rows(domain, layers) < 1e9:  # a benchmark, not a test
+        return "left out"
+    options = some_options(rng, domain, real, wild)
+    options["effort"] = "fast"
+    if not wild:
+        options.pop("n_cells", None)  # may be fewer than the rows
+    result = adapter(real).run(domain, some_size(rng, domain, wild), layers=layers, **options)
+    rows, free = place_layers(domain, layers), free_domain(domain, layers)
+    # Coordinates of the device are relative to the frame, those of the host to 0.
+    slack = 8 * np.finfo(real).eps * domain.extent.max()
+    slack += 4 * sum(np.spacing(np.abs(corner).max()) for corner in (domain.upper, domain.lower))
+    if not np.abs(result.points[: len(rows)] - rows).max() <= slack:
+        raise Wrong("a layer's generator has moved")
+    others = result.points[len(rows) :]
+    if isinstance(domain, clvoro.Box):
+        away = np.abs(others - np.clip(others, free.lower, free.upper)).max(initial=0)
+    else:
+        away = shapely.distance(free.geometry, shapely.points(others)).max(initial=0)
+    demand(result, real)
+    if not away <= slack:
+        raise Wrong(f"generators are {away:.3g} beyond what layers leave to them")
+    return "mesh"
+
+
+# What follows on runs.
+
+
+def some_domain(rng: np.random.Generator) -> clvoro.Box | clvoro.Polygon:
+    kind = rng.integers(0, 5)
+    if kind < 2:
+        return some_box(rng, int(rng.choice([2, 2, 3])), wild=False)
+    return (
+        some_polygon(rng)
+        if kind == 2
+        else some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild=False)
+    )
+
+
+def try_resumed(rng: np.random.Generator) -> str:
+    """A run that is interrupted and goes on ends with the same bits."""
+    domain, real = some_domain(rng), some_real(rng)
+    arguments = (domain, some_size(rng, domain, wild=False))
+    options = some_options(rng, domain, real, wild=False)
+    if (
+        not isinstance(domain, clvoro.Polygon)
+        and domain.dim == 2
+        and rng.random() < 0.2
+        and not any(domain.periodic)
+    ):
+        options["layers"] = some_layers(rng, domain, wild=False)
+        options.pop("n_cells", None)
+    whole = clvoro.Adapter(adapter(real).ctx, real).run(*arguments, **options)
+    demand(whole, real)
+    left = int(rng.integers(1, len(whole.history) + 1))
+    with tempfile.TemporaryDirectory() as folder:
+        state, rows = Path(folder) / "state", 0
+
+        def stop(_: np.void) -> bool:
+            nonlocal rows
+            rows += 1
+            return rows >= left
+
+        adapter(real).run(*arguments, callback=stop, checkpoint=state, **options)
+        if not state.exists():
+            return "mesh"  # it had ended
+        resumed = adapter(real).run(*arguments, resume=state, **options)
+    for name in ("points", "error", "quality", "size"):
+        if not np.array_equal(getattr(resumed, name), getattr(whole, name)):
+            raise Wrong(f"a resumed run has other {name}, stopped after row {left}")
+    return "mesh"
+
+
+def try_moved(rng: np.random.Generator) -> str:
+    """A mesh adapted to another field, and values carried over to it."""
+    domain, real = some_domain(rng), some_real(rng)
+    options = {
+        "effort": "fast",
+        "method": str(rng.choice(["adaptive", "exact"])),
+        "seed": int(rng.integers(99)),
+    }
+    first = adapter(real).run(domain, some_size(rng, domain, wild=False), **options)
+    second = adapter(real).run(
+        domain, some_size(rng, domain, wild=False), points=first.points, **options
+    )
+    demand(second, real)
+    values = rng.choice([1.0, 1e-200, 1e200]) * rng.standard_normal(
+        (len(first.points), 2)
+    ) + rng.choice([0, 1])
+    got = first.transfer(values, onto=second, order=int(rng.choice([1, 2])))
+    before, after = first.diagram.volumes @ values, second.diagram.volumes @ got
+    # In single precision volumes sum to others, and bounds come first.
+    off = abs(first.diagram.volumes.sum() - second.diagram.volumes.sum())
+    slack = 1e-11 * (first.diagram.volumes @ np.abs(values)) + off * np.abs(values).max(axis=0)
+    if not (np.abs(after - before) <= slack).all():
+        raise Wrong(f"of {before} there are {after} after the transfer")
+    low, high = values.min(axis=0), values.max(axis=0)
+    if not ((got >= low) & (got <= high)).all():
+        raise Wrong("values beyond the bounds after the transfer")
+    return "mesh"
+
+
+def try_case(rng: np.random.Generator) -> str:
+    """A case file with what it may hold, from the text to the files written."""
+    with tempfile.TemporaryDirectory() as folder:
+        text = toml.write(some_case(rng, Path(folder)))
+        case = Case.from_toml(text, "fuzz.toml", Path(folder))
+        out = Path(folder) / "out"
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            Job(case, out, report=False, quiet=True).run()
+        real = case.run.get("dtype", "float64")
+        for name, reader in (("mesh.npz", clvoro.load), ("mesh.vtu", load_vtu)):
+            demand(reader(out / name), real)
+        again = Case.from_toml((out / "case.toml").read_text(), "case.toml", out)
+        if (again.domain, again.layers) != (case.domain, case.layers):
+            raise Wrong("the case that was written is another")
+    return "mesh"
+
+
+def some_case(rng: np.random.Generator, folder: Path) -> dict[str, Any]:
+    wild = rng.random() < WILD
+    fields: list[dict[str, Any]] = [
+        {"kind": "constant", "value": 0.2},
+        {"kind": "expression", "expression": "0.1 + 0.05*x"},
+        {"kind": "distance", "shapes": [{"kind": "circle", "centre": [0.5, 0.5], "radius": 0.2}],
+         "h_min": 0.1, "growth": 1.3, "h_max": 0.3},
+        {"kind": "distance", "shapes": [{"kind": "boundary"}], "h_min": 0.1, "slope": 0.5},
+        {"kind": "raster", "file": "a.npy", "lower": [0, 0], "upper": [2, 1]},
+        {"kind": "raster", "file": "a.npy"},
+    ]  # fmt: skip
+    np.save(folder / "a.npy", 0.1 + 0.1 * rng.random((4, 5)))
+    size = dict(fields[rng.integers(len(fields))])
+    kind = rng.integers(0, 4)
+    if kind == 0:
+        size = {"kind": "graded", "field": size, "growth": 1.3}
+    elif kind == 1:
+        other = dict(fields[rng.integers(len(fields))])
+        size = {"kind": str(rng.choice(["min", "max"])), "fields": [size, other]}
+    domains: list[dict[str, Any]] = [
+        {"lower": [0, 0], "upper": [2, 1]},
+        {"lower": [0, 0], "upper": [2, 2], "periodic": bool(rng.integers(2))},
+        {"outer": [[0, 0], [2, 0], [2, 1], [0, 1.5]], "holes": [{"kind": "circle", "centre": [1, 0.6], "radius": 0.2}]},
+        {"polygon": "g.geojson"},
+    ]  # fmt: skip
+    (folder / "g.geojson").write_bytes(files.GEOJSON)
+    domain = domains[rng.integers(len(domains))]
+    run = {"method": str(rng.choice(["adaptive", "exact", "coupled"])), "effort": "fast", "max_steps": 5,
+           "seed": int(rng.integers(99)), "dtype": some_real(rng)}  # fmt: skip
+    case: dict[str, Any] = {"name": "fuzz", "domain": domain, "size": size, "run": run}
+    if rng.random() < 0.2 and "periodic" not in domain:
+        case["layers"] = [{"height": 0.02, "count": int(rng.integers(1, 4))}]
+    if rng.random() < 0.1:
+        case["sequence"] = {"frames": 2}
+    if wild:
+        table: Any = [case, domain, size, run][rng.integers(4)]
+        key = str(rng.choice(list(table)))
+        strange = [
+            None,
+            -1,
+            0,
+            "",
+            "nonsense",
+            [],
+            {},
+            True,
+            [1],
+            1e300,
+            [[1, 2]],
+            float("nan"),
+            "../a.npy",
+        ]
+        value = strange[rng.integers(len(strange))]
+        if value is None:
+            del table[key]
+        elif rng.random() < 0.3:
+            table[key + "s"] = table.pop(key)
+        else:
+            table[key] = value
+    return case
+
+
+# Files.
+
+
+def try_file(rng: np.random.Generator) -> str:
+    """A file with some bits changed, bytes lost, doubled or exchanged is refused, or no harm is done."""
+    if not _files:
+        _files.update(files.valid_files(adapter("float64")))
+    name = str(rng.choice(list(_files)))
+    with tempfile.TemporaryDirectory() as folder:
+        path, right = Path(folder) / name, Path(folder) / "right"
+        path.write_bytes(files.damaged(rng, _files[name]))
+        found = files.read(path)
+        if isinstance(found, Saved):
+            right.write_bytes(_files[name])
+            if not files.same(found, Saved(right)):
+                raise Wrong("a damaged checkpoint was taken")
+    return f"{path.suffix or 'checkpoint'} read"
+
+
+WORK = {
+    "diagram": (try_diagram, 0.3),
+    "solid": (try_solid, 0.12),
+    "polygon": (try_polygon, 0.15),
+    "periodic": (try_periodic, 0.12),
+    "run": (try_run, 0.15),
+    "solid-run": (try_solid_run, 0.08),
+    "polygon-run": (try_polygon_run, 0.1),
+    "periodic-run": (try_periodic_run, 0.12),
+    "layers": (try_layers, 0.1),
+    "resumed": (try_resumed, 0.06),
+    "moved": (try_moved, 0.05),
+    "case": (try_case, 0.06),
+    "file": (try_file, 0.1),
+}
+"""What is tried by kind of input, and how often."""
