@@ -191,7 +191,6 @@ def _check(arguments: argparse.Namespace) -> int:
     import json
 
     from .io import load
-    from .io.vtu_read import load_vtu
 
     code = OK
     for name in arguments.files:
@@ -201,7 +200,7 @@ def _check(arguments: argparse.Namespace) -> int:
                 raise InputError(
                     f"{name} is no mesh.npz and no mesh.vtu, which are what can be checked"
                 )
-            report = (load if path.suffix.lower() == ".npz" else load_vtu)(path).check()
+            report = load(path).check()
         except InputError as error:  # the other files are looked at all the same
             code = _complain(error, BAD_INPUT)
             continue

@@ -93,6 +93,28 @@ class Diagram:
     ------
     AttributeError
         For the arrays that diagrams of such a domain do not have.
+
+    Examples
+    --------
+    The neighbour graph as a sparse matrix, with the faces' lengths:
+
+    >>> import numpy as np, scipy.sparse, clvoro
+    >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]
+    >>> d = clvoro.Adapter().diagram(clvoro.Box((0, 0), (1, 1)), points)
+    >>> owners = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))  # whose face each is
+    >>> inner = d.neighbours >= 0
+    >>> edges = owners[inner], d.neighbours[inner]
+    >>> graph = scipy.sparse.csr_array((d.face_measures[inner], edges), shape=(len(d), len(d)))
+    >>> graph.nnz, graph.sum(axis=1).round(3).tolist()
+    (10, [0.952, 0.997, 0.894, 1.123])
+
+    The corners of a cell, and the Delaunay triangles:
+
+    >>> corners = d.vertices[d.cell_vertices[d.cell_vertex_starts[0]:d.cell_vertex_starts[1]]]
+    >>> corners.round(2).tolist()
+    [[0.0, 0.0], [0.4, 0.0], [0.49, 0.44], [0.0, 0.56]]
+    >>> d.triangles().tolist()
+    [[0, 1, 3], [1, 2, 3]]
     """
 
     _NAMES = (
@@ -116,6 +138,40 @@ class Diagram:
         if callable(value):
             value = self._arrays[name] = value()
         return value
+
+    def __dir__(self) -> list[str]:
+        return [
+            *super().__dir__(),
+            *(n for n in Diagram._NAMES if n == "shifts" or n in self._arrays),
+        ]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Arrays that have not been asked for are fetched: they may be on a device still.
+        return {"domain": self.domain, "_arrays": {n: getattr(self, n) for n in self._arrays}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+    def triangles(self) -> np.ndarray:
+        """Return the dual triangulation in the plane: triples of generators whose cells meet in a vertex.
+
+        They are the Delaunay triangles whose circumcentre lies in the domain (those of others, between cells that meet
+        only beyond a wall, are not there). Where more than three cells meet, as in a square lattice, their generators'
+        polygon is cut into triangles.
+
+        Returns
+        -------
+        (t, 3) int32
+            Counter-clockwise, sorted by vertex.
+
+        Raises
+        ------
+        InputError
+            In 3D, and in periodic boxes, where a triangle's corners may be images.
+        """
+        from .dual import dual_triangles
+
+        return dual_triangles(self)
 
     def check(self) -> Report:
         """Verify the diagram on the host: graph, faces, volumes, and that it is the Voronoi diagram of its generators.
@@ -211,17 +267,22 @@ class Result:
     Attributes
     ----------
     points : (n, d) float
+        Generators: `diagram.points`, in the order of `origin`.
     diagram : Diagram
     size : (n,) float
         Target size h at the generators.
     error : (n,) float
         Signed metric error, the paper's (3.1).
     quality : (n,) float
-        Cell quality, the paper's (4.1). In a polygonal domain faces on the boundary count as one side as long as they
-        turn by no more than 30 degrees in sum, and holes within a cell as none.
+        Cell quality, the paper's (4.1), 1 for a regular polygon; in 3D the isoperimetric quotient 36 pi V^2 / S^3. In a
+        polygonal domain faces on the boundary count as one side as long as they turn by no more than 30 degrees in
+        sum, and holes within a cell as none; with a bent side the quality may be a little above 1.
     history : structured array of `HISTORY_DTYPE`
+        One row per step: ``history["mean_error"]``, ...
     converged : bool
+        Whether the run ended by itself: at its tolerance, or with its plan.
     stop_reason : str
+        Why it ended, for people.
     initial, final : Displacements or None
         Lloyd and Poisson displacements of the first and of the last step; where a run may end after any step (methods
         that repeat one kind, a callback that stops it), those of the step that would come next are the last.

@@ -5,6 +5,7 @@ import dataclasses
 import io as streams
 import json
 import os
+import pickle
 import stat
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -16,6 +17,7 @@ import reference
 from hypothesis import given
 from hypothesis import strategies as st
 
+import clvoro
 from clvoro import io
 from clvoro.domain import Box
 from clvoro.errors import InputError, InputTypeError
@@ -107,6 +109,25 @@ def test_npz_returns_what_was_saved(tmp_path_factory, n, seed):
     saved = make_result(n, seed)
     io.save(saved, path)
     assert_equal_results(saved, io.load(path))
+
+
+def test_load_reads_vtu_too(result, tmp_path):
+    io.save(result, tmp_path / "mesh.VTU")
+    again = clvoro.load(tmp_path / "mesh.VTU")
+    assert np.array_equal(again.diagram.volumes, result.diagram.volumes)
+    assert np.array_equal(again.error, result.error)
+    assert len(again.history) == 0
+
+
+def test_diagrams_of_a_device_can_be_pickled_and_listed():
+    points = np.random.default_rng(41).random((30, 2))
+    diagram = clvoro.Adapter().diagram(clvoro.Box((0, 0), (1, 1)), points)
+    again = pickle.loads(pickle.dumps(diagram))
+    assert again.domain == diagram.domain
+    for name in ("volumes", "neighbours", "vertices", "cell_vertices", "shifts"):
+        assert name in dir(again)
+        assert np.array_equal(getattr(again, name), getattr(diagram, name))
+    assert "face_vertices" not in dir(again)  # only in 3D and in polygons
 
 
 def test_npz_knows_every_array_of_a_diagram():

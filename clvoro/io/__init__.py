@@ -15,12 +15,40 @@ from .atomic import check_writable
 from .foam import write_foam
 from .formats import write_foreign
 from .history import write_history
-from .npz import load, write_npz
+from .npz import load as load_npz
+from .npz import write_npz
 from .vtu import write_vtu
+from .vtu_read import load_vtu
 
 __all__ = ["check_writable", "load", "save", "write_history"]
 
 _WRITERS = {".npz": write_npz, ".vtu": write_vtu}
+
+
+def load(path: str | PathLike[str]) -> Result:
+    """Read a result that `Result.save` wrote to a ``.npz`` or ``.vtu`` file.
+
+    A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is made anew,
+    the history is empty, and a plain box is taken as the bounding box of the cells. The file is not trusted: nothing in
+    it is executed, sizes are compared with the bytes that are there before memory is asked for, and the arrays must fit
+    each other.
+
+    Parameters
+    ----------
+    path : str or path
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, cut off, of another format or of a newer version; names the file and what is
+        wrong.
+
+    """
+    return (load_vtu if Path(path).suffix.lower() == ".vtu" else load_npz)(path)
 
 
 def save(
@@ -38,10 +66,9 @@ def save(
         ``.npz`` holds everything and is read back by `load`; ``.vtu`` is for ParaView and other VTK
         programs (polygons or polyhedra with h, error, quality and more as cell data);
         ``.../constant/polyMesh`` is a folder for OpenFOAM, and ``CASE/name.foam`` the same within a
-        case, for ParaView, too (2D: one layer of prisms between patches of type `empty`; seams of periodic boxes: pairs
-        of cyclic patches); ``.vtk``,
-        ``.ply`` and ``.obj`` hold 2D meshes and are written through meshio (``pip install
-        "clvoro[formats]"``), the latter two without cell data.
+        case, for ParaView, too, both made if need be (2D: one layer of prisms between patches of type `empty`; seams of
+        periodic boxes: pairs of cyclic patches); ``.vtk``, ``.ply`` and ``.obj`` hold 2D meshes and are written
+        through meshio (``pip install "clvoro[formats]"``), the latter two without cell data.
     patches : mapping, optional
         For OpenFOAM and a polygonal domain: names of patches, and the numbers of the edges in each, as in
         `Polygon.edge_numbers`. Edges in none are in the patch of their ring, ``outer``, ``hole-1``, ...

@@ -34,7 +34,7 @@ def write_foam(
     path : Path
         The folder ``.../constant/polyMesh``, made if need be; its five files are replaced, others there are left.
         Or a case's marker ``CASE/name.foam``, an empty file which ParaView opens, with the mesh in
-        ``CASE/constant/polyMesh``.
+        ``CASE/constant/polyMesh``; the case's folder is made, too.
     patches : mapping, optional
         See `poly_mesh`.
     """
@@ -42,6 +42,7 @@ def write_foam(
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:
+        _make(marker.parent)
         with atomic_file(marker):  # first: it says whether the case's folder can be written
             pass
     _make(folder)

@@ -41,6 +41,8 @@ class Sizing:
     field : Field, number or callable
         A callable is evaluated on the host, and so is the combination of a callable with other
         fields: each evaluation then moves the points to the host and the sizes back.
+    gradient_step : float, optional
+        Step of the differences that give dh/dx, over h; by default what suits the precision.
 
     Attributes
     ----------

@@ -35,16 +35,18 @@ class Surface:
         Vertices so near to each other count as one for `closed` and its like, in the unit of the
         coordinates; 0 joins those at the same place.
 
-    Corners at the same place count as one vertex, so a file of separate triangles (STL) is as good
-    as one with shared vertices. Open, branching and self-intersecting surfaces are accepted: the
-    distance to them is well defined. `closed`, `open_edges`, `require_closed` and `check` are for
-    those who need more.
-
     Raises
     ------
     InputError, InputTypeError
         If there is no triangle, or none with an area, if a vertex is not finite, or an index points
         to no vertex; names the first.
+
+    Notes
+    -----
+    Corners at the same place count as one vertex, so a file of separate triangles (STL) is as good
+    as one with shared vertices. Open, branching and self-intersecting surfaces are accepted: the
+    distance to them is well defined. `closed`, `open_edges`, `require_closed` and `check` are for
+    those who need more.
 
     Examples
     --------

@@ -1,0 +1,59 @@
+"""What users of the public names are told: every one has a docstring, and its examples are right."""
+
+import doctest
+import inspect
+import re
+
+import numpy as np
+import pytest
+
+import clvoro
+
+PUBLIC = [getattr(clvoro, name) for name in clvoro.__all__] + [
+    getattr(clvoro.sizing, name) for name in clvoro.sizing.__all__
+]
+
+
+def members(thing):
+    """The public functions that a class of clvoro defines itself or inherits from another of clvoro."""
+    if not inspect.isclass(thing):
+        return []
+    found = inspect.getmembers(thing, lambda m: inspect.isfunction(m) or isinstance(m, property))
+    return [m for name, m in found if not name.startswith("_")]
+
+
+@pytest.mark.parametrize("thing", PUBLIC, ids=lambda t: getattr(t, "__name__", str(t)))
+def test_public_names_say_what_they_are(thing):
+    assert (thing.__doc__ or "").strip()
+    # A dataclass without a docstring of its own is given its signature.
+    assert not thing.__doc__.startswith(f"{thing.__name__}(")
+    for member in members(thing):
+        assert (inspect.getdoc(member) or "").strip(), member
+
+
+@pytest.mark.parametrize("thing", PUBLIC, ids=lambda t: getattr(t, "__name__", str(t)))
+def test_parameters_are_all_described(thing):
+    """A docstring that lists parameters lists those that there are, and no others."""
+    for what in [thing, *members(thing)]:
+        text = inspect.getdoc(what) or ""
+        if "Parameters\n----------" not in text or isinstance(what, property):
+            continue
+        part = re.split(r"\n[A-Z]\w+\n---", text.split("Parameters\n----------\n")[1])[0]
+        listed = set()
+        for line in part.split("\n"):
+            if line and not line.startswith(" "):
+                listed |= {n.strip().lstrip("*") for n in line.split(" : ")[0].split(",")}
+        there = set(inspect.signature(what).parameters) - {"self", "cls"}
+        assert listed == there, what
+
+
+@pytest.mark.parametrize("thing", PUBLIC, ids=lambda t: getattr(t, "__name__", str(t)))
+def test_examples_are_right(thing, ctx, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"clvoro": clvoro, "np": np, "sizing": clvoro.sizing}
+    finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner()
+    things = [thing] if inspect.ismodule(thing) else [thing, *members(thing)]
+    for what in things:
+        for test in finder.find(what, getattr(what, "__name__", "property"), globs=names):
+            runner.run(test)
+    assert runner.failures == 0
