@@ -47,8 +47,8 @@ class Layers:
     spacing : float, optional
         Width of the cells along the wall; by default the height of the last layer.
     edges : sequence of int, optional
-        Walls of the `Box` (0 to 3), or edges of the `Polygon` (see `Polygon.edge_numbers` for their numbers in the
-        rings as they were given); by default all.
+        Walls of the `Box` (0 to 3; where it is periodic there are none), or edges of the `Polygon` (see
+        `Polygon.edge_numbers` for their numbers in the rings as they were given); by default all.
 
     Raises
     ------
@@ -200,15 +200,21 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
 
 
 def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
-    """Return a domain in 2D as a polygon, and for each of its edges the number by which `Layers.edges` means it."""
+    """Return a domain in 2D as a polygon, and for each of its edges the number by which `Layers.edges` means it.
+
+    The number is -1 where a periodic box has a seam in the place of a wall.
+    """
     if isinstance(domain, Polygon):
         return domain, np.arange(len(domain.vertices))
-    if not isinstance(domain, Box) or domain.dim != 2 or any(domain.periodic):
+    if not isinstance(domain, Box) or domain.dim != 2 or all(domain.periodic):
         raise InputTypeError(
             f"layers are for a Box with walls or a Polygon in 2D, not for {domain}"
         )
     (a, b), (c, d) = domain.lower, domain.upper
-    return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
+    walls = np.array([2, 1, 3, 0])
+    return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.where(
+        np.take(domain.periodic, walls // 2), -1, walls
+    )
 
 
 def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
@@ -223,12 +229,12 @@ def _chosen(polygon: Polygon, number: np.ndarray, layer: Layers) -> np.ndarray:
     if not isinstance(layer, Layers):
         raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
     if layer.edges is None:
-        return np.ones(len(number), bool)
+        return number >= 0
     missing = np.setdiff1d(layer.edges, number)
     if missing.size or not layer.edges:
-        raise InputError(
-            f"Layers edges has {missing.tolist() or 'none'}, expected some of 0 to {len(number) - 1}"
-        )
+        walls = np.sort(number[number >= 0])
+        known = f"0 to {len(number) - 1}" if len(walls) == len(number) else str(walls.tolist())
+        raise InputError(f"Layers edges has {missing.tolist() or 'none'}, expected some of {known}")
     return np.isin(number, layer.edges)
 
 
@@ -336,13 +342,14 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
     if isinstance(domain, Box):
         corners = np.array([domain.lower, domain.upper])
         for layer, distance in zip(layers, distances, strict=True):
-            for wall in range(4) if layer.edges is None else layer.edges:
+            walls = [w for w in range(4) if not domain.periodic[w // 2]]
+            for wall in walls if layer.edges is None else layer.edges:
                 axis, end = divmod(wall, 2)
                 moved = (domain.lower, domain.upper)[end][axis] + (-distance if end else distance)
                 corners[end, axis] = (min if end else max)(corners[end, axis], moved)
         if not (corners[0] < corners[1]).all():
             raise InputError(_NO_ROOM)
-        return _FreeBox(tuple(corners[0]), tuple(corners[1]), whole=domain)
+        return _FreeBox(tuple(corners[0]), tuple(corners[1]), domain.periodic, whole=domain)
     polygon, _ = as_polygon(domain)
     strips = [
         shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer)))).buffer(

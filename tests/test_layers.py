@@ -51,6 +51,36 @@ def test_layers_of_a_straight_wall_are_rectangles(adapter):
     assert result.check()
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
+    """On both walls, rectangles all around: those at the seam are like the others."""
+    shape = (2.0, 1.0) if axis == 0 else (1.0, 2.0)
+    channel = clvoro.Box((0, 0), shape, periodic=(axis == 0, axis == 1))
+    layers = Layers(0.02, count=3, growth=1.2)
+    result = adapter.run(channel, 0.1, layers=layers, effort="fast")
+    rows, d = place_layers(channel, [layers]), result.diagram
+    columns = round(2 / layers.width)
+    assert len(rows) == 2 * 4 * columns
+    moved = result.points[: len(rows)] - rows
+    assert np.abs(moved - np.rint(moved / channel.extent) * channel.extent).max() < 1e-14
+    heights = np.minimum(rows[:, 1 - axis], 1 - rows[:, 1 - axis])
+    for row, height in zip(layers.rows[:-1], layers.heights, strict=True):
+        layer = np.flatnonzero(np.isclose(heights, row))
+        assert len(layer) == 2 * columns
+        assert d.volumes[layer] == pytest.approx(height * 2 / columns, rel=1e-12)
+        assert (np.diff(d.neighbour_starts)[layer] == 4).all()
+    assert d.volumes.sum() == pytest.approx(2, rel=1e-12)
+    # The others are what a run without layers gives, as in a box; none has come between the rows.
+    assert np.abs(result.error[len(rows) :]).mean() < 0.025
+    others = result.points[len(rows) :, 1 - axis]
+    assert np.minimum(others, 1 - others).min() > layers.rows[-1]
+    result.check().demand()
+    with pytest.raises(
+        InputError, match=r"expected some of \[" + ("2, 3" if axis == 0 else "0, 1")
+    ):
+        adapter.run(channel, 0.1, layers=Layers(0.02, edges=[0, 2]))
+
+
 def test_sizes_grow_from_the_layers(adapter):
     layers = Layers(0.02, count=3, growth=1.2, edges=range(4, 84))
     result = adapter.run(CHANNEL, 0.2, layers=layers, effort="fast")

@@ -117,10 +117,10 @@ class _RoundSteps(MaxNLocator):
     def __init__(self) -> None:
         super().__init__(steps=[1, 2, 5, 10])
 
-    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+    def tick_values(self, vmin: float, vmax: float) -> list[float]:
         length, lies = _length(self.axis)
         self.set_params(nbins=int(np.clip(length / _PER_TICK[lies], 2, 9)))
-        return np.asarray(super().tick_values(vmin, vmax))
+        return list(super().tick_values(vmin, vmax))
 
 
 class _EndsAndRound(Locator):
@@ -129,17 +129,17 @@ class _EndsAndRound(Locator):
     def __init__(self, low: float, high: float) -> None:
         self._ends = low, high
 
-    def __call__(self) -> np.ndarray:
+    def __call__(self) -> list[float]:
         return self.tick_values(*self._ends)
 
-    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+    def tick_values(self, vmin: float, vmax: float) -> list[float]:
         length, lies = _length(self.axis)
         apart = (vmax / vmin) ** (_APART[lies] / max(length, 1e-3))  # a ratio
         ticks = [vmin]
         for number in round_numbers(vmin, vmax):
             if number > ticks[-1] * apart and number < vmax / apart:
                 ticks.append(number)
-        return np.array([*ticks, vmax])
+        return [*ticks, vmax]
 
 
 def round_numbers(low: float, high: float) -> list[float]:
