@@ -1,6 +1,6 @@
-/* The clip of a polyhedron by the half-space nearer to its generator than to a neighbour. A clip takes out the triangles of
-   the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new face. Only that structure,
-   never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
+/* The clip of a polyhedron by the half-space nearer to its generator than to a neighbour. A clip takes out the
+   triangles of the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new face. Only
+   that structure, never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
 #include "common/noise.h"
 #include "common/polyhedron.h"
 
@@ -22,8 +22,9 @@ inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const
 {
     if (label_p < 0 || label_q < 0)
         return q;
-    const REAL4 w = (REAL4)(points[3 * label_q] - points[3 * label_p], points[3 * label_q + 1] - points[3 * label_p + 1],
-                            points[3 * label_q + 2] - points[3 * label_p + 2], 0);
+    const REAL4 w =
+        (REAL4)(points[3 * label_q] - points[3 * label_p], points[3 * label_q + 1] - points[3 * label_p + 1],
+                points[3 * label_q + 2] - points[3 * label_p + 2], 0);
     const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
     if (w2 > R(2e-3) * p.s3) /* level is half a square */
         return q;
@@ -51,7 +52,7 @@ inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 {
     REAL *s = (REAL *)cell->beyond;
     bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* of the disc: vertices, faces */
-    int added = 0, left = 0; /* left: vertices certainly beyond, and not in the disc yet */
+    int added = 0, left = 0;                         /* left: vertices certainly beyond, and not in the disc yet */
     for (int v = 0; v < cell->n; ++v) {
         inside[v] = false;
         added = s[v] > s[added] ? v : added;
@@ -88,12 +89,12 @@ inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 
 /* The edges over which a bisector leaves the cell. */
 typedef struct {
-    int gone;                                              /* vertices beyond the bisector */
-    int n;                                                 /* edges */
-    ulong dead[FACE_WORDS];                                /* faces all of which is beyond */
-    INDEX vertices[VERTEX_CAPACITY + 1];                   /* those beyond, ascending */
+    int gone;                                                  /* vertices beyond the bisector */
+    int n;                                                     /* edges */
+    ulong dead[FACE_WORDS];                                    /* faces all of which is beyond */
+    INDEX vertices[VERTEX_CAPACITY + 1];                       /* those beyond, ascending */
     INDEX before[FACE_CAPACITY + 4], after[FACE_CAPACITY + 4]; /* faces of an edge, along the rim */
-    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];   /* its ends, kept and not */
+    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];       /* its ends, kept and not */
 } rim_t;
 
 /* Find the rim; false if it is not one simple cycle. */
@@ -167,13 +168,69 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
     return true;
 }
 
+/* Take out the faces that lie within the rim, and put one in their place; FACE_CAPACITY if there is no room. */
+inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
+{
+    for (int w = 0; w < FACE_WORDS; ++w)
+        cell->alive[w] &= ~rim->dead[w];
+    const int face = first_spare(cell->alive);
+    if (face < FACE_CAPACITY) {
+        add_face(cell->alive, face);
+        cell->labels[face] = label;
+    }
+    return face;
+}
+
+/* New vertices, where the plane meets the edges of the rim, by interpolation. */
+inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, REAL *nz)
+{
+    const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
+    SHORT_LOOP
+    for (int k = 0; k < rim->n; ++k) {
+        const int in = rim->in[k], out = rim->out[k];
+        const REAL s_in = s[in] < 0 ? s[in] : 0;
+        const REAL t = s_in / (s_in - s[out]);
+        nx[k] = x[in] + t * (x[out] - x[in]);
+        ny[k] = y[in] + t * (y[out] - y[in]);
+        nz[k] = z[in] + t * (z[out] - z[in]);
+    }
+}
+
+/* Join the rim to the new face by the new vertices. They take the places of those that are gone, then go behind the
+   last; places left over are filled from the end. */
+inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, const REAL *ny, const REAL *nz)
+{
+    REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
+    SHORT_LOOP
+    for (int k = 0; k < rim->n; ++k) {
+        const int v = k < rim->gone ? rim->vertices[k] : cell->n++;
+        x[v] = nx[k];
+        y[v] = ny[k];
+        z[v] = nz[k];
+        cell->faces[v] = (INDEX4)(rim->before[k], rim->after[k], face, 0);
+        link_vertex(cell, v);
+    }
+    SHORT_LOOP
+    for (int k = rim->gone - 1; k >= rim->n; --k) {
+        const int v = rim->vertices[k], last = --cell->n;
+        if (v != last) {
+            x[v] = x[last];
+            y[v] = y[last];
+            z[v] = z[last];
+            cell->faces[v] = cell->faces[last];
+            link_vertex(cell, v);
+        }
+        x[last] = y[last] = z[last] = 0;
+    }
+}
+
 /* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbours that are seen are known to have a face. */
 #ifndef CLIP_SHARPLY
 #define CLIP_SHARPLY 0
 #endif
 
-/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before` the
-   neighbour may be a face of the cell already. */
+/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before`
+   the neighbour may be a face of the cell already. */
 inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
     const REAL level = d2 / 2;
@@ -206,30 +263,17 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
         if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
             return CLIP_COLLAPSED;
     }
-    for (int w = 0; w < FACE_WORDS; ++w)
-        cell->alive[w] &= ~rim.dead[w];
-    const int face = first_spare(cell->alive);
+    const int face = replace_faces(cell, &rim, label);
     if (face == FACE_CAPACITY)
         return CLIP_FULL;
-    add_face(cell->alive, face);
-    cell->labels[face] = label;
     cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
 
-    /* New vertices. Interpolation rounds by eps of the edge's length; where that may be much beside the distance of the
-       generators (while the cell is not closed yet, or near-duplicates), planes are intersected instead. */
+    /* Interpolation rounds by eps of the edge's length; where that may be much beside the distance of the generators
+       (while the cell is not closed yet, or near-duplicates), planes are intersected instead. */
     REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
-    REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
-    const REAL *s = (const REAL *)cell->beyond;
-    SHORT_LOOP
-    for (int k = 0; k < rim.n; ++k) {
-        const int in = rim.in[k], out = rim.out[k];
-        const REAL s_in = s[in] < 0 ? s[in] : 0;
-        const REAL t = s_in / (s_in - s[out]);
-        nx[k] = x[in] + t * (x[out] - x[in]);
-        ny[k] = y[in] + t * (y[out] - y[in]);
-        nz[k] = z[in] + t * (z[out] - z[in]);
-    }
+    cut_edges(cell, &rim, nx, ny, nz);
     if (cell->reach2 > 16 * d2) {
+        const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
         const REAL reach = distance * sqrt(cell->reach2);
         for (int k = 0; k < rim.n; ++k) {
             const int in = rim.in[k], out = rim.out[k];
@@ -245,28 +289,7 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
             }
         }
     }
-    /* They take the places of those that are gone, then go behind the last; places left over are filled from the end. */
-    SHORT_LOOP
-    for (int k = 0; k < rim.n; ++k) {
-        const int v = k < rim.gone ? rim.vertices[k] : cell->n++;
-        x[v] = nx[k];
-        y[v] = ny[k];
-        z[v] = nz[k];
-        cell->faces[v] = (INDEX4)(rim.before[k], rim.after[k], face, 0);
-        link_vertex(cell, v);
-    }
-    SHORT_LOOP
-    for (int k = rim.gone - 1; k >= rim.n; --k) {
-        const int v = rim.vertices[k], last = --cell->n;
-        if (v != last) {
-            x[v] = x[last];
-            y[v] = y[last];
-            z[v] = z[last];
-            cell->faces[v] = cell->faces[last];
-            link_vertex(cell, v);
-        }
-        x[last] = y[last] = z[last] = 0;
-    }
+    close_rim(cell, &rim, face, nx, ny, nz);
     find_reach(cell);
     return CLIP_CUT;
 }

@@ -3,9 +3,7 @@
 
 #define NEAR_CAPACITY 512
 #define NEAR_STEP 16
-/* What holds no more than WHOLE generators is taken whole: looking into divided bins costs more than testing a few that
-   are too far. */
-#define WHOLE 32
+#define WHOLE 32 /* generators in divided bins that are taken as they are: more than that may be too far */
 
 /* Behind the last place there may be others, of no meaning. */
 typedef struct {
@@ -48,20 +46,9 @@ inline bool collect_near(near_t *near, double2 lower, double2 upper, global cons
         }
         while (row <= top && child < 0) {
             global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
-            while (next <= right) {
-                /* Bins beside each other are a run of items. */
-                const int2 first = row_bins[next];
-                int2 end = row_bins[right + 1];
-                if (first.s1 == end.s1 || end.s0 - first.s0 <= WHOLE) {
-                    next = right + 1;
-                } else {
-                    end = row_bins[++next];
-                    if (first.s1 != end.s1 && end.s0 - first.s0 > WHOLE) {
-                        child = first.s1;
-                        break;
-                    }
-                }
-                if (!add_run(near, first.s0, end.s0))
+            while (next <= right && child < 0) {
+                const int2 run = next_run(row_bins, &next, right, WHOLE, &child);
+                if (child < 0 && !add_run(near, run.s0, run.s1))
                     return false;
             }
             if (next > right && child < 0) {

@@ -49,9 +49,9 @@ typedef struct {
     int labels[CELL_CAPACITY];
 } piece_t;
 
-#define EACH_FACE(piece, f) \
-    int f = 0; \
-    f < (piece)->n; \
+#define EACH_FACE(piece, f)                                                                                            \
+    int f = 0;                                                                                                         \
+    f < (piece)->n;                                                                                                    \
     ++f
 
 inline int face_label(const piece_t *piece, int f)
@@ -162,9 +162,9 @@ inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
 
 typedef cell_t piece_t;
 
-#define EACH_FACE(piece, f) \
-    int f = next_face((piece)->alive, 0); \
-    f < FACE_CAPACITY; \
+#define EACH_FACE(piece, f)                                                                                            \
+    int f = next_face((piece)->alive, 0);                                                                              \
+    f < FACE_CAPACITY;                                                                                                 \
     f = next_face((piece)->alive, f + 1)
 
 inline int face_label(const piece_t *piece, int f)
@@ -199,7 +199,8 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
    any plane, and new vertices by interpolation only: the edges are no longer than the cell. */
 inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
-    REAL *x = X(piece), *y = Y(piece), *z = Z(piece), *s = (REAL *)piece->beyond;
+    const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
+    REAL *s = (REAL *)piece->beyond;
     int beyond = 0;
     for (int v = 0; v < piece->n; ++v) {
         s[v] = x[v] * normal.s0 + y[v] * normal.s1 + z[v] * normal.s2 - level;
@@ -216,42 +217,12 @@ inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int l
         if (rim.gone == piece->n)
             return PIECE_EMPTY;
     }
-    for (int w = 0; w < FACE_WORDS; ++w)
-        piece->alive[w] &= ~rim.dead[w];
-    const int face = first_spare(piece->alive);
+    const int face = replace_faces(piece, &rim, label);
     if (face == FACE_CAPACITY)
         return PIECE_FULL;
-    add_face(piece->alive, face);
-    piece->labels[face] = label;
     REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
-    for (int k = 0; k < rim.n; ++k) {
-        const int in = rim.in[k], out = rim.out[k];
-        const REAL s_in = s[in] < 0 ? s[in] : 0;
-        const REAL t = s_in / (s_in - s[out]);
-        nx[k] = x[in] + t * (x[out] - x[in]);
-        ny[k] = y[in] + t * (y[out] - y[in]);
-        nz[k] = z[in] + t * (z[out] - z[in]);
-    }
-    /* They take the places of those that are gone, then go behind the last; places left over are filled from the end. */
-    for (int k = 0; k < rim.n; ++k) {
-        const int v = k < rim.gone ? rim.vertices[k] : piece->n++;
-        x[v] = nx[k];
-        y[v] = ny[k];
-        z[v] = nz[k];
-        piece->faces[v] = (INDEX4)(rim.before[k], rim.after[k], face, 0);
-        link_vertex(piece, v);
-    }
-    for (int k = rim.gone - 1; k >= rim.n; --k) {
-        const int v = rim.vertices[k], last = --piece->n;
-        if (v != last) {
-            x[v] = x[last];
-            y[v] = y[last];
-            z[v] = z[last];
-            piece->faces[v] = piece->faces[last];
-            link_vertex(piece, v);
-        }
-        x[last] = y[last] = z[last] = 0;
-    }
+    cut_edges(piece, &rim, nx, ny, nz);
+    close_rim(piece, &rim, face, nx, ny, nz);
     return PIECE_CUT;
 }
 

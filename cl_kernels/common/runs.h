@@ -122,21 +122,9 @@ inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, doub
                 const int right = rights[pair - first_pair];
                 next = max(next, nexts[pair - first_pair]);
                 global const int2 *row_bins = bins + offsets[pair - first_pair];
-                while (next <= right) {
-                    /* A run of leaves beside each other is a run of items; where there are divided bins ahead, one bin.
-                     */
-                    const int2 first = row_bins[next];
-                    int2 end = row_bins[right + 1];
-                    if (first.s1 == end.s1 || end.s0 - first.s0 <= WHOLE) {
-                        next = right + 1;
-                    } else {
-                        end = row_bins[++next];
-                        if (first.s1 != end.s1 && end.s0 - first.s0 > WHOLE) {
-                            child = first.s1;
-                            break;
-                        }
-                    }
-                    if (!add_run(runs, first.s0, end.s0) || runs->total > limit)
+                while (next <= right && child < 0) {
+                    const int2 run = next_run(row_bins, &next, right, WHOLE, &child);
+                    if (child < 0 && (!add_run(runs, run.s0, run.s1) || runs->total > limit))
                         return false;
                 }
                 if (child >= 0)
