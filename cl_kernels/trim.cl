@@ -11,6 +11,7 @@
 #define FLAG_LOST 1   /* as in chords.cl */
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
 #define ON_BOUNDARY (4 * REAL_EPS)
+#define ONE_POINT (64 * REAL_EPS)
 
 #define CONVEX_ARGS                                                                                                  \
     global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,        \
@@ -383,7 +384,8 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
             add_triangle(&m, p, q);
             int other;
             if (!is_face(&s, k, home, i, slots, roots, &other)) {
-                if (other == i)
+                /* Pieces that meet in a point, give or take a rounding, do not go on in each other. */
+                if (other == i && dot(e, e) > ONE_POINT * ONE_POINT)
                     join_runs(&o);
                 continue;
             }

@@ -319,7 +319,7 @@ def _check_result(check: Check, result: Result) -> None:
         counts = np.diff(d.neighbour_starts)
         perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
         if dim == 2:
-            quality = _quality_2d(d, perimeter, q, eps)
+            quality = _quality_2d(d, perimeter, q, eps, g.unit)
         else:
             quality = 36 * np.pi * d.volumes**2 / perimeter**3
     check.note(
@@ -339,7 +339,9 @@ def _check_result(check: Check, result: Result) -> None:
     )  # fmt: skip
 
 
-def _quality_2d(d: Diagram, perimeter: np.ndarray, q: np.ndarray, eps: float) -> np.ndarray:
+def _quality_2d(
+    d: Diagram, perimeter: np.ndarray, q: np.ndarray, eps: float, unit: float
+) -> np.ndarray:
     """Return the quality (4.1) of each cell (n,).
 
     Where rounding decides how many sides the boundary is, as many are taken as suit the quality `q` best.
@@ -353,7 +355,9 @@ def _quality_2d(d: Diagram, perimeter: np.ndarray, q: np.ndarray, eps: float) ->
         alone = np.bincount(owner, ~on_wall, len(d)) == 0
         meets = on_wall & (d.neighbours[next_faces(d)] == d.neighbours)
         joints = np.bincount(owner, meets, len(d)).astype(int)
-        few, many = few - joints, many + joints + alone
+        # And a face no longer than a rounding is a side or none, as where pieces touch.
+        points = np.bincount(owner, d.face_measures <= ROUNDINGS * unit, len(d)).astype(int)
+        few, many = few - joints - points, many + joints + points + alone
     few, many = np.maximum(few, 3), np.maximum(many, 3)
     quality = np.zeros(len(q))
     for more in range(int((many - few).max(initial=0)) + 1):

@@ -126,6 +126,16 @@ def test_a_generator_in_a_corner_where_pieces_touch(ctx) -> None:
     assert report, report
 
 
+def test_a_face_of_a_rounding_is_a_side_or_none(ctx) -> None:
+    a = np.array([(0, 4), (1, 4), (1, 5), (0, 5)]) / 7
+    domain = Polygon.from_pieces([[a], [a + np.array([1, -1]) / 7]])
+    x = [(0.1369047619047619, 0.5718085607390168), (0.14247715354669752, 0.5773809523809523),
+         (0.1488095238095238, 0.571048582118126)]  # fmt: skip
+    made = clvoro.Adapter(ctx).run(domain, 0.05, points=x, method="lloyd", max_steps=0)
+    assert made.diagram.face_measures.min() < 1e-14
+    assert made.check(), made.check()
+
+
 @pytest.mark.parametrize("scale", [1e-45, 1e10, 1e45])
 def test_checks_in_any_unit(ctx, scale: float) -> None:
     domain = Polygon(SQUARE * scale, [SQUARE * 0.2 * scale + 0.3 * scale])
