@@ -21,6 +21,7 @@ from .sizing.shapes import Edges
 _SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin anew
 _NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
 _GROWTH = 1.2  # of sizes beyond layers that do not grow themselves
+_SHORT = 1e-9  # of the domain: shorter edges of what layers leave are none
 _APART = 0.3  # of a width, between the last row and the generators that move
 _MOST = 2.0**62  # columns, more than any device holds: numbers of them stay finite
 _NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
@@ -358,7 +359,12 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
         for layer, distance in zip(layers, distances, strict=True)
     ]
     left = polygon.geometry.difference(shapely.union_all(strips))
-    parts = [part for part in getattr(left, "geoms", [left]) if part.area > 1e-6 * domain.measure]
+    # Where a strip ends beside a corner, an edge may be left that is no longer than a rounding.
+    left = shapely.make_valid(
+        shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max()))
+    )
+    every = [part for some in shapely.get_parts(left) for part in shapely.get_parts(some)]
+    parts = [part for part in every if part.area > 1e-6 * domain.measure]
     if not parts:
         raise InputError(_NO_ROOM)
     inner = Polygon.from_shapely(shapely.MultiPolygon(parts))

@@ -193,6 +193,16 @@ def test_no_more_are_placed_than_are_counted(domain, edges):
     assert 0.8 * count < placed <= count
 
 
+@pytest.mark.parametrize("beside", [-1e-13, -1e-14, 0, 1e-14, 1e-13, 1e-10])
+def test_strips_may_end_beside_corners(adapter, beside):
+    """What they leave has no edge there that is as short as a rounding."""
+    layer = clvoro.Layers(0.05, count=1, spacing=0.1, edges=[0])
+    reach = layer.rows[-1] + 0.03
+    shore = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1), (0, reach + beside)])
+    assert free_domain(shore, [layer]).lower[1] == pytest.approx(reach, abs=1e-9)
+    assert adapter.run(shore, 0.1, layers=layer, method="lloyd", max_steps=1).check()
+
+
 def test_domains_without_walls_in_2d_are_refused():
     for domain in (clvoro.Box((0, 0, 0), (1, 1, 1)), clvoro.Box((0, 0), (1, 1), periodic=True)):
         with pytest.raises(InputTypeError, match="walls"):
