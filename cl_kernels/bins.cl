@@ -31,7 +31,7 @@ inline int child_side(int count)
 }
 
 /* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins (and one entry that ends
- * them)? */
+   them)? */
 kernel void plan_children(const int size, global const int *counts, const int begin, const int may_divide,
                           global int *grid_flags, global int *child_bins)
 {

@@ -1,8 +1,9 @@
 #include "common/boundary.h"
 #include "common/sort.h"
 
-/* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex diagram.
-   Each crossing of an edge with a face is computed once, for both cells beside it, so that trimmed cells tile the domain. */
+/* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex
+   diagram. Each crossing of an edge with a face is computed once, for both cells beside it, so that trimmed cells tile
+   the domain. */
 
 /* Bits of the word in which kernels report what went wrong; see common/face_rows.h. */
 #define FLAG_LOST 1    /* a walk found no way on */
@@ -14,10 +15,11 @@ inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
     return dot(d, d);
 }
 
-/* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is nearer.
-   `inner` are the vertices a few roundings further inside, so that what lies on faces counts to the cells within. */
-kernel void find_owners(const int size, global const REAL2 *inner, global const int *starts, global const int *neighbours,
-                        global const REAL *points, global int *owners)
+/* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is
+   nearer. `inner` are the vertices a few roundings further inside, so that what lies on faces counts to the cells
+   within. */
+kernel void find_owners(const int size, global const REAL2 *inner, global const int *starts,
+                        global const int *neighbours, global const REAL *points, global int *owners)
 {
     WORK_ITEM(v);
     const REAL2 y = inner[v];
@@ -54,8 +56,9 @@ inline bool is_on_face(REAL beyond, REAL d2)
     return beyond * beyond <= ON_FACE * ON_FACE * d2;
 }
 
-/* On which side of the faces between generators at x and x + d does a corner v of the polygon count that lies on their line?
-   On that of its own generator at `own`, if v is a point of the cell of x. Elsewhere on the left of edge e. Positive: of x + d. */
+/* On which side of the faces between generators at x and x + d does a corner v of the polygon count that lies on their
+   line? On that of its own generator at `own`, if v is a point of the cell of x. Elsewhere on the left of edge e.
+   Positive: of x + d. */
 inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
 {
     const REAL2 between = x - own;
@@ -64,13 +67,15 @@ inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
     return side != 0 ? side : e.s0 * d.s1 - e.s1 * d.s0;
 }
 
-/* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, from cell `origin` to cell `target`; -1 if there is none.
-   Of the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends. Where rounding
-   has led past the end of the edge, the neighbour that is nearest to the target's generator: that way leads to it.
+/* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, from cell `origin` to cell `target`; -1 if there is
+   none. Of the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends.
+   Where rounding has led past the end of the edge, the neighbour that is nearest to the target's generator: that way
+   leads to it.
 
-   Rounding must not choose an order of crossings that no edges could have. An end of the edge on a face counts as a little
-   inside the cell that it is in, a share of the way to its generator, and faces there are crossed in that order (rank), at
-   the end itself. An edge on a face counts to the side of its ends: to the cell on its left, as ends are moved inwards. */
+   Rounding must not choose an order of crossings that no edges could have. An end of the edge on a face counts as a
+   little inside the cell that it is in, a share of the way to its generator, and faces there are crossed in that order
+   (rank), at the end itself. An edge on a face counts to the side of its ends: to the cell on its left, as ends are
+   moved inwards. */
 inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
                       global const int *neighbours, global const REAL *points, REAL *t)
 {
@@ -91,7 +96,8 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
             towards = j;
         }
         const REAL along = dot(e, d), dd = dot(d, d);
-        const bool begins_on = is_on_face(dot(a - x - d / 2, d), dd), ends_on = is_on_face(dot(a + e - x - d / 2, d), dd);
+        const bool begins_on = is_on_face(dot(a - x - d / 2, d), dd),
+                   ends_on = is_on_face(dot(a + e - x - d / 2, d), dd);
         REAL at = 0, rank = -REAL_MAX;
         if (begins_on && ends_on) {
             if (side_of(a + e, goal, x, d, e) <= 0)
@@ -121,12 +127,13 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
     return past ? towards : next;
 }
 
-/* Per edge: walk along it. Without chord_cells only the number of chords is counted. `generators` are those in the domain;
-   the cells of others must not be met: those are marked. */
-kernel void walk_edges(const int size, const int generators, global const REAL2 *vertices, global const int *next_vertex,
-                       global const int *owners, global const int *starts, global const int *neighbours,
-                       global const REAL *points, const int write, global int *firsts, global int *chord_cells,
-                       global int *chord_edges, global REAL *chord_ends, global int *intruders, global int *flags)
+/* Per edge: walk along it. Without chord_cells only the number of chords is counted. `generators` are those in the
+   domain; the cells of others must not be met: those are marked. */
+kernel void walk_edges(const int size, const int generators, global const REAL2 *vertices,
+                       global const int *next_vertex, global const int *owners, global const int *starts,
+                       global const int *neighbours, global const REAL *points, const int write, global int *firsts,
+                       global int *chord_cells, global int *chord_edges, global REAL *chord_ends, global int *intruders,
+                       global int *flags)
 {
     WORK_ITEM(v);
     const int w = next_vertex[v], target = owners[w];
@@ -194,8 +201,8 @@ kernel void count_chords(const int size, global const int *chord_cells, global c
 }
 
 /* Per chord: into the list of its cell. The order is put right by sort_chords. */
-kernel void place_chords(const int size, global const int *chord_cells, global const int *slots, global const int *ranks,
-                         global const int *starts, global int *listed)
+kernel void place_chords(const int size, global const int *chord_cells, global const int *slots,
+                         global const int *ranks, global const int *starts, global int *listed)
 {
     WORK_ITEM(c);
     listed[starts[slots[chord_cells[c]]] + ranks[c]] = c;

@@ -2,18 +2,16 @@
 #include "common/join.h"
 #include "common/clip.h"
 
-/* The corners of a diagram's cells in 3D, and which of them are surely one vertex. Each cell is clipped once more, by its
-   neighbours alone. Its vertices, the corners, are numbered cell by cell: corner u. Two corners are one vertex where the
-   same four generators or walls meet, whatever their positions have rounded to, and where an edge between them has no
-   length; the least corner of a vertex is its label. What is left to agree about is that of loops.cl.
+/* The corners of a diagram's cells in 3D, and which of them are surely one vertex. Each cell is clipped once more, by
+   its neighbours alone. Its vertices, the corners, are numbered cell by cell: corner u. Two corners are one vertex
+   where the same four generators or walls meet, whatever their positions have rounded to, and where an edge between
+   them has no length; the least corner of a vertex is its label. What is left to agree about is that of loops.cl.
 
    starts, neighbours          the graph: faces k, in rows i
-   view_starts (n + 1,)        rows of views, a cell's faces as it sees them itself: those of the graph in its order, then
-                               walls that the cell touches although the graph has no face there
-   view_labels (v,)            a generator, or -1 - wall
-   corner_starts (n + 1,)      first corner of each cell; its first turn is the triple of that
-   turn_starts (v + 1,)        first turn of each view: its loop, counter-clockwise from outside
-   turns (t,)                  corners */
+   view_starts (n + 1,)        rows of views, a cell's faces as it sees them itself: those of the graph in its order,
+   then walls that the cell touches although the graph has no face there view_labels (v,)            a generator, or -1
+   - wall corner_starts (n + 1,)      first corner of each cell; its first turn is the triple of that turn_starts (v +
+   1,)        first turn of each view: its loop, counter-clockwise from outside turns (t,)                  corners */
 
 /* The cell of generator i; false if there is not enough room. */
 inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
@@ -52,8 +50,8 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
     view_counts[i] = count;
 }
 
-/* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each, as
-   the bisector of generators d apart rounds by r / d of what they do at the distance r. */
+/* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each,
+   as the bisector of generators d apart rounds by r / d of what they do at the distance r. */
 inline REAL sharpness_of(const cell_t *cell, int v)
 {
     const INDEX4 f = cell->faces[v];
@@ -140,7 +138,8 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
                 const int w = cell.at[a[e + 1] * FACE_CAPACITY + a[e]];
                 if (joined[w] >= joined[v])
                     continue;
-                const REAL dx = X(&cell)[w] - X(&cell)[v], dy = Y(&cell)[w] - Y(&cell)[v], dz = Z(&cell)[w] - Z(&cell)[v];
+                const REAL dx = X(&cell)[w] - X(&cell)[v], dy = Y(&cell)[w] - Y(&cell)[v],
+                           dz = Z(&cell)[w] - Z(&cell)[v];
                 if (dx * dx + dy * dy + dz * dz < least * least) {
                     joined[v] = joined[w];
                     changed = true;
@@ -168,8 +167,8 @@ inline bool has_label(global const int *corner_faces, int u, int label)
     return corner_faces[3 * u] == label || corner_faces[3 * u + 1] == label || corner_faces[3 * u + 2] == label;
 }
 
-/* Per corner u of cell i, where the faces a, b, c meet: twin_corners[u], that of the first cell before i in which the same
-   four meet, or u. */
+/* Per corner u of cell i, where the faces a, b, c meet: twin_corners[u], that of the first cell before i in which the
+   same four meet, or u. */
 kernel void match_corners(const int size, global const int *owners, global const int *corner_starts,
                           global const int *corner_faces, global int *twin_corners)
 {
@@ -191,10 +190,10 @@ kernel void match_corners(const int size, global const int *owners, global const
     twin_corners[u] = found;
 }
 
-/* Per corner u: pass on the least label to the corners that are one vertex with it. The least of all is where this ends, in
-   whatever order. */
-kernel void spread_labels(const int size, global const int *same, global const int *twin_corners,
-                          global const int *old, global int *new, global int *changed)
+/* Per corner u: pass on the least label to the corners that are one vertex with it. The least of all is where this
+   ends, in whatever order. */
+kernel void spread_labels(const int size, global const int *same, global const int *twin_corners, global const int *old,
+                          global int *new, global int *changed)
 {
     WORK_ITEM(u);
     bool any = join(old, new, u, same[u]);

@@ -37,42 +37,46 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
 
 /* Per generator i: grad log h by least squares over the neighbours, weighted by 1 / distance^2. One evaluation of h per
    generator serves all that needs its gradient, and the fit averages over kinks of h at the scale of the cells. */
-kernel void fit_gradient(const int size, global const int *starts, global const int *neighbours, global const REAL *points,
-                         global const REAL *log_h, global REAL *gradient)
+kernel void fit_gradient(const int size, global const int *starts, global const int *neighbours,
+                         global const REAL *points, global const REAL *log_h, global REAL *gradient)
 {
     WORK_ITEM(i);
     MANY(REAL) sums[DIM][DIM], rises[DIM];
     REAL m[DIM][DIM], b[DIM], g[DIM];
-    EACH_AXIS(p) {
+    EACH_AXIS(p)
+    {
         rises[p] = 0;
         EACH_AXIS(q)
-            sums[p][q] = 0;
+        sums[p][q] = 0;
     }
     const int faces = starts[size], end = starts[i + 1];
     for (int k = starts[i]; k < end; k += AT_ONCE) {
         const MANY(int) facing = TAKE(int, neighbours, k, faces), counts = INSIDE(k, end) & (facing >= 0);
         const MANY(int) j = CHOOSE(int, counts, facing, i);
         MANY(REAL) d[DIM], d2 = 0;
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
             d2 += d[a] * d[a];
         }
         /* What does not count is at no distance. */
         const MANY(REAL) weight = 1 / CHOOSE(REAL, counts, d2, 1), rise = PICK(REAL, log_h, j, 1, 0) - log_h[i];
-        EACH_AXIS(p) {
+        EACH_AXIS(p)
+        {
             const MANY(REAL) weighted = d[p] * weight;
             rises[p] += weighted * rise;
             EACH_AXIS(q)
-                if (q >= p)
-                    sums[p][q] += weighted * d[q];
+            if (q >= p)
+                sums[p][q] += weighted * d[q];
         }
     }
-    EACH_AXIS(p) {
+    EACH_AXIS(p)
+    {
         b[p] = SUM(REAL, rises[p]);
         g[p] = 0;
         EACH_AXIS(q)
-            if (q >= p)
-                m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
+        if (q >= p)
+            m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
     /* Too few or collinear neighbours leave the gradient undetermined: take none. */
     const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);
@@ -90,28 +94,31 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
     const REAL det = m[0][0] * c0 + m[0][1] * c1 + m[0][2] * c2;
     if (det > least * trace * trace * trace) {
         g[0] = (b[0] * c0 + b[1] * (m[0][2] * m[2][1] - m[0][1] * m[2][2]) +
-                b[2] * (m[0][1] * m[1][2] - m[0][2] * m[1][1])) / det;
+                b[2] * (m[0][1] * m[1][2] - m[0][2] * m[1][1])) /
+               det;
         g[1] = (b[0] * c1 + b[1] * (m[0][0] * m[2][2] - m[0][2] * m[2][0]) +
-                b[2] * (m[0][2] * m[1][0] - m[0][0] * m[1][2])) / det;
+                b[2] * (m[0][2] * m[1][0] - m[0][0] * m[1][2])) /
+               det;
         g[2] = (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) +
-                b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) / det;
+                b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
+               det;
     }
 #endif
     EACH_AXIS(a)
-        gradient[DIM * i + a] = g[a];
+    gradient[DIM * i + a] = g[a];
 }
 
 /* Per generator i: displacement to the centroid weighted by h^-(d + 2) (the paper's 2.4; the density whose centroidal
    diagrams have cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell that is
    c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
    nothing. */
-kernel void weight_offsets(const int size, global const REAL *offsets, global const REAL *covariances, global const REAL *gradient,
-                           global REAL *lloyd)
+kernel void weight_offsets(const int size, global const REAL *offsets, global const REAL *covariances,
+                           global const REAL *gradient, global REAL *lloyd)
 {
     WORK_ITEM(i);
     REAL g[DIM];
     EACH_AXIS(a)
-        g[a] = -(DIM + 2) * gradient[DIM * i + a];
+    g[a] = -(DIM + 2) * gradient[DIM * i + a];
 #if DIM == 2
     const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
     lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];

@@ -18,8 +18,8 @@
 /* A fall that counts, relative to u. */
 #define NOTABLE (8 * REAL_EPS)
 
-/* The u of the scheme from the lesser neighbours a (REAL_MAX: none) at distances d: in the order of ascending a, as many
-   axes count as have a below the u that those before them give. */
+/* The u of the scheme from the lesser neighbours a (REAL_MAX: none) at distances d: in the order of ascending a, as
+   many axes count as have a below the u that those before them give. */
 inline REAL upwind(REAL *a, REAL *d, REAL growth)
 {
     for (int k = 1; k < DIM; ++k)
@@ -31,7 +31,8 @@ inline REAL upwind(REAL *a, REAL *d, REAL growth)
             d[j] = d[j - 1];
             d[j - 1] = swap;
         }
-    /* With b = a - a_0 and w = 1/d^2: u - a_0 = (S + sqrt(g^2 W - W T + S^2)) / W, W = sum w, S = sum w b, T = sum w b^2. */
+    /* With b = a - a_0 and w = 1/d^2: u - a_0 = (S + sqrt(g^2 W - W T + S^2)) / W, W = sum w, S = sum w b, T = sum w
+       b^2. */
     REAL rise = growth * d[0];
     REAL W = 1 / (d[0] * d[0]), S = 0, T = 0;
     for (int k = 1; k < DIM; ++k) {

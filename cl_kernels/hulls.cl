@@ -143,7 +143,7 @@ kernel void wrap_cells(const int size, const int n, const int rows_wanted, globa
         list.nearest = 0;
         int kept = 0;
         /* Of the generators nearer than `done` all are in the list that can be neighbours; now those nearer than `r`
-         * are added. */
+           are added. */
         const double8 unit = vload8(0, spacings);
         double8 done2 = 0, r = first_look(&needs, first_reach) * unit;
         long8 todo = vload8(0, wanted), walled = 0;

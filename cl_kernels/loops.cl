@@ -1,16 +1,17 @@
 #include "common/join.h"
 #include "common/noise.h"
 
-/* Loops of faces in 3D, from each cell's view of its own faces (corners.cl). Where many cells meet, or a face is as narrow
-   as vertices round, cells see different corners. A cell's own view is closed whatever is done to it by
+/* Loops of faces in 3D, from each cell's view of its own faces (corners.cl). Where many cells meet, or a face is as
+   narrow as vertices round, cells see different corners. A cell's own view is closed whatever is done to it by
 
      - joining vertices, everywhere;
      - putting a vertex into one of its edges, in both faces there;
      - leaving out of a loop what it passes there and back (a spur), and with it faces that are nothing else.
 
-   So views of a face that differ are brought together by these, within a tolerance: corners of either view that are near
-   each other are joined, and corners near an edge are put into it, as in snap rounding. Where nothing is near enough, the
-   tolerance of the face is doubled. In the end both cells of every face see the same loop, or both see none.
+   So views of a face that differ are brought together by these, within a tolerance: corners of either view that are
+   near each other are joined, and corners near an edge are put into it, as in snap rounding. Where nothing is near
+   enough, the tolerance of the face is doubled. In the end both cells of every face see the same loop, or both see
+   none.
 
    twins (v,)                  the same face in the neighbour's row; itself for a wall, -1 where the graph has no face
    turn_starts, turns          of each view: its loop with what was put into it, corners; labels[u] is the vertex of u
@@ -77,7 +78,8 @@ kernel void reduce_views(const int size, global const int *turn_starts, global c
     reduced_counts[k] = n;
 }
 
-/* Per view k: does it differ from its twin, or pass a vertex twice? Views without a face in the graph should be nothing. */
+/* Per view k: does it differ from its twin, or pass a vertex twice? Views without a face in the graph should be
+   nothing. */
 kernel void compare_views(const int size, global const int *twins, global const int *turn_starts,
                           global const int *reduced, global const int *reduced_counts, global uchar *differs,
                           global int *any)
@@ -140,7 +142,8 @@ typedef struct {
 inline REAL4 place_of(int label, const places_t *in)
 {
     const int u = in->chosen[label], i = in->owners[u];
-    return (REAL4)(in->points[3 * i] - in->x.s0 + in->corners[3 * u], in->points[3 * i + 1] - in->x.s1 + in->corners[3 * u + 1],
+    return (REAL4)(in->points[3 * i] - in->x.s0 + in->corners[3 * u],
+                   in->points[3 * i + 1] - in->x.s1 + in->corners[3 * u + 1],
                    in->points[3 * i + 2] - in->x.s2 + in->corners[3 * u + 2], 0);
 }
 
@@ -175,8 +178,8 @@ inline int2 turns_of(int view, global const int *turn_starts)
     return view < 0 ? (int2)(0, 0) : (int2)(turn_starts[view], turn_starts[view + 1]);
 }
 
-/* Per view k that differs from its twin, the lesser of both: bring them together by one step. joined[u] is the new label,
-   proposals[t] a vertex to be put into the edge that leaves turn t, or -1. */
+/* Per view k that differs from its twin, the lesser of both: bring them together by one step. joined[u] is the new
+   label, proposals[t] a vertex to be put into the edge that leaves turn t, or -1. */
 kernel void snap_views(const int size, global const REAL *points, global const REAL *corners, global const int *owners,
                        global const int *labels, global const int *chosen, global const int *twins,
                        global const int *turn_starts, global const int *turns, global const int *chains,
@@ -190,7 +193,12 @@ kernel void snap_views(const int size, global const REAL *points, global const R
     const int2 ranges[2] = {turns_of(k, turn_starts), turns_of(twin > k ? twin : -1, turn_starts)};
     const int own = ranges[0].s0 < ranges[0].s1 ? ranges[0].s0 : ranges[1].s0;
     const int i = owners[turns[own]];
-    const places_t in = {points, corners, owners, labels, chosen, turns,
+    const places_t in = {points,
+                         corners,
+                         owners,
+                         labels,
+                         chosen,
+                         turns,
                          (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0)};
     REAL far2 = 0;
     for (int r = 0; r < 2; ++r)
@@ -292,8 +300,8 @@ kernel void write_views(const int size, global const int *turn_starts, global co
     }
 }
 
-/* Per corner u: the greatest sharpness at its vertex, in best[label], which begins as 0. Bits of floats >= 0 are in their
-   order. */
+/* Per corner u: the greatest sharpness at its vertex, in best[label], which begins as 0. Bits of floats >= 0 are in
+   their order. */
 kernel void rate_corners(const int size, global const int *labels, global const float *sharpness, global uint *best)
 {
     WORK_ITEM(u);

@@ -1,11 +1,20 @@
 #include "common/outline.h"
 
 #if DIM == 2
-/* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Nearly all cells have so few sides that it need not be evaluated. */
-constant REAL ROUNDNESS[12] = {
-    0, 0, 0, R(20.784609690826521), R(15.999999999999998), R(14.530850560107218), R(13.856406460551018),
-    R(13.484089326610802), R(13.254833995939041), R(13.102928433583283), R(12.996787849316252),
-    R(12.919565689288136)};
+/* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Nearly all cells have so few sides that it need not be
+   evaluated. */
+constant REAL ROUNDNESS[12] = {0,
+                               0,
+                               0,
+                               R(20.784609690826521),
+                               R(15.999999999999998),
+                               R(14.530850560107218),
+                               R(13.856406460551018),
+                               R(13.484089326610802),
+                               R(13.254833995939041),
+                               R(13.102928433583283),
+                               R(12.996787849316252),
+                               R(12.919565689288136)};
 
 inline REAL regular_roundness(int n)
 {
@@ -20,9 +29,10 @@ inline REAL regular_roundness(int n)
    energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
    quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
-kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts, global const FACE *face_measures,
-                            global const REAL *offsets, global const REAL *covariances, global const REAL *h,
-                            global REAL *error, global REAL *quality, global REAL *energy, global REAL *reach OUTLINE_ARGS)
+kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
+                            global const FACE *face_measures, global const REAL *offsets,
+                            global const REAL *covariances, global const REAL *h, global REAL *error,
+                            global REAL *quality, global REAL *energy, global REAL *reach OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
@@ -64,8 +74,9 @@ inline ulong mixed(ulong v)
 
 /* Per generator i: has its set of neighbours changed since the signature was taken? signatures[i] is renewed, and
    ever[i] remembers. Walls count as neighbours. labels name generators for good, whatever their present index. */
-kernel void compare_neighbours(const int size, global const int *starts, global const int *neighbours, global const int *labels,
-                               const int first, global ulong *signatures, global REAL *changed, global REAL *ever)
+kernel void compare_neighbours(const int size, global const int *starts, global const int *neighbours,
+                               global const int *labels, const int first, global ulong *signatures,
+                               global REAL *changed, global REAL *ever)
 {
     WORK_ITEM(i);
     ulong signature = 0;
@@ -80,7 +91,8 @@ kernel void compare_neighbours(const int size, global const int *starts, global 
 }
 
 /* Per generator i that does not move, labels[i] < fixed: the size that its cell has is the right one. */
-kernel void hold_sizes(const int size, global const int *labels, const int fixed, global const REAL *volumes, global REAL *h)
+kernel void hold_sizes(const int size, global const int *labels, const int fixed, global const REAL *volumes,
+                       global REAL *h)
 {
     WORK_ITEM(i);
     if (labels[i] < fixed)

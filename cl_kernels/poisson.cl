@@ -2,8 +2,8 @@
 
        (A phi)_i = sum_j w_ij (phi_i - phi_j)        w_ij = rho_ij l_ij / |x_i - x_j|
 
-   One work-item per cell in `assemble`, a block of cells per group elsewhere. Columns are the diagram's neighbours: walls are
-   negative, and have weight 0. Weights and the vectors of an iteration are in STORE, which may be single. */
+   One work-item per cell in `assemble`, a block of cells per group elsewhere. Columns are the diagram's neighbours:
+   walls are negative, and have weight 0. Weights and the vectors of an iteration are in STORE, which may be single. */
 #include "common/domain.h"
 #include "common/blocks.h"
 #include "common/reduce.h"
@@ -14,8 +14,8 @@
 
 /* The measure that cell j has of its face with cell i, -1 if it has none; eight of its faces at a time on a CPU, as in
    row_difference. */
-inline REAL measured_by(
-    int j, int i, int last, global const int *starts, global const int *neighbours, global const FACE *face_measures)
+inline REAL measured_by(int j, int i, int last, global const int *starts, global const int *neighbours,
+                        global const FACE *face_measures)
 {
     const int end = starts[j + 1];
     int k = starts[j];
@@ -31,19 +31,22 @@ inline REAL measured_by(
     }
 #endif
     for (; k < end; ++k)
-        if (neighbours[k] == i) measure = fmax(measure, (REAL)face_measures[k]);
+        if (neighbours[k] == i)
+            measure = fmax(measure, (REAL)face_measures[k]);
     return measure;
 }
 
-/* Weights. The two cells of a face have measured it each for itself, with roundings of their own: both take the mean of the two,
-   so that A is symmetric to the last bit. A face that only one of them has seen is shorter than rounding, and gets the
-   weight 0, as do walls. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho is smooth. */
-kernel void assemble(
-    int n, int weighted, global const int *starts, global const int *neighbours, global const FACE *face_measures,
-    global const REAL *points, global const REAL *density, global STORE *weights)
+/* Weights. The two cells of a face have measured it each for itself, with roundings of their own: both take the mean of
+   the two, so that A is symmetric to the last bit. A face that only one of them has seen is shorter than rounding, and
+   gets the weight 0, as do walls. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho
+   is smooth. */
+kernel void assemble(int n, int weighted, global const int *starts, global const int *neighbours,
+                     global const FACE *face_measures, global const REAL *points, global const REAL *density,
+                     global STORE *weights)
 {
     const int i = get_global_id(0);
-    if (i >= n) return;
+    if (i >= n)
+        return;
     const REAL root_i = weighted ? sqrt(density[i]) : R(1);
     const int last = starts[n] - 8;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -52,13 +55,15 @@ kernel void assemble(
         if (j >= 0 && j != i) {
             const REAL other = measured_by(j, i, last, starts, neighbours, face_measures);
             REAL square = 0;
-            EACH_AXIS(a) {
+            EACH_AXIS(a)
+            {
                 const REAL d = DIFFERENCE(a, points[i * DIM + a], points[j * DIM + a]);
                 square += d * d;
             }
             if (other >= 0) {
                 weight = R(0.5) * (face_measures[k] + other) / sqrt(square);
-                if (weighted) weight *= root_i * sqrt(density[j]);
+                if (weighted)
+                    weight *= root_i * sqrt(density[j]);
             }
         }
         weights[k] = weight;
@@ -69,16 +74,17 @@ kernel void assemble(
 kernel void invert_diagonal(int n, global const int *starts, global const STORE *weights, global STORE *inverse)
 {
     const int i = get_global_id(0);
-    if (i >= n) return;
+    if (i >= n)
+        return;
     REAL sum = 0;
-    for (int k = starts[i]; k < starts[i + 1]; ++k) sum += weights[k];
+    for (int k = starts[i]; k < starts[i + 1]; ++k)
+        sum += weights[k];
     inverse[i] = sum == 0 ? 0 : 1 / sum;
 }
 
 /* y = A x, and row `q` of partial = (x, y). */
-kernel void apply(
-    int n, int q, global const int *starts, global const int *columns, global const STORE *weights, global const STORE *x,
-    global STORE *y, global REAL *partial)
+kernel void apply(int n, int q, global const int *starts, global const int *columns, global const STORE *weights,
+                  global const STORE *x, global STORE *y, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum product = SUM_ZERO;
@@ -88,18 +94,19 @@ kernel void apply(
         sum_add(&product, (REAL)x[i] * yi);
     }
     const REAL put = group_sum(product.value, scratch);
-    if (get_local_id(0) == 0) partial[q * get_num_groups(0) + get_group_id(0)] = put;
+    if (get_local_id(0) == 0)
+        partial[q * get_num_groups(0) + get_group_id(0)] = put;
 }
 
 /* The same without the product, for an x in full precision: the residual of a start. */
-kernel void apply_full(
-    int n, global const int *starts, global const int *columns, global const STORE *weights, global const REAL *x,
-    global STORE *y)
+kernel void apply_full(int n, global const int *starts, global const int *columns, global const STORE *weights,
+                       global const REAL *x, global STORE *y)
 {
     for (BLOCK_LOOP(i, n)) {
         REAL sum = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k)
-            if (columns[k] >= 0) sum += weights[k] * (x[i] - x[columns[k]]);
+            if (columns[k] >= 0)
+                sum += weights[k] * (x[i] - x[columns[k]]);
         y[i] = sum;
     }
 }
@@ -120,11 +127,12 @@ kernel void source_sums(int n, global const REAL *source, global const REAL *vol
     }
 }
 
-kernel void compatible(
-    int n, global const REAL *source, global const REAL *volumes, global REAL *rhs, global const REAL *partial)
+kernel void compatible(int n, global const REAL *source, global const REAL *volumes, global REAL *rhs,
+                       global const REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     const REAL moment = total_sum(partial, scratch), volume = total_sum(partial + get_num_groups(0), scratch);
     const REAL mean = moment / volume;
-    for (BLOCK_LOOP(i, n)) rhs[i] = volumes[i] * (source[i] - mean);
+    for (BLOCK_LOOP(i, n))
+        rhs[i] = volumes[i] * (source[i] - mean);
 }

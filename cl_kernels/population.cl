@@ -3,8 +3,8 @@
 
 /* Insertion and deletion of generators: the paper's 2.3.1, where the lattice (in 2D) and the count ask for it.
 
-   A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell (charge -1
-   and +1). One that sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the
+   A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell (charge
+   -1 and +1). One that sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the
    5-sided one goes. One that has come to a wall ends there. The same moves carry the count of generators to what the
    size field asks for. Sites act at the same time only if they are several rings of cells apart. */
 
@@ -25,13 +25,14 @@ inline ulong site_key(REAL magnitude, int i)
 #if DIM == 2
 inline REAL2 difference(global const REAL *points, int from, int to)
 {
-    return (REAL2)(DIFFERENCE(0, points[2 * from], points[2 * to]), DIFFERENCE(1, points[2 * from + 1], points[2 * to + 1]));
+    return (REAL2)(DIFFERENCE(0, points[2 * from], points[2 * to]),
+                   DIFFERENCE(1, points[2 * from + 1], points[2 * to + 1]));
 }
 
 #define LATTICE_2 R(1.1547005383792515) /* (neighbour distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
 
-/* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5 at
-   a wall, 4 in a corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an
+/* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5
+   at a wall, 4 in a corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an
    unstrained lattice, in single precision: it is compared with thresholds. Only six-sided inner cells have weight. */
 kernel void measure_strain(const int size, global const int *starts, global const int *neighbours,
                            global const REAL *points, global const REAL *h, global int2 *kinds,
@@ -51,7 +52,8 @@ kernel void measure_strain(const int size, global const int *starts, global cons
         s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(d.s0 * d.s0, d.s0 * d.s1, d.s1 * d.s1, 0);
     }
 #ifdef POLYGON
-    /* Half a neighbour more or less is none. A cell between two boundaries, or at a sharp corner, is as one in a corner. */
+    /* Half a neighbour more or less is none. A cell between two boundaries, or at a sharp corner, is as one in a
+       corner. */
     const REAL charge = n - walls - outlines[i].s1;
     kinds[i] = (int2)((int)(charge > 0 ? ceil(charge - R(0.5)) : floor(charge + R(0.5))),
                       walls == 0 ? 0 : (outlines[i].s1 < R(3.2) ? 2 : 1));
@@ -83,9 +85,10 @@ kernel void average_strain(const int size, global const int *starts, global cons
     mean[i] = sum;
 }
 
-/* Per cell i of negative charge: the pull s = b.S.b - t.S.t on its pair with the neighbour of positive charge where |s| is
-   largest, t from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if wanted,
-   come first: they can go altogether. So do those of a cell with a charge of 2, the worst cells that there are. */
+/* Per cell i of negative charge: the pull s = b.S.b - t.S.t on its pair with the neighbour of positive charge where |s|
+   is largest, t from i to the neighbour, b across. Pairs with both cells at walls are left alone; those with one, if
+   wanted, come first: they can go altogether. So do those of a cell with a charge of 2, the worst cells that there
+   are. */
 kernel void score_pairs(const int size, global const int *starts, global const int *neighbours,
                         global const REAL *points, global const int2 *kinds, global const float4 *strain,
                         const int at_walls, global int *partners, global REAL *pull, global ulong *keys)
@@ -123,8 +126,8 @@ kernel void score_pairs(const int size, global const int *starts, global const i
 #endif
 
 /* Per generator i: the largest key in itself and its neighbours. */
-kernel void spread_keys(const int size, global const int *starts, global const int *neighbours, global const ulong *keys,
-                        global ulong *spread)
+kernel void spread_keys(const int size, global const int *starts, global const int *neighbours,
+                        global const ulong *keys, global ulong *spread)
 {
     WORK_ITEM(i);
     ulong key = keys[i];
@@ -134,7 +137,8 @@ kernel void spread_keys(const int size, global const int *starts, global const i
     spread[i] = key;
 }
 
-/* Per generator i: a site whose key is the largest for rings around is chosen; `chosen` collects over several rounds. */
+/* Per generator i: a site whose key is the largest for rings around is chosen; `chosen` collects over several
+   rounds. */
 kernel void choose_sites(const int size, global const ulong *keys, global const ulong *spread, global ulong *chosen,
                          global ulong *latest)
 {
@@ -154,9 +158,10 @@ kernel void drop_sites(const int size, global const ulong *spread, global ulong 
         keys[i] = 0;
 }
 
-/* Per generator i: no site where it does not move (labels less than `fixed`) or, with `around`, one of its neighbours. */
-kernel void exempt_fixed(const int size, global const int *starts, global const int *neighbours, global const int *labels,
-                         const int fixed, const int around, global ulong *keys)
+/* Per generator i: no site where it does not move (labels less than `fixed`) or, with `around`, one of its
+   neighbours. */
+kernel void exempt_fixed(const int size, global const int *starts, global const int *neighbours,
+                         global const int *labels, const int fixed, const int around, global ulong *keys)
 {
     WORK_ITEM(i);
     bool near = labels[i] < fixed;
@@ -192,10 +197,10 @@ kernel void flag_sites(const int size, global const ulong *chosen, global int *f
 }
 
 #if DIM == 2
-/* What a pair does to the count of generators, 1 if it is split, -1 if it is deleted. Thresholds give way as the count needs:
-   shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A pair with one cell at a wall ends there, unless the
-   strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. An inner cell of four
-   sides always goes, one of eight is always split. */
+/* What a pair does to the count of generators, 1 if it is split, -1 if it is deleted. Thresholds give way as the count
+   needs: shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A pair with one cell at a wall ends there,
+   unless the strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. An
+   inner cell of four sides always goes, one of eight is always split. */
 inline int pair_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
 {
     if (minus.s0 < -1 && minus.s1 == 0)
@@ -252,8 +257,8 @@ kernel void mark_pairs(const int size, global const ulong *chosen, global const 
     births[j] = -shifts[j];
 }
 
-/* Per six-sided cell i among six-sided cells: the anisotropy of the strain, the difference of its eigenvalues, as a site
-   where a pair may be made. */
+/* Per six-sided cell i among six-sided cells: the anisotropy of the strain, the difference of its eigenvalues, as a
+   site where a pair may be made. */
 kernel void score_strain(const int size, global const int *starts, global const int *neighbours,
                          global const int2 *kinds, global const float4 *strain, const REAL threshold,
                          global ulong *keys)
@@ -270,8 +275,8 @@ kernel void score_strain(const int size, global const int *starts, global const 
 /* Per chosen site, by its rank in turn: a new generator in the middle of its longest edge, or itself and its nearest
    neighbour merged. */
 kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, global const int *starts,
-                        global const int *neighbours, global const REAL *points, global int *kept,
-                        global REAL2 *shifts, global int *born, global REAL2 *births, global ulong *busy)
+                        global const int *neighbours, global const REAL *points, global int *kept, global REAL2 *shifts,
+                        global int *born, global REAL2 *births, global ulong *busy)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -300,9 +305,9 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
 
 #endif
 
-/* Per generator i: the excess of its cell, in the sense of `sign`, as a site to split (sign > 0) or to delete. Cells of few
-   faces go, those of many are split, if their excess is alike. Above 4 all are alike. A cell without neighbours stays: it
-   is the last of its piece of the domain. */
+/* Per generator i: the excess of its cell, in the sense of `sign`, as a site to split (sign > 0) or to delete. Cells of
+   few faces go, those of many are split, if their excess is alike. Above 4 all are alike. A cell without neighbours
+   stays: it is the last of its piece of the domain. */
 kernel void score_excess(const int size, global const int *starts, global const int *neighbours,
                          global const REAL *excess, const REAL sign, global ulong *keys)
 {
@@ -369,9 +374,8 @@ kernel void mark_excess(const int size, global const ulong *chosen, const REAL s
 
 /* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
    generators go behind all kept rows, with new labels. */
-kernel void apply_changes(const int size, global const int *place, global const int *birth_place,
-                          const int next_label, DOMAIN_ARGS,
-                          global const REAL *points, global const int *labels, global const REAL *velocity,
+kernel void apply_changes(const int size, global const int *place, global const int *birth_place, const int next_label,
+                          DOMAIN_ARGS, global const REAL *points, global const int *labels, global const REAL *velocity,
                           global const ulong *signatures, global const REAL *ever, global const REAL *shifts,
                           global const REAL *births, global REAL *new_points, global int *new_labels,
                           global REAL *new_velocity, global ulong *new_signatures, global REAL *new_ever)
@@ -379,18 +383,20 @@ kernel void apply_changes(const int size, global const int *place, global const 
     WORK_ITEM(i);
     REAL x[DIM], y[DIM];
     EACH_AXIS(a)
-        x[a] = points[DIM * i + a];
+    x[a] = points[DIM * i + a];
     if (place[i + 1] > place[i]) {
         const int p = place[i];
         bool moved = false;
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             const REAL shift = shifts[DIM * i + a];
             moved |= shift != 0;
             y[a] = x[a] + shift;
         }
         if (moved)
             keep_inside(x, y, DOMAIN);
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             new_points[DIM * p + a] = y[a];
             new_velocity[DIM * p + a] = moved ? 0 : velocity[DIM * i + a];
         }
@@ -401,9 +407,10 @@ kernel void apply_changes(const int size, global const int *place, global const 
     if (birth_place[i + 1] > birth_place[i]) {
         const int q = place[size] + birth_place[i];
         EACH_AXIS(a)
-            y[a] = x[a] + births[DIM * i + a];
+        y[a] = x[a] + births[DIM * i + a];
         keep_inside(x, y, DOMAIN);
-        EACH_AXIS(a) {
+        EACH_AXIS(a)
+        {
             new_points[DIM * q + a] = y[a];
             new_velocity[DIM * q + a] = 0;
         }

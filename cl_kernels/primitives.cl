@@ -63,17 +63,17 @@ kernel void scan_few(const int size, global const int *values, const int first, 
     out[n] = total;
 }
 
-/* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier, with Knuth's exact difference, which
-   has no branch), so that float32 totals of millions of terms stay exact to a few ulp. */
+/* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier, with Knuth's exact difference,
+   which has no branch), so that float32 totals of millions of terms stay exact to a few ulp. */
 typedef struct {
     REAL sum, sum_low, magnitude, magnitude_low, least, largest;
 } summary_t;
 
-#define ADD_COMPENSATED(T, sum, low, value) \
-    do { \
-        const T total_ = (sum) + (value), part_ = total_ - (sum); \
-        (low) += ((sum) - (total_ - part_)) + ((value) - part_); \
-        (sum) = total_; \
+#define ADD_COMPENSATED(T, sum, low, value)                                                                            \
+    do {                                                                                                               \
+        const T total_ = (sum) + (value), part_ = total_ - (sum);                                                      \
+        (low) += ((sum) - (total_ - part_)) + ((value)-part_);                                                         \
+        (sum) = total_;                                                                                                \
     } while (0)
 
 inline void merge_summary(summary_t *a, summary_t b)
@@ -136,8 +136,8 @@ kernel void summarise_blocks(global const REAL *a0, global const REAL *a1, globa
     local summary_t shares[GROUP_SIZE];
 #endif
     for (int a = 0; a < count; ++a) {
-        global const REAL *values = a < 4 ? (a < 2 ? (a < 1 ? a0 : a1) : (a < 3 ? a2 : a3))
-                                          : (a < 6 ? (a < 5 ? a4 : a5) : (a < 7 ? a6 : a7));
+        global const REAL *values =
+            a < 4 ? (a < 2 ? (a < 1 ? a0 : a1) : (a < 3 ? a2 : a3)) : (a < 6 ? (a < 5 ? a4 : a5) : (a < 7 ? a6 : a7));
         global summary_t *out = partials + get_num_groups(0) * slot_of[a] + get_group_id(0);
         summary_t mine = {0, 0, 0, 0, REAL_MAX, -REAL_MAX};
 #if GROUP_SIZE == 1
@@ -177,7 +177,8 @@ kernel void combine_blocks(const int size, global const summary_t *partials, con
 }
 
 /* Row p of `out` is row items[p] of `rows`; a row is `words` 32-bit words, whatever they mean. */
-kernel void gather_rows(const int size, global const int *items, global const uint *rows, const int words, global uint *out)
+kernel void gather_rows(const int size, global const int *items, global const uint *rows, const int words,
+                        global uint *out)
 {
     WORK_ITEM(p);
     const int i = items[p];

@@ -60,8 +60,8 @@ inline float penalty_of(float penalty, float lenience, float worst, float bound,
    columns[k] = dr_j/dx_i h_i, axis by axis in arrays of `room`; eps; the inverse of the diagonal of B B^T + eps; and
    r = b = excess + J displacement with the first direction, z = start if `warm`, else D^-1 r. Walls have derivatives of
    0. Generators of labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any
-   size is in range.
- */
+   size is in
+   range. */
 kernel void assemble(int n, const int room, global const int *starts, global const int *neighbours,
                      global const FACE *face_measures, global const FACE *face_centroids, global const REAL *volumes,
                      global const REAL *points, global const REAL *gradient, global const REAL *h,

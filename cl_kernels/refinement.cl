@@ -1,9 +1,9 @@
 #include "common/domain.h"
 #include "common/outline.h"
 
-/* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular lattice
-   over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbour, so that cells
-   along it would be left alone: each gets one new generator between its generator and the wall. */
+/* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular
+   lattice over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbour, so that
+   cells along it would be left alone: each gets one new generator between its generator and the wall. */
 
 /* A pair is counted once, by its lower index. */
 inline bool has_middle(int i, int j, REAL measure, REAL volume)
@@ -20,7 +20,8 @@ inline bool is_fixed(int i, int j, global const int *labels, int fixed)
 
 #ifdef POLYGON
 /* A cell at the boundary brings one, before its longest edge there: of two equally long, the first. */
-inline bool is_wall_side(int k, int begin, int end, global const int *neighbours, global const FACE *face_measures, REAL volume)
+inline bool is_wall_side(int k, int begin, int end, global const int *neighbours, global const FACE *face_measures,
+                         REAL volume)
 {
     bool longest = neighbours[k] < 0 && face_measures[k] > SHORT_FACE * sqrt(volume);
     for (int m = begin; m < end && longest; ++m)
@@ -33,8 +34,9 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbours
 #endif
 
 /* Per generator i: how many new generators it brings. */
-kernel void count_children(const int size, global const int *starts, global const int *neighbours, global const FACE *face_measures,
-                           global const REAL *volumes, global const int *labels, const int fixed, global int *counts)
+kernel void count_children(const int size, global const int *starts, global const int *neighbours,
+                           global const FACE *face_measures, global const REAL *volumes, global const int *labels,
+                           const int fixed, global int *counts)
 {
     WORK_ITEM(i);
     int count = 0;
@@ -50,10 +52,10 @@ kernel void count_children(const int size, global const int *starts, global cons
 
 /* Per generator i: write itself to row i of `finer` and its new generators behind row n. firsts are the prefix sums of
    the counts; h is the size on the new level. */
-kernel void place_children(const int size, global const int *starts, global const int *neighbours, global const FACE *face_measures,
-                           global const REAL *volumes, global const REAL *points, global const int *labels,
-                           const int fixed, global const REAL *h, const int n,
-                           DOMAIN_ARGS, global const int *firsts, global REAL *finer, global const FACE *face_centroids OUTLINE_ARGS)
+kernel void place_children(const int size, global const int *starts, global const int *neighbours,
+                           global const FACE *face_measures, global const REAL *volumes, global const REAL *points,
+                           global const int *labels, const int fixed, global const REAL *h, const int n, DOMAIN_ARGS,
+                           global const int *firsts, global REAL *finer, global const FACE *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);
@@ -88,8 +90,7 @@ kernel void place_children(const int size, global const int *starts, global cons
 #endif
         } else if (has_middle(i, j, face_measures[k], volumes[i])) {
             for (int a = 0; a < DIM; ++a)
-                child[a] = PLACED(a, points[DIM * i + a] +
-                                         DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
+                child[a] = PLACED(a, points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
 #ifdef POLYGON
             /* Around a corner of the boundary the middle of the common face is in sight of both; where cells meet on
                both sides of an obstacle, each face but the longest (of two equally long, the first) brings its own. */

@@ -1,17 +1,19 @@
 #include "common/domain.h"
 #include "common/outline.h"
 
-/* The gradient of cell quality by the generators, in 2D. By the paper's (4.1), up to a constant for each number of faces,
+/* The gradient of cell quality by the generators, in 2D. By the paper's (4.1), up to a constant for each number of
+   faces,
 
      E = sum_c omega_c (2 log P_c - log A_c),   dE/dx_i = sum over the corners and faces of cell i,
 
    omega >= 1 weighs bad cells more. A cell pulls at its corners along its faces with the tension 2 omega / P and pushes
    its faces outwards with the pressure omega / A. */
 
-/* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. Four generators per work-item, as their
-   logarithms come at the price of one on a CPU. */
-kernel void load_cells(const int size, global const int *starts, global const FACE *face_measures, global const REAL *volumes,
-                       global const REAL *quality, const REAL emphasis, global REAL *tension, global REAL *pressure)
+/* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. Four generators per work-item, as
+   their logarithms come at the price of one on a CPU. */
+kernel void load_cells(const int size, global const int *starts, global const FACE *face_measures,
+                       global const REAL *volumes, global const REAL *quality, const REAL emphasis,
+                       global REAL *tension, global REAL *pressure)
 {
     const int begin = 4 * get_global_id(0), count = min(4, size - begin);
     REAL q[4] = {1, 1, 1, 1};
@@ -65,10 +67,10 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points, global c
 
    The corner v between the faces to j and q obeys (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it moves
    along the wall. Its pull is the sum of its faces' tensions along them, each that of the two cells beside the face. */
-kernel void descend_shape(const int size, global const int *starts, global const int *neighbours, global const FACE *face_measures,
-                          global const FACE *face_centroids, global const REAL *points, global const REAL *tension,
-                          global const REAL *pressure, global const REAL *h, const REAL rate, const REAL longest,
-                          global REAL *lloyd OUTLINE_ARGS)
+kernel void descend_shape(const int size, global const int *starts, global const int *neighbours,
+                          global const FACE *face_measures, global const FACE *face_centroids,
+                          global const REAL *points, global const REAL *tension, global const REAL *pressure,
+                          global const REAL *h, const REAL rate, const REAL longest, global REAL *lloyd OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL2 x = (REAL2)(points[2 * i], points[2 * i + 1]);
@@ -84,8 +86,8 @@ kernel void descend_shape(const int size, global const int *starts, global const
 #ifdef POLYGON
         /* A cell may have several loops: do the two faces meet? */
         const int last = k == begin ? end - 1 : k - 1;
-        const REAL2 other = (REAL2)(face_centroids[2 * last], face_centroids[2 * last + 1]) +
-                            face_measures[last] / 2 * before.tangent;
+        const REAL2 other =
+            (REAL2)(face_centroids[2 * last], face_centroids[2 * last + 1]) + face_measures[last] / 2 * before.tangent;
         const bool apart = dot(other - r, other - r) > R(1e-6) * dot(r, r);
 #else
         const bool apart = false;

@@ -29,8 +29,9 @@ kernel void evaluate(const int size, global const REAL *restrict points, global 
 
 /* grad_a log h = (h(x + s e_a) - h(x - s e_a)) / (2 s h), s = GRADIENT_STEP * h. Both sample points are kept inside
    the domain, where alone the field must be defined; 2 s is then the distance that was really stepped. */
-kernel void evaluate_with_gradient(const int size, global const REAL *restrict points,
-                                   global const REAL *restrict data, DOMAIN_ARGS, global REAL *restrict h_out, global REAL *restrict gradient, global int *bad)
+kernel void evaluate_with_gradient(const int size, global const REAL *restrict points, global const REAL *restrict data,
+                                   DOMAIN_ARGS, global REAL *restrict h_out, global REAL *restrict gradient,
+                                   global int *bad)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);

@@ -4,12 +4,12 @@
 
 /* What became of a cell. */
 #define DONE 0
-#define LIST_FULL 1  /* it meets more old cells than the list holds */
+#define LIST_FULL 1   /* it meets more old cells than the list holds */
 #define PIECE_LARGE 2 /* more faces than a piece holds */
 #define FAILED 3
 
-/* The old cells that a new cell is known to meet: a queue, and a hash table with open addressing, of twice its capacity (a
-   power of two), that says which are in it. */
+/* The old cells that a new cell is known to meet: a queue, and a hash table with open addressing, of twice its capacity
+   (a power of two), that says which are in it. */
 typedef struct {
     int n, capacity;
     global int *queue, *table;
@@ -65,8 +65,8 @@ inline int nearest_generator(global const REAL *x, int n, global const int *item
     return j;
 }
 
-/* Leave of a piece, relative to x, what lies in old cell j: { y : |y - x_j| <= |y - x_k| for its neighbours k }. The plane
-   between two cells is computed in one way for both, so that the two get complements. One of PIECE_*. */
+/* Leave of a piece, relative to x, what lies in old cell j: { y : |y - x_j| <= |y - x_k| for its neighbours k }. The
+   plane between two cells is computed in one way for both, so that the two get complements. One of PIECE_*. */
 inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, global const int *starts,
                        global const int *neighbours, global const REAL *points)
 {
@@ -99,8 +99,8 @@ inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, global const 
 
        q_i = sum_j |V_i and V_j| (q_j + g_j . (c_ij - c_j)) / sum_j |V_i and V_j|,
 
-   with the centroid c_ij of the piece V_i and V_j. The pieces are found by flooding: from the old cell that holds x_i over
-   the faces that the pieces have in common with each other.
+   with the centroid c_ij of the piece V_i and V_j. The pieces are found by flooding: from the old cell that holds x_i
+   over the faces that the pieces have in common with each other.
 
    values, least, most (n_old, width)  of the old cells: q_j, and bounds of what is in them
    slopes (n_old, width, DIM)          g_j; with_slopes = 0: none
@@ -182,8 +182,8 @@ kernel void transfer(const int size, const int first, global const int *todo, co
     status[i] = sum > 0 ? DONE : FAILED;
 }
 
-/* Solve M g = b, M symmetric and not negative, in place of M and b: by elimination, the largest pivot first. False, with
-   b as it was, if M is singular but for rounding. */
+/* Solve M g = b, M symmetric and not negative, in place of M and b: by elimination, the largest pivot first. False,
+   with b as it was, if M is singular but for rounding. */
 inline bool eliminate(REAL m[DIM][DIM], REAL *b)
 {
     int order[DIM];
@@ -222,8 +222,8 @@ inline bool eliminate(REAL m[DIM][DIM], REAL *b)
     return true;
 }
 
-/* Solve the normal equations M g = b in place of b. A direction that the neighbours say nothing about, as in the corner of
-   a box with one neighbour, gets no slope: the least solution, to the root of rounding. */
+/* Solve the normal equations M g = b in place of b. A direction that the neighbours say nothing about, as in the corner
+   of a box with one neighbour, gets no slope: the least solution, to the root of rounding. */
 inline void solve_normal(REAL m[DIM][DIM], REAL *b)
 {
     REAL copy[DIM][DIM], trace = 0;

@@ -2,9 +2,11 @@
 
 /* Corners of cells and the vertices that they share. Corner k of cell i, at place c = starts[i] + k, lies between its
    faces k - 1 and k. Walking from cell to cell around the point visits all corners that are one vertex; the least of
-   them owns it. The walk uses the graph alone, so it needs no tolerance and holds for any number of cells at a point. */
+   them owns it. The walk uses the graph alone, so it needs no tolerance and holds for any number of cells at a
+   point. */
 
-/* Place of the face of `cell` with `neighbour`; a graph is symmetric, but the walk must not leave the row of one that is not. */
+/* Place of the face of `cell` with `neighbour`; a graph is symmetric, but the walk must not leave the row of one that
+   is not. */
 inline int find_face(global const int *starts, global const int *neighbours, int cell, int neighbour)
 {
     int k = starts[cell];

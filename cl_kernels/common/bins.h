@@ -1,6 +1,6 @@
 /* Hierarchical bins. Grid 0 covers the domain; a bin that holds many generators is divided by a grid of its own, and so
-   on, so that a leaf holds a few generators however the set is graded. Within a grid the bins lie row by row, and what a
-   divided bin holds stays in its place: the generators in neighbouring bins of a row are one run of memory.
+   on, so that a leaf holds a few generators however the set is graded. Within a grid the bins lie row by row, and what
+   a divided bin holds stays in its place: the generators in neighbouring bins of a row are one run of memory.
 
    grid_frames[g]  origin (DIM), 1 / edge of a bin
    grid_shapes[g]  (first bin, bins along x, y, z); behind its bins a grid has one more entry, which only ends the last

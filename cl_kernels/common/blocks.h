@@ -16,7 +16,7 @@ inline int block_end(int n)
 }
 
 /* for (BLOCK_LOOP(i, n)) { ... } */
-#define BLOCK_LOOP(i, n) \
-    int i = block_begin(n) + get_local_id(0), i##_end = block_end(n); \
-    i < i##_end; \
+#define BLOCK_LOOP(i, n)                                                                                               \
+    int i = block_begin(n) + get_local_id(0), i##_end = block_end(n);                                                  \
+    i < i##_end;                                                                                                       \
     i += GROUP_SIZE

@@ -1,5 +1,5 @@
-/* The boundary of a polygonal domain as cells see it: cut by them into chords, which are numbered edge by edge and along each
-   edge, so that in a ring of edges one chord begins where the one before ends.
+/* The boundary of a polygonal domain as cells see it: cut by them into chords, which are numbered edge by edge and
+   along each edge, so that in a ring of edges one chord begins where the one before ends.
 
    vertices[v]    corner of the polygon; edge v runs from it to vertices[next_vertex[v]], the domain on its left
    chord_firsts   (edges + 1) prefix sums: chords of each edge
@@ -16,11 +16,14 @@ typedef struct {
     global const int *shells;
 } chords_t;
 
-#define CHORD_ARGS                                                                                                 \
-    global const REAL2 *vertices, global const int *next_vertex, global const int *vertex_owners,                  \
-        global const int *chord_firsts, global const int *chord_cells, global const int *chord_edges,              \
+#define CHORD_ARGS                                                                                                     \
+    global const REAL2 *vertices, global const int *next_vertex, global const int *vertex_owners,                      \
+        global const int *chord_firsts, global const int *chord_cells, global const int *chord_edges,                  \
         global const REAL *chord_ends, global const int *shells
-#define CHORDS {vertices, next_vertex, vertex_owners, chord_firsts, chord_cells, chord_edges, chord_ends, shells}
+#define CHORDS                                                                                                         \
+    {                                                                                                                  \
+        vertices, next_vertex, vertex_owners, chord_firsts, chord_cells, chord_edges, chord_ends, shells               \
+    }
 
 /* Does the chord begin, or end, inside its cell, at a corner of the polygon? Else on a face of the cell. */
 inline bool begins_inside(const chords_t *c, int chord)

@@ -19,8 +19,8 @@ inline void begin_descent(descent_t *way, int4 start)
 }
 
 /* Leave the open grid: for the grid `child` of one of its bins, to come back to `place`; or, if that is negative, for
- * good.
- */
+ *
+    good. */
 inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
 {
     if (child < 0) {

@@ -1,4 +1,5 @@
-/* What a kernel that places generators has to know of the domain: DOMAIN_ARGS in its signature, DOMAIN to hand them on. */
+/* What a kernel that places generators has to know of the domain: DOMAIN_ARGS in its signature, DOMAIN to hand them
+   on. */
 #include "common/real.h"
 
 #ifdef POLYGON
@@ -9,13 +10,13 @@
 #endif
 
 /* Corners of the box as arrays. */
-#define BOX_CORNERS(lower, upper) \
-    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3}; \
+#define BOX_CORNERS(lower, upper)                                                                                      \
+    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};                                    \
     const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3}
 
 #ifdef PERIODIC
-/* Length of the period along axis a, in which positions lie in [0, period); 0 where there are walls. Positions and periods
-   are multiples of eps in the unit box, so that differences are exact, whatever the image. */
+/* Length of the period along axis a, in which positions lie in [0, period); 0 where there are walls. Positions and
+   periods are multiples of eps in the unit box, so that differences are exact, whatever the image. */
 #define PERIOD(a) ((a) == 0 ? R(PERIOD_0) : (a) == 1 ? R(PERIOD_1) : R(PERIOD_2))
 
 inline REAL nearest_image(REAL d, REAL period)
@@ -49,14 +50,15 @@ inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a)
-        y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
+    y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
 }
 
 /* The same, but a generator that would leave comes back: so no two meet on a wall. */
 inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
-    EACH_AXIS(a) {
+    EACH_AXIS(a)
+    {
         if (PERIOD(a) > 0)
             continue;
         if (y[a] < lower[a])

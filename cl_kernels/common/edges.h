@@ -6,18 +6,18 @@
    edge_ends    both ends of each edge, the domain on the left */
 #include "common/real.h"
 
-#define DOMAIN_ARGS                                                                                                  \
-    const REAL4 box_lower, const REAL4 box_upper, const REAL4 edge_frame, const int4 edge_shape,                     \
+#define DOMAIN_ARGS                                                                                                    \
+    const REAL4 box_lower, const REAL4 box_upper, const REAL4 edge_frame, const int4 edge_shape,                       \
         global const int *edge_starts, global const REAL4 *edge_ends
 #define DOMAIN box_lower, box_upper, edge_frame, edge_shape, edge_starts, edge_ends
 
-/* Generators come no nearer to the boundary than this, so that no rounding carries them out. Those that the caller has put on
-   it, or on it but for rounding, may leave it inwards. */
+/* Generators come no nearer to the boundary than this, so that no rounding carries them out. Those that the caller has
+   put on it, or on it but for rounding, may leave it inwards. */
 #define OFF_EDGE (2 * REAL_EPS)
 #define BEHIND (16 * REAL_EPS)
 
-/* Where the way from x to y, t = 0 to 1, leaves the domain first, and over which edge (a place in edge_ends); 2 if it does
-   not. Corners are seen by both their edges with the same numbers, so that no way slips through between them. */
+/* Where the way from x to y, t = 0 to 1, leaves the domain first, and over which edge (a place in edge_ends); 2 if it
+   does not. Corners are seen by both their edges with the same numbers, so that no way slips through between them. */
 inline REAL leaves_over(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
 {
     const REAL2 from = (REAL2)(x[0], x[1]), way = (REAL2)(y[0], y[1]) - from;
@@ -36,8 +36,7 @@ inline REAL leaves_over(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
             const REAL here = a.s0 * e.s1 - a.s1 * e.s0 - OFF_EDGE * length; /* e x (x - a): positive inside */
             const REAL there = here + e.s0 * way.s1 - e.s1 * way.s0;
             const REAL side_a = way.s0 * a.s1 - way.s1 * a.s0, side_b = way.s0 * b.s1 - way.s1 * b.s0;
-            if (there <= 0 && there < here && here > -BEHIND * length &&
-                (side_a < 0 ? side_b >= 0 : side_b <= 0)) {
+            if (there <= 0 && there < here && here > -BEHIND * length && (side_a < 0 ? side_b >= 0 : side_b <= 0)) {
                 const REAL t = fmax(here, 0) / (fmax(here, 0) - there);
                 if (t < first) {
                     first = t;
@@ -61,7 +60,7 @@ inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
     const REAL t = leaves_at(x, y, DOMAIN);
     if (t <= 1)
         EACH_AXIS(a)
-            y[a] = x[a] + t / 2 * (y[a] - x[a]);
+    y[a] = x[a] + t / 2 * (y[a] - x[a]);
 }
 
 /* The same, but a generator that would leave comes back from the edge, if that is not over another one. */

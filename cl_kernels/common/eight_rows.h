@@ -18,7 +18,7 @@ inline bool fits_exactly(int i, global const int *row, int n, global const int *
 }
 
 /* Check the rows of LANES generators from number `first` on; see `check_rows`. Returns how many are not as they should
- * be. */
+   be. */
 inline int check_eight(int first, int size, global const int *starts, global const int *neighbours,
                        global const double *points, const double *lower, const double *upper, global int *fits,
                        global int *marks)

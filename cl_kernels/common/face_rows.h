@@ -52,8 +52,8 @@ inline bool is_doubtful_row(const face_rows_t *rows, int i)
     return place >= 0 && rows->counts[place] < 0;
 }
 
-/* Write the faces of a clipped cell to its slot, the least label first: a row depends on the cell alone, not on the order
-   in which it was clipped. Its count is negative if rounding might let a neighbour see the faces otherwise. */
+/* Write the faces of a clipped cell to its slot, the least label first: a row depends on the cell alone, not on the
+   order in which it was clipped. Its count is negative if rounding might let a neighbour see the faces otherwise. */
 inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
                        global int *counts, global int *flags)
 {

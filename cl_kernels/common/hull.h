@@ -9,7 +9,7 @@
 /* Faces of a cell. */
 #define HULL_CAPACITY 16
 /* A turn is certain if it is more than this share of the largest p^2: hundreds of times the rounding of p and of the
- * turn. */
+   turn. */
 #define TURN_ROUNDING 1e-13
 /* A cell is certain if it is far from what `is_doubtful` (common/polygon.h) calls doubtful: least square of a face's
    length over that of its generator's distance; largest square of the reach over that of the least distance; least
@@ -28,8 +28,8 @@ typedef struct {
     long8 sizes, doubt, lost; /* corners; is a decision near to rounding; does the hull leave out x? */
 } hull_t;
 
-/* A candidate on the right of which none has been found yet: its direction from the hull's last corner, and its number.
- */
+/* A candidate on the right of which none has been found yet: its direction from the hull's last corner, and its
+   number. */
 typedef struct {
     double8 dx, dy;
     long8 at;
@@ -126,8 +126,8 @@ inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, dou
     *least = hull->sizes == hull->steps ? min(*least, ratio) : *least;
 }
 
-/* Is any decision that made or measured the hulls near to rounding? A hull that leaves out x is of no use, but certain.
- */
+/* Is any decision that made or measured the hulls near to rounding? A hull that leaves out x is of no use, but
+   certain. */
 inline long8 is_uncertain(const hull_t *hull, const list_t *list, double8 reach2, double8 least)
 {
     return !(list->largest2 < 1 / CERTAIN_DISTANCE2) |

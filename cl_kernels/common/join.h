@@ -1,7 +1,7 @@
 #include "common/real.h"
 
-/* Note that the corners u and w are one vertex. What is read is not written meanwhile: labels go from `old` to `new`, which
-   begins as its copy. */
+/* Note that the corners u and w are one vertex. What is read is not written meanwhile: labels go from `old` to `new`,
+   which begins as its copy. */
 inline bool join(global const int *old, global int *new, int u, int w)
 {
     const int a = old[u], b = old[w];

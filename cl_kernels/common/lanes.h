@@ -1,5 +1,5 @@
 /* Eight cells at a time, one in each lane of vectors: for CPUs, whose compilers make no vectors of work-items that
- * branch. */
+   branch. */
 #include "common/real.h"
 
 #if !IS_DOUBLE

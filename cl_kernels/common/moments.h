@@ -1,7 +1,8 @@
 #include "common/real.h"
 
-/* Twice the area of a cell, and with it its first and second moments, unscaled: sums over triangles of the origin and a piece
-   of its outline. A triangle 0, v, w has the centroid (v + w) / 3 and the second moments area (v v + w w + (v + w) (v + w)) / 12. */
+/* Twice the area of a cell, and with it its first and second moments, unscaled: sums over triangles of the origin and a
+   piece of its outline. A triangle 0, v, w has the centroid (v + w) / 3 and the second moments area (v v + w w + (v +
+   w) (v + w)) / 12. */
 typedef struct {
     REAL area, cx, cy, xx, xy, yy;
 } moments_t;
@@ -19,7 +20,8 @@ inline void add_triangle(moments_t *m, REAL2 v, REAL2 w)
 }
 
 /* Area, centroid - generator, and second moments about the centroid per unit area (xx, xy, yy) of cell i. */
-inline void write_moments(const moments_t *m, int i, global REAL *volumes, global REAL *offsets, global REAL *covariances)
+inline void write_moments(const moments_t *m, int i, global REAL *volumes, global REAL *offsets,
+                          global REAL *covariances)
 {
     REAL cx = m->cx, cy = m->cy, xx = m->xx, xy = m->xy, yy = m->yy;
     const REAL area = m->area;

@@ -1,8 +1,8 @@
 #include "common/real.h"
 
-/* How deep beyond the bisector with the neighbour at x + d, times |d|, a vertex must lie to be cut off: deeper than what
-   rounds in the vertex, and than what rounded in the positions of generators in the unit box, unless generators are so
-   near each other that they must differ by less. Cells of a lattice are thus not shredded. */
+/* How deep beyond the bisector with the neighbour at x + d, times |d|, a vertex must lie to be cut off: deeper than
+   what rounds in the vertex, and than what rounded in the positions of generators in the unit box, unless generators
+   are so near each other that they must differ by less. Cells of a lattice are thus not shredded. */
 #if IS_DOUBLE
 #define FINEST R(4e-11)
 #else

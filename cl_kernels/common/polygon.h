@@ -73,8 +73,7 @@ inline void copy_corner(cell_t *cell, int to, int from)
 
 /* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2. False if the cell is full.
    A cut shallower than rounding is none, so that cocircular generators do not shred a corner. */
-inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool seen_before,
-                      global const REAL *points)
+inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool seen_before, global const REAL *points)
 {
     const int n = cell->n;
     const REAL level = d2 / 2;
@@ -182,8 +181,9 @@ inline bool is_short(REAL e2, REAL d2)
     return e2 <= POSITION_NOISE * POSITION_NOISE && e2 <= R(1e-6) * d2;
 }
 
-/* Might rounding let a neighbour see this cell's faces otherwise? Only where a face is short, or a generator is near beside
-   the cell (then far corners are ill-conditioned) or beside the rounding of positions. In single precision anything may. */
+/* Might rounding let a neighbour see this cell's faces otherwise? Only where a face is short, or a generator is near
+   beside the cell (then far corners are ill-conditioned) or beside the rounding of positions. In single precision
+   anything may. */
 inline bool is_doubtful(const cell_t *cell, const REAL *x, global const REAL *points)
 {
     bool doubtful = !IS_DOUBLE;

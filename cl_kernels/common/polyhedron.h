@@ -1,5 +1,5 @@
-/* A convex polyhedron around its generator. Coordinates are relative to the generator: differences of close positions are
-   exact, so cells stay accurate whatever their size.
+/* A convex polyhedron around its generator. Coordinates are relative to the generator: differences of close positions
+   are exact, so cells stay accurate whatever their size.
 
    The polyhedron is simple: three faces meet in every vertex (where more do, vertices coincide). Its dual is a
    triangulated sphere: a vertex is the triangle of its three faces, counter-clockwise seen from outside. */
@@ -28,11 +28,6 @@
 /* Sets of faces. */
 #define FACE_WORDS (FACE_CAPACITY / 64)
 #define WORD_OF(f) (FACE_WORDS == 1 ? 0 : (f) >> 6)
-
-inline bool has_face(const ulong *set, int f)
-{
-    return (set[WORD_OF(f)] >> (f & 63)) & 1;
-}
 
 inline void add_face(ulong *set, int f)
 {
@@ -68,11 +63,11 @@ typedef struct {
     REAL reach2;             /* largest squared distance of a vertex from the generator */
     ulong alive[FACE_WORDS]; /* set of the faces that there are */
     REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
-    REAL8 beyond[VERTEX_CAPACITY / 8];        /* signed distances from a bisector, times |d| */
-    INDEX4 faces[VERTEX_CAPACITY];            /* of a vertex, counter-clockwise */
-    INDEX at[FACE_CAPACITY * FACE_CAPACITY];  /* [a][b]: the vertex whose faces are a, b, in this order, and another */
-    int labels[FACE_CAPACITY];                /* of a face: a generator, or -1 - wall */
-    REAL4 planes[FACE_CAPACITY];              /* of a face: d, level; the plane is y.d = level */
+    REAL8 beyond[VERTEX_CAPACITY / 8];       /* signed distances from a bisector, times |d| */
+    INDEX4 faces[VERTEX_CAPACITY];           /* of a vertex, counter-clockwise */
+    INDEX at[FACE_CAPACITY * FACE_CAPACITY]; /* [a][b]: the vertex whose faces are a, b, in this order, and another */
+    int labels[FACE_CAPACITY];               /* of a face: a generator, or -1 - wall */
+    REAL4 planes[FACE_CAPACITY];             /* of a face: d, level; the plane is y.d = level */
 } cell_t;
 
 #define X(cell) ((REAL *)(cell)->x)

@@ -32,16 +32,18 @@
 #define REAL2 CLVORO_JOIN(REAL, 2)
 #define REAL3 CLVORO_JOIN(REAL, 3)
 #define REAL4 CLVORO_JOIN(REAL, 4)
-/* EACH_AXIS(a) ...: a loop over the axes, unrolled: PoCL keeps such loops, and with them every array of DIM values in memory. */
+/* EACH_AXIS(a) ...: a loop over the axes, unrolled: PoCL keeps such loops, and with them every array of DIM values in
+   memory. */
 #define EACH_AXIS(a) _Pragma("unroll") for (int a = 0; a < DIM; ++a)
 /* A literal in the working precision: R(0.5). */
 #define R(x) ((REAL)(x))
 
-/* The index of a work-item, one of `size`, the kernel's first argument; the rest of the last work-group is idle. Launches
-   are rounded up to whole groups of one fixed size: PoCL compiles a kernel anew for every group size it meets. */
-#define WORK_ITEM(i) \
-    const int i = get_global_id(0); \
-    if (i >= size) \
+/* The index of a work-item, one of `size`, the kernel's first argument; the rest of the last work-group is idle.
+   Launches are rounded up to whole groups of one fixed size: PoCL compiles a kernel anew for every group size it
+   meets. */
+#define WORK_ITEM(i)                                                                                                   \
+    const int i = get_global_id(0);                                                                                    \
+    if (i >= size)                                                                                                     \
     return
 
 /* Rounds to 1 ulp where a*b and c*d cancel (Kahan): the determinant of two short vectors. */

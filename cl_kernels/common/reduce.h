@@ -1,10 +1,11 @@
 /* Sums and maxima that repeat bit by bit: every group writes one partial value per quantity, and whoever needs the
    total adds the partial values of all groups in their order. Include after blocks.h and real.h.
 
-   All hold barriers. A kernel must not return before one, not even all of its work-items alike: PoCL then runs astray with
-   groups of more than one. What is not to be done becomes a loop of no turns. */
+   All hold barriers. A kernel must not return before one, not even all of its work-items alike: PoCL then runs astray
+   with groups of more than one. What is not to be done becomes a loop of no turns. */
 
-/* Running sum of one work-item; compensated (Kahan) in single precision, where a CPU's work-item adds up many thousands. */
+/* Running sum of one work-item; compensated (Kahan) in single precision, where a CPU's work-item adds up many
+   thousands. */
 typedef struct {
     REAL value;
 #if !IS_DOUBLE
@@ -13,9 +14,15 @@ typedef struct {
 } Sum;
 
 #if IS_DOUBLE
-#define SUM_ZERO {R(0)}
+#define SUM_ZERO                                                                                                       \
+    {                                                                                                                  \
+        R(0)                                                                                                           \
+    }
 #else
-#define SUM_ZERO {R(0), R(0)}
+#define SUM_ZERO                                                                                                       \
+    {                                                                                                                  \
+        R(0), R(0)                                                                                                     \
+    }
 #endif
 
 inline void sum_add(Sum *s, REAL x)
@@ -39,7 +46,8 @@ inline REAL group_sum(REAL x, local REAL *scratch)
     scratch[me] = x;
     for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (me < half_) scratch[me] += scratch[me + half_];
+        if (me < half_)
+            scratch[me] += scratch[me + half_];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     x = scratch[0];
@@ -55,7 +63,8 @@ inline REAL group_max(REAL x, local REAL *scratch)
     scratch[me] = x;
     for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (me < half_) scratch[me] = fmax(scratch[me], scratch[me + half_]);
+        if (me < half_)
+            scratch[me] = fmax(scratch[me], scratch[me + half_]);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     x = scratch[0];
@@ -67,13 +76,15 @@ inline REAL group_max(REAL x, local REAL *scratch)
 inline REAL total_sum(global const REAL *partial, local REAL *scratch)
 {
     REAL x = 0;
-    for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE) x += partial[g];
+    for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE)
+        x += partial[g];
     return group_sum(x, scratch);
 }
 
 inline REAL total_max(global const REAL *partial, local REAL *scratch)
 {
     REAL x = partial[0];
-    for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE) x = fmax(x, partial[g]);
+    for (int g = get_local_id(0); g < (int)get_num_groups(0); g += GROUP_SIZE)
+        x = fmax(x, partial[g]);
     return group_max(x, scratch);
 }

@@ -13,13 +13,15 @@
 #error "build with -DMAX_DEPTH=levels that the bins may have"
 #endif
 
-#define BATCH 256  /* generators that are sorted by distance at a time */
+#define BATCH 256 /* generators that are sorted by distance at a time */
 #define SHELLS 32
 
 /* The flag that tells of an outcome of clip_cell or clip_by_row, or 0. */
 inline int flag_of(int what)
 {
-    return what < CLIP_FULL ? 0 : (what == CLIP_FULL ? FLAG_FULL : (what == CLIP_COINCIDE ? FLAG_COINCIDE : FLAG_COLLAPSED));
+    return what < CLIP_FULL
+               ? 0
+               : (what == CLIP_FULL ? FLAG_FULL : (what == CLIP_COINCIDE ? FLAG_COINCIDE : FLAG_COLLAPSED));
 }
 
 /* Where to look for neighbours. */
@@ -38,8 +40,8 @@ typedef struct {
     REAL d2[BATCH];
 } batch_t;
 
-/* Clip the cell by the generators of a batch, about the nearest first: by shells of 1 / `per_shell` in squared distance.
-   Returns FLAG_* or 0. */
+/* Clip the cell by the generators of a batch, about the nearest first: by shells of 1 / `per_shell` in squared
+   distance. Returns FLAG_* or 0. */
 inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
 {
     ushort ends[SHELLS], order[BATCH];
@@ -65,7 +67,8 @@ inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, 
         const int q = batch->places[order[k]];
         if (d2 == 0)
             return FLAG_COINCIDE;
-        const REAL4 d = (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
+        const REAL4 d =
+            (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
         const int what = clip_cell(cell, d, d2, in->items[q], warm, in->points);
         if (what >= CLIP_FULL)
             return flag_of(what);

@@ -9,19 +9,22 @@ typedef struct {
     global const REAL2 *p, *q;
 } segments_t;
 
-#define SEGMENT_ARGS                                                                                                 \
-    global const int *segment_starts, global const int *segment_labels, global const int *segment_from,              \
-        global const int *segment_to, global const int *segment_places, global const REAL2 *segment_p,               \
+#define SEGMENT_ARGS                                                                                                   \
+    global const int *segment_starts, global const int *segment_labels, global const int *segment_from,                \
+        global const int *segment_to, global const int *segment_places, global const REAL2 *segment_p,                 \
         global const REAL2 *segment_q
-#define SEGMENTS {segment_starts, segment_labels, segment_from, segment_to, segment_places, segment_p, segment_q}
+#define SEGMENTS                                                                                                       \
+    {                                                                                                                  \
+        segment_starts, segment_labels, segment_from, segment_to, segment_places, segment_p, segment_q                 \
+    }
 
 inline bool is_empty(const segments_t *s, int k)
 {
     return s->labels[k] < 0 ? s->from[k] < 0 : s->from[k] == s->to[k];
 }
 
-/* The segment of cell j, number u of those that the boundary passes through, that is segment k of cell i from the other side;
-   -1 if there is none. */
+/* The segment of cell j, number u of those that the boundary passes through, that is segment k of cell i from the other
+   side; -1 if there is none. */
 inline int other_side(const segments_t *s, int k, int i, int u)
 {
     for (int m = s->starts[u]; m < s->starts[u + 1]; ++m) {

@@ -1,7 +1,7 @@
 #include "common/outline.h"
 
-/* The boundary of a cell, run by run of chords: how many sides it has there, a side turning by less than 30 degrees, and how many
-   neighbours a hexagonal lattice would have there: 6 - sum of 2 + turning / 60 degrees over the runs. */
+/* The boundary of a cell, run by run of chords: how many sides it has there, a side turning by less than 30 degrees,
+   and how many neighbours a hexagonal lattice would have there: 6 - sum of 2 + turning / 60 degrees over the runs. */
 typedef struct {
     REAL2 ahead; /* along the chord before, 0 at the start of a run */
     REAL turned, sides, missing;

@@ -1,6 +1,6 @@
-/* A cell trimmed by the boundary of the domain: what is left of a convex cell, as loops of segments, each with the domain on
-   its left. A loop follows the chords of the boundary through the cell and, where one leaves the cell, the cell's own faces,
-   counter-clockwise, to the place where the next chord enters. */
+/* A cell trimmed by the boundary of the domain: what is left of a convex cell, as loops of segments, each with the
+   domain on its left. A loop follows the chords of the boundary through the cell and, where one leaves the cell, the
+   cell's own faces, counter-clockwise, to the place where the next chord enters. */
 #include "common/boundary.h"
 
 /* A convex cell: its generator, faces, and the chords in it in the order of their numbers. */
@@ -11,9 +11,9 @@ typedef struct {
     global const REAL *points;
 } convex_t;
 
-/* A piece of a loop from p to q, relative to the generator. It lies on the boundary's edge -1 - label, or on the face with
-   generator `label`. from, to: a chord that ends there, where a segment ends on a face; else -1 - corner of the cell; on
-   the boundary the chord. A segment is empty if both ends are in the same place: for all cells that see it. */
+/* A piece of a loop from p to q, relative to the generator. It lies on the boundary's edge -1 - label, or on the face
+   with generator `label`. from, to: a chord that ends there, where a segment ends on a face; else -1 - corner of the
+   cell; on the boundary the chord. A segment is empty if both ends are in the same place: for all cells that see it. */
 typedef struct {
     REAL2 p, q;
     int label, from, to;
@@ -32,8 +32,8 @@ typedef struct {
     REAL along, turn;
 } place_t;
 
-/* Of the crossing at which `chord` ends, between this cell and the one of generator j: the same numbers for both cells, but
-   for the sign. */
+/* Of the crossing at which `chord` ends, between this cell and the one of generator j: the same numbers for both cells,
+   but for the sign. */
 inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
 {
     const int edge = c->edges[chord], o = min(cell->i, j), q = max(cell->i, j);
@@ -62,10 +62,10 @@ inline bool is_after(place_t a, place_t b)
 
 /* Around a loop, segment by segment. */
 typedef struct {
-    int chord;  /* on this chord; -1: on a face */
-    int face;   /* the face */
-    int from;   /* the segment on the face begins where this chord ends; -1: at the face's first corner */
-    int entry;  /* the chord by which the loop comes back from the faces; -1: never, it goes around the whole cell */
+    int chord; /* on this chord; -1: on a face */
+    int face;  /* the face */
+    int from;  /* the segment on the face begins where this chord ends; -1: at the face's first corner */
+    int entry; /* the chord by which the loop comes back from the faces; -1: never, it goes around the whole cell */
     place_t left, entered; /* where the faces are reached and left */
 } cursor_t;
 

@@ -21,8 +21,8 @@ typedef struct {
 inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t minus_y, vectors_t ray)
 {
     const double8 x = list->planes[k].x, y = list->planes[k].y, z = list->planes[k].z;
-    /* Not less than none: rounding may put y beyond the bisectors that it lies on, and a ray that leaves them would then
-       seem to be cut off by them, whatever had cut it off before. */
+    /* Not less than none: rounding may put y beyond the bisectors that it lies on, and a ray that leaves them would
+       then seem to be cut off by them, whatever had cut it off before. */
     double8 slack = fma(minus_y.x, x, fma(minus_y.y, y, fma(minus_y.z, z, 0.5 + BIAS)));
     slack = slack > 0 ? slack : 0;
     const double8 speed = fma(ray.x, x, fma(ray.y, y, ray.z * z));

@@ -39,7 +39,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
                         global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
     /* Through rows in outward order, parts of rows, bins; and whether the grid's own bin was opened for the inner
-     * square. */
+       square. */
     descent_t way;
     begin_descent(&way, (int4)(0, 0, -1, inner >= 0));
     while (way.depth >= 0) {
