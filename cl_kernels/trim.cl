@@ -3,18 +3,18 @@
 #include "common/sides.h"
 #include "common/trimmed.h"
 
-/* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a cell, what
-   lies in the domain is cut out: its pieces, each an outer loop and the islands in it. The piece with the generator is the
-   cell; the others, which a spit or a slit cuts off from it, go to the cell beside them with which they share the longest
-   face, and stay where they are only if there is none. */
+/* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a
+   cell, what lies in the domain is cut out: its pieces, each an outer loop and the islands in it. The piece with the
+   generator is the cell; the others, which a spit or a slit cuts off from it, go to the cell beside them with which
+   they share the longest face, and stay where they are only if there is none. */
 
-#define FLAG_LOST 1   /* as in chords.cl */
+#define FLAG_LOST 1    /* as in chords.cl */
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
 #define ON_BOUNDARY (4 * REAL_EPS)
 #define ONE_POINT (64 * REAL_EPS)
 
-#define CONVEX_ARGS                                                                                                  \
-    global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,        \
+#define CONVEX_ARGS                                                                                                    \
+    global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,          \
         const REAL4 box_upper, global const int *touched, global const int *list_starts, global const int *listed
 
 inline convex_t convex_cell(int u, CONVEX_ARGS)
@@ -111,7 +111,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         }
         const int shell = c.shells[c.edges[begin]];
         const bool is_outer = open || shell < 0;
-        /* A hole within the cell whose piece goes on beyond it: the cell's faces lie in the domain, if no chord leaves it. */
+        /* A hole within the cell whose piece goes on beyond it: the cell's faces lie in the domain, if no chord leaves
+           it. */
         rim |= !is_outer && c.cells[c.firsts[shell]] != cell.i;
         const int place = first + loops;
         loop_chords[place] = begin;
@@ -146,7 +147,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     }
     for (int place = first; place < first + loops; ++place)
         if (loop_pieces[place] < 0) {
-            /* A hole lies in the outer ring of its piece. Where that leaves the cell, one of the pieces that it leaves by has it. */
+            /* A hole lies in the outer ring of its piece. Where that leaves the cell, one of the pieces that it leaves
+               by has it. */
             const int shell = c.firsts[c.shells[c.edges[loop_chords[place]]]];
             const int ring = c.cells[shell] == cell.i ? first + chord_loops[shell] : -1;
             loop_pieces[place] = main;
@@ -205,11 +207,13 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
     }
 }
 
-/* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a generator
-   outside the domain, and so the cells tile the domain. Where edges cross a face closer to each other than rounding, they do
-   not. And is anything left for the generator, beside those that are as near to the boundary as it is? `n` generators are in the domain. */
-kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global const int *touched, global const int *slots,
-                           global const int *roots, global const int *starts, global const int *neighbours, global int *flags)
+/* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a
+   generator outside the domain, and so the cells tile the domain. Where edges cross a face closer to each other than
+   rounding, they do not. And is anything left for the generator, beside those that are as near to the boundary as it
+   is? `n` generators are in the domain. */
+kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global const int *touched,
+                           global const int *slots, global const int *roots, global const int *starts,
+                           global const int *neighbours, global int *flags)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;
@@ -242,10 +246,11 @@ kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global con
         atomic_or(flags, FLAG_LOST);
 }
 
-/* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is known.
-   Only cells that the boundary passes through take pieces. */
-kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots, global const int *list_starts,
-                         global const int *loop_pieces, global const int *roots, global int *new_roots)
+/* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is
+   known. Only cells that the boundary passes through take pieces. */
+kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                         global const int *list_starts, global const int *loop_pieces, global const int *roots,
+                         global int *new_roots)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;
@@ -270,8 +275,8 @@ kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched
     }
 }
 
-/* Per touched cell: a piece that nobody takes stays its own. orphans[place] = 1 for pieces that go to another cell, whose
-   untouched neighbours are to name that one: marked. */
+/* Per touched cell: a piece that nobody takes stays its own. orphans[place] = 1 for pieces that go to another cell,
+   whose untouched neighbours are to name that one: marked. */
 kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
                           global const int *list_starts, global const int *loop_pieces, global int *roots,
                           global int *orphans, global int *marks)
@@ -323,8 +328,8 @@ kernel void count_trimmed(const int size, SEGMENT_ARGS, global const int *touche
     }
 }
 
-/* Per generator of the domain whose cell the boundary does not pass through: its row as it was. Where a neighbour's piece
-   goes to another cell (marks), that one is named. */
+/* Per generator of the domain whose cell the boundary does not pass through: its row as it was. Where a neighbour's
+   piece goes to another cell (marks), that one is named. */
 kernel void copy_whole(const int size, global const int *starts, global const int *neighbours,
                        global const REAL *face_measures, global const REAL2 *face_centroids, SEGMENT_ARGS,
                        global const int *slots, global const int *roots, global const int *marks,
@@ -352,16 +357,16 @@ kernel void copy_whole(const int size, global const int *starts, global const in
     }
 }
 
-/* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that have
-   changed cells, in order; place_cells[place] is the touched cell that they lie in.
+/* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that
+   have changed cells, in order; place_cells[place] is the touched cell that they lie in.
 
    outlines[i] = (sides, neighbours that a hexagonal lattice would have here) */
 kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *points, global const int *touched,
-                          global const int *slots, global const int *roots, global const int *orphans, const int orphan_count,
-                          global const int *place_cells, global const int *new_starts, global int *new_neighbours,
-                          global REAL *new_measures, global REAL2 *new_centroids, global int *face_segments,
-                          global REAL *volumes, global REAL *offsets, global REAL *covariances, global REAL2 *outlines,
-                          global const REAL2 *tangents)
+                          global const int *slots, global const int *roots, global const int *orphans,
+                          const int orphan_count, global const int *place_cells, global const int *new_starts,
+                          global int *new_neighbours, global REAL *new_measures, global REAL2 *new_centroids,
+                          global int *face_segments, global REAL *volumes, global REAL *offsets,
+                          global REAL *covariances, global REAL2 *outlines, global const REAL2 *tangents)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;
