@@ -11,6 +11,7 @@ import shapely
 from scipy.spatial import KDTree
 
 from ._arrays import check_integer, check_number
+from .columns import count_columns, find_chains, place_columns
 from .domain import Box, Domain
 from .errors import InputError, InputTypeError
 from .polygon import Polygon
@@ -18,12 +19,10 @@ from .sizing import Distance, as_field, minimum
 from .sizing.field import Field
 from .sizing.shapes import Edges
 
-_SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin anew
 _NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
 _GROWTH = 1.2  # of sizes beyond layers that do not grow themselves
 _SHORT = 1e-9  # of the domain: shorter edges of what layers leave are none
 _APART = 0.3  # of a width, between the last row and the generators that move
-_MOST = 2.0**62  # columns, more than any device holds: numbers of them stay finite
 _NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
 _OWN = 0.9  # of its distance from the wall: a generator that another wall is nearer to than this is not in its place
 
@@ -109,25 +108,6 @@ class Layers:
         return np.append(rows, 2 * tops[-1] - rows[-1])
 
 
-@dataclass(frozen=True)
-class Chain:
-    """Edges of the boundary one after the other, without a sharp turn.
-
-    Attributes
-    ----------
-    corners : (k, 2) float
-        The domain on the left.
-    closed : bool
-        Do the ends, which are then the same, meet smoothly?
-    fan : float
-        Angle at the end by which the boundary turns away from the domain, to the next chain; 0 if it does not.
-    """
-
-    corners: np.ndarray
-    closed: bool
-    fan: float
-
-
 def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     """Return the generators (n, 2) of `layers` in `domain`.
 
@@ -143,8 +123,8 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     polygon, number = as_polygon(domain)
     found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
     for layer in layers:
-        for chain in _chains(polygon, _chosen(polygon, number, layer)):
-            feet, normals = _columns(chain, layer.width, layer.thickness)
+        for chain in find_chains(polygon, _chosen(polygon, number, layer)):
+            feet, normals = place_columns(chain, layer.width, layer.thickness)
             for y in layer.rows:
                 found.append(feet + y * normals)
                 limits.append(np.full(len(feet), _NEAR * min(layer.width, layer.heights.min())))
@@ -192,10 +172,10 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
     polygon, number = as_polygon(domain)
     total = 0
     for layer in layers:
-        chains = _chains(polygon, _chosen(polygon, number, layer))
+        chains = find_chains(polygon, _chosen(polygon, number, layer))
         if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
             raise InputError(_NO_ROOM)
-        columns = sum(sum(_counts(chain, layer.width, layer.thickness)) for chain in chains)
+        columns = sum(sum(count_columns(chain, layer.width, layer.thickness)) for chain in chains)
         total += columns * (layer.count + 1)
     return total
 
@@ -239,84 +219,13 @@ def _chosen(polygon: Polygon, number: np.ndarray, layer: Layers) -> np.ndarray:
     return np.isin(number, layer.edges)
 
 
-def _chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
-    """Join the chosen edges to chains."""
-    vertices, following = polygon.vertices, polygon.next_vertex
-    along = vertices[following] - vertices
-    after = along[following]
-    turn = np.arctan2(
-        along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
-    )
-    # Does edge e go on smoothly in the next one?
-    onward = chosen & chosen[following] & (np.abs(turn) < _SHARP)
-    starts = chosen.copy()
-    starts[following[onward]] = False
-    chains, seen = [], np.zeros(len(chosen), bool)
-    for e in [*np.flatnonzero(starts).tolist(), *np.flatnonzero(chosen).tolist()]:
-        if seen[e]:
-            continue
-        edges = [e]
-        while onward[edges[-1]] and following[edges[-1]] != e:
-            edges.append(int(following[edges[-1]]))
-        seen[edges] = True
-        last = edges[-1]
-        fan = (
-            -turn[last] if chosen[following[last]] and not onward[last] and turn[last] < 0 else 0.0
-        )
-        chains.append(
-            Chain(
-                np.vstack([vertices[edges], vertices[following[last]]]),
-                bool(onward[last]),
-                float(fan),
-            )
-        )
-    return chains
-
-
-def _counts(chain: Chain, width: float, thickness: float) -> tuple[int, int]:
-    """Return how many columns stand along the chain, and how many are spokes about its end."""
-    length = float(np.hypot(*np.diff(chain.corners, axis=0).T).sum())
-    count, fan = length / width, chain.fan * (thickness + width) / 2 / width
-    return max(1, round(min(count, _MOST))), round(min(fan, _MOST))
-
-
 def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
     polygon, number = as_polygon(domain)
-    chains = _chains(polygon, _chosen(polygon, number, layer))
-    made = [_columns(chain, layer.width, layer.thickness) for chain in chains]
+    chains = find_chains(polygon, _chosen(polygon, number, layer))
+    made = [place_columns(chain, layer.width, layer.thickness) for chain in chains]
     feet, normals = zip(*made, strict=True)
     return np.concatenate(feet), np.concatenate(normals)
-
-
-def _columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return feet (c, 2) on the wall and unit normals (c, 2) into the domain of columns about `width` apart."""
-    corners = chain.corners
-    along = np.diff(corners, axis=0)
-    lengths = np.hypot(*along.T)
-    reached = np.concatenate([[0], np.cumsum(lengths)])
-    count, fan = _counts(chain, width, thickness)
-    at = (np.arange(count) + 0.5) * (reached[-1] / count)
-    edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
-    share = ((at - reached[edge]) / lengths[edge])[:, None]
-    normal = np.column_stack([-along[:, 1], along[:, 0]]) / lengths[:, None]
-    # Normals turn from corner to corner, so that columns neither cross nor gape where the wall is bent.
-    first, last = (normal[-1], normal[0]) if chain.closed else (normal[0], normal[-1])
-    at_corners = np.vstack([first, normal]) + np.vstack([normal, last])
-    at_corners /= np.hypot(*at_corners.T)[:, None]
-    # Half an edge's normal, at most a width from its corner, is bent.
-    bend = np.minimum(0.5, width / lengths[edge])[:, None]
-    to_first, to_last = np.clip(1 - share / bend, 0, 1), np.clip(1 - (1 - share) / bend, 0, 1)
-    mixed = (
-        normal[edge]
-        + to_first * (at_corners[edge] - normal[edge])
-        + to_last * (at_corners[edge + 1] - normal[edge])
-    )
-    feet, normals = corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
-    angles = -chain.fan * (np.arange(fan) + 0.5) / max(fan, 1)
-    end = math.atan2(normal[-1, 1], normal[-1, 0])
-    spokes = np.column_stack([np.cos(end + angles), np.sin(end + angles)])
-    return np.vstack([feet, np.tile(corners[-1], (fan, 1))]), np.vstack([normals, spokes])
 
 
 def bounded(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:

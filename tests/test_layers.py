@@ -5,7 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError
-from clvoro.layers import Layers, count_rows, free_domain, place_layers
+from clvoro.layers import Layers, chosen_segments, count_rows, free_domain, place_layers
 
 BOX = clvoro.Box((0, 0), (2, 1))
 HOLE = 0.2 * np.stack(
@@ -49,6 +49,42 @@ def test_layers_of_a_straight_wall_are_rectangles(adapter):
     assert error[:n].max() == 0
     assert error[n:].mean() < 0.025
     assert result.check()
+
+
+RAMP = clvoro.Polygon([(0, 0), (0.93, 0), (1.4, 0.12), (2, 0.2), (2, 1), (0, 1)])
+UNEVEN = np.radians([0, 38, 80, 121, 160, 200, 243, 281, 320])  # turns of less than 50 degrees
+RAGGED = clvoro.Polygon(
+    [(-1, -0.7), (1, -0.7), (1, 0.7), (-1, 0.7)],
+    [0.45 * np.column_stack([np.cos(UNEVEN), np.sin(UNEVEN)])],
+)
+
+
+@pytest.mark.parametrize(
+    ("domain", "edges", "spacing"),
+    [(RAMP, range(3), 0.05), (CHANNEL, range(4, 84), 0.0075), (CHANNEL, range(4, 84), 0.014),
+     (CHANNEL, range(4, 84), 0.034), (RAGGED, range(4, 13), 0.06)],
+    ids=["ramp", "circle, two to an edge", "circle, one to an edge", "circle, two edges each", "loop"],
+)  # fmt: skip
+def test_cells_have_their_corners_at_those_of_the_wall(adapter, domain, edges, spacing):
+    """Where there is room for it: no wall's face is a sliver, cut off by a corner of the wall."""
+    layers = Layers(0.4 * spacing, count=2, spacing=spacing, edges=edges)
+    rows = place_layers(domain, [layers])
+    diagram = adapter.diagram(domain, rows)
+    owners = np.repeat(np.arange(len(rows)), np.diff(diagram.neighbour_starts))
+    walls = -1 - diagram.neighbours
+    mine = np.isin(walls, np.flatnonzero(np.isin(domain.edge_numbers, edges)))
+    lengths = diagram.face_measures[mine]
+    ends = domain.boundary_distance(rows[owners[mine]]) < 1.01 * layers.rows[0]
+    assert ends.all()  # the first row has all of the wall
+    each = np.unique(owners[mine], return_counts=True)[1]
+    two_edges = spacing > 0.03 and domain is CHANNEL
+    assert (each == (2 if two_edges else 1)).all()
+    # Half an edge of two, to rounding, or a column whose edge is not a multiple of the spacing.
+    assert lengths.min() > (0.4 if two_edges else 0.7) * spacing
+    assert lengths.max() < 1.3 * spacing
+    assert lengths.sum() == pytest.approx(
+        sum(np.linalg.norm(b - a) for a, b in chosen_segments(domain, layers)), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1])

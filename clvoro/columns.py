@@ -1,0 +1,161 @@
+"""Columns of layers along a boundary: where they stand, and in which direction they go."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .polygon import Polygon
+
+_SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin anew
+_MOST = 2.0**62  # columns, more than any device holds: numbers of them stay finite
+_LONG = 1.5  # widths: an edge that has two columns or more of its own
+_EQUAL = 1e-6  # of their length: edges of regular polygons
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Edges of the boundary one after the other, without a sharp turn.
+
+    Attributes
+    ----------
+    corners : (k, 2) float
+        The domain on the left.
+    closed : bool
+        Do the ends, which are then the same, meet smoothly?
+    fan : float
+        Angle at the end by which the boundary turns away from the domain, to the next chain; 0 if it does not.
+    """
+
+    corners: np.ndarray
+    closed: bool
+    fan: float
+
+
+def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
+    """Join the `chosen` edges, (k,) bool, to chains."""
+    vertices, following = polygon.vertices, polygon.next_vertex
+    along = vertices[following] - vertices
+    after = along[following]
+    turn = np.arctan2(
+        along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
+    )
+    # Does edge e go on smoothly in the next one?
+    onward = chosen & chosen[following] & (np.abs(turn) < _SHARP)
+    starts = chosen.copy()
+    starts[following[onward]] = False
+    chains, seen = [], np.zeros(len(chosen), bool)
+    for e in [*np.flatnonzero(starts).tolist(), *np.flatnonzero(chosen).tolist()]:
+        if seen[e]:
+            continue
+        edges = [e]
+        while onward[edges[-1]] and following[edges[-1]] != e:
+            edges.append(int(following[edges[-1]]))
+        seen[edges] = True
+        last = edges[-1]
+        fan = (
+            -turn[last] if chosen[following[last]] and not onward[last] and turn[last] < 0 else 0.0
+        )
+        chains.append(
+            Chain(
+                np.vstack([vertices[edges], vertices[following[last]]]),
+                bool(onward[last]),
+                float(fan),
+            )
+        )
+    return chains
+
+
+def count_columns(chain: Chain, width: float, thickness: float) -> tuple[int, int]:
+    """Return how many columns stand along the chain, and how many are spokes about its end."""
+    corners, _ = _begun(chain, width)
+    _, counts = _runs(np.hypot(*np.diff(corners, axis=0).T), width)
+    fan = chain.fan * (thickness + width) / 2 / width
+    return sum(map(int, counts.tolist())), round(min(fan, _MOST))
+
+
+def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
+    """Return the corners of a chain, of a closed one from where a run begins, and whether there is such a place."""
+    long = np.hypot(*np.diff(chain.corners, axis=0).T) >= _LONG * width
+    begins = np.flatnonzero(long & np.roll(long, 1)) if chain.closed else np.empty(0, int)
+    if not len(begins):
+        return chain.corners, False
+    first = int(begins[0])
+    return np.vstack([chain.corners[first:-1], chain.corners[: first + 1]]), True
+
+
+def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cut a chain at the corners between long edges, which then are corners of cells, too: no sliver of a face is left.
+
+    Returns
+    -------
+    runs, counts : (r,) float
+        Their lengths, and how many columns stand on each.
+    """
+    long = lengths >= _LONG * width
+    first = np.flatnonzero(np.concatenate([[True], long[1:] & long[:-1], [True]]))
+    reached = np.concatenate([[0], np.cumsum(lengths)])
+    runs = np.diff(reached[first])
+    with np.errstate(over="ignore"):
+        counts = np.maximum(np.rint(np.minimum(runs / width, _MOST)), 1)
+    edges = len(lengths)
+    if len(runs) == 1 and np.ptp(lengths) <= _EQUAL * lengths[0]:
+        # As many on each edge of a regular polygon, or as many edges to each.
+        share = counts[0] / edges
+        whole = max(1, round(1 / share))
+        if share >= 0.75:
+            counts[0] = edges * round(min(share, _MOST))
+        elif edges % whole == 0:
+            counts[0] = edges // whole
+    return runs, counts
+
+
+def _places(lengths: np.ndarray, width: float, joined: bool) -> np.ndarray:
+    """Return how far along the chain the columns stand: from a corner between runs as far on both sides of it.
+
+    `joined` tells whether the first run begins at such a corner, too.
+    """
+    runs, counts = _runs(lengths, width)
+    starts = np.cumsum(runs) - runs
+    half = 0.5 * runs / counts
+    meet = 0.5 * (half[1:] + half[:-1])
+    ends = 0.5 * (half[0] + half[-1]) if joined else None
+    before = np.concatenate([[half[0] if ends is None else ends], meet])
+    after = np.concatenate([meet, [half[-1] if ends is None else ends]])
+    steps = (runs - before - after) / np.maximum(counts - 1, 1)
+    n = counts.astype(np.int64)
+    run = np.repeat(np.arange(len(runs)), n)
+    number = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    return starts[run] + before[run] + number * steps[run]
+
+
+def place_columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return feet (c, 2) on the wall and unit normals (c, 2) into the domain of columns about `width` apart."""
+    corners, joined = _begun(chain, width)
+    along = np.diff(corners, axis=0)
+    lengths = np.hypot(*along.T)
+    reached = np.concatenate([[0], np.cumsum(lengths)])
+    _, fan = count_columns(chain, width, thickness)
+    at = _places(lengths, width, joined)
+    edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
+    share = ((at - reached[edge]) / lengths[edge])[:, None]
+    normal = np.column_stack([-along[:, 1], along[:, 0]]) / lengths[:, None]
+    # Normals turn from corner to corner, so that columns neither cross nor gape where the wall is bent.
+    first, last = (normal[-1], normal[0]) if chain.closed else (normal[0], normal[-1])
+    at_corners = np.vstack([first, normal]) + np.vstack([normal, last])
+    at_corners /= np.hypot(*at_corners.T)[:, None]
+    # Half an edge's normal, at most a width from its corner, is bent.
+    bend = np.minimum(0.5, width / lengths[edge])[:, None]
+    to_first, to_last = np.clip(1 - share / bend, 0, 1), np.clip(1 - (1 - share) / bend, 0, 1)
+    mixed = (
+        normal[edge]
+        + to_first * (at_corners[edge] - normal[edge])
+        + to_last * (at_corners[edge + 1] - normal[edge])
+    )
+    feet, normals = corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
+    angles = -chain.fan * (np.arange(fan) + 0.5) / max(fan, 1)
+    end = math.atan2(normal[-1, 1], normal[-1, 0])
+    spokes = np.column_stack([np.cos(end + angles), np.sin(end + angles)])
+    return np.vstack([feet, np.tile(corners[-1], (fan, 1))]), np.vstack([normals, spokes])
