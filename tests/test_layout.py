@@ -1,0 +1,291 @@
+"""The house as it is laid out: what imports and includes what, kernels and their names, and how kernels are written."""
+
+import ast
+import collections
+import functools
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import clvoro
+from clvoro._program import kernel_folder
+
+PACKAGE = Path(clvoro.__file__).parent
+KERNELS = kernel_folder()
+SOURCES = sorted([*KERNELS.glob("*.cl"), *KERNELS.glob("common/*.h")])
+HOUSE = PACKAGE.parent
+CLANG_FORMAT = "14"
+"""The version whose style is the kernels': others break some lines elsewhere."""
+FACES = {"cli", "jobs", "sequence", "report", "io", "cases", "__init__", "__main__"}
+"""What stands on the library, which does without: command line, pictures, files."""
+OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")
+"""An expression in Python that stands for the kernels of a file."""
+PARTS = {
+    "poisson": {"krylov", "multigrid"},
+    "multigrid": {"coarsening"},
+    "loops": {"corners"},
+    "repair": {"cells"},
+}
+"""Stages that are made of others."""
+
+
+def name_of(path):
+    return path.relative_to(KERNELS).as_posix()
+
+
+@functools.cache
+def text_of(path):
+    return path.read_text()
+
+
+@functools.cache
+def code_of(path):
+    """Return the text of kernels without comments."""
+    return re.sub(r"/\*.*?\*/|//[^\n]*", " ", text_of(path), flags=re.S)
+
+
+@functools.cache
+def functions(path):
+    """Return the functions of one file as [(name, body, is it a kernel)]."""
+    found, code = [], code_of(path)
+    for head in re.finditer(r"^(inline|kernel) [^;{}#]*?\b(\w+)\(", code, re.M):
+        begin = code.index("{", head.end())
+        depth, end = 1, begin + 1
+        while depth:
+            depth += {"{": 1, "}": -1}.get(code[end], 0)
+            end += 1
+        found.append((head[2], code[begin:end], head[1] == "kernel"))
+    return found
+
+
+@functools.cache
+def macros(path):
+    """Return the macros of one file as [(name, replacement)]."""
+    pattern = r"^[ \t]*#define (\w+)(?:\([^)]*\))?((?:[^\n]*\\\n)*[^\n]*)"
+    return re.findall(pattern, code_of(path), re.M)
+
+
+@functools.cache
+def unit(path):
+    """Return the files that make a program of `path`: itself and what it includes."""
+    found = [path]
+    for header in re.findall(r'^#include "([^"]+)"', text_of(path), re.M):
+        found += [other for other in unit(KERNELS / header) if other not in found]
+    return found
+
+
+def kernels_of(stage):
+    """Return the names of a stage's kernels."""
+    files = unit(KERNELS / f"{stage}.cl")
+    return {name for path in files for name, _, is_kernel in functions(path) if is_kernel}
+
+
+@functools.cache
+def modules():
+    """Return all modules of the package as {name: syntax tree}, without the package's own name."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+        found[name] = ast.parse(text_of(path))
+    return found
+
+
+def imports(name, tree, known):
+    """Return which modules of the package are imported when `name` is, with the names taken: {module: names}."""
+    found = {}
+    package = name.split(".")[:-1]
+    lazy = set()
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.If)) and not (
+            isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test)
+        ):
+            lazy |= {id(n) for n in ast.walk(node)}
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.ImportFrom) or not node.level or id(node) in lazy:
+            continue
+        base = package[: len(package) - (node.level - 1)] + (node.module or "").split(".")
+        base = [part for part in base if part]
+        for alias in node.names:
+            whole = ".".join([*base, alias.name])
+            if whole not in known:
+                whole = ".".join(base)
+                whole = whole if whole in known else ".".join([*base, "__init__"])
+            assert whole in known, f"{name} imports {whole}"
+            found.setdefault(whole, set()).add(alias.name)
+    return found
+
+
+def stages():
+    """Return the names of files of kernels."""
+    return {path.stem for path in KERNELS.glob("*.cl")}
+
+
+# Modules.
+
+
+def test_imports_go_down_only():
+    """In no circle, and from a layer to those below it."""
+    trees = modules()
+    graph = {name: set(imports(name, tree, trees)) for name, tree in trees.items()}
+    assert len(graph) > 80
+    left = dict(graph)
+    while True:
+        ground = {name for name, needs in left.items() if not needs & set(left) - {name}}
+        if not ground:
+            break
+        for name in ground:
+            del left[name]
+    assert not left, "modules that import each other, or stand on such"
+    for name, needs in graph.items():
+        top = name.split(".")[0]
+        for need in needs:
+            assert top in FACES or need.split(".")[0] not in FACES, f"{name} imports {need}"
+            if name.startswith("_") and name not in FACES:
+                allowed = need.startswith("_") or need in ("errors", "device", "domain")
+                assert allowed, f"{name}, which knows nothing of meshes, imports {need}"
+
+
+def test_stages_import_no_stages():
+    """But for what they hand on (data, constants), and where a stage is made of others."""
+    trees = modules()
+    makers = {  # classes that have kernels
+        name: {
+            node.name
+            for node in tree.body
+            if isinstance(node, ast.ClassDef) and ".kernels(" in ast.unparse(node)
+        }
+        for name, tree in trees.items()
+    }
+    seen = set()
+    for name in sorted(stages() & set(trees)):
+        for other, taken in imports(name, trees[name], trees).items():
+            if other in stages() and taken & makers[other]:
+                assert other in PARTS.get(name, ()), f"{name} imports {taken} of {other}"
+                seen.add((name, other))
+    assert seen == {(name, part) for name, parts in PARTS.items() for part in parts}
+
+
+# Files of kernels.
+
+
+def test_every_header_is_used():
+    included = {path for stage in stages() for path in unit(KERNELS / f"{stage}.cl")}
+    by_python = {
+        KERNELS / name
+        for tree in modules().values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        for name in re.findall(r"^common/\w+\.h$", node.value)
+    }
+    assert included | by_python == set(SOURCES)
+
+
+def test_nothing_is_defined_in_vain():
+    """Functions and macros are used somewhere beside their definitions; kernels: see below."""
+    counts = collections.Counter(w for path in SOURCES for w in re.findall(r"\w+", code_of(path)))
+    defined = collections.Counter(
+        name
+        for path in SOURCES
+        for name in [
+            *(name for name, _, is_kernel in functions(path) if not is_kernel),
+            *(name for name, _ in macros(path)),
+        ]
+    )
+    asked = collections.Counter(
+        name
+        for path in SOURCES
+        for name in re.findall(r"^[ \t]*#ifn?def (\w+)", code_of(path), re.M)
+        if name in defined
+    )
+    assert len(defined) > 300, "the patterns find nothing any more"
+    vain = {name for name in defined if counts[name] <= defined[name] + asked[name]}
+    # But for those that are put together, as by CLVORO_JOIN(NAME_, REAL), and of three kinds
+    # the one that is told by being none of the others.
+    together = re.compile("(?<=_)(double|float|int)$")
+    vain -= {name for name in vain if together.search(name) and counts[together.sub("", name)]}
+    assert vain == {"SIZE_ROUND"}
+
+
+def test_kernels_are_those_that_python_asks_for():
+    """Each kernel is named in a module that builds its file, and no other one is."""
+    asked = {stage: set() for stage in stages()}
+    for module, tree in modules().items():
+        built = set(re.findall(r"\.kernels\('(\w+)'", ast.unparse(tree)))
+        assert built <= stages(), module
+        if not built:
+            continue
+        known = set().union(*map(kernels_of, built))
+        sets = {"kernels", "_kernels"}  # names of variables and functions that have kernels
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Assign):
+                pairs = [(node.targets[0], node.value)]
+                if isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    pairs = zip(node.targets[0].elts, node.value.elts, strict=True)
+                for target, value in pairs:
+                    if isinstance(target, ast.Name) and OF_KERNELS.search(ast.unparse(value)):
+                        sets.add(target.id)
+        names = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant):
+                names.add(node.value)
+            elif isinstance(node, ast.Attribute):
+                names.add(node.attr)
+                holder = re.sub(r"(\(.*\)|\[.*\])$", "", ast.unparse(node.value)).split(".")[-1]
+                if holder in sets and node.attr not in (*dir(dict), "kernels"):
+                    assert node.attr in known, f"{module} asks for {node.attr}"
+        for stage in built:
+            asked[stage] |= names
+    asked["copy"] = kernels_of("copy")  # the only one: the profile takes what there is
+    for stage in stages():
+        assert kernels_of(stage), stage
+        assert kernels_of(stage) <= asked[stage], f"{stage}: nobody asks for these"
+
+
+def test_no_kernel_returns_before_a_barrier():
+    """Work-items that have returned would be waited for: PoCL fails at that with groups of more than one."""
+    checked = set()
+    for stage in stages():
+        files = unit(KERNELS / f"{stage}.cl")
+        bodies = [(name, body) for path in files for name, body, _ in functions(path)]
+        texts = [(name, body) for path in files for name, body in macros(path)]
+
+        def reaching(names, texts):
+            """Names of those which contain one of `names`, or another that does."""
+            while True:
+                pattern = re.compile(rf"(?<![.>\w])({'|'.join(sorted(names))})\b")
+                more = {name for name, body in texts if pattern.search(body)} - names
+                if not more:
+                    return pattern
+                names |= more
+
+        waits = reaching({"barrier"}, bodies + texts)
+        # A function that returns something ends itself, a macro that does so what it stands in.
+        returns = reaching({"return"}, texts)
+        for name, body in bodies:
+            calls = [match.start() for match in waits.finditer(body)]
+            if calls:
+                checked.add((stage, name))
+                # What a function that waits has found may be returned.
+                before = re.sub(r"\breturn\b[^;]*$", "", body[: calls[-1]])
+                assert not returns.search(before), (stage, name)
+    assert {("krylov", "solve_alone"), ("poisson", "compatible")} <= checked
+
+
+def test_kernels_are_formatted():
+    if not (HOUSE / ".clang-format").is_file():
+        pytest.skip("the tests lie outside a source tree")
+    if shutil.which("clang-format") is None:
+        pytest.skip("needs clang-format")
+    said = subprocess.run(["clang-format", "--version"], capture_output=True, text=True).stdout
+    if re.search(rf"version {CLANG_FORMAT}\.", said) is None:
+        pytest.skip(f"needs clang-format {CLANG_FORMAT}, this is {said.strip()}")
+    done = subprocess.run(
+        ["clang-format", "--dry-run", "--Werror", *map(str, SOURCES)],
+        cwd=HOUSE,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
