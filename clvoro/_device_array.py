@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import inspect
 import math
+from functools import cached_property
+from itertools import count
 from typing import Any, cast
 
 import numpy as np
@@ -22,10 +24,19 @@ _PATTERN = 64
 _ZEROS = np.zeros(_PATTERN, np.uint8)
 _LARGEST_FILL = 2**31
 """Bytes from which on NVIDIA's way to fill memory fails, and PyOpenCL's kernel takes over."""
+_marks = count()
 
 
 class DeviceArray(cla.Array):
     """A contiguous array on an in-order queue; see `make_array`."""
+
+    @cached_property
+    def mark(self) -> int:
+        """A number that no other array has, or ever had, but views that begin where this one does.
+
+        By it a kernel's arguments are told from its last ones, whose memory may long be another's.
+        """
+        return next(_marks)
 
     def _place(self) -> tuple[cl.CommandQueue, cl.Buffer]:
         """Return queue and buffer of an array that is not empty; PyOpenCL's need not have them."""
@@ -38,7 +49,9 @@ class DeviceArray(cla.Array):
         if type(index) is slice and index.start is None and index.step is None:
             if type(index.stop) is int and 0 <= index.stop <= self.shape[0]:
                 shape, (queue, buffer) = (index.stop, *self.shape[1:]), self._place()
-                return make_array(queue, shape, self.dtype, buffer, self.offset)
+                view = make_array(queue, shape, self.dtype, buffer, self.offset)
+                view.mark = self.mark
+                return view
         elif isinstance(index, int) and len(self.shape) == 1 and 0 <= index < self.shape[0]:
             offset, (queue, buffer) = self.offset + index * self.dtype.itemsize, self._place()
             return make_array(queue, (), self.dtype, buffer, offset)
@@ -83,6 +96,16 @@ class DeviceArray(cla.Array):
 def buffer_of(array: cla.Array) -> cl.Buffer:
     """Return the buffer that `array` begins, for what PyOpenCL does with buffers; its arrays may lie elsewhere."""
     return cast("cl.Buffer", array.data)
+
+
+def read_number(array: cla.Array, index: int) -> Any:
+    """Fetch one number of a flat array: as ``array[index].get()`` does, but for the view, which costs as much."""
+    if not 0 <= index < len(array):
+        raise IndexError(f"index {index} of an array of {len(array)}")
+    host = np.empty(1, array.dtype)
+    start = array.offset + index * array.dtype.itemsize
+    cl.enqueue_copy(cast("cl.CommandQueue", array.queue), host, array.base_data, src_offset=start)
+    return host.item()
 
 
 def make_array(

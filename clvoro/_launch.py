@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl as cl
 
-from ._program import Engine, bind
+from ._program import Engine, bind, plain, set_args
 
 
 def most_alone(engine: Engine) -> int:
@@ -27,7 +27,9 @@ class Launch:
     def __init__(
         self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None
     ) -> None:
-        self._args = bind(kernel, args)
+        bind(kernel, args)
+        self._args = args
+        self._given: list[object] = []
         self._kernel = kernel
         self._queue = engine.queue
         self._size = ((engine.groups if groups is None else groups) * engine.group_size,)
@@ -35,8 +37,10 @@ class Launch:
 
     def set_first(self, value: int) -> None:
         """Set the kernel's first argument, an int."""
-        self._args[0] = np.int32(value)
-        bind(self._kernel, self._args)
+        if not self._given:
+            self._given = plain(self._args)
+        self._given[0] = np.int32(value)
+        set_args(self._kernel, self._given)
 
     def __call__(self) -> None:
         """Enqueue the kernel."""

@@ -14,8 +14,7 @@ use it are done by then.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -56,40 +55,46 @@ class Workspace:
         self._queue = queue
         # Sub-buffers have to begin at multiples of this; a cache line at least keeps arrays apart.
         self._unit = max(64, queue.device.mem_base_addr_align // 8)
-        self._depth = 0
+        # Per frame that is open, what was taken of each piece when it began.
+        self._before: list[list[int]] = []
         self.clear()
 
     def clear(self) -> None:
         """Let go of all memory, outside of any frame; within one, nothing is done."""
-        if self._depth:
+        if self._before:
             return
         # Each piece is taken from its beginning on; so many bytes of it are.
         self._pieces: list[cl.Buffer] = []
         self._taken: list[int] = []
-        self._views: dict[tuple[object, ...], cla.Array] = {}
+        self._views: dict[tuple[object, ...], tuple[cla.Array, int]] = {}
         self._most = 0
 
-    @contextmanager
-    def frame(self) -> Iterator[None]:
-        """Give back at the end what is taken meanwhile."""
-        if self._depth == 0 and len(self._pieces) > 1:
+    def frame(self) -> Workspace:
+        """Return what, at the end of a ``with``, gives back all that is taken meanwhile."""
+        return self
+
+    def __enter__(self) -> None:
+        if not self._before and len(self._pieces) > 1:
             # One piece in the place of those that it took to find out how much is needed.
             self._pieces, self._taken, self._views = [], [], {}
             self._add(self._most)
-        if self._depth == 0 and len(self._views) > MOST_VIEWS:
+        if not self._before and len(self._views) > MOST_VIEWS:
             self._views = {}
-        before = self._taken.copy()
-        self._depth += 1
-        try:
-            yield
-        finally:
-            self._depth -= 1
-            self._taken[:] = before + [0] * (len(self._pieces) - len(before))
+        self._before.append(self._taken.copy())
+
+    def __exit__(self, *_: object) -> None:
+        before = self._before.pop()
+        self._taken[:] = before + [0] * (len(self._pieces) - len(before))
 
     def take(self, shape: int | tuple[int, ...], dtype: np.dtype) -> cla.Array | None:
         """Return an array whose content is arbitrary, valid to the end of the frame; None outside of any."""
-        if self._depth == 0:
+        if not self._before:
             return None
+        if len(self._taken) == 1:
+            known = self._views.get((0, self._taken[0], shape, dtype))
+            if known is not None:
+                view, self._taken[0] = known
+                return view
         items = math.prod(shape) if isinstance(shape, tuple) else int(shape)
         size = max(items * dtype.itemsize, 1)
         size = -(-size // self._unit) * self._unit
@@ -101,12 +106,12 @@ class Workspace:
         start = self._taken[number]
         key = number, start, shape, dtype
         if key not in self._views:
-            # Kept, as to make one costs as much as a launch.
+            # Kept with its end, as to make one costs as much as a launch.
             view = self._pieces[number].get_sub_region(start, size)
-            self._views[key] = make_array(self._queue, shape, dtype, view)
-        self._taken[number] += size
+            self._views[key] = make_array(self._queue, shape, dtype, view), start + size
+        array, self._taken[number] = self._views[key]
         self._most = max(self._most, sum(self._taken))
-        return self._views[key]
+        return array
 
     def _add(self, size: int) -> None:
         self._pieces.append(cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size))

@@ -9,7 +9,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
-from ._device_array import buffer_of
+from ._device_array import buffer_of, read_number
 from ._primitives import Scan
 from ._program import Engine
 from .domain import ClipBox
@@ -152,10 +152,10 @@ class Bins:
                 k.place_bins, size, self._starts, np.int32(begin), self._grid_of, self._shapes,
                 self._grid_items, np.int32(grids), self._flags, self._bins,
             )  # fmt: skip
-            new_grids = int(self._flags[size].get())
+            new_grids = read_number(self._flags, size)
             if new_grids == 0:
                 break
-            new_bins = int(self._sizes[size].get())
+            new_bins = read_number(self._sizes, size)
             child_firsts = self._sizes  # _reserve may replace it
             self._reserve(n, end + new_bins)
             self._clear(self._counts, end, new_bins)

@@ -10,6 +10,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
+from ._device_array import read_number
 from ._primitives import Room, Scan
 from ._program import Engine, Kernels
 
@@ -224,7 +225,7 @@ class Coarsening:
             run(k.propose, n, size, one, *rows, sums, mate, choice)
             run(k.join, n, size, mate, choice, numbers)
             self._scan.exclusive(numbers, numbers, n)
-            count = int(numbers[n : n + 1].get()[0])
+            count = read_number(numbers, n)
             standing, number = scratch(count, ints), np.int32(count)
             run(k.number_groups, n, size, mate, choice, numbers, group, standing)
             listing = (graph.starts, graph.columns, mate, choice, standing, starts)
@@ -249,7 +250,7 @@ class Coarsening:
         number, starts = np.int32(count), array("starts", count + 1, np.int32)
         run(k.count_rows, count, number, *rows, starts)
         self._scan.exclusive(starts, starts, count)
-        entries = int(starts[count : count + 1].get()[0])
+        entries = read_number(starts, count)
         columns, weights = array("columns", entries, np.int32), array("weights", entries)
         scale = self.engine.real.type(factor)
         run(k.merge_rows, count, number, scale, *rows, starts, columns, weights)

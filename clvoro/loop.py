@@ -266,7 +266,8 @@ class Loop:
             size=size,
             error=error,
             quality=quality,
-            history=np.concatenate(self.rows),
+            # With the type it need not be found out from all of them.
+            history=np.concatenate(self.rows, dtype=HISTORY_DTYPE),
             converged=converged,
             stop_reason=reason,
             initial=self.initial,

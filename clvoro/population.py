@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
+from ._device_array import read_number
 from ._primitives import Room, Scan
 from ._program import Engine
 from .cells import Tessellation
@@ -270,7 +271,7 @@ class PopulationControl:
         engine, n = self.engine, t.n
         self._scan.exclusive(marks.kept, marks.kept, n)
         self._scan.exclusive(marks.born, marks.born, n)
-        deleted, inserted = n - int(marks.kept[n].get()), int(marks.born[n].get())
+        deleted, inserted = n - read_number(marks.kept, n), read_number(marks.born, n)
         m = n - deleted + inserted
         if m == 0 or (deleted == 0 and inserted == 0):
             return None

@@ -9,6 +9,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ._device_array import read_number
 from ._primitives import Scan
 from ._program import Engine
 from .cells import Cells, Tessellation
@@ -82,7 +83,7 @@ class Repair:
         base = 0
         for _ in range(MAX_ROUNDS):
             self._scan.exclusive(marks, sums, n)
-            count = int(sums[n].get())
+            count = read_number(sums, n)
             if count == 0:
                 return cells.complete(rows, box, points, previous, self._fits)
             if base + count > (most if base else first_most):

@@ -6,7 +6,7 @@ import pyopencl.array as cla
 import pytest
 
 from clvoro import _device_array
-from clvoro._device_array import make_array
+from clvoro._device_array import make_array, read_number
 
 
 @pytest.fixture
@@ -112,3 +112,22 @@ def test_what_is_written_must_fit(queue):
     strided = np.arange(8, dtype=np.int32)[::2]
     with pytest.raises(RuntimeError):
         array.set(strided)
+
+
+@pytest.mark.usefixtures("quick")
+def test_one_number_is_read_as_by_a_view(queue):
+    host = np.array([3, -1, 2**31 - 1, 7], np.int32)
+    array = make_array(queue, 4, host.dtype)
+    array.set(host)
+    assert [read_number(array, k) for k in range(4)] == host.tolist()
+    assert [read_number(array[1:], k) for k in range(3)] == host[1:].tolist()
+    for outside in (-1, 4):
+        with pytest.raises(IndexError):
+            read_number(array, outside)
+
+
+def test_marks_tell_what_begins_where(queue):
+    array = make_array(queue, 8, np.dtype(np.int32))
+    assert array[:3].mark == array.mark == array[:0].mark or array[:0].base_data is None
+    others = [array[2:], array[2], make_array(queue, 8, array.dtype), array.copy(), array + array]
+    assert len({array.mark, *(other.mark for other in others)}) == 1 + len(others)
