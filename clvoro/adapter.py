@@ -14,12 +14,13 @@ import pyopencl as cl
 from . import device
 from ._arrays import Naming, check_number, check_points
 from ._program import Engine
-from .checkpoint import Checkpointer, Saved, describe
+from .checkpoint import Checkpointer, Saved
 from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
 from .layers import Layers
 from .loop import Loop
+from .made_by import describe
 from .memory import check_memory
 from .mesh import Stages
 from .preparation import Options, Preparation, check_options
@@ -297,8 +298,10 @@ class Adapter:
         """Prepare a run and carry it out, with fewer coarse levels where a periodic box has too few cells around it."""
         stages = self._stages_for(domain)
         host = None if points is None else check_points(points, domain)
-        made_by = describe(domain, vars(options), self.dtype, host)
         saved = None if resume is None else Saved(resume)
+        made_by = {}
+        if saved is not None or checkpoint is not None:
+            made_by = describe(domain, vars(options), self.dtype, host)
         if saved is not None:
             saved.fit(made_by)
         most = MOST_LEVELS if saved is None else saved.levels

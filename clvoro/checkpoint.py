@@ -1,9 +1,9 @@
 """Checkpoints: a run's whole state in one file, from which it goes on to the same end, bit for bit.
 
 What a step leaves for the next one is saved as it is: generators in the device's order, their diagram (the next one is
-repaired from it), sizes, velocities, the solvers' starts, the multigrid's coarse levels (which last for several steps), and
-the few numbers that the host keeps. What is computed anew from
-these (the size field, the plan) is compared with what the file says, so that a run does not go on from another's state.
+repaired from it), sizes, velocities, the solvers' starts, the multigrid's coarse levels (which last for several steps),
+and the few numbers that the host keeps. What is computed anew from these (the size field, the plan) is compared with
+what the file says, so that a run does not go on from another's state.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 
 from .cells import Cells, Tessellation
 from .errors import InputError
+from .made_by import named
 from .mesh import SUMMARIES, Mesh, Stages
 from .plans import Action, Step
 from .polygon import Polygon
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from .loop import Loop
     from .sizing import Sizing
 
-FORMAT, VERSION = "clvoro-checkpoint", 4
+FORMAT, VERSION = "clvoro-checkpoint", 5
 _MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
 _PER_FACE = ("neighbours", "face_measures", "face_centroids")
 _DIAGRAM = (
@@ -48,30 +49,6 @@ _COUNTS = (
     "spare",
     "seam_cells",
 )
-
-
-def describe(
-    domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None
-) -> dict:
-    """Return what makes a run, as plain values: a checkpoint of other ones is refused."""
-    start = None if points is None else hashlib.sha256(np.ascontiguousarray(points).tobytes())
-    return {
-        "domain": _identity(domain),
-        "dtype": dtype.name,
-        "points": None if start is None else start.hexdigest(),
-        **options,
-        "layers": [repr(layer) for layer in options["layers"]],
-    }
-
-
-def _identity(domain: Domain) -> list:
-    """Return what tells `domain` from others: corners, number of walls if that is no plain box's, and what else."""
-    corners = [list(domain.lower), list(domain.upper)]
-    if isinstance(domain, Polygon):
-        return [*corners, len(domain.vertices), domain.digest]
-    if any(domain.periodic):
-        return [*corners, 2 * domain.dim, list(domain.periodic)]
-    return corners
 
 
 def fingerprint(plan: list[Action]) -> str:
@@ -177,6 +154,12 @@ class Saved:
 
         self.name = fspath(path)
         self.arrays = read_arrays(path, FORMAT, VERSION)
+        version = self.arrays["version"].item()
+        if version != VERSION:
+            raise InputError(
+                f"cannot resume from {self.name}: it is a checkpoint of version {version}, expected {VERSION}, as this "
+                "version of clvoro writes; begin anew without resume"
+            )
         try:
             about = json.loads(self.arrays["about"].item())
             self.made_by, self.plan = dict(about["made_by"]), str(about["plan"])
@@ -190,11 +173,11 @@ class Saved:
                 raise ValueError("coarsening")
             if not self.levels >= 0:
                 raise ValueError("levels")
-            lower, _, *more = self.made_by["domain"]
-            walls = int(more[0]) if more else 2 * len(lower)
-            self._check(len(lower), walls, np.dtype(self.made_by["dtype"]))
-            if len(more) > 1 and isinstance(more[1], list):  # directions, not a polygon's digest
-                self._check_seams(len(lower))
+            domain = self.made_by["domain"]
+            d = len(domain["lower"])
+            self._check(d, int(domain["walls"]), np.dtype(self.made_by["dtype"]))
+            if any(domain["periodic"]):
+                self._check_seams(d)
         except (
             KeyError,
             ValueError,
@@ -266,6 +249,8 @@ class Saved:
                 continue
             if name == "points":
                 was, now = ("none" if v is None else f"others ({v:.8}...)" for v in (was, now))
+            if name == "domain":
+                was, now = (named(v) for v in (was, now))
             raise InputError(
                 f"cannot resume from {self.name}: it is of a run with {name} = {was}, and this one has {name} = "
                 f"{now}; give the settings of that run, or begin anew without resume"

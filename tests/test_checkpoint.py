@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro import cli, poisson
+from clvoro import checkpoint, cli, poisson
 from clvoro.checkpoint import Saved
 from clvoro.errors import InputError
+from clvoro.made_by import identity
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")
@@ -176,6 +177,37 @@ def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path.parent, **options)
     with pytest.raises(InputError, match="no folder"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path / "none" / "state", **options)
+
+
+RECTANGLE = [(0, 0), (2.5, 0), (2.5, 1.5), (0, 1.5)]
+ALIKE = {
+    "box": BOX,
+    "periodic": clvoro.Box((0, 0), (2.5, 1.5), periodic=True),
+    "channel": clvoro.Box((0, 0), (2.5, 1.5), periodic=(True, False)),
+    "polygon": clvoro.Polygon(RECTANGLE),
+    "from another corner": clvoro.Polygon(RECTANGLE[1:] + RECTANGLE[:1]),
+    "turned round": clvoro.Polygon(RECTANGLE[::-1]),
+    "with a hole": clvoro.Polygon(RECTANGLE, [[(1, 1), (1.1, 1), (1, 1.1)]]),
+}
+
+
+def test_domains_of_the_same_extent_are_told_apart(saved):
+    """By what files hold of them."""
+    told = {name: identity(domain) for name, domain in ALIKE.items()}
+    assert len({json.dumps(t, sort_keys=True) for t in told.values()}) == len(ALIKE)
+    assert identity(clvoro.Polygon(RECTANGLE)) == told["polygon"]
+    for name in set(ALIKE) - {"box"}:
+        with pytest.raises(InputError, match=r"domain = Box\(.*'walls': 4.* has domain = "):
+            Saved(saved[0]).fit({**Saved(saved[0]).made_by, "domain": told[name]})
+
+
+def test_checkpoints_of_other_versions_are_refused(saved, tmp_path):
+    def older(name, array):
+        return np.array(checkpoint.VERSION - 1) if name == "version" else array
+
+    rewrite(saved[0], tmp_path / "state", older)
+    with pytest.raises(InputError, match=rf"of version {checkpoint.VERSION - 1}.*begin anew"):
+        Saved(tmp_path / "state")
 
 
 def rewrite(path, target, change):

@@ -280,7 +280,7 @@ def test_files_hold_the_domain(tmp_path) -> None:
 
 
 def test_checkpoints_tell_domains_apart() -> None:
-    from clvoro.checkpoint import describe
+    from clvoro.made_by import describe
 
     domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
     options: dict = {"layers": []}
