@@ -39,9 +39,13 @@ class Progress:
         self._live = self._status is not None or self.stream.isatty()
 
     def __enter__(self) -> Progress:
+        text = f"{self.title}: preparing (a first run builds its kernels)"
         if self._status is not None:
             self._status.start()
-            self._status.update(f"{self.title}: preparing")
+            self._status.update(text)
+        elif self._live:
+            self._replace(text)
+            self._shown = time.monotonic() - REFRESH
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -68,10 +72,14 @@ class Progress:
         if self._status is not None:
             self._status.update(text)
         elif self._live:
-            columns = shutil.get_terminal_size().columns
-            self.stream.write(f"\r{text[: columns - 1]}\x1b[K")
+            self._replace(text)
         else:
             self.stream.write(text + "\n")
+        self.stream.flush()
+
+    def _replace(self, text: str) -> None:
+        columns = shutil.get_terminal_size().columns
+        self.stream.write(f"\r{text[: columns - 1]}\x1b[K")
         self.stream.flush()
 
     def line(self, row: np.void) -> str:

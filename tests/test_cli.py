@@ -353,7 +353,9 @@ def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
             shown(row(step, step))
     text = stream.getvalue()
     assert "\n" not in text
-    assert text.count("\r") == 4  # three steps, and the line is cleared in the end
+    # That it prepares, three steps, and the line is cleared in the end.
+    assert text.startswith("\rx: preparing")
+    assert text.count("\r") == 5
 
 
 def test_terminal_with_rich(monkeypatch):

@@ -14,6 +14,15 @@ PUBLIC = [getattr(clvoro, name) for name in clvoro.__all__] + [
 ]
 
 
+def test_the_package_itself():
+    found = doctest.testmod(clvoro)
+    assert found.attempted > 5
+    assert found.failed == 0
+    for name in clvoro.__all__:
+        if inspect.isclass(getattr(clvoro, name)) and name not in ("ClvoroError", "Displacements"):
+            assert f"`{name}`" in clvoro.__doc__ or f"`{name}." in clvoro.__doc__, name
+
+
 def members(thing):
     """The public functions that a class of clvoro defines itself or inherits from another of clvoro."""
     if not inspect.isclass(thing):
