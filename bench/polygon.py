@@ -37,7 +37,7 @@ from _common import (
 
 import clvoro
 from clvoro._program import Engine
-from clvoro.mesh import Stages
+from clvoro.stages import Stages
 from clvoro.tessellator import Tessellator
 
 MOST_RATIO = 1.3

@@ -33,11 +33,12 @@ from _common import BOX, Report, counts, heading, make_adapter, markdown, names,
 
 import clvoro
 from clvoro._program import Engine
-from clvoro.mesh import Mesh, Stages
+from clvoro.mesh import Mesh
 from clvoro.methods import Method, ProjectedMethod, WeightedMethod
 from clvoro.plans import Step, plan_adaptive
 from clvoro.profile import Profile, profiled_queue
 from clvoro.sizing import Sizing
+from clvoro.stages import Stages
 
 CELLS_OF_F2 = 22972
 SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -16,9 +16,7 @@ from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
-
-if TYPE_CHECKING:
-    from .trim import Trimmed
+from .tessellation import COINCIDE, DOUBT, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
 
 CELL_CAPACITY = 24
 """Faces that a cell may have while it is clipped."""
@@ -29,51 +27,6 @@ LANES, EIGHTS = 8, 16
 """Cells that a CPU's work-item makes at a time, in lanes of vectors, and how many times `hulls.cl` does so."""
 FIRST_REACH = 1.9
 """How far it looks for neighbours at first, or less, in units of the spacing that the bins know."""
-EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
-"""Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
-# FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
-FULL, COINCIDE, DOUBT, NARROW = 1, 2, 8, 16
-
-
-@dataclass(frozen=True)
-class Tessellation:
-    """A Voronoi diagram on the device: normalised coordinates, vectors relative to the generator of the row.
-
-    Attributes
-    ----------
-    n : int
-    points : (n, d) real
-    starts : (n + 1,) int32
-    neighbours : (m,) int32
-        A generator, or ``-1 - wall``; counter-clockwise in 2D.
-    face_measures : (m,) real, or single
-    face_centroids : (m, d) real, or single
-        Relative to the generator; see `Engine.face` for the precision.
-    volumes : (n,) real
-    offsets : (n, d) real
-        Centroid minus generator: the Lloyd displacement.
-    covariances : (n, d (d + 1) / 2) real
-        Second moments about the centroid per unit volume: xx, xy, yy in 2D.
-    outlines : tuple of arrays
-        Of a diagram trimmed by a boundary what kernels take as OUTLINE_ARGS (common/outline.h); else empty.
-    trimmed : Trimmed, optional
-        How such a diagram came to be.
-    narrow : bool
-        Whether faces (in 3D) may be as narrow as their vertices round: of those, what has no loop in `Loops` is none.
-    """
-
-    n: int
-    points: cla.Array
-    starts: cla.Array
-    neighbours: cla.Array
-    face_measures: cla.Array
-    face_centroids: cla.Array
-    volumes: cla.Array
-    offsets: cla.Array
-    covariances: cla.Array
-    outlines: tuple[cla.Array, ...] = ()
-    trimmed: Trimmed | None = None
-    narrow: bool = False
 
 
 @dataclass

@@ -13,10 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
-from .check_polygon import check_cells, check_edges, check_outlines, hidden
+from .check_polygon import (
+    check_cells,
+    check_edges,
+    check_outlines,
+    hidden,
+    near_shared_corners,
+)
 from .faces import face_keys
 from .findings import Check, MisfitError, Report
-from .outlines import SIDE_TURN, count_sides, next_faces
+from .outlines import SIDE_TURN, count_sides, face_ends, next_faces
 from .polygon import Polygon
 from .rebuilt import Doubts, Rebuilt
 from .walls import surface, wall_count, wall_distance
@@ -351,9 +357,12 @@ def _quality_2d(
     on_wall = d.neighbours < 0
     if isinstance(d.domain, Polygon):
         # So does the corner in which the count begins, where a cell is a whole piece of the domain. Where parts of a
-        # cell come together amid an edge, turning is summed up anew, which may make a side more or less.
+        # cell come together amid an edge, or in a corner of several rings, turning is summed up anew, which may make a
+        # side more or less.
         alone = np.bincount(owner, ~on_wall, len(d)) == 0
         meets = on_wall & (d.neighbours[next_faces(d)] == d.neighbours)
+        ends = d.vertices[face_ends(d)[:, 1]]
+        meets |= on_wall & near_shared_corners(d.domain, ends, ROUNDINGS * unit)
         joints = np.bincount(owner, meets, len(d)).astype(int)
         # And a face no longer than a rounding is a side or none, as where pieces touch.
         points = np.bincount(owner, d.face_measures <= ROUNDINGS * unit, len(d)).astype(int)

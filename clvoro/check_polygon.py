@@ -123,12 +123,18 @@ def hidden(
     part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
     lines = shapely.linestrings(np.stack([at[place] + part[:, None] * way, goal], axis=1))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
-    once, times = np.unique(domain.vertices, axis=0, return_counts=True)
-    if (times > 1).any():
-        touching = shapely.STRtree(np.asarray(shapely.points(once[times > 1])))
-        rows, _ = touching.query(shapely.points(at), predicate="dwithin", distance=slack)
-        away[rows] = True
-        # Nor is anything seen through a point, or from one.
-        rows, _ = touching.query(lines, predicate="dwithin", distance=slack)
-        away[place[rows]] = True
+    away |= near_shared_corners(domain, at, slack)
+    # Nor is anything seen through a point, or from one.
+    away[place[near_shared_corners(domain, lines, slack)]] = True
     return places[away]
+
+
+def near_shared_corners(domain: Polygon, places: np.ndarray, slack: float) -> np.ndarray:
+    """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of a corner that several rings have."""
+    once, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    near = np.zeros(len(places), bool)
+    if (times > 1).any():
+        tree = shapely.STRtree(np.asarray(shapely.points(once[times > 1])))
+        shapes = shapely.points(places) if places.ndim == 2 else places
+        near[tree.query(shapes, predicate="dwithin", distance=slack)[0]] = True
+    return near

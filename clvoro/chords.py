@@ -9,9 +9,9 @@ import pyopencl.array as cla
 
 from ._primitives import Room, Scan
 from ._program import Engine
-from .cells import Tessellation
 from .errors import InputError
 from .polygon import Polygon
+from .tessellation import Tessellation
 
 LOST, OUTSIDE = 1, 2  # of the bits in chords.cl
 UNTOUCHED = 0x7FFFFFFF

@@ -11,9 +11,9 @@ import pyopencl.array as cla
 from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
-from .cells import Tessellation
 from .domain import ClipBox
 from .errors import MemoryLimitError
+from .tessellation import Tessellation
 
 FACE_CAPACITY = 64
 MOST_TURNS = 2**31 - 1

@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from ._primitives import Summaries
 from ._program import Engine
-from .cells import Tessellation
+from .tessellation import Tessellation
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
-from .cells import Tessellation
 from .domain import Box, Domain
 from .loops import FaceLoops, Loops
 from .polygon import Polygon
 from .results import Diagram
+from .tessellation import Tessellation
 from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
 

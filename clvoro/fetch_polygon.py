@@ -8,10 +8,10 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
-from .cells import Tessellation
 from .chords import UNTOUCHED
 from .fetch import _Fetched, kept_faces
 from .polygon import Polygon
+from .tessellation import Tessellation
 from .vertices import VertexNumbering, Vertices
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
-from .cells import Tessellation
 from .domain import Box
 from .fetch import _Fetched, kept_faces
 from .loops import FaceLoops, Loops
+from .tessellation import Tessellation
 from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
 

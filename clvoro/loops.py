@@ -12,10 +12,10 @@ import pyopencl.array as cla
 from ._device_array import buffer_of
 from ._primitives import Scan
 from ._program import Engine
-from .cells import Tessellation
 from .corners import Corners, Views
 from .domain import ClipBox
 from .errors import ClvoroError
+from .tessellation import Tessellation
 
 MOST_ROUNDS = 200
 """Steps in which cells may come to agree; spheres of a hundred generators take some thirty."""

@@ -4,33 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 import pyopencl.array as cla
 
-from ._primitives import Gather, Summaries, Summary
-from ._program import Engine
-from .bins import BinnedPoints, Bins
-from .cells import Cells, Tessellation
-from .density import Density, Excess, Weighting
+from ._primitives import Summaries, Summary
+from .bins import BinnedPoints
+from .density import Excess, Weighting
 from .domain import Domain
 from .fetch import fetch_diagram
-from .folded import FoldedCells
-from .metric import Metric
-from .motion import Motion
-from .poisson import Poisson
-from .polyhedra import Polyhedra
-from .population import THETA, Population, PopulationControl
-from .projection import Projection
-from .refinement import Refinement
-from .repair import Repair
+from .population import THETA, Population
 from .results import Diagram
-from .seam import Seam
-from .shape import Shape
 from .sizing import Sizing
+from .stages import Stages
+from .tessellation import Tessellation
 from .tessellator import Tessellator
-from .trim import Trim
 
 _DERIVED = ("h", "error", "quality", "reach", "potential")
 """Arrays of a mesh that follow from its generators."""
@@ -39,57 +27,6 @@ _UNKNOWN = {"tessellation": None, "multipliers": None}
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
 )  # fmt: skip
-
-
-class Stages:
-    """The stages of one engine, each compiled when first used, their buffers reused by every mesh."""
-
-    bins: Bins
-    cells: Cells | Polyhedra
-    repair: Repair
-    seam: Seam
-    folded: FoldedCells
-    metric: Metric
-    density: Density
-    poisson: Poisson
-    projection: Projection
-    shape: Shape
-    motion: Motion
-    refinement: Refinement
-    population: PopulationControl
-    gather: Gather
-    trim: Trim
-
-    _CLASSES: ClassVar = {
-        "bins": Bins, "cells": Cells, "repair": Repair, "metric": Metric, "density": Density, "poisson": Poisson,
-        "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
-        "population": PopulationControl, "gather": Gather, "trim": Trim, "seam": Seam,
-        "folded": FoldedCells,
-    }  # fmt: skip
-
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-
-    def __getattr__(self, name: str) -> object:
-        if name not in Stages._CLASSES:
-            raise AttributeError(name)
-        three = name == "cells" and self.engine.dim == 3
-        stage = (Polyhedra if three else Stages._CLASSES[name])(self.engine)
-        setattr(self, name, stage)
-        return stage
-
-    def clear(self, *names: str) -> None:
-        """Let go of the buffers of those of these stages that there are; their kernels stay."""
-        for name in names:
-            if name in self.__dict__:
-                getattr(self, name).clear()
-
-    def release(self) -> None:
-        """Let go of all stages and their buffers; those that are used again are made again."""
-        for name in Stages._CLASSES:
-            self.__dict__.pop(name, None)
-        self.engine.workspace.clear()
-        self.engine.pool.take_back()
 
 
 class Mesh:

@@ -7,8 +7,8 @@ import pyopencl.array as cla
 
 from ._primitives import Summaries
 from ._program import Engine
-from .cells import Tessellation
 from .domain import Domain
+from .tessellation import Tessellation
 
 
 class Motion:

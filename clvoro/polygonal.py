@@ -10,11 +10,11 @@ import pyopencl.array as cla
 
 from ._device_array import buffer_of
 from .bins import BinnedPoints
-from .cells import Tessellation
 from .chords import Boundary
 from .polygon import Polygon
 from .sentinels import place_sentinels
-from .stages import DiagramStages, tessellate_box
+from .stages import Stages, tessellate_box
+from .tessellation import Tessellation
 
 PATIENCE = 3
 """Times that sentinels are taken away one by one, before all are."""
@@ -32,7 +32,7 @@ class PolygonTessellator:
 
     def __init__(
         self,
-        stages: DiagramStages,
+        stages: Stages,
         domain: Polygon,
         spacing: Callable[[np.ndarray], np.ndarray] | None,
     ) -> None:

@@ -14,9 +14,9 @@ from ._primitives import Scan
 from ._program import Engine
 from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
-from .cells import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
 from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
+from .tessellation import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
 
 FACE_CAPACITY = 64
 """Faces that a cell may have while it is clipped; doubled for those cells that have more."""

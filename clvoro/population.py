@@ -11,8 +11,8 @@ import pyopencl.array as cla
 from ._device_array import read_number
 from ._primitives import Room, Scan
 from ._program import Engine
-from .cells import Tessellation
 from .domain import Domain
+from .tessellation import Tessellation
 
 THETA = 0.06
 """Strain across a pair of a 5-sided and a 7-sided cell at which it climbs."""

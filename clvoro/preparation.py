@@ -13,7 +13,7 @@ from .domain import Domain
 from .errors import CoarseSizeWarning, InputError, InputTypeError
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
 from .memory import check_memory, images_expected
-from .mesh import Mesh, Stages
+from .mesh import Mesh
 from .methods import PUBLISHED, Relaxation, make_method
 from .misfits import warn_of_misfits
 from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
@@ -22,6 +22,7 @@ from .precision import check_precision
 from .quadrature import DensityTree
 from .rings import may_be_degrees
 from .sizing import Sizing, as_field
+from .stages import Stages
 from .start import density_tree, sample_density, sample_uniform
 
 METHODS = ("adaptive", "exact", *PUBLISHED)

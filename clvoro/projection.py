@@ -13,9 +13,9 @@ import pyopencl.array as cla
 from ._launch import Launch, most_alone
 from ._program import Engine
 from ._workspace import framed
-from .cells import Tessellation
 from .errors import SolverError
 from .krylov import Solution
+from .tessellation import Tessellation
 
 SINGLE = 1e-4
 """Tolerance from which on the iteration's vectors are in single precision."""

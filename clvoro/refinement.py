@@ -7,8 +7,8 @@ import pyopencl.array as cla
 
 from ._primitives import Scan
 from ._program import Engine
-from .cells import Tessellation
 from .domain import Domain
+from .tessellation import Tessellation
 
 SHORT_FACE = 0.02
 """Share of a cell's length (squared in 3D) under which a face is an accident that deserves no new generator."""

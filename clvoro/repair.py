@@ -12,8 +12,9 @@ import pyopencl.array as cla
 from ._device_array import read_number
 from ._primitives import Scan
 from ._program import Engine
-from .cells import Cells, Tessellation
+from .cells import Cells
 from .domain import ClipBox
+from .tessellation import Tessellation
 
 MAX_ROUNDS = 6
 """Rounds of clipping and checking, beyond which a diagram is made anew."""

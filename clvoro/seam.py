@@ -10,8 +10,8 @@ import pyopencl.array as cla
 from ._primitives import Room, Scan
 from ._program import Engine
 from .bins import BinnedPoints
-from .cells import Tessellation
 from .domain import Box
+from .tessellation import Tessellation
 
 DROPPED, FAR, COLLAPSED = 1, 2, 4
 """Bits of a report: see `seam.cl`."""

@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._program import Engine
-from .cells import Tessellation
+from .tessellation import Tessellation
 
 
 class Shape:

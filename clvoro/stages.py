@@ -1,38 +1,85 @@
-"""The stages that a diagram takes, and their order in a box with walls."""
+"""The stages of one engine, and the order of those that a diagram takes in a box with walls."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import ClassVar
 
 import pyopencl.array as cla
 
 from ._primitives import Gather
 from ._program import Engine
 from .bins import BinnedPoints, Bins
-from .cells import Cells, Tessellation
+from .cells import Cells
+from .density import Density
 from .domain import Domain
 from .folded import FoldedCells
+from .metric import Metric
+from .motion import Motion
+from .poisson import Poisson
 from .polyhedra import Polyhedra
+from .population import PopulationControl
+from .projection import Projection
+from .refinement import Refinement
 from .repair import Repair
 from .seam import Seam
+from .shape import Shape
+from .tessellation import Tessellation
 from .trim import Trim
 
 
-class DiagramStages(Protocol):
-    """The stages that a diagram takes."""
+class Stages:
+    """The stages of one engine, each compiled when first used, their buffers reused by every mesh."""
 
-    engine: Engine
     bins: Bins
     cells: Cells | Polyhedra
     repair: Repair
     seam: Seam
     folded: FoldedCells
-    trim: Trim
+    metric: Metric
+    density: Density
+    poisson: Poisson
+    projection: Projection
+    shape: Shape
+    motion: Motion
+    refinement: Refinement
+    population: PopulationControl
     gather: Gather
+    trim: Trim
+
+    _CLASSES: ClassVar = {
+        "bins": Bins, "cells": Cells, "repair": Repair, "metric": Metric, "density": Density, "poisson": Poisson,
+        "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
+        "population": PopulationControl, "gather": Gather, "trim": Trim, "seam": Seam,
+        "folded": FoldedCells,
+    }  # fmt: skip
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+
+    def __getattr__(self, name: str) -> object:
+        if name not in Stages._CLASSES:
+            raise AttributeError(name)
+        three = name == "cells" and self.engine.dim == 3
+        stage = (Polyhedra if three else Stages._CLASSES[name])(self.engine)
+        setattr(self, name, stage)
+        return stage
+
+    def clear(self, *names: str) -> None:
+        """Let go of the buffers of those of these stages that there are; their kernels stay."""
+        for name in names:
+            if name in self.__dict__:
+                getattr(self, name).clear()
+
+    def release(self) -> None:
+        """Let go of all stages and their buffers; those that are used again are made again."""
+        for name in Stages._CLASSES:
+            self.__dict__.pop(name, None)
+        self.engine.workspace.clear()
+        self.engine.pool.take_back()
 
 
 def tessellate_box(
-    stages: DiagramStages,
+    stages: Stages,
     domain: Domain,
     points: cla.Array,
     n: int,

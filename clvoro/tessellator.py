@@ -8,12 +8,12 @@ import numpy as np
 import pyopencl.array as cla
 
 from .bins import BinnedPoints
-from .cells import Tessellation
 from .domain import Box, Domain
 from .polygon import Polygon
 from .polygonal import PolygonTessellator
 from .polyhedra import Polyhedra
-from .stages import DiagramStages, tessellate_box
+from .stages import Stages, tessellate_box
+from .tessellation import Tessellation
 from .torus import Torus, Unfolded
 
 
@@ -32,7 +32,7 @@ class Tessellator:
 
     def __init__(
         self,
-        stages: DiagramStages,
+        stages: Stages,
         domain: Domain,
         spacing: Callable[[np.ndarray], np.ndarray] | None = None,
         coarser: Tessellator | None = None,

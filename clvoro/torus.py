@@ -9,14 +9,14 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._primitives import Summaries
-from .cells import EXACT_SHARE, ROUGH_SHARE, Tessellation
 from .domain import Box
 from .errors import InputError
 from .polyhedra import Polyhedra
 from .seam import COLLAPSED, FAR, SLACK, ExtendedBox, Folded, Images, Margins
+from .tessellation import EXACT_SHARE, ROUGH_SHARE, Tessellation
 
 if TYPE_CHECKING:
-    from .stages import DiagramStages
+    from .stages import Stages
 
 FIRST_MARGIN = 2.7
 """What cells are thought to need before the first diagram, in mean spacings."""
@@ -54,7 +54,7 @@ class Torus:
         Of the latest diagram, if that was a whole one.
     """
 
-    def __init__(self, stages: DiagramStages, domain: Box, margins: Margins | None = None) -> None:
+    def __init__(self, stages: Stages, domain: Box, margins: Margins | None = None) -> None:
         self.stages, self.domain = stages, domain
         self.periods = domain.periods(stages.engine.real)
         lower, upper = (

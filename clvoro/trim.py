@@ -9,10 +9,10 @@ import pyopencl.array as cla
 
 from ._primitives import Room, Scan
 from ._program import Engine
-from .cells import Tessellation
 from .chords import Chords
 from .errors import InputError
 from .polygon import Polygon
+from .tessellation import Tessellation
 
 LOST, ORPHANS = 1, 4  # of the bits in trim.cl
 ROUNDS = 6

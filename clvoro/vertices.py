@@ -9,8 +9,8 @@ import pyopencl.array as cla
 
 from ._primitives import Scan
 from ._program import Engine
-from .cells import Tessellation
 from .domain import ClipBox
+from .tessellation import Tessellation
 
 MAX_CELLS_AT_VERTEX = 1024
 

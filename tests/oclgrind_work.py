@@ -21,7 +21,6 @@ from scipy.spatial import ConvexHull
 import clvoro
 from clvoro import _program, repair
 from clvoro._primitives import Scan
-from clvoro.mesh import Stages
 from clvoro.population import Population, PopulationControl
 from clvoro.sizing import (
     Circle,
@@ -35,6 +34,7 @@ from clvoro.sizing import (
     Surface,
     minimum,
 )
+from clvoro.stages import Stages
 from clvoro.tessellator import Tessellator
 from tests.gpu_like import use_groups
 from tests.patch import BOX as PATCH

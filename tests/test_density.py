@@ -6,8 +6,8 @@ import patch
 import pytest
 import reference
 
-from clvoro.cells import Tessellation
 from clvoro.density import Density
+from clvoro.tessellation import Tessellation
 
 N = 250
 

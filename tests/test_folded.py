@@ -7,7 +7,7 @@ import pytest
 import clvoro
 from clvoro import repair
 from clvoro._program import Engine
-from clvoro.mesh import Stages
+from clvoro.stages import Stages
 from clvoro.torus import Torus
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)

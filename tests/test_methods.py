@@ -7,7 +7,7 @@ import pytest
 
 from clvoro import sizing
 from clvoro.errors import SizeFieldError
-from clvoro.mesh import Mesh, Stages
+from clvoro.mesh import Mesh
 from clvoro.methods import (
     PUBLISHED,
     ProjectedMethod,
@@ -17,6 +17,7 @@ from clvoro.methods import (
     make_method,
 )
 from clvoro.sizing import Sizing
+from clvoro.stages import Stages
 
 N = 150
 FIELD = sizing.Distance(sizing.Circle((0.4, 0.35), 0.12), 0.03, slope=0.3)

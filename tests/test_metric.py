@@ -5,8 +5,9 @@ import patch
 import pytest
 import reference
 
-from clvoro.cells import Cells, Tessellation
+from clvoro.cells import Cells
 from clvoro.metric import Metric
+from clvoro.tessellation import Tessellation
 
 N = 300
 

@@ -136,6 +136,22 @@ def test_a_face_of_a_rounding_is_a_side_or_none(ctx) -> None:
     assert made.check(), made.check()
 
 
+def test_sides_in_a_corner_of_two_holes(ctx) -> None:
+    """Parts of a cell come together in the corner: where its sides end there is a matter of taste."""
+    holes = [[(0.25, 0.75), (0.5, 0.5), (0.25, 0.25)], [(0.75, 0.75), (0.75, 0.25), (0.5, 0.5)]]
+    x = [(0.5122103171985511, 0.48721031719855123), (0.48778968280144874, 0.48721031719855123),
+         (0.5135252778420708, 0.5142524999357069), (0.5113436115611626, 0.5164341662166151),
+         (0.504798612718438, 0.5229791650593397), (0.5603541682739935, 0.5785347206148953)]  # fmt: skip
+    made = clvoro.Adapter(ctx).run(
+        Polygon(SQUARE, holes), 0.05, points=x, method="lloyd", max_steps=0
+    )
+    assert made.check(), made.check()
+    # Elsewhere it is none: one side more or less is found.
+    quality = made.quality.copy()
+    quality[5] *= 6 * np.tan(np.pi / 6) / (5 * np.tan(np.pi / 5))
+    assert not dataclasses.replace(made, quality=quality).check()
+
+
 @pytest.mark.parametrize("scale", [1e-45, 1e10, 1e45])
 def test_checks_in_any_unit(ctx, scale: float) -> None:
     domain = Polygon(SQUARE * scale, [SQUARE * 0.2 * scale + 0.3 * scale])

@@ -10,7 +10,7 @@ import clvoro
 from clvoro._program import Engine
 from clvoro.errors import InputError
 from clvoro.fetch import fetch_diagram
-from clvoro.mesh import Stages
+from clvoro.stages import Stages
 from clvoro.tessellator import Tessellator
 
 REALS = ("float64", "float32")

@@ -11,8 +11,9 @@ import pytest
 from clvoro import sizing
 from clvoro._program import Engine
 from clvoro._workspace import MOST_VIEWS
-from clvoro.mesh import Mesh, Stages
+from clvoro.mesh import Mesh
 from clvoro.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
+from clvoro.stages import Stages
 
 
 @pytest.fixture
