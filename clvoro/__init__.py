@@ -15,8 +15,8 @@ True
 Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls. Sizes:
 numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`. `Adapter.run` gives a `Result` (and
 `Adapter.diagram` a `Diagram` alone): arrays, `save`, `plot`, `check`, `transfer`; `load` reads it again. Errors and
-warnings are in `clvoro.errors`, pictures in `clvoro.report`, times of kernels in `clvoro.profile`. The command's help is
-``clvoro --help``.
+warnings are in `clvoro.errors`, pictures in `clvoro.report`, times of kernels in `clvoro.profile`. The command is
+``clvoro``; begin with ``clvoro --help``.
 """
 
 from . import profile, sizing
