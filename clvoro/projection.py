@@ -40,7 +40,7 @@ class Projection:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._partial = engine.empty(_ROWS * engine.groups)
-        self._record = engine.empty(4 * 64)
+        self._record = engine.zeros(4 * 64)  # more rows than are written are read
         self._kernels: dict[np.dtype, SimpleNamespace] = {}
         self._ahead = 8
         self._most_alone = most_alone(engine)
@@ -55,7 +55,7 @@ class Projection:
         """Return the iteration's arrays for `n` cells and `m` faces; make room for `most` iterations."""
         engine, d = self.engine, self.engine.dim
         if 4 * (most + 1) > len(self._record):
-            self._record = engine.empty(4 * (most + 1))
+            self._record = engine.zeros(4 * (most + 1))
         return SimpleNamespace(
             **{name: engine.scratch((d, m), np.float32) for name in ("rows", "columns")},
             **{name: engine.scratch((n, d), store) for name in ("own", "s", "u")},

@@ -1,11 +1,14 @@
 """The derivative of the volumes against differences of Qhull's, and the projection against NumPy."""
 
+import warnings
+
 import numpy as np
 import patch
 import pytest
 import reference
 
 from clvoro import projection
+from clvoro._program import Engine
 from clvoro.density import Density
 from clvoro.errors import SolverError
 from clvoro.projection import Projection
@@ -184,6 +187,24 @@ def test_iterations_end_at_the_most(engine, points):
     _, solution = project(engine, *given, eps=0.02, max_iterations=5, tolerance=1e-9)
     assert (solution.iterations, solution.converged) == (5, False)
     assert solution.reason == "max_iterations"
+
+
+def test_rows_that_nobody_has_written_are_no_numbers_to_warn_of(ctx, points, monkeypatch):
+    """The host reads more rows of the record than there are: fresh memory may hold NaNs that signal, as this does."""
+    engine, plain = patch.make_engine(ctx, "float32"), Engine.empty
+
+    def full_of_nan(self, shape, dtype=None):
+        array = plain(self, shape, dtype)
+        if array.dtype == np.float32 and array.size:
+            array.view(np.uint32).fill(np.uint32(0x7FA00001))
+        return array
+
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    monkeypatch.setattr(Engine, "empty", full_of_nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, solution = project(engine, *given, eps=0.1, max_iterations=40, tolerance=1e-3)
+    assert solution.converged
 
 
 def test_result_does_not_depend_on_when_the_host_looks(engine, points):
