@@ -5,11 +5,8 @@ Every command is timed, by whichever stage it is enqueued (see `_hooks`). A run 
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +14,7 @@ import pyopencl as cl
 
 from . import _hooks
 from ._program import build_program, build_seconds
+from .costs import Cost, Span, tabulate
 from .errors import InputError
 
 if TYPE_CHECKING:
@@ -24,79 +22,10 @@ if TYPE_CHECKING:
 
 PENDING = 2048
 """Most events that are kept: the older half is then read and let go, while the newer ones run."""
-SMALL = 0.005
-"""Share of the device's time below which a table puts kernels together."""
 LARGE = 256 << 20
 """Bytes of the buffer that is copied to measure the bandwidth: more than any cache holds."""
 
 _bandwidths: dict[int, float] = {}
-
-
-@dataclass
-class Cost:
-    """What a kernel has cost, or several together.
-
-    Attributes
-    ----------
-    calls : int
-    seconds : float
-        Device time, from start to end of each call.
-    bytes : int
-        Sizes of the buffers that were bound to the calls, each buffer once a call. An estimate of
-        what they move. It is rather too high, since buffers may be longer than what a call needs of
-        them and a cache may hold them; it is too low where something is both read and written, or
-        read again after it has left the cache.
-    seconds_known : float
-        Time of those calls whose buffers are known.
-    """
-
-    calls: int = 0
-    seconds: float = 0.0
-    bytes: int = 0
-    seconds_known: float = 0.0
-
-    def __add__(self, other: Cost) -> Cost:
-        return Cost(
-            self.calls + other.calls,
-            self.seconds + other.seconds,
-            self.bytes + other.bytes,
-            self.seconds_known + other.seconds_known,
-        )
-
-    @property
-    def rate(self) -> float | None:
-        """Bytes per second; None where no call's buffers are known."""
-        return self.bytes / self.seconds_known if self.seconds_known else None
-
-
-@dataclass
-class Span:
-    """The time between two rows of a run's history.
-
-    Attributes
-    ----------
-    step, level, cells : int or None
-        Of the row that ended it: step 0 is all that comes before the first step. None: what came after the last row.
-    wall : float
-        Seconds by the clock.
-    stages : dict
-        Device time per stage.
-    read : int
-        Bytes that the host has read from the device.
-    """
-
-    began: float
-    step: int | None = None
-    level: int | None = None
-    cells: int | None = None
-    wall: float = 0.0
-    stages: dict[str, float] = field(default_factory=dict)
-    read: int = 0
-
-    @property
-    def host(self) -> float:
-        """Seconds that the device did not work."""
-        return self.wall - sum(self.stages.values())
 
 
 class Profile:
@@ -283,7 +212,7 @@ class Profile:
             "stages": [{"stage": name, **figures(cost)} for name, cost in self.stages().items()],
             "kernels": [
                 {"stage": stage, "kernel": name, **figures(cost)}
-                for (stage, name), cost in self._ranked()
+                for (stage, name), cost in self.ranked()
             ],
             "spans": [
                 {"step": s.step, "level": s.level, "cells": s.cells, "wall": s.wall,
@@ -295,56 +224,7 @@ class Profile:
     def table(self) -> str:
         """Return stages and kernels as tables in plain text."""
         self._require_closed()
-        levels = sorted({s.level for s in self.steps if s.level is not None}, reverse=True)
-        groups = {f"level {level}": [s for s in self.steps if s.level == level] for level in levels}
-        columns = {"ms/step": self.steps} if self.steps else {}
-        if len(levels) > 1:
-            columns |= groups
-
-        def per_step(seconds: Callable[[Span], float]) -> list[str]:
-            return [f"{1e3 * sum(map(seconds, s)) / len(s):.2f}" for s in columns.values()]
-
-        def time_of(seconds: float) -> list[str]:
-            return [f"{1e3 * seconds:.1f}", f"{seconds / self.wall:.1%}"]
-
-        def moving(cost: Cost) -> list[str]:
-            rate = cost.rate
-            if rate is None:
-                return ["-", "-"]
-            return [f"{1e-9 * rate:.1f}", f"{rate / self.bandwidth:.0%}"]
-
-        stages = [["stage", "calls", "ms", "share", "GB/s", "of copy", *columns]]
-        for name, cost in self.stages().items():
-            row = [name, str(cost.calls), *time_of(cost.seconds), *moving(cost)]
-            stages.append([*row, *per_step(lambda s, name=name: s.stages.get(name, 0.0))])
-        stages.append(["host", "", *time_of(self.host), "", "", *per_step(lambda s: s.host)])
-        whole = ["wall", str(self.launches), *time_of(self.wall), "", ""]
-        stages.append([*whole, *per_step(lambda s: s.wall)])
-
-        kernels = [["kernel", "calls", "ms", "share", "GB/s", "of copy", "us/call", "MB/call"]]
-        small = Cost()
-        for (stage, name), cost in self._ranked():
-            if cost.seconds < SMALL * self.device:
-                small += cost
-                continue
-            kernels.append([f"{stage}.{name}", *_kernel_row(cost, time_of, moving)])
-        if small.calls:
-            name = f"{len(self.costs) + 1 - len(kernels)} smaller ones"
-            kernels.append([name, *_kernel_row(small, time_of, moving)])
-        notes = [
-            f"host: the clock less the device's time; {1e3 * self.building:.0f} ms of it built "
-            "programs; this profile's own work is in it",
-            f"copy: {1e-9 * self.bandwidth:.1f} GB/s, read and written by copying a large buffer",
-            "GB/s, MB: as if a call passed once over every buffer bound to it; an estimate, rather "
-            "too high",
-        ]
-        for name, spans in groups.items():
-            cells = max(s.cells or 0 for s in spans)
-            read = statistics.median(s.read for s in spans)
-            notes.append(
-                f"{name}: {len(spans)} steps, up to {cells} cells; the host read {read:.0f} bytes a step"
-            )
-        return "\n".join([_aligned(stages), "", _aligned(kernels), "", *notes])
+        return tabulate(self)
 
     def _require_closed(self) -> None:
         if not self.spans or self.spans[-1].step is not None:
@@ -353,7 +233,8 @@ class Profile:
                 "figures after the `with` block"
             )
 
-    def _ranked(self) -> list[tuple[tuple[str, str], Cost]]:
+    def ranked(self) -> list[tuple[tuple[str, str], Cost]]:
+        """Return stages and kernels with their costs, the longest first."""
         return sorted(self.costs.items(), key=lambda item: -item[1].seconds)
 
 
@@ -388,24 +269,3 @@ def copy_bandwidth(ctx: cl.Context, repeat: int = 5) -> float:
     source.release()
     target.release()
     return 2 * size / best
-
-
-def _kernel_row(
-    cost: Cost, time_of: Callable[[float], list[str]], moving: Callable[[Cost], list[str]]
-) -> list[str]:
-    calls = max(cost.calls, 1)
-    moved = "-" if cost.rate is None else f"{1e-6 * cost.bytes / calls:.3f}"
-    per_call = [f"{1e6 * cost.seconds / calls:.1f}", moved]
-    return [str(cost.calls), *time_of(cost.seconds), *moving(cost), *per_call]
-
-
-def _aligned(rows: list[list[str]]) -> str:
-    """Return `rows` as text: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join([
-            row[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-        ])
-        for row in rows
-    )  # fmt: skip

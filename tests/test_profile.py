@@ -8,7 +8,7 @@ import pyopencl.array as cla
 import pytest
 
 import clvoro
-from clvoro import _hooks, cli, profile
+from clvoro import _hooks, cli, costs, profile
 from clvoro._program import Engine
 from clvoro.errors import InputError
 from clvoro.multigrid import Multigrid
@@ -240,7 +240,7 @@ def test_table_says_what_the_profile_knows(run):
 def test_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # Kernels of a small share of the time are not listed apart: which those are, the machine's load decides.
-    monkeypatch.setattr(profile, "SMALL", 0.0)
+    monkeypatch.setattr(costs, "SMALL", 0.0)
     options = "run paper --cells 90 --steps 3 --method coupled --no-report".split()
     assert cli.main([*options, "--json"]) == cli.OK
     assert "profile" not in json.loads(capsys.readouterr().out)
