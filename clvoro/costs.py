@@ -1,0 +1,156 @@
+"""What kernels and steps have cost, as a `Profile` counts it, and as tables."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .profile import Profile
+
+SMALL = 0.005
+"""Share of the device's time below which a table puts kernels together."""
+
+
+@dataclass
+class Cost:
+    """What a kernel has cost, or several together.
+
+    Attributes
+    ----------
+    calls : int
+    seconds : float
+        Device time, from start to end of each call.
+    bytes : int
+        Sizes of the buffers that were bound to the calls, each buffer once a call. An estimate of
+        what they move. It is rather too high, since buffers may be longer than what a call needs of
+        them and a cache may hold them; it is too low where something is both read and written, or
+        read again after it has left the cache.
+    seconds_known : float
+        Time of those calls whose buffers are known.
+    """
+
+    calls: int = 0
+    seconds: float = 0.0
+    bytes: int = 0
+    seconds_known: float = 0.0
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(
+            self.calls + other.calls,
+            self.seconds + other.seconds,
+            self.bytes + other.bytes,
+            self.seconds_known + other.seconds_known,
+        )
+
+    @property
+    def rate(self) -> float | None:
+        """Bytes per second; None where no call's buffers are known."""
+        return self.bytes / self.seconds_known if self.seconds_known else None
+
+
+@dataclass
+class Span:
+    """The time between two rows of a run's history.
+
+    Attributes
+    ----------
+    step, level, cells : int or None
+        Of the row that ended it: step 0 is all that comes before the first step. None: what came after the last row.
+    wall : float
+        Seconds by the clock.
+    stages : dict
+        Device time per stage.
+    read : int
+        Bytes that the host has read from the device.
+    """
+
+    began: float
+    step: int | None = None
+    level: int | None = None
+    cells: int | None = None
+    wall: float = 0.0
+    stages: dict[str, float] = field(default_factory=dict)
+    read: int = 0
+
+    @property
+    def host(self) -> float:
+        """Seconds that the device did not work."""
+        return self.wall - sum(self.stages.values())
+
+
+def tabulate(profile: Profile) -> str:
+    """Return stages and kernels as tables in plain text."""
+    levels = sorted({s.level for s in profile.steps if s.level is not None}, reverse=True)
+    groups = {f"level {level}": [s for s in profile.steps if s.level == level] for level in levels}
+    columns = {"ms/step": profile.steps} if profile.steps else {}
+    if len(levels) > 1:
+        columns |= groups
+
+    def per_step(seconds: Callable[[Span], float]) -> list[str]:
+        return [f"{1e3 * sum(map(seconds, s)) / len(s):.2f}" for s in columns.values()]
+
+    def time_of(seconds: float) -> list[str]:
+        return [f"{1e3 * seconds:.1f}", f"{seconds / profile.wall:.1%}"]
+
+    def moving(cost: Cost) -> list[str]:
+        rate = cost.rate
+        if rate is None:
+            return ["-", "-"]
+        return [f"{1e-9 * rate:.1f}", f"{rate / profile.bandwidth:.0%}"]
+
+    stages = [["stage", "calls", "ms", "share", "GB/s", "of copy", *columns]]
+    for name, cost in profile.stages().items():
+        row = [name, str(cost.calls), *time_of(cost.seconds), *moving(cost)]
+        stages.append([*row, *per_step(lambda s, name=name: s.stages.get(name, 0.0))])
+    stages.append(["host", "", *time_of(profile.host), "", "", *per_step(lambda s: s.host)])
+    whole = ["wall", str(profile.launches), *time_of(profile.wall), "", ""]
+    stages.append([*whole, *per_step(lambda s: s.wall)])
+
+    kernels = [["kernel", "calls", "ms", "share", "GB/s", "of copy", "us/call", "MB/call"]]
+    small = Cost()
+    for (stage, name), cost in profile.ranked():
+        if cost.seconds < SMALL * profile.device:
+            small += cost
+            continue
+        kernels.append([f"{stage}.{name}", *_kernel_row(cost, time_of, moving)])
+    if small.calls:
+        name = f"{len(profile.costs) + 1 - len(kernels)} smaller ones"
+        kernels.append([name, *_kernel_row(small, time_of, moving)])
+    notes = [
+        f"host: the clock less the device's time; {1e3 * profile.building:.0f} ms of it built "
+        "programs; this profile's own work is in it",
+        f"copy: {1e-9 * profile.bandwidth:.1f} GB/s, read and written by copying a large buffer",
+        "GB/s, MB: as if a call passed once over every buffer bound to it; an estimate, rather "
+        "too high",
+    ]
+    for name, spans in groups.items():
+        cells = max(s.cells or 0 for s in spans)
+        read = statistics.median(s.read for s in spans)
+        notes.append(
+            f"{name}: {len(spans)} steps, up to {cells} cells; the host read {read:.0f} bytes a step"
+        )
+    return "\n".join([_aligned(stages), "", _aligned(kernels), "", *notes])
+
+
+def _kernel_row(
+    cost: Cost, time_of: Callable[[float], list[str]], moving: Callable[[Cost], list[str]]
+) -> list[str]:
+    calls = max(cost.calls, 1)
+    moved = "-" if cost.rate is None else f"{1e-6 * cost.bytes / calls:.3f}"
+    per_call = [f"{1e6 * cost.seconds / calls:.1f}", moved]
+    return [str(cost.calls), *time_of(cost.seconds), *moving(cost), *per_call]
+
+
+def _aligned(rows: list[list[str]]) -> str:
+    """Return `rows` as text: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join([
+            row[0].ljust(widths[0]),
+            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
+        ])
+        for row in rows
+    )  # fmt: skip
