@@ -4,8 +4,17 @@ import numpy as np
 import patch
 import pytest
 
-from clvoro.bins import MAX_LEVELS, OCCUPANCY, SPACING_COUNT, SPLIT_COUNT, Bins
+from clvoro.bins import MAX_CHILD_SIDE, MAX_LEVELS, OCCUPANCY, SPACING_COUNT, SPLIT_COUNT, Bins
 from clvoro.domain import Box
+
+
+def child_side(count, dim):
+    """Return how many bins each way a bin of `count` generators is divided into, by the counts that bins aim at."""
+    if dim == 2:
+        sides = [s for s in range(2, MAX_CHILD_SIDE + 1) if count >= OCCUPANCY * s**2]
+        return max(sides, default=2)
+    sides = [s for s in (2, 4, 8, 16, 32) if count <= OCCUPANCY * (2 * s) ** 3]
+    return min(sides, default=MAX_CHILD_SIDE)
 
 
 def walk(binned, n, dim, eps):
@@ -41,6 +50,8 @@ def walk(binned, n, dim, eps):
             else:
                 assert frames[grid, :dim] == pytest.approx(origin, abs=8 * eps)
                 assert shapes[grid][1] / frames[grid, 3] == pytest.approx(edge, rel=8 * eps)
+                assert count > SPLIT_COUNT[dim]
+                assert set(shapes[grid][1 : dim + 1]) == {child_side(count, dim)}
                 inside = open_grid(grid, level + 1)
                 assert inside == count, "a divided bin does not hold what its grid holds"
             held += count
