@@ -224,7 +224,9 @@ class Saved:
             raise ValueError("points")
         if not ((h > 0).all() and np.isfinite(h).all()):
             raise ValueError("sizes")
-        if self.state["spare"] > 64 * n + 64 or not len(a["history"]):
+        # Room that was made for the most cells that the run had is kept when there are fewer.
+        cells = max(n, self.state["n_start"], int(a["history"]["cells"].max()))
+        if self.state["spare"] > 64 * cells + 64:
             raise ValueError("spare")
 
     def _check_seams(self, d: int) -> None:

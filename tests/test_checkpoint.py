@@ -138,6 +138,17 @@ def test_own_points_and_callables(ctx, tmp_path):
     assert_same(clvoro.Adapter(ctx).run(BOX, size, resume=path, **options), whole)
 
 
+def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
+    """Rows keep the room that the first mesh took."""
+    points, path = np.random.default_rng(12).random((3000, 2)), tmp_path / "state"
+    square, options = clvoro.Box((0, 0), (1, 1)), {"points": points, "effort": "fast"}
+    whole = clvoro.Adapter(ctx).run(square, 0.25, **options)
+    stop = {"callback": stop_after(3), "checkpoint": path}
+    stopped = clvoro.Adapter(ctx).run(square, 0.25, **stop, **options)
+    assert len(stopped.points) < 30
+    assert_same(clvoro.Adapter(ctx).run(square, 0.25, resume=path, **options), whole)
+
+
 @pytest.fixture(scope="module")
 def saved(ctx, tmp_path_factory):
     path = tmp_path_factory.mktemp("checkpoint") / "state"
