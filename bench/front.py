@@ -166,8 +166,8 @@ def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
                 label="notes: given figures,\nnot measured here*" if k == 0 else None,
             )  # fmt: skip
             ax.annotate(
-                name, (error, 1 - quality), xytext=(8, 0), textcoords="offset points",
-                fontsize=7.5, va="center",
+                name.replace(", ", ",\n"), (error, 1 - quality), xytext=(8, 0),
+                textcoords="offset points", fontsize=7.5, va="center",
             )  # fmt: skip
         for r in records:
             if r["group"] == "exact":

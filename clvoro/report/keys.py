@@ -17,7 +17,7 @@ from .style import is_flat
 _BELOW: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 45}
 _GAP, _THICKNESS = 0.12, 0.14  # between picture and colour bar, and of the bar; inches
 _PER_LETTER = 0.066  # width of a label's letters at the size that labels have, inches
-_PER_TICK = (0.24, 0.8)  # room for a number beside, and below a bar, inches
+_PER_TICK = (0.24, 0.65)  # room for a number beside, and below a bar, inches
 _APART = (0.15, 0.45)  # least distance of two numbers there, inches
 _BELOW_TICKS = 26  # from the axes to a legend below their numbers, points
 
