@@ -222,11 +222,11 @@ def some_graded(rng: np.random.Generator, domain: Domain, field, wild: bool) -> 
         # More nodes than any grid may have; what lies between is a benchmark, not a test.
         options["resolution"] = [10**7, 2.5, 1, (10**7,) * domain.dim][rng.integers(4)]
     if rng.random() < 0.3:
+        # Around the domain, or around a part of it; `wild`: anywhere.
+        begin, across = (rng.choice([-1, 0, 0.4, 3]), rng.choice([1e-3, 0.5, 1, 4]))
+        if not wild:
+            begin, across = [(-1, 4), (0, 1), (0, 0.5), (0.4, 0.5)][rng.integers(4)]
         with np.errstate(all="ignore"):
-            low = (
-                np.array(domain.lower) + rng.choice([-1, 0, 0.4, 3 if wild else 0]) * domain.extent
-            )
-            options["box"] = clvoro.Box(
-                low, low + rng.choice([0.5, 1, 4, 1e-3 if wild else 1]) * domain.extent
-            )
+            low = np.array(domain.lower) + begin * domain.extent
+            options["box"] = clvoro.Box(low, low + across * domain.extent)
     return sizing.Graded(field, **options)

@@ -197,6 +197,8 @@ def try_layers(rng: np.random.Generator) -> str:
     wild = rng.random() < WILD
     domain = some_polygon(rng) if rng.random() < 0.6 else some_box(rng, 2, wild)
     layers, real = some_layers(rng, domain, wild), some_real(rng)
+    while not wild and count_rows(domain, layers) > 5000:
+        layers = some_layers(rng, domain, wild)
     if 5000 < count_rows(domain, layers) < 1e9:  # a benchmark, not a test
         return "left out"
     options = some_options(rng, domain, real, wild)
@@ -262,7 +264,10 @@ def try_resumed(rng: np.random.Generator) -> str:
         adapter(real).run(*arguments, callback=stop, checkpoint=state, **options)
         if not state.exists():
             return "mesh"  # it had ended
-        resumed = adapter(real).run(*arguments, resume=state, **options)
+        try:
+            resumed = adapter(real).run(*arguments, resume=state, **options)
+        except InputError as error:
+            raise Wrong(f"not resumed after row {left}: {error}") from error
     for name in ("points", "error", "quality", "size"):
         if not np.array_equal(getattr(resumed, name), getattr(whole, name)):
             raise Wrong(f"a resumed run has other {name}, stopped after row {left}")
@@ -282,6 +287,8 @@ def try_moved(rng: np.random.Generator) -> str:
         domain, some_size(rng, domain, wild=False), points=first.points, **options
     )
     demand(second, real)
+    if domain.dim == 3 and any(domain.periodic):  # where nothing is carried over yet
+        return "mesh"
     values = rng.choice([1.0, 1e-200, 1e200]) * rng.standard_normal(
         (len(first.points), 2)
     ) + rng.choice([0, 1])
