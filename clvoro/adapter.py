@@ -35,6 +35,9 @@ MOST_LEVELS = 99
 class Adapter:
     """Adapts Voronoi meshes on one device.
 
+    Kernels are built when they are first needed, and kept; so is memory. One adapter does one thing at a time: calls
+    from other threads wait.
+
     Parameters
     ----------
     ctx : pyopencl.Context, optional
@@ -42,10 +45,25 @@ class Adapter:
     dtype : "float64" or "float32"
         Precision on the device.
 
+    Attributes
+    ----------
+    ctx, queue : pyopencl.Context, pyopencl.CommandQueue
+    dtype : numpy.dtype
+
     Raises
     ------
     DeviceError
         If there is no working device, or it has no double precision and `dtype` is "float64".
+    InputError, InputTypeError
+        If `dtype` is another one, or `ctx` no context.
+
+    Examples
+    --------
+    >>> adapter = clvoro.Adapter(dtype="float32")
+    >>> unit = clvoro.Box((0, 0), (1, 1))
+    >>> result = adapter.run(unit, lambda p: 0.05 + 0.1 * p[:, 0], effort="fast", seed=7)
+    >>> result.points.shape == (len(result.diagram), 2)
+    True
     """
 
     def __init__(self, ctx: cl.Context | None = None, dtype: object = "float64") -> None:
@@ -69,6 +87,9 @@ class Adapter:
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
+
+    def __repr__(self) -> str:
+        return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
@@ -135,9 +156,12 @@ class Adapter:
     def diagram(self, domain: Domain, points: np.ndarray) -> Diagram:
         """Tessellate `domain` by `points`.
 
+        To save or plot such a diagram, with sizes beside it, take no step from the points:
+        ``run(domain, size, points=points, method="lloyd", max_steps=0)``.
+
         Parameters
         ----------
-        domain : Domain
+        domain : Box or Polygon
         points : (n, d) array of float
             Distinct generators inside the domain, walls included.
 
@@ -152,6 +176,12 @@ class Adapter:
             If the points are not as expected, or too close together for the precision.
         MemoryLimitError
             If the device has not enough memory.
+
+        Examples
+        --------
+        >>> points = np.array([(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)])
+        >>> clvoro.Adapter().diagram(clvoro.Box((0, 0), (1, 1)), points).volumes.round(3).tolist()
+        [0.391, 0.275, 0.334]
         """
         with self._alone():
             return self._diagram(domain, points)
@@ -197,7 +227,7 @@ class Adapter:
 
         Parameters
         ----------
-        domain : Domain
+        domain : Box or Polygon
         size : number, callable or clvoro.sizing field
             Target size h(x) > 0: a cell of the right size has volume h^d. A callable takes points (n, d), returns
             (n,), and is evaluated on the host: each step then moves all points there and back.
@@ -227,7 +257,8 @@ class Adapter:
         seed : int
             Of the random start.
         callback : callable, optional
-            Called with each new row of the history; the run stops when it returns True.
+            Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...); the
+            run stops when it returns True.
         effort : "fast", "default" or "best"
             Work that "adaptive" and "exact" take.
         levels : int or "auto"

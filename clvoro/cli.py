@@ -13,9 +13,10 @@ from .errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, I
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 
 _EPILOG = """\
-exit codes: 0 done; 1 the run failed (check: the mesh is wrong); 2 bad usage or input (check: a file
-that cannot be read); 3 no usable device;
-130 interrupted (Ctrl-C; what there was has been written)
+exit codes:
+  0 done                2 bad usage or input (check: a file that cannot be read)
+  1 the run failed      3 no usable device
+    (check: wrong)    130 interrupted (Ctrl-C; what there was has been written)
 
 examples:
   clvoro run paper                      the paper's validation case, into out/paper
@@ -42,8 +43,8 @@ def build_parser() -> argparse.ArgumentParser:
     run = commands.add_parser(
         "run",
         help="run a case: mesh, history and report",
-        description="Run a case and write mesh.vtu, mesh.npz, history.csv, case.toml, report.html "
-        "and pictures/. Options override what the case says.",
+        description="Run a case and write mesh.vtu, mesh.npz, history.csv, case.toml, report.html and\n"
+        "pictures/. Options override what the case says.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -57,7 +58,8 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--method",
         metavar="M",
-        help="adaptive (the default), exact, coupled, ...; or several: lloyd,coupled",
+        help="adaptive (the default), exact, or one kind of step: coupled (the paper's), lloyd, "
+        "poisson, weighted-lloyd, weighted; or several: lloyd,coupled",
     )
     run.add_argument(
         "--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform"

@@ -106,6 +106,11 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     fp64 : bool
         Take only devices that compute in float64.
 
+    Returns
+    -------
+    pyopencl.Context
+        Of one device.
+
     Raises
     ------
     DeviceError
@@ -146,6 +151,16 @@ def list_devices() -> list[DeviceInfo]:
 
     A child process tries them first, so that a runtime that crashes is listed with its reason. That
     takes about a second.
+
+    Returns
+    -------
+    list of DeviceInfo
+        With ``index``, ``name``, ``kind``, ``works`` and, if it does not, the ``reason``.
+
+    Examples
+    --------
+    >>> any(device.works for device in clvoro.list_devices())
+    True
     """
     crashed = _probe.crashing_platforms()
     found, broken = _candidates(skip=crashed)

@@ -137,6 +137,12 @@ class Box(Domain):
     InputTypeError
         If `periodic` is something else than truth values.
 
+    Examples
+    --------
+    >>> channel = clvoro.Box((0, 0), (4, 1), periodic=(True, False))
+    >>> channel.measure, channel.contains(np.array([(0.5, 0.5), (0.5, 1.5)])).tolist()
+    (4.0, [True, False])
+
     Notes
     -----
     On the device the lengths of periods, and coordinates along them, are multiples of 2^-52 (2^-23 in float32) of the

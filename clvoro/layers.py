@@ -54,6 +54,17 @@ class Layers:
     ------
     InputError, InputTypeError
         If a number is out of range.
+
+    Notes
+    -----
+    Where edges are 1.5 widths long or more, or all alike, cells have corners where the wall has: no wall's face is a
+    sliver. Along finer polygons cells are as wide as asked for, whatever the corners between them.
+
+    Examples
+    --------
+    >>> layers = clvoro.Layers(0.01, count=3, growth=1.2, edges=[2, 3])  # lower and upper wall of a box
+    >>> layers.heights.round(4).tolist(), round(layers.width, 4)
+    ([0.01, 0.012, 0.0144], 0.0144)
     """
 
     height: float

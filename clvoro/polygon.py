@@ -64,6 +64,13 @@ class Polygon(Domain):
         no area, crosses or touches itself (slits of no width, too), holes lie outside or overlap or cut
         the domain apart, pieces overlap, an edge is shorter than 1e-12 of the domain, or the whole is
         too large, small or far from the origin for float64.
+
+    Examples
+    --------
+    >>> square = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    >>> pond = clvoro.Polygon(square, [[(0.4, 0.4), (0.6, 0.4), (0.5, 0.6)]])
+    >>> round(pond.measure, 12), pond.n_pieces, pond.edge_numbers[pond.ring_starts[1]:].tolist()
+    (0.98, 1, [5, 4, 6])
     """
 
     framed_by: Polygon | None = None
@@ -80,7 +87,13 @@ class Polygon(Domain):
 
     @classmethod
     def from_pieces(cls, pieces: Sequence[Sequence[object]]) -> Polygon:
-        """Make a domain of several pieces, each a list of its outer ring and its holes."""
+        """Make a domain of several pieces, each a list of its outer ring and its holes.
+
+        Examples
+        --------
+        >>> clvoro.Polygon.from_pieces([[[(0, 0), (1, 0), (1, 1)]], [[(2, 0), (3, 0), (3, 1)]]]).n_pieces
+        2
+        """
         made = cls.__new__(cls)
         made._build(pieces)
         return made
@@ -92,7 +105,13 @@ class Polygon(Domain):
 
     @classmethod
     def from_wkt(cls, text: str) -> Polygon:
-        """Make a domain of a POLYGON or MULTIPOLYGON in well-known text."""
+        """Make a domain of a POLYGON or MULTIPOLYGON in well-known text.
+
+        Examples
+        --------
+        >>> clvoro.Polygon.from_wkt("POLYGON ((0 0, 2 0, 2 1, 0 1, 0 0))").measure
+        2.0
+        """
         if not isinstance(text, str):
             raise InputTypeError(f"text is a {type(text).__name__}, expected well-known text")
         try:
@@ -111,6 +130,17 @@ class Polygon(Domain):
             A file, a text that begins with ``{``, or what `json.loads` makes of it: a Polygon, MultiPolygon,
             Feature or collection of these. Coordinates are taken as they are, in the plane: project
             longitudes and latitudes before.
+
+        Raises
+        ------
+        InputError
+            If there is no such file, it is no GeoJSON, holds something else than polygons, or these make no domain.
+
+        Examples
+        --------
+        >>> ring = [[0, 0], [2, 0], [2, 1], [0, 0]]
+        >>> clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [ring]}).measure
+        1.0
         """
         pieces = pieces_of_geojson(source)
         try:
