@@ -5,8 +5,6 @@
    diagram. Each crossing of an edge with a face is computed once, for both cells beside it, so that trimmed cells tile
    the domain. */
 
-/* Bits of the word in which kernels report what went wrong; see common/face_rows.h. */
-#define FLAG_LOST 1    /* a walk found no way on */
 #define FLAG_OUTSIDE 2 /* the cell of a generator outside the domain, an auxiliary one, reaches into it */
 
 inline REAL squared_distance(REAL2 y, int i, global const REAL *points)

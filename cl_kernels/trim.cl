@@ -8,59 +8,9 @@
    generator is the cell; the others, which a spit or a slit cuts off from it, go to the cell beside them with which
    they share the longest face, and stay where they are only if there is none. */
 
-#define FLAG_LOST 1    /* as in chords.cl */
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
 #define ON_BOUNDARY (4 * REAL_EPS)
 #define ONE_POINT (64 * REAL_EPS)
-
-#define CONVEX_ARGS                                                                                                    \
-    global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,          \
-        const REAL4 box_upper, global const int *touched, global const int *list_starts, global const int *listed
-
-inline convex_t convex_cell(int u, CONVEX_ARGS)
-{
-    convex_t cell;
-    cell.i = touched[u];
-    cell.row = neighbours + starts[cell.i];
-    cell.n = starts[cell.i + 1] - starts[cell.i];
-    cell.chords = listed + list_starts[u];
-    cell.chord_count = list_starts[u + 1] - list_starts[u];
-    cell.points = points;
-    cell.x[0] = points[2 * cell.i];
-    cell.x[1] = points[2 * cell.i + 1];
-    cell.lower[0] = box_lower.s0;
-    cell.lower[1] = box_lower.s1;
-    cell.upper[0] = box_upper.s0;
-    cell.upper[1] = box_upper.s1;
-    return cell;
-}
-#define CONVEX starts, neighbours, points, box_lower, box_upper, touched, list_starts, listed
-
-inline cursor_t loop_begin(int chord)
-{
-    return chord >= 0 ? along_chord(chord) : around_cell();
-}
-
-inline bool winds_around(const convex_t *cell, const chords_t *c, int chord, REAL2 y)
-{
-    cursor_t cursor = loop_begin(chord);
-    int turns = 0;
-    do
-        turns += winding(next_segment(&cursor, cell, c), y);
-    while (!is_complete(&cursor, chord));
-    return turns > 0;
-}
-
-/* Does a loop leave the boundary for faces of the cell? */
-inline bool is_open(const convex_t *cell, const chords_t *c, int chord)
-{
-    cursor_t cursor = loop_begin(chord);
-    do {
-        if (next_segment(&cursor, cell, c).label >= 0)
-            return true;
-    } while (!is_complete(&cursor, chord));
-    return false;
-}
 
 /* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
 

@@ -9,6 +9,9 @@
    shells[v]      of edges of holes: an edge of the outer ring of their piece; -1 for edges of outer rings */
 #include "common/corner.h"
 
+/* Bits of the word in which kernels report what went wrong: this one; others' own follow in their files. */
+#define FLAG_LOST 1 /* a walk found no way on */
+
 typedef struct {
     global const REAL2 *vertices;
     global const int *next_vertex, *owners, *firsts, *cells, *edges;

@@ -11,6 +11,30 @@ typedef struct {
     global const REAL *points;
 } convex_t;
 
+/* Of number u of those that the boundary passes through. */
+#define CONVEX_ARGS                                                                                                    \
+    global const int *starts, global const int *neighbours, global const REAL *points, const REAL4 box_lower,          \
+        const REAL4 box_upper, global const int *touched, global const int *list_starts, global const int *listed
+
+inline convex_t convex_cell(int u, CONVEX_ARGS)
+{
+    convex_t cell;
+    cell.i = touched[u];
+    cell.row = neighbours + starts[cell.i];
+    cell.n = starts[cell.i + 1] - starts[cell.i];
+    cell.chords = listed + list_starts[u];
+    cell.chord_count = list_starts[u + 1] - list_starts[u];
+    cell.points = points;
+    cell.x[0] = points[2 * cell.i];
+    cell.x[1] = points[2 * cell.i + 1];
+    cell.lower[0] = box_lower.s0;
+    cell.lower[1] = box_lower.s1;
+    cell.upper[0] = box_upper.s0;
+    cell.upper[1] = box_upper.s1;
+    return cell;
+}
+#define CONVEX starts, neighbours, points, box_lower, box_upper, touched, list_starts, listed
+
 /* A piece of a loop from p to q, relative to the generator. It lies on the boundary's edge -1 - label, or on the face
    with generator `label`. from, to: a chord that ends there, where a segment ends on a face; else -1 - corner of the
    cell; on the boundary the chord. A segment is empty if both ends are in the same place: for all cells that see it. */
@@ -171,4 +195,32 @@ inline REAL squared_distance_to(segment_t s)
     const REAL t = e2 > 0 ? clamp(-dot(s.p, e) / e2, R(0), R(1)) : 0;
     const REAL2 y = s.p + t * e;
     return dot(y, y);
+}
+
+/* The beginning of the loop that begins with `chord`; -1: around the cell. */
+inline cursor_t loop_begin(int chord)
+{
+    return chord >= 0 ? along_chord(chord) : around_cell();
+}
+
+/* Is y, relative to the generator, inside of a loop? */
+inline bool winds_around(const convex_t *cell, const chords_t *c, int chord, REAL2 y)
+{
+    cursor_t cursor = loop_begin(chord);
+    int turns = 0;
+    do
+        turns += winding(next_segment(&cursor, cell, c), y);
+    while (!is_complete(&cursor, chord));
+    return turns > 0;
+}
+
+/* Does a loop leave the boundary for faces of the cell? */
+inline bool is_open(const convex_t *cell, const chords_t *c, int chord)
+{
+    cursor_t cursor = loop_begin(chord);
+    do {
+        if (next_segment(&cursor, cell, c).label >= 0)
+            return true;
+    } while (!is_complete(&cursor, chord));
+    return false;
 }
