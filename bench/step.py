@@ -63,7 +63,7 @@ NEEDS = {
     "cells.measure_cells": (2 + 1 + 2 + 3, 6 + 6 + 4 + 6 + 12, 6 * 75 + 40),
     "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
     "metric.compare_neighbours": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
-    "density.fit_gradient": (2 + 1 + 2, 6 + 1, 6 * 20 + 40),
+    "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
     "shape.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
     "projection.assemble": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),

@@ -1,5 +1,6 @@
 #include "common/domain.h"
 #include "common/blocks.h"
+#include "common/reduce.h"
 #include "common/at_once.h"
 
 /* The size field as a density of generators, rho = h^-d, and what follows from it. */
@@ -35,10 +36,34 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
     }
 }
 
-/* Per generator i: grad log h by least squares over the neighbours, weighted by 1 / distance^2. One evaluation of h per
-   generator serves all that needs its gradient, and the fit averages over kinks of h at the scale of the cells. */
+/* Displacement to a cell's centroid weighted by h^-(d + 2) (the paper's 2.4; the density whose centroidal diagrams have
+   cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell, g = grad log h, that is
+   c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
+   nothing. */
+inline void weight_offset(const int i, const REAL *gradient, global const REAL *offsets, global const REAL *covariances,
+                          global REAL *lloyd)
+{
+    REAL g[DIM];
+    EACH_AXIS(a)
+    g[a] = -(DIM + 2) * gradient[a];
+#if DIM == 2
+    const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
+    lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
+    lloyd[2 * i + 1] = offsets[2 * i + 1] + xy * g[0] + yy * g[1];
+#else
+    global const REAL *c = covariances + 6 * i;
+    lloyd[3 * i] = offsets[3 * i] + c[0] * g[0] + c[1] * g[1] + c[2] * g[2];
+    lloyd[3 * i + 1] = offsets[3 * i + 1] + c[1] * g[0] + c[3] * g[1] + c[4] * g[2];
+    lloyd[3 * i + 2] = offsets[3 * i + 2] + c[2] * g[0] + c[4] * g[1] + c[5] * g[2];
+#endif
+}
+
+/* Per generator i: grad log h by least squares over the neighbours, weighted by 1 / distance^2, and the displacement to
+   the weighted centroid. One evaluation of h per generator serves all that needs its gradient, and the fit averages
+   over kinks of h at the scale of the cells. */
 kernel void fit_gradient(const int size, global const int *starts, global const int *neighbours,
-                         global const REAL *points, global const REAL *log_h, global REAL *gradient)
+                         global const REAL *points, global const REAL *log_h, global const REAL *offsets,
+                         global const REAL *covariances, global REAL *gradient, global REAL *lloyd)
 {
     WORK_ITEM(i);
     MANY(REAL) sums[DIM][DIM], rises[DIM];
@@ -106,42 +131,30 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
 #endif
     EACH_AXIS(a)
     gradient[DIM * i + a] = g[a];
+    weight_offset(i, g, offsets, covariances, lloyd);
 }
 
-/* Per generator i: displacement to the centroid weighted by h^-(d + 2) (the paper's 2.4; the density whose centroidal
-   diagrams have cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell that is
-   c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
-   nothing. */
-kernel void weight_offsets(const int size, global const REAL *offsets, global const REAL *covariances,
-                           global const REAL *gradient, global REAL *lloyd)
+/* Block-wise, two launches: r -= mean r, weighted by V rho. A wrong count of generators shows as the mean: strain
+   cannot mend it, insertion and deletion can. partial: the groups' sums of V rho r, then those of V rho. */
+kernel void sum_excess(const int size, global const REAL *weight, global const REAL *excess, global REAL *partial)
 {
-    WORK_ITEM(i);
-    REAL g[DIM];
-    EACH_AXIS(a)
-    g[a] = -(DIM + 2) * gradient[DIM * i + a];
-#if DIM == 2
-    const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
-    lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
-    lloyd[2 * i + 1] = offsets[2 * i + 1] + xy * g[0] + yy * g[1];
-#else
-    global const REAL *c = covariances + 6 * i;
-    lloyd[3 * i] = offsets[3 * i] + c[0] * g[0] + c[1] * g[1] + c[2] * g[2];
-    lloyd[3 * i + 1] = offsets[3 * i + 1] + c[1] * g[0] + c[3] * g[1] + c[4] * g[2];
-    lloyd[3 * i + 2] = offsets[3 * i + 2] + c[2] * g[0] + c[4] * g[1] + c[5] * g[2];
-#endif
+    local REAL scratch[GROUP_SIZE];
+    Sum weighed = SUM_ZERO, total = SUM_ZERO;
+    for (BLOCK_LOOP(i, size)) {
+        sum_add(&weighed, weight[i] * excess[i]);
+        sum_add(&total, weight[i]);
+    }
+    const REAL sums[2] = {group_sum(weighed.value, scratch), group_sum(total.value, scratch)};
+    if (get_local_id(0) == 0) {
+        partial[get_group_id(0)] = sums[0];
+        partial[get_num_groups(0) + get_group_id(0)] = sums[1];
+    }
 }
 
-/* Per generator i: the product V rho r, to be summed. */
-kernel void weigh_excess(const int size, global const REAL *weight, global const REAL *excess, global REAL *weighed)
+kernel void remove_mean(const int size, global const REAL *partial, global REAL *excess)
 {
-    WORK_ITEM(i);
-    weighed[i] = weight[i] * excess[i];
-}
-
-/* Per generator i: r -= mean r, weighted by V rho; summaries hold the sums of V rho r and of V rho. A wrong count of
-   generators shows as the mean: strain cannot mend it, insertion and deletion can. */
-kernel void remove_mean(const int size, global const REAL *summaries, global REAL *excess)
-{
-    WORK_ITEM(i);
-    excess[i] -= summaries[0] / summaries[4];
+    local REAL scratch[GROUP_SIZE];
+    const REAL mean = total_sum(partial, scratch) / total_sum(partial + get_num_groups(0), scratch);
+    for (BLOCK_LOOP(i, size))
+        excess[i] -= mean;
 }

@@ -1,11 +1,18 @@
 /* One multigrid cycle on graphs of matched cells (coarsening.cl), in a precision of its own (REAL); where that is not
    the caller's (SOURCE), the residual comes and the correction goes in that. One work-item per cell or group, one
-   work-group for the coarsest level.
+   work-group where cells are few.
 
    Smoothing is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], as two damped pairwise-Jacobi steps. */
 #include "common/real.h"
 #include "common/blocks.h"
 #include "common/rows.h"
+
+/* (B^-1 r)_i: B has the diagonal and 2 x 2 blocks of A. */
+inline REAL pairwise(int i, global const int *partner, global const REAL *own, global const REAL *both,
+                     global const REAL *r)
+{
+    return own[i] * r[i] + both[i] * (r[i] + r[partner[i]]);
+}
 
 /* b = r, x = omega B^-1 b: the first step from a start of zero. On the finest level b is rounded from `r`. */
 kernel void first_rounded(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
@@ -24,7 +31,7 @@ kernel void first(int n, REAL omega, global const int *partner, global const REA
 {
     const int i = get_global_id(0);
     if (i < n)
-        x[i] = omega * (own[i] * b[i] + both[i] * (b[i] + b[partner[i]]));
+        x[i] = omega * pairwise(i, partner, own, both, b);
 }
 
 /* t = b - A x. */
@@ -42,7 +49,7 @@ kernel void correct(int n, REAL omega, global const int *partner, global const R
 {
     const int i = get_global_id(0);
     if (i < n)
-        x[i] += omega * (own[i] * t[i] + both[i] * (t[i] + t[partner[i]]));
+        x[i] += omega * pairwise(i, partner, own, both, t);
 }
 
 /* u = x + omega B^-1 t in the caller's precision: the cycle's last step. */
@@ -51,20 +58,28 @@ kernel void correct_out(int n, REAL omega, global const int *partner, global con
 {
     const int i = get_global_id(0);
     if (i < n)
-        u[i] = x[i] + omega * (own[i] * t[i] + both[i] * (t[i] + t[partner[i]]));
+        u[i] = x[i] + omega * pairwise(i, partner, own, both, t);
 }
 
-/* b of a group = sum of its members' t. */
-kernel void restrict_sum(int groups, global const int *member_starts, global const int *members, global const REAL *t,
-                         global REAL *b)
+/* Sum of b - A x over the members of group g. */
+inline REAL group_defect(int g, int n, global const int *starts, global const int *columns, global const REAL *weights,
+                         global const REAL *b, global const REAL *x, global const int *member_starts,
+                         global const int *members)
 {
-    const int g = get_global_id(0);
-    if (g >= groups)
-        return;
     REAL sum = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s)
-        sum += t[members[s]];
-    b[g] = sum;
+        sum += b[members[s]] - row_difference(members[s], n, starts, columns, weights, x);
+    return sum;
+}
+
+/* b of a group = sum of its members' defects. */
+kernel void restrict_defect(int groups, int n, global const int *starts, global const int *columns,
+                            global const REAL *weights, global const REAL *b, global const REAL *x,
+                            global const int *member_starts, global const int *members, global REAL *coarse_b)
+{
+    const int g = get_global_id(0);
+    if (g < groups)
+        coarse_b[g] = group_defect(g, n, starts, columns, weights, b, x, member_starts, members);
 }
 
 /* Every member takes its group's correction. */
@@ -73,6 +88,45 @@ kernel void prolong(int n, global const int *group, global const REAL *e, global
     const int i = get_global_id(0);
     if (i < n)
         x[i] += e[group[i]];
+}
+
+/* One group of work-items, where cells are few: a step of smoothing. */
+inline void relax_alone(int n, REAL omega, global const int *starts, global const int *columns,
+                        global const REAL *weights, global const int *partner, global const REAL *own,
+                        global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
+{
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    for (BLOCK_LOOP(i, n))
+        t[i] = b[i] - row_difference(i, n, starts, columns, weights, x);
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    for (BLOCK_LOOP(j, n))
+        x[j] += omega * pairwise(j, partner, own, both, t);
+}
+
+/* One group: all that is done on a level on the way down, with the same bits as by the kernels above. */
+kernel void descend_alone(int n, REAL late, REAL early, global const int *starts, global const int *columns,
+                          global const REAL *weights, global const int *partner, global const REAL *own,
+                          global const REAL *both, global const REAL *b, global REAL *x, global REAL *t, int groups,
+                          global const int *member_starts, global const int *members, global REAL *coarse_b)
+{
+    for (BLOCK_LOOP(i, n))
+        x[i] = late * pairwise(i, partner, own, both, b);
+    relax_alone(n, early, starts, columns, weights, partner, own, both, b, x, t);
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    for (BLOCK_LOOP(g, groups))
+        coarse_b[g] = group_defect(g, n, starts, columns, weights, b, x, member_starts, members);
+}
+
+/* One group: the same on the way up. */
+kernel void ascend_alone(int n, REAL late, REAL early, global const int *starts, global const int *columns,
+                         global const REAL *weights, global const int *partner, global const REAL *own,
+                         global const REAL *both, global const REAL *b, global REAL *x, global REAL *t,
+                         global const int *group, global const REAL *e)
+{
+    for (BLOCK_LOOP(i, n))
+        x[i] += e[group[i]];
+    relax_alone(n, early, starts, columns, weights, partner, own, both, b, x, t);
+    relax_alone(n, late, starts, columns, weights, partner, own, both, b, x, t);
 }
 
 /* One group of work-items: cells are eliminated one by one, which leaves a graph of the others,
@@ -126,34 +180,30 @@ kernel void eliminate(int n, global const int *starts, global const int *columns
     }
 }
 
-/* t = D^-1 Z (b - mean b), then x = Z^T t less its mean: the coarsest level. Such a product is positive semidefinite
-   whatever is rounded in it, as an inverse matrix in one piece is not. Without the means the last cell would be the one
-   at zero, and the constant by which all others differ from it leave its roundings in the scalar products of the
-   iteration. */
-kernel void solve_down(int n, global const REAL *factor, global const REAL *b, global REAL *t)
+/* One group, on the coarsest level: t = D^-1 Z (b - mean b), then x = Z^T t less its mean. Such a product is positive
+   semidefinite whatever is rounded in it, as an inverse matrix in one piece is not. Without the means the last cell
+   would be the one at zero, and the constant by which all others differ from it leave its roundings in the scalar
+   products of the iteration. */
+kernel void solve(int n, global const REAL *factor, global const REAL *b, global REAL *t, global REAL *x)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
-    REAL mean = 0, sum = 0;
+    global const REAL *inverse = factor + 2 * n * n, *means = inverse + n;
+    REAL mean_b = 0, mean_x = 0;
     for (int k = 0; k < n; ++k)
-        mean += b[k];
-    mean /= n;
-    for (int k = 0; k <= i; ++k)
-        sum += factor[i * n + k] * (b[k] - mean);
-    t[i] = sum * factor[2 * n * n + i];
-}
-
-kernel void solve_up(int n, global const REAL *factor, global const REAL *t, global REAL *x)
-{
-    const int k = get_global_id(0);
-    if (k >= n)
-        return;
-    global const REAL *means = factor + 2 * n * n + n;
-    REAL sum = 0, mean = 0;
-    for (int i = 0; i < n; ++i)
-        mean += means[i] * t[i];
-    for (int i = k; i < n; ++i)
-        sum += factor[i * n + k] * t[i];
-    x[k] = sum - mean;
+        mean_b += b[k];
+    mean_b /= n;
+    for (BLOCK_LOOP(i, n)) {
+        REAL sum = 0;
+        for (int k = 0; k <= i; ++k)
+            sum += factor[i * n + k] * (b[k] - mean_b);
+        t[i] = sum * inverse[i];
+    }
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    for (int k = 0; k < n; ++k)
+        mean_x += means[k] * t[k];
+    for (BLOCK_LOOP(j, n)) {
+        REAL sum = 0;
+        for (int i = j; i < n; ++i)
+            sum += factor[i * n + j] * t[i];
+        x[j] = sum - mean_x;
+    }
 }

@@ -159,11 +159,14 @@ kernel void summarise_blocks(global const REAL *a0, global const REAL *a1, globa
     }
 }
 
-/* One work-item per slot whose bit is set in `which`: out[4 slot ...] = sum, sum of magnitudes, least, largest. */
+/* One work-item per slot whose bit is set in `which`: out[4 slot ...] = sum, sum of magnitudes, least, largest. Behind
+   them all comes the first of `note`, where there is one: the host reads all at once. */
 kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int which,
-                           global REAL *out)
+                           const int noted, global const int *note, global REAL *out, global int *behind)
 {
     WORK_ITEM(slot);
+    if (noted && slot == 0)
+        behind[4 * size * (int)(sizeof(REAL) / sizeof(int))] = note[0];
     if (!(which >> slot & 1))
         return;
     summary_t all = partials[groups * slot];

@@ -77,6 +77,7 @@ class Summaries:
         self.slots = {name: slot for slot, name in enumerate(names)}
         self._kernels = engine.kernels("primitives")
         self._partials = engine.empty(6 * engine.groups * len(names))
+        self._slots_of: dict[tuple[str, ...], tuple[np.ndarray, int]] = {}
         self._pending = 0
         # Behind the figures there is room for an integer that the host reads with them.
         size = 4 * len(names) * engine.real.itemsize
@@ -90,27 +91,34 @@ class Summaries:
 
     def collect_all(self, arrays: Mapping[str, cla.Array], n: int) -> None:
         """Summarise the first `n` of each of `AT_ONCE` arrays at most into the slot of its name."""
-        given, count = list(arrays.values()), np.int32(len(arrays))
+        given, names = list(arrays.values()), tuple(arrays)
         spare = given[:1] * (AT_ONCE - len(given))
-        slots = np.zeros(AT_ONCE, np.int32)
-        slots[: len(given)] = [self.slots[name] for name in arrays]
+        if names not in self._slots_of:
+            slots = [self.slots[name] for name in names]
+            vector = np.array(slots + [0] * len(spare), np.int32)
+            self._slots_of[names] = vector, sum(1 << slot for slot in slots)
+        slots, which = self._slots_of[names]
         self.engine.run_blocks(
-            self._kernels.summarise_blocks, *given, *spare, count, np.int32(n), slots,
+            self._kernels.summarise_blocks, *given, *spare, np.int32(len(given)), np.int32(n), slots,
             self._partials,
         )  # fmt: skip
-        for name in arrays:
-            self._pending |= 1 << self.slots[name]
+        self._pending |= which
 
     @property
     def values(self) -> cla.Array:
         """What there is on the device: a row for each name of sum, sum of magnitudes, least, largest."""
         if self._pending:
-            self.engine.run_each(
-                self._kernels.combine_blocks, len(self.slots), self._partials,
-                np.int32(self.engine.groups), np.int32(self._pending), self._values, group=1,
-            )  # fmt: skip
-            self._pending = 0
+            self._combine(None)
         return self._values
+
+    def _combine(self, note: cla.Array | None) -> None:
+        """Bring the figures up to date, and put the first of `note` behind them."""
+        self.engine.run_each(
+            self._kernels.combine_blocks, len(self.slots), self._partials, np.int32(self.engine.groups),
+            np.int32(self._pending), np.int32(note is not None), self._record if note is None else note,
+            self._values, self._record, group=1,
+        )  # fmt: skip
+        self._pending = 0
 
     def read_one(self, name: str) -> Summary:
         """Fetch one slot."""
@@ -123,13 +131,9 @@ class Summaries:
 
     def read_with(self, other: cla.Array | None) -> tuple[dict[str, Summary], int]:
         """Fetch every slot, and the first of `other`, int32, in the same transfer (0 if there is none)."""
-        self.values  # noqa: B018  brought up to date
+        if self._pending or other is not None:
+            self._combine(other)
         size = self._values.nbytes
-        if other is not None:
-            cl.enqueue_copy(
-                self.engine.queue, buffer_of(self._record), buffer_of(other), dst_offset=size,
-                byte_count=other.dtype.itemsize,
-            )  # fmt: skip
         host = self._record.get()
         rows = host[:size].view(self.engine.real).reshape(-1, 4).tolist()
         summaries = {name: Summary(*rows[slot]) for name, slot in self.slots.items()}

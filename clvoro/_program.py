@@ -114,13 +114,18 @@ def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
 
     A step's arrays are those of the step before, mostly: to see that costs a quarter of setting them.
     """
-    key = [
-        a.mark if type(a) is DeviceArray else a if type(a) is np.int32 else _key_of(a) for a in args
-    ]
+    key = key_of(args)
     if key == getattr(kernel, "bound", None):
         return
     set_args(kernel, plain(args))
     kernel.bound = key  # type: ignore[attr-defined]
+
+
+def key_of(args: Sequence[object]) -> list[object]:
+    """Return what arguments can be compared by without keeping them: equal only if all is the same."""
+    return [
+        a.mark if type(a) is DeviceArray else a if type(a) is np.int32 else _key_of(a) for a in args
+    ]
 
 
 def plain(args: Sequence[object]) -> list[Any]:

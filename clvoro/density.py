@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ._primitives import Summaries
 from ._program import Engine
 from .tessellation import Tessellation
 
@@ -53,7 +52,7 @@ class Density:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("density")
-        self._sums = Summaries(engine, ("weighed", "weight"))
+        self._partial = engine.empty(2 * engine.groups)
 
     def weigh(self, t: Tessellation, h: cla.Array) -> Excess:
         """Return the excess of the cells of `t` over sizes `h` (n,)."""
@@ -87,15 +86,14 @@ class Density:
         w = Weighting(engine.scratch(t.n), engine.scratch(t.n), excess, gradient, lloyd)
         with engine.workspace.frame():
             log_h = self._weigh(t, h, w)
-            engine.run_each(k.fit_gradient, t.n, t.starts, t.neighbours, t.points, log_h, gradient)
-            engine.run_each(k.weight_offsets, t.n, t.offsets, t.covariances, gradient, lloyd)
+            engine.run_each(
+                k.fit_gradient, t.n, t.starts, t.neighbours, t.points, log_h, t.offsets, t.covariances,
+                gradient, lloyd,
+            )  # fmt: skip
         return w
 
     def remove_mean(self, w: Excess) -> None:
         """Take the mean of ``w.excess``, weighted by ``w.weight``, away from it."""
-        engine, n = self.engine, len(w.excess)
-        with engine.workspace.frame():
-            weighed = engine.scratch(n)
-            engine.run_each(self._kernels.weigh_excess, n, w.weight, w.excess, weighed)
-            self._sums.collect_all({"weighed": weighed, "weight": w.weight}, n)
-            engine.run_each(self._kernels.remove_mean, n, self._sums.values, w.excess)
+        run, k, size = self.engine.run_blocks, self._kernels, np.int32(len(w.excess))
+        run(k.sum_excess, size, w.weight, w.excess, self._partial)
+        run(k.remove_mean, size, self._partial, w.excess)

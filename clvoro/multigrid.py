@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
-from operator import is_not
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.array as cla
 
 from ._primitives import Room
-from ._program import Engine, Kernels, bind
-from .coarsening import GROUP, Coarsening, Graph, Groups, PairInverse, whole_groups
+from ._program import Engine
+from .coarsening import Coarsening, Graph, Groups, PairInverse
+from .cycle import Cycle, Level
 
 _COARSEST = 64
 _MOST_LEVELS = 30
-# Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as damping factors of two steps. What lies
-# below is left to the coarse levels.
-_LOWEST = 0.35
-_CENTRE, _RADIUS = (2 + _LOWEST) / 2, (2 - _LOWEST) / 2
-_DAMPING = (
-    np.float32(1 / (_CENTRE - _RADIUS * math.sqrt(0.5))),
-    np.float32(1 / (_CENTRE + _RADIUS * math.sqrt(0.5))),
-)
-_NONE = np.float32(0)
-
-
-@dataclass(frozen=True)
-class _Level:
-    graph: Graph
-    pairs: PairInverse
-    groups: Groups | None
 
 
 class _SavedLevel:
@@ -84,29 +65,6 @@ def _cuts(starts: np.ndarray, rows: int, length: int) -> bool:
     return fits and starts[0] == 0 and starts[-1] == length and bool((np.diff(starts) >= 0).all())
 
 
-class _Bound:
-    """A kernel with arguments of its own, which are set when they change only."""
-
-    def __init__(self, engine: Engine, kernel: cl.Kernel) -> None:
-        self._queue, self._kernel = engine.queue, kernel
-        self._args: list[object] = []
-
-    def bind(self, size: int, args: Iterable[object]) -> _Bound:
-        """Set the arguments."""
-        given = [a.data if isinstance(a, cla.Array) else a for a in args]
-        if len(given) != len(self._args) or any(map(is_not, given, self._args)):
-            bind(self._kernel, given)
-            self._args, self._size = given, (whole_groups(size),)
-        return self
-
-    def release(self) -> None:
-        """Let go of the arguments."""
-        self._args = []
-
-    def __call__(self) -> None:
-        cl.enqueue_nd_range_kernel(self._queue, self._kernel, self._size, (GROUP,))
-
-
 class Multigrid:
     """Aggregation multigrid cycle as a preconditioner: symmetric positive definite, deterministic.
 
@@ -130,18 +88,17 @@ class Multigrid:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._single = engine.single()
+        self._kernels = self._single.kernels("multigrid", {"SOURCE": "float"})
         self._coarsening = Coarsening(self._single)
-        self._bound: dict[tuple, _Bound] = {}
-        self._programme: tuple[Sequence[object], list[_Bound]] | None = None
+        self._cycle = Cycle(self._single)
         self._room = Room(self._single)
-        self._levels: list[_Level] = []
+        self._levels: list[Level] = []
         self._factor: cla.Array | None = None
 
     def clear(self) -> None:
         """Let go of all levels."""
-        self._levels, self._factor, self._programme = [], None, None
-        for bound in self._bound.values():
-            bound.release()
+        self._levels, self._factor = [], None
+        self._cycle.clear()
         self._coarsening.clear()
         self._room.clear()
 
@@ -166,17 +123,17 @@ class Multigrid:
             depth, n = len(self._levels), len(graph)
             if n <= _COARSEST:
                 pairs = self._coarsening.pairs(graph, depth)
-                self._levels.append(_Level(graph, pairs, None))
+                self._levels.append(Level(graph, pairs, None))
                 self._eliminate(graph)
                 break
             pairs, groups, coarse = self._coarsening.coarsen(graph, depth)
             if len(groups) > 0.8 * n or depth == _MOST_LEVELS:
                 # Hardly a neighbour left: smoothing is all there is to do.
-                self._levels.append(_Level(graph, pairs, None))
+                self._levels.append(Level(graph, pairs, None))
                 break
-            self._levels.append(_Level(graph, pairs, groups))
+            self._levels.append(Level(graph, pairs, groups))
             graph = coarse
-        self._programme = None
+        self._cycle.take(self._levels, self._factor)
 
     def renew(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
         """Take a similar operator on the same cells: only the smoother of the finest level follows.
@@ -194,7 +151,7 @@ class Multigrid:
         finest = self._levels[0]
         self._coarsening.renew_pairs(graph, finest.pairs)
         self._levels[0] = replace(finest, graph=graph)
-        self._programme = None
+        self._cycle.take(self._levels, self._factor)
 
     def save(self) -> dict[str, np.ndarray]:
         """Return what `renew` builds on: pairs, groups and coarse graphs, fetched from the device."""
@@ -243,15 +200,15 @@ class Multigrid:
             if depth > 0:
                 self._coarsening.renew_pairs(graph, pairs)
             groups = host.groups and Groups(*(single.upload(a, np.int32) for a in host.groups))
-            self._levels.append(_Level(graph, pairs, groups))
+            self._levels.append(Level(graph, pairs, groups))
         if "factor" in arrays:
             self._factor = single.upload(arrays["factor"], np.float32)
-        self._programme = None
+        self._cycle.take(self._levels, self._factor)
 
     def _eliminate(self, graph: Graph) -> None:
         n = len(graph)
         self._factor = self._room("factor", size=_factor_size(n))
-        kernel = self._kernels(np.dtype(np.float32)).eliminate
+        kernel = self._kernels.eliminate
         group = self._single.group_size
         self._single.run(
             kernel, group, np.int32(n), graph.starts, graph.columns, graph.weights, self._factor,
@@ -267,91 +224,4 @@ class Multigrid:
         spare : (n,) of the same, optional
             What is in it is lost.
         """
-        arrays = [a if a is None else a.base_data for a in (r, u, spare)]
-        programme = self._programme
-        if programme is None or any(map(is_not, programme[0], arrays)):
-            programme = self._programme = (arrays, self._compile(r, u, spare))
-        for launch in programme[1]:
-            launch()
-
-    def _vectors(self, depth: int) -> list[cla.Array]:
-        """Right side, solution and defect of a level."""
-        n = len(self._levels[depth].graph)
-        return [self._room(depth, name, size=n) for name in "bxt"]
-
-    def _compile(self, r: cla.Array, u: cla.Array, spare: cla.Array | None) -> list[_Bound]:
-        """One cycle as a list of kernels with their arguments set: down to the coarsest level, and up again."""
-        launches: list[_Bound] = []
-        early, late = _DAMPING
-        inside = r.dtype == np.float32
-        vectors = [self._vectors(depth) for depth in range(1, len(self._levels))]
-        if inside and spare is not None:
-            vectors.insert(0, [r, u, spare])
-        else:
-            vectors.insert(0, self._vectors(0))
-            inside = False
-
-        def bind(depth: int, name: str, size: int, *args: object, variant: int = 0) -> None:
-            key = (depth, name, variant, r.dtype)
-            if key not in self._bound:
-                kernel = getattr(self._kernels(r.dtype), name)
-                self._bound[key] = _Bound(self._single, kernel)
-            launches.append(self._bound[key].bind(size, (_integer(size), *args)))
-
-        def relax(depth: int, damping: np.float32, last: bool = False) -> None:
-            """One step of smoothing from the x that there is."""
-            level, (b, x, t), variant = self._levels[depth], vectors[depth], int(damping is late)
-            n, blocks = len(level.graph), _blocks(level)
-            bind(depth, "defect", n, *_rows(level), b, x, t)
-            if last and depth == 0 and not inside:
-                bind(depth, "correct_out", n, damping, *blocks, t, x, u)
-            else:
-                bind(depth, "correct", n, damping, *blocks, t, x, variant=variant)
-
-        deepest = len(self._levels) - 1
-        for depth, level in enumerate(self._levels):
-            n, (b, x, t) = len(level.graph), vectors[depth]
-            if depth == 0 and not inside:
-                bind(0, "first_rounded", n, late, *_blocks(level), r, b, x)
-            elif level.groups is not None or self._factor is None:
-                bind(depth, "first", n, late, *_blocks(level), b, x)
-            if depth == deepest and self._factor is not None:
-                bind(depth, "solve_down", n, self._factor, b, t)
-                bind(depth, "solve_up", n, self._factor, t, x)
-                if depth == 0 and not inside:
-                    bind(0, "correct_out", n, _NONE, *_blocks(level), b, x, u)
-                break
-            relax(depth, early)
-            if level.groups is not None:
-                bind(depth, "defect", n, *_rows(level), b, x, t)
-                lists, coarse_b = (level.groups.starts, level.groups.members), vectors[depth + 1][0]
-                bind(depth, "restrict_sum", len(level.groups), *lists, t, coarse_b)
-        for depth in range(deepest, -1, -1):
-            level = self._levels[depth]
-            if depth == deepest and self._factor is not None:
-                continue
-            if level.groups is not None:
-                (_, x, _), (_, e, _) = vectors[depth], vectors[depth + 1]
-                bind(depth, "prolong", len(level.graph), level.groups.group, e, x)
-            relax(depth, early)
-            relax(depth, late, last=True)
-        return launches
-
-    def _kernels(self, source: np.dtype) -> Kernels:
-        """Kernels of their own arguments that take the residual in `source`."""
-        name = "double" if source == np.float64 else "float"
-        return self._single.kernels("multigrid", {"SOURCE": name})
-
-
-def _rows(level: _Level) -> tuple[cla.Array, ...]:
-    return level.graph.starts, level.graph.columns, level.graph.weights
-
-
-def _blocks(level: _Level) -> tuple[cla.Array, ...]:
-    return level.pairs.partner, level.pairs.own, level.pairs.both
-
-
-@cache
-def _integer(value: int) -> np.int32:
-    """Return the same object for the same value, by which arguments are compared."""
-    return np.int32(value)
+        self._cycle.enqueue(r, u, spare)

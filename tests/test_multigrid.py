@@ -4,12 +4,13 @@ import functools
 
 import graphs
 import numpy as np
+import patch
 import pyopencl as cl
 import pytest
 import scipy.sparse as sp
 from scipy.spatial import Delaunay
 
-from clvoro import create_context
+from clvoro import create_context, cycle
 from clvoro._program import Engine
 from clvoro.coarsening import Coarsening, Graph
 from clvoro.errors import SolverError
@@ -177,6 +178,33 @@ def test_cycle_in_place(make, n):
         multigrid.apply(r, v, spare)
         assert np.array_equal(u.get(), v.get())
     assert np.array_equal(r.get(), right)
+
+
+@pytest.mark.parametrize("group_size", [None, 16], ids=["cpu", "gpu"])
+@pytest.mark.parametrize("name", ["random", "random 3D", "star"])
+def test_few_cells_are_gone_through_by_one_group_to_the_same_bits(
+    make, monkeypatch, name, group_size
+):
+    """Against launches of their own for each step of each level, whose cells then fill several work-groups."""
+    W, found, plain = GRAPHS[name](), [], cl.enqueue_nd_range_kernel
+    right = np.random.default_rng(6).standard_normal(W.shape[0])
+    engine = patch.make_engine(make().ctx, group_size=group_size)
+    for most in (0, 10**6):
+        monkeypatch.setattr(cycle, "most_alone", lambda _, most=most: most)
+        multigrid = Multigrid(engine)
+        multigrid.set_up(*upload(engine, W))
+        assert len(multigrid.sizes) > 2 or name == "star"
+        r, u = engine.upload(right), engine.empty(len(right))
+        launched = []
+        with monkeypatch.context() as patched:
+            patched.setattr(
+                cl, "enqueue_nd_range_kernel",
+                lambda *args, into=launched: into.append(args[1].function_name) or plain(*args),
+            )  # fmt: skip
+            multigrid.apply(r, u)
+        assert ("descend_alone" in launched) == (most > 0 and len(multigrid.sizes) > 2)
+        found.append(u.get())
+    assert np.array_equal(*found)
 
 
 def test_walls_count_for_nothing(make):
