@@ -41,7 +41,6 @@ class Raster(Field):
         With "nodes" the first and last values of a row lie on the box's sides, as in
         ``linspace(lower, upper, nx)``; with "centres" each value is the centre of one of nx equal
         pixels.
-
     missing : "error" or "nearest"
         Whether values that are missing (NaN, or under a NumPy mask) are refused, or filled with the
         nearest one that is there.
@@ -55,6 +54,17 @@ class Raster(Field):
     InputError
         If shape and corners do not fit, or a value is missing or infinite. (Values that are not positive are
         refused only where the finished field is: a `maximum` may cover them.)
+
+    Examples
+    --------
+    Cells of the size of the waves in a sea of this depth (m, rows from south to north; NaN on land), growing by a tenth
+    per cell at most:
+
+    >>> depth = np.array([[10.0, 40.0, np.nan], [10.0, 90.0, 160.0]])
+    >>> size = sizing.Raster(20 * np.sqrt(depth), (0, 0), (2000, 1000), missing="nearest")
+    >>> size(np.array([(0.0, 0.0), (1000.0, 1000.0)])).round(1).tolist()
+    [63.2, 189.7]
+    >>> graded = sizing.Graded(size, growth=1.1)
     """
 
     def __init__(
