@@ -30,7 +30,19 @@ def coordinates(what: str, values: object, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Circle, in 3D the sphere, of `centre` and `radius`; a radius of 0 makes it a point."""
+    """Circle, in 3D the sphere.
+
+    Parameters
+    ----------
+    centre : (2,) or (3,) float
+    radius : float
+        0 makes it a point.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is none, not finite, or the radius negative.
+    """
 
     centre: np.ndarray
     radius: float
@@ -53,7 +65,18 @@ Sphere = Circle
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """Open chain of straight segments through `points` (m, d), m >= 2."""
+    """Open chain of straight segments.
+
+    Parameters
+    ----------
+    points : (m, 2) or (m, 3) float
+        Two or more.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If they are too few, not finite, or of another shape.
+    """
 
     points: np.ndarray
 
@@ -75,7 +98,18 @@ class Polyline:
 
 
 class Polygon(Polyline):
-    """Closed chain of straight segments: `points` (m, d), m >= 3, the last joins the first."""
+    """Closed chain of straight segments, a curve. (The domain that has an inside is `clvoro.Polygon`.)
+
+    Parameters
+    ----------
+    points : (m, 2) or (m, 3) float
+        Three or more; the last joins the first.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If they are too few, not finite, or of another shape.
+    """
 
     @staticmethod
     def _least() -> int:
@@ -88,9 +122,16 @@ class Polygon(Polyline):
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Straight segments that need not hang together, from `begin` (m, d) to `end` (m, d).
+    """Straight segments that need not hang together; `clvoro.Polygon.boundary` gives them for edges of a domain.
 
-    `clvoro.Polygon.boundary` gives them for edges of a domain.
+    Parameters
+    ----------
+    begin, end : (m, 2) or (m, 3) float
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If there is none, a number is not finite, or shapes differ.
     """
 
     begin: np.ndarray
@@ -116,7 +157,18 @@ class Edges:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Straight segment from `a` to `b`."""
+    """Straight segment.
+
+    Parameters
+    ----------
+    a, b : (2,) or (3,) float
+        Its ends.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is none or not finite, or the ends differ in dimension.
+    """
 
     a: np.ndarray
     b: np.ndarray
