@@ -98,7 +98,7 @@ class Polyline:
 
 
 class Polygon(Polyline):
-    """Closed chain of straight segments, a curve. (The domain that has an inside is `clvoro.Polygon`.)
+    """Closed chain of straight segments, a curve; the domain that has an inside is `clvoro.Polygon`.
 
     Parameters
     ----------
