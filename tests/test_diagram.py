@@ -1,6 +1,7 @@
 """The diagram against references, and its invariants, over point sets x precision."""
 
 import numpy as np
+import pyopencl as cl
 import pytest
 import reference
 from hypothesis import given, settings
@@ -10,8 +11,10 @@ import clvoro
 from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import ROW_CAPACITY, Cells
+from clvoro.tessellation import DOUBT
 
 BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
+COLLAPSED = 4  # FLAG_COLLAPSED of common/face_rows.h
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -310,3 +313,28 @@ def test_a_search_that_is_repeated_widens(ctx, seed):
         clvoro.Adapter(ctx, "float32").diagram(
             clvoro.Box((0, 0), (1, 1)), np.concatenate([around, cluster])
         )
+
+
+@pytest.mark.parametrize("doubtful", [False, True])
+def test_what_has_two_faces_is_no_cell(ctx, doubtful):
+    """Rounding leaves such rows where generators are too close for the precision: they are refused, and named."""
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype("float64"))
+    cells, points = Cells(engine), engine.upload([[0.2, 0.2], [0.5, 0.3], [0.4, 0.6]])
+    for two in (True, False):
+        lists = [[1, 2] if two else [1, 2, -1], [0, -3, 2], [0, 1, -4]]
+        rows, n = cells.take_rows(3), len(lists)
+        slots = np.zeros((n, cells.row_capacity), np.int32)
+        for i, labels in enumerate(lists):
+            slots[i, : len(labels)] = labels
+        rows.slots.set(slots.ravel())
+        rows.places.set(np.arange(n, dtype=np.int32))
+        # A doubt has all rows compared, and none is found wanting.
+        sign = -1 if doubtful else 1
+        rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
+        rows.flags.set(np.array([0, n, doubtful, 0], np.int32))
+        old = rows.places, rows.places
+        flags, generator, m, _ = cells._match(rows, BOX, points, n, *old, exact=True)
+        assert m == 9 - two
+        assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)
+        if two:
+            assert generator == 0
