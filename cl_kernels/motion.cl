@@ -2,11 +2,11 @@
 
 /* Per generator i: u = -grad phi (the paper's 3.3). The solver's potential is psi = -phi, from -div grad psi = e, so
    that u = grad psi, with grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i), which is exact for linear
-   psi in a closed cell; walls carry no flux. speed[i] = |u| / h. */
+   psi in a closed cell; walls carry no flux. */
 kernel void follow_potential(const int size, global const int *starts, global const int *neighbours,
                              global const FACE *face_measures, global const FACE *face_centroids,
                              global const REAL *volumes, global const REAL *points, global const REAL *psi,
-                             global const REAL *h, global REAL *u, global REAL *speed)
+                             global REAL *u)
 {
     WORK_ITEM(i);
     REAL sum[DIM] = {0};
@@ -24,14 +24,8 @@ kernel void follow_potential(const int size, global const int *starts, global co
         EACH_AXIS(a)
         sum[a] += flux * face_centroids[DIM * k + a];
     }
-    REAL u2 = 0;
     EACH_AXIS(a)
-    {
-        const REAL ua = sum[a] / volumes[i];
-        u[DIM * i + a] = ua;
-        u2 += ua * ua;
-    }
-    speed[i] = sqrt(u2) / h[i];
+    u[DIM * i + a] = sum[a] / volumes[i];
 }
 
 /* Per generator i: correction = alpha u with one alpha for all, alpha = min(limit, k / max_i(|u_i| / h_i)) (the paper's
@@ -47,14 +41,19 @@ kernel void relax_globally(const int size, global const REAL *summaries, const i
     speed[i] *= alpha;
 }
 
-/* Per generator i: length of a displacement over h. */
-kernel void measure_displacement(const int size, global const REAL *u, global const REAL *h, global REAL *speed)
+/* Per generator i: lengths of two displacements over h. */
+kernel void measure_displacements(const int size, global const REAL *u, global const REAL *v, global const REAL *h,
+                                  global REAL *u_speed, global REAL *v_speed)
 {
     WORK_ITEM(i);
-    REAL u2 = 0;
+    REAL u2 = 0, v2 = 0;
     EACH_AXIS(a)
-    u2 += u[DIM * i + a] * u[DIM * i + a];
-    speed[i] = sqrt(u2) / h[i];
+    {
+        u2 += u[DIM * i + a] * u[DIM * i + a];
+        v2 += v[DIM * i + a] * v[DIM * i + a];
+    }
+    u_speed[i] = sqrt(u2) / h[i];
+    v_speed[i] = sqrt(v2) / h[i];
 }
 
 /* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the

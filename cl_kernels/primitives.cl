@@ -1,7 +1,7 @@
 #include "common/real.h"
 #include "common/blocks.h"
 
-/* Exclusive prefix sums in three passes. One work-item stands for one contiguous chunk of the array. */
+/* Exclusive prefix sums in two passes. One work-item stands for one contiguous chunk of the array. */
 
 inline int chunk_begin(int n, int w, int width)
 {
@@ -19,27 +19,16 @@ kernel void chunk_sums(const int size, global const int *values, const int first
     sums[w] = sum;
 }
 
-/* One work-item: sums becomes its own exclusive prefix sum, with the total at sums[width]. */
-kernel void scan_sums(const int size, global int *sums, const int width)
-{
-    WORK_ITEM(only);
-    (void)only;
-    int total = 0;
-    for (int w = 0; w < width; ++w) {
-        const int sum = sums[w];
-        sums[w] = total;
-        total += sum;
-    }
-    sums[width] = total;
-}
-
-/* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. */
+/* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. Each
+   work-item adds up the chunks before its own itself: all read the same, and none has to wait for one that does. */
 kernel void scan_chunks(const int size, global const int *values, const int first, global const int *sums,
                         global int *out, const int n)
 {
     WORK_ITEM(w);
     const int end = chunk_begin(n, w + 1, size);
-    int total = sums[w];
+    int total = 0;
+    for (int v = 0; v < w; ++v)
+        total += sums[v];
     for (int i = chunk_begin(n, w, size); i < end; ++i) {
         const int value = values[first + i];
         out[i] = total;

@@ -1,6 +1,6 @@
 """Scans and reductions on the device, deterministic and without work-group scans.
 
-pyopencl's generic scan was measured first: 3.4 ms for 1e6 integers on PoCL with two cores, where the three plain
+pyopencl's generic scan was measured first: 3.4 ms for 1e6 integers on PoCL with two cores, where plain
 loops of `primitives.cl` take 0.5 ms, and 1.7 s to compile at the first use.
 """
 
@@ -28,10 +28,10 @@ class Scan:
         self.engine = engine
         cpu = bool(engine.queue.device.type & cl.device_type.CPU)
         self.width = engine.queue.device.max_compute_units * 4 if cpu else 4096
-        # On a CPU one work-item is through with so many before three launches are.
+        # On a CPU one work-item is through with so many before two launches are.
         self._few = 8192 if cpu else 0
         self._kernels = engine.kernels("primitives")
-        self._sums = engine.empty(self.width + 1, np.int32)
+        self._sums = engine.empty(self.width, np.int32)
 
     def exclusive(self, values: cla.Array, out: cla.Array, n: int, first: int = 0) -> None:
         """Write the n + 1 exclusive prefix sums of ``values[first : first + n]`` to ``out[: n + 1]``.
@@ -44,7 +44,6 @@ class Scan:
             engine.run_each(k.scan_few, 1, values, begin, out, count, group=1)
             return
         engine.run_each(k.chunk_sums, self.width, values, begin, self._sums, count, group=1)
-        engine.run_each(k.scan_sums, 1, self._sums, np.int32(self.width), group=1)
         engine.run_each(k.scan_chunks, self.width, values, begin, self._sums, out, count, group=1)
 
 

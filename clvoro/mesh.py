@@ -174,9 +174,12 @@ class Mesh:
         """Take room for the right side of a Poisson equation."""
         self.source = self.engine.scratch(self.n)
 
-    def take_speeds(self) -> None:
-        """Take room for the displacements' lengths."""
+    def measure_speeds(self) -> None:
+        """Measure how far generators are displaced, in room for a step alone."""
         self.lloyd_speed, self.correction_speed = (self.engine.scratch(self.n) for _ in range(2))
+        self.stages.motion.measure_displacements(
+            self.lloyd, self.correction, self.h, self.lloyd_speed, self.correction_speed
+        )
 
     def note_speeds(self) -> None:
         """Summarise how far generators are displaced."""

@@ -79,9 +79,8 @@ class PublishedMethod:
             solution = poisson.solve(
                 laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
             )
-        mesh.take_speeds()
-        motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
+        motion.follow_potential(t, mesh.potential, mesh.correction)
+        mesh.measure_speeds()
         mesh.hold(mesh.correction)
         mesh.summaries.collect("correction", mesh.correction_speed, mesh.n)
         alpha = mesh.engine.dim if r.alpha is None else r.alpha
@@ -135,9 +134,8 @@ class WeightedMethod:
                 laplacian, mesh.source, mesh.potential, tolerance=self.tolerance,
                 numbering=mesh.labels, from_zero=True,
             )  # fmt: skip
-        mesh.take_speeds()
-        motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        motion.follow_potential(t, mesh.potential, mesh.h, mesh.correction, mesh.correction_speed)
+        motion.follow_potential(t, mesh.potential, mesh.correction)
+        mesh.measure_speeds()
         mesh.hold(mesh.correction)
         mesh.note_speeds()
         return solution
@@ -232,9 +230,7 @@ class ProjectedMethod:
             max_iterations=self.iterations, tolerance=self.tolerance, labels=mesh.labels,
             fixed=mesh.fixed, start=mesh.multipliers, warm=warm,
         )  # fmt: skip
-        mesh.take_speeds()
-        stages.motion.measure_displacement(mesh.lloyd, mesh.h, mesh.lloyd_speed)
-        stages.motion.measure_displacement(mesh.correction, mesh.h, mesh.correction_speed)
+        mesh.measure_speeds()
         mesh.note_speeds()
         return solution
 

@@ -18,13 +18,11 @@ class Motion:
         self.engine = engine
         self._kernels = engine.kernels("motion")
 
-    def follow_potential(
-        self, t: Tessellation, psi: cla.Array, h: cla.Array, u: cla.Array, speed: cla.Array
-    ) -> None:
-        """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d) and |u| / h to `speed` (n,)."""
+    def follow_potential(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
+        """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d)."""
         self.engine.run_each(
             self._kernels.follow_potential, t.n, t.starts, t.neighbours, t.face_measures,
-            t.face_centroids, t.volumes, t.points, psi, h, u, speed,
+            t.face_centroids, t.volumes, t.points, psi, u,
         )  # fmt: skip
 
     def relax_globally(
@@ -47,9 +45,13 @@ class Motion:
             real(limit), real(k), u, speed,
         )  # fmt: skip
 
-    def measure_displacement(self, u: cla.Array, h: cla.Array, speed: cla.Array) -> None:
-        """Write |u| / h to `speed` (n,)."""
-        self.engine.run_each(self._kernels.measure_displacement, speed.shape[0], u, h, speed)
+    def measure_displacements(
+        self, u: cla.Array, v: cla.Array, h: cla.Array, u_speed: cla.Array, v_speed: cla.Array
+    ) -> None:
+        """Write |u| / h to `u_speed` (n,) and |v| / h to `v_speed` (n,)."""
+        self.engine.run_each(
+            self._kernels.measure_displacements, h.shape[0], u, v, h, u_speed, v_speed
+        )
 
     def move_generators(
         self,

@@ -130,15 +130,19 @@ def test_weighted_centroids(double):
 def test_gradient_of_a_linear_potential(engine):
     points = random_points(600, 904, engine.real)
     t = tessellate(engine, points)
-    host, u, speed = patch.fetch(t), engine.empty((600, 3)), engine.empty(600)
+    host, u = patch.fetch(t), engine.empty((600, 3))
     psi = engine.upload(5 + points @ SLOPE)
-    Motion(engine).follow_potential(t, psi, engine.upload(np.ones(600)), u, speed)
+    Motion(engine).follow_potential(t, psi, u)
     closed = ~at_walls(host)
     assert 100 < closed.sum() < 600
     # Differences of psi (about 5) over distances that go down to 0.01.
     assert np.abs(u.get()[closed] - SLOPE).max() < 8000 * np.finfo(engine.real).eps
     assert np.abs(u.get()[~closed] - SLOPE).max() > 0.1, "a wall lets no flux through"
-    assert speed.get() == pytest.approx(np.linalg.norm(u.get(), axis=1), rel=1e-5)
+    speeds = [engine.empty(600) for _ in range(2)]
+    halves = engine.upload(np.full(600, 0.5))
+    Motion(engine).measure_displacements(u, engine.zeros((600, 3)), halves, *speeds)
+    assert speeds[0].get() == pytest.approx(2 * np.linalg.norm(u.get(), axis=1), rel=1e-5)
+    assert not speeds[1].get().any()
 
 
 def test_potential_solves_the_equation(double):
