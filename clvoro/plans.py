@@ -117,9 +117,10 @@ COUNT_LEAST = 1e-3
 """The same while polishing: a cell that comes late has few steps left to get its shape."""
 COUNT_THETA = 0.3
 """Strain for pairs to climb while polishing: only the count makes them."""
-START_TOLERANCE, COUPLE_TOLERANCE = 3e-2, 0.1
+START_TOLERANCE, COUPLE_TOLERANCE = 3e-2, 0.2
 """Relative residuals of Poisson solves in 2D where there are coarser levels: on the coarsest, and after refinement. The
-next step sees the rest: measured on F2 and F3, three starts each, a tenth of them changes neither sizes nor shapes."""
+next step sees the rest: measured on F2 and F3, three starts each, with 11,000 to 300,000 cells, a tenth of the one and
+half of the other change neither sizes nor shapes (0.4 in the place of 0.2 does)."""
 GLIDE_TOLERANCE, POLISH_TOLERANCE = 0.3, 3e-2
 """The same of projections while defects glide and while cells are polished; each begins with the last one's solution.
 Measured on F2 and F3, six starts each: sizes and shapes are those of a tenth of these, for half the iterations (from
