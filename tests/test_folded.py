@@ -1,4 +1,4 @@
-"""Repairs of folded diagrams: in lanes against one by one."""
+"""Repairs of folded diagrams: in lanes against one by one; what covers the torus twice."""
 
 import numpy as np
 import patch
@@ -78,3 +78,20 @@ def test_lanes_have_the_bits_of_one_by_one(ctx, box, monkeypatch):
         across = np.abs(a.points[a.owners[inner]] - a.points[a.neighbours[inner]])
         assert (across.max(axis=0) > 0.25).tolist() == list(box.periodic)
     assert changed == 5
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_cells_that_cover_the_torus_twice(ctx, real):
+    """Twice around in one step: all rows stay right, each of the other sheet's generators unknown to its own."""
+    m, stages = 8, make_stages(ctx, UNIT, real)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(2 * m), np.arange(m)))
+    points = np.column_stack([(i + j % 2 / 2) / (2 * m), j / m])
+    # The two sheets must not lie on each other.
+    apart = 0.25 / m * np.exp(2j * np.pi * points[:, 0])
+    run = Carried(stages, UNIT, points + 0.001)
+    twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
+    stages.folded.reserve(run.n)
+    covered = stages.repair.follow(stages.folded, run.torus._wide, run.place(twice), run.t)
+    assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
+    run = Carried(stages, UNIT, points + 0.001)
+    assert run.move(twice) is None

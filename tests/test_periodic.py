@@ -362,19 +362,6 @@ def rows_of(t):
     return t.neighbours.get()[: starts[-1]], starts[1:-1]
 
 
-def test_a_repair_that_covers_twice_is_refused(double):
-    """Volumes tell a torus that is covered twice from one that is covered once."""
-    from clvoro.torus import Torus
-
-    stages = double._stages_for(UNIT)
-    x = stages.engine.upload(UNIT.place(some_points(UNIT, 500), double.dtype))
-    torus = Torus(stages, UNIT)
-    t = torus.tessellate(x, 500)
-    assert torus._repaired(x, 500, t) is not None
-    torus._edges = torus._edges / 2**0.5
-    assert torus._repaired(x, 500, torus.tessellate(x, 500)) is None
-
-
 def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
     """The generators' rows are the same whether or not their images get cells, also in lattices a rounding off."""
     from clvoro.torus import Torus
