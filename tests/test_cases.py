@@ -211,6 +211,13 @@ def test_sizes_from_a_solution(tmp_path):
         ("size = -0.1", ["size", "-0.1", "above 0"]),
         ("size = nan", ["size", "finite"]),
         ("sise = 0.1", ["'sise'", "did you mean 'size'"]),
+        ("seed = 3\nsize = 0.1", ["'seed'", "it belongs to [run]"]),
+        ("size = 0.1\n[run]\nperiodic = true", ["run", "'periodic'", "it belongs to [domain]"]),
+        ("size = 0.1\n[run]\nspacing = 0.1", ["run", "'spacing'", "it belongs to [[layers]]"]),
+        (
+            "[size]\nkind = 'constant'\nvalue = 0.1\nslope = 0.2",
+            ["size", "'slope'", "it is for kind = 'distance' or 'graded'"],
+        ),
         ("", ["lacks size"]),
         ("[size]\nkind = 'distnce'", ["size.kind", "did you mean 'distance'"]),
         ("[size]\nkind = 'raster'", ["size", "lacks file"]),

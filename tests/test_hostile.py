@@ -5,6 +5,7 @@ import pickle
 import re
 import struct
 import time
+import warnings
 import zipfile
 import zlib
 
@@ -14,9 +15,11 @@ import pytest
 import clvoro
 from clvoro.cases import load_case
 from clvoro.cases.fields import load_array
+from clvoro.checkpoint import Saved
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
 from clvoro.sizing import Expression
+from tests import fuzz_files as files
 
 BOX = clvoro.Box((0, 0), (1, 1))
 
@@ -218,3 +221,101 @@ def test_cases_that_are_none_are_refused(tmp_path, name):
     (tmp_path / "c.toml").write_bytes(CASES[name])
     with pytest.raises(InputError):
         load_case(tmp_path / "c.toml").size_field()
+
+
+FORMATS = [
+    "m.npz", "m.vtu", "a.npy", "state", "c.toml", "g.geojson", "w.wkt", "s.stl", "ascii.stl", "s.obj", "s.off", "s.ply",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def valid(ctx):
+    return files.valid_files(clvoro.Adapter(ctx))
+
+
+def test_valid_files_of_all_formats_are_read(valid, tmp_path):
+    assert sorted(valid) == sorted(FORMATS)
+    for name, data in valid.items():
+        (tmp_path / name).write_bytes(data)
+        files.read(tmp_path / name)
+
+
+def read_damaged(folder, name, data, seeds):
+    """Read `data` damaged in one way for each of `seeds`; return how many were read and how many refused."""
+    ends = {"read": 0, "refused": 0}
+    (folder / "right").write_bytes(data)
+    for seed in seeds:
+        path = folder / name
+        path.write_bytes(files.damaged(np.random.default_rng(seed), data))
+        began = time.monotonic()
+        try:
+            found = files.read(path)
+        except InputError:
+            ends["refused"] += 1
+        else:
+            ends["read"] += 1
+            if isinstance(found, Saved):  # from which a run would go on
+                assert files.same(found, Saved(folder / "right")), seed
+        assert time.monotonic() - began < 20, seed
+    return ends
+
+
+def test_surfaces_with_bytes_that_are_no_text(valid, tmp_path):
+    (tmp_path / "s.off").write_bytes(valid["s.off"].replace(b"0.0", b"\xff\xfe\x80", 1))
+    with pytest.raises(InputError, match=r"s\.off' cannot be read as OFF.*export it anew"):
+        files.read(tmp_path / "s.off")
+
+
+def test_coordinates_that_are_no_numbers_are_refused_without_a_warning(valid, tmp_path):
+    data = bytearray(valid["s.stl"])
+    data[84 + 12 : 84 + 16] = struct.pack("<f", np.inf)
+    (tmp_path / "s.stl").write_bytes(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match="finite"):
+            files.read(tmp_path / "s.stl")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_damaged_files_are_refused_or_read(valid, tmp_path, name):
+    assert read_damaged(tmp_path, name, valid[name], range(40))["refused"] > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_thousand_damaged_files_are_refused_or_read(valid, tmp_path, name):
+    assert read_damaged(tmp_path, name, valid[name], range(1000, 2000))["refused"] > 300
+
+
+@pytest.mark.parametrize(
+    "count", [60, pytest.param(2000, marks=pytest.mark.slow)], ids=["some", "many"]
+)
+@pytest.mark.parametrize("name", ["state", "m.npz"])
+def test_a_changed_bit_is_found_or_harmless(valid, tmp_path, name, count):
+    """Every bit of what counts is under a checksum: what is read in spite of one changed is the same."""
+    data, rng = valid[name], np.random.default_rng(17)
+    (tmp_path / "right").write_bytes(data)
+    read = read_state if name == "state" else read_result
+    right, found = read(tmp_path / "right"), 0
+    for _ in range(count):
+        changed = bytearray(data)
+        changed[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+        (tmp_path / name).write_bytes(changed)
+        try:
+            got = read(tmp_path / name)
+        except InputError:
+            found += 1
+        else:
+            assert got == right
+    assert found > 0.8 * count
+
+
+def read_state(path):
+    return {name: array.tobytes() for name, array in Saved(path).arrays.items()}
+
+
+def read_result(path):
+    result = clvoro.load(path)
+    arrays = (result.points, result.size, result.error, result.quality, result.history)
+    of_diagram = {name: getattr(result.diagram, name).tobytes() for name in result.diagram._arrays}
+    return [*(a.tobytes() for a in arrays), of_diagram, result.settings]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -134,9 +135,9 @@ class Table:
         checks = {**self.required, **self.optional}
         for key in value:
             if key not in checks:
+                hint = _home(key, place) or _nearest(key, checks)
                 raise InputError(
-                    f"{place} has the unknown key {key!r}{_nearest(key, checks)}; "
-                    f"it takes {_join(checks)}"
+                    f"{place} has the unknown key {key!r}{hint}; it takes {_join(checks)}"
                 )
         missing = [key for key in self.required if key not in value]
         if missing:
@@ -177,6 +178,15 @@ def _join(names: Iterable[object]) -> str:
 def _nearest(name: object, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(name), list(known), 1, 0.5)
     return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _home(name: object, place: str) -> str:
+    """Say where in a case a key belongs that is not known at `place`, if that is one table, or which kinds have it."""
+    kinds = [kind for kind, t in _SIZE.tables.items() if name in (*t.required, *t.optional)]
+    if kinds and re.search(r" size\b", place):
+        return f" (it is for kind = {' or '.join(map(repr, kinds))})"
+    homes = [home for home, keys in _HOMES.items() if name in keys]
+    return f" (it belongs to {homes[0]})" if len(homes) == 1 else ""
 
 
 SHAPE = Kinds(
@@ -371,3 +381,13 @@ CASE = Table(
     {"domain": domain, "size": size},
     {"name": text, "title": text, "run": RUN, "layers": list_of(LAYERS), "sequence": SEQUENCE},
 )
+
+_HOMES = {
+    "the case itself, above all tables": {*CASE.required, *CASE.optional},
+    "[domain]": {key for t in _DOMAINS.tables.values() for key in (*t.required, *t.optional)},
+    "[size]": {key for t in _SIZE.tables.values() for key in (*t.required, *t.optional)},
+    "[run]": {*RUN.optional},
+    "[[layers]]": {*LAYERS.required, *LAYERS.optional},
+    "[sequence]": {*SEQUENCE.optional},
+}
+"""The keys of each table."""

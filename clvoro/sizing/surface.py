@@ -122,11 +122,18 @@ class Surface:
         # Pictures and materials beside the surface are none of our business.
         extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
         try:
-            with path.open("rb") as file:
+            # What is no number among the coordinates is refused below.
+            with path.open("rb") as file, np.errstate(all="ignore"):
                 mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
             vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         except MemoryError:
             raise
+        except (
+            ModuleNotFoundError
+        ) as error:  # it would guess what the bytes that are no text could be
+            raise InputError(
+                f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged, or no text in UTF-8; export it anew"
+            ) from error
         except Exception as error:  # a reader may fail in any way on a broken file
             raise InputError(
                 f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: "
