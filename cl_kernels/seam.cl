@@ -74,6 +74,15 @@ inline bool make_image(const REAL *x, int code, global const float *margins, glo
     return true;
 }
 
+/* Does x lie so far from all seams that none of its images is within the margins? As most do. */
+inline bool is_inside(const REAL *x, global const int *widest)
+{
+    bool inside = true;
+    EACH_AXIS(a)
+    inside = inside && (PERIOD(a) == 0 || fmin(x[a], PERIOD(a) - x[a]) > as_float(widest[a]));
+    return inside;
+}
+
 /* Per block: the margin that images are taken from next. needed is what cells needed, there and in the blocks around
    it, as cells move; it is to be `factor` times as wide and, with `grow`, no less than it was. widest[a]
    collects the largest along axis a, as bits of a float, which are in the order of floats >= 0. */
@@ -107,7 +116,7 @@ kernel void count_images(const int size, global const REAL *points, global const
     EACH_AXIS(a)
     x[a] = points[DIM * i + a];
     int count = 0;
-    for (int code = 0; code < CODES; ++code)
+    for (int code = is_inside(x, widest) ? CODES : 0; code < CODES; ++code)
         count += code != CENTRE && make_image(x, code, margins, widest, lower, edge, y);
     counts[i] = count;
 }
@@ -123,7 +132,7 @@ kernel void place_images(const int size, global const REAL *points, global const
     EACH_AXIS(a)
     extended[DIM * i + a] = x[a] = points[DIM * i + a];
     int g = firsts[i];
-    for (int code = 0; code < CODES; ++code)
+    for (int code = is_inside(x, widest) ? CODES : 0; code < CODES; ++code)
         if (code != CENTRE && make_image(x, code, margins, widest, lower, edge, y)) {
             EACH_AXIS(a)
             extended[DIM * (size + g) + a] = y[a];
