@@ -63,6 +63,13 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points, global c
     return f;
 }
 
+/* Does face k end at the corner r of its cell? */
+inline bool ends_at(REAL2 r, int k, REAL2 tangent, global const FACE *face_measures, global const FACE *face_centroids)
+{
+    const REAL2 end = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]) + face_measures[k] / 2 * tangent;
+    return !(dot(end - r, end - r) > R(1e-6) * dot(r, r));
+}
+
 /* Per generator i: lloyd = -rate h^2 dE/dx_i, at most `longest` h.
 
    The corner v between the faces to j and q obeys (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it moves
@@ -83,14 +90,19 @@ kernel void descend_shape(const int size, global const int *starts, global const
         const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
         const REAL2 r = m - face_measures[k] / 2 * face.tangent; /* corner k */
         REAL s = 0;
+        bool apart = false;
 #ifdef POLYGON
-        /* A cell may have several loops: do the two faces meet? */
+        /* A cell may have several loops, the first face of which follows their last one; where no face ends, the cell
+           goes on in a piece that has come to it. */
         const int last = k == begin ? end - 1 : k - 1;
-        const REAL2 other =
-            (REAL2)(face_centroids[2 * last], face_centroids[2 * last + 1]) + face_measures[last] / 2 * before.tangent;
-        const bool apart = dot(other - r, other - r) > R(1e-6) * dot(r, r);
-#else
-        const bool apart = false;
+        apart = !ends_at(r, last, before.tangent, face_measures, face_centroids);
+        for (int other = begin; other < end && apart; ++other) {
+            const Face ending = look_at_face(neighbours[other], x, points, tension OUTLINE);
+            if (ends_at(r, other, ending.tangent, face_measures, face_centroids)) {
+                before = ending;
+                apart = false;
+            }
+        }
 #endif
         if (apart) {
         } else if (before.label >= 0 && face.label >= 0) {

@@ -2,10 +2,16 @@
 
 import numpy as np
 import patch
+import pyopencl as cl
 import pytest
 import reference
+from reference_polygon import polygon_voronoi
 
+import clvoro
+from clvoro._program import Engine
 from clvoro.shape import Shape
+from clvoro.stages import Stages
+from clvoro.tessellator import Tessellator
 
 N = 40
 
@@ -54,6 +60,52 @@ def test_gradient(ctx, emphasis):
     expected = -0.3 * h[:, None] ** 2 * gradient
     # Central differences: rounding of E (about 100 (1 + emphasis)) over the step, curvature times its square.
     assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+
+
+def test_gradient_in_a_polygon(ctx):
+    """Cells at slanted edges, in concave corners, around a hole that lies in one of them, and beside a larger one."""
+    domain = clvoro.Polygon(
+        [(0, 0), (2, 0.1), (1.9, 1.2), (1.2, 1), (0.9, 1.5), (0.1, 1.1)],
+        [[(0.25, 0.4), (0.3, 0.47), (0.33, 0.38)], [(1.2, 0.4), (1.7, 0.4), (1.4, 0.65)]],
+    )
+    rng = np.random.default_rng(2115)
+    grid = np.stack(np.meshgrid(np.arange(0.2, 2, 0.42), np.arange(0.15, 1.5, 0.35)), -1)
+    points = grid.reshape(-1, 2) + rng.uniform(-0.05, 0.05, (grid.size // 2, 2))
+    points = points[domain.contains_well(points, 0.02)]
+    n, cells = len(points), polygon_voronoi(domain, points)
+    assert any({(i, -7), (i, -8), (i, -9)} <= set(cells.lengths) for i in range(n))
+    # Where a piece changes cells, where it goes is no smooth function.
+    assert all(piece.root == piece.home for piece in cells.pieces)
+    real = np.dtype("float64")
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.defines(real))
+    placed = domain.place(points, real)
+    t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
+    q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)
+    out = engine.empty((n, 2))
+    Shape(engine).descend(
+        t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
+    )
+    # E is the same in any unit.
+    unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
+    omega, step = 1 - 5 * np.log(q), 1e-5
+
+    def energy(points):
+        cells = polygon_voronoi(domain, points)
+        perimeter = np.zeros(n)
+        for (i, _), length in cells.lengths.items():
+            perimeter[i] += length
+        return float((omega * (2 * np.log(perimeter) - np.log(cells.areas))).sum())
+
+    gradient = np.zeros((n, 2))
+    for i in range(n):
+        for a in range(2):
+            ahead, behind = points.copy(), points.copy()
+            ahead[i, a] += step
+            behind[i, a] -= step
+            gradient[i, a] = (energy(ahead) - energy(behind)) / (2 * step)
+    expected = -0.3 * (h[:, None]) ** 2 * gradient * unit
+    # As above.
+    assert out.get() == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
 def test_descends(ctx):
