@@ -283,6 +283,7 @@ def fields(adapter: clvoro.Adapter) -> None:
 
 def multigrid(adapter: clvoro.Adapter) -> None:
     """The preconditioner, which runs would only take for larger meshes; a solve in two precisions."""
+    from clvoro import cycle
     from clvoro.poisson import ROUGH, Poisson
 
     n = 300  # the fewest that take every kernel of it
@@ -300,6 +301,13 @@ def multigrid(adapter: clvoro.Adapter) -> None:
         )
         assert solution.converged
         stage.apply(laplacian, potential, rhs)
+    # The levels below the finest by one work-group each.
+    with mock.patch.object(cycle, "most_alone", return_value=n):
+        potential, kind = engine.zeros(n), "multigrid"
+        alone = Poisson(engine).solve(
+            laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind
+        )
+        assert alone.converged
     # One that starts from something else than zero.
     rough = stage.assemble(t.starts, t.neighbours, t.face_measures, t.points, tolerance=ROUGH)
     assert stage.solve(rough, rhs, engine.upload(points(n)[:, 1]), tolerance=ROUGH).converged
