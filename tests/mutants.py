@@ -47,6 +47,9 @@ _STATEMENT = re.compile(
 _DECLARED = re.compile(r"(?:const |global |local |private )*(?:[A-Za-z_]\w*) \*?\w+(?: =|\[|;|,)")
 
 
+_SIZED = re.compile(r"\b(?!return)[A-Za-z_]\w* \w+\[$")
+
+
 @dataclass(frozen=True)
 class Mutant:
     file: str
@@ -88,7 +91,9 @@ def mutants(file: str) -> list[Mutant]:
         spaced = code[start - 1 : start].isspace() and code[end : end + 1].isspace()
         if name[0].isdigit():
             number = name.rstrip("f")
-            if re.fullmatch(r"\d+", name):
+            if _SIZED.search(code, code.rfind("\n", 0, start), start):
+                pass  # room to spare
+            elif re.fullmatch(r"\d+", name):
                 add(start, end, str(int(name) + 1))
             elif not name.startswith("0x"):
                 add(start, end, f"{2 * float(number)!r}{name[len(number) :]}")

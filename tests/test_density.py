@@ -52,6 +52,26 @@ def test_gradient_of_an_exponential(engine):
     assert not gradient[~told].any()
 
 
+def test_gradient_is_that_of_least_squares(engine):
+    """Of any values, each neighbour counts, by 1 / distance^2, and walls do not."""
+    points = patch.random_points(N, 114)
+    h = np.random.default_rng(7).uniform(0.02, 0.2, N)
+    t = patch.tessellate(engine, points)
+    gradient = Density(engine).evaluate(t, engine.upload(h)).gradient.get()
+    host, eps = patch.fetch(t), float(np.finfo(engine.real).eps)
+    for i in range(N):
+        row = host.neighbours[host.starts[i] : host.starts[i + 1]]
+        j = row[row >= 0]
+        d = points[j] - points[i]
+        m = (d.T / (d**2).sum(axis=1)) @ d
+        expected = np.linalg.solve(m, (d.T / (d**2).sum(axis=1)) @ np.log(h[j] / h[i]))
+        # Positions round by eps of the domain: that over the distance of the nearest is what it is off by, in parts of
+        # its rise over that distance; the matrix enlarges it.
+        nearest = np.sqrt((d**2).sum(axis=1).min())
+        rounding = 4 * eps * np.linalg.cond(m) / nearest**2
+        assert gradient[i] == pytest.approx(expected, rel=0, abs=rounding)
+
+
 def test_gradient_in_three_dimensions(ctx):
     engine = patch.make_engine(ctx, dim=3)
     points, starts, neighbours, measures, volumes = graphs.random_graph(150, 3, seed=23)
