@@ -67,7 +67,7 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};
     const int start = starts[i], n = starts[i + 1] - start;
     global const int *row = neighbours + start;
-    if (n < 3 || n > CHECKED_FACES) {
+    if (n > CHECKED_FACES) {
         atomic_or(marks + i, 1);
         return true;
     }

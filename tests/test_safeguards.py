@@ -132,3 +132,15 @@ def test_a_square_lattice_is_carried(ctx, noise, generous):
     t, expected = carry(ctx, "float32", None, before, moved)
     assert t is not None
     assert np.abs(t.volumes - expected.volumes).max() < 1e-3 * expected.volumes.mean()
+
+
+@pytest.mark.parametrize("count", [14, 18])
+def test_cells_of_many_faces(ctx, count, group_size, generous):
+    """Beyond sixteen faces a cell is clipped anew each time."""
+    rng, turn = np.random.default_rng(50302), 2 * np.pi * np.arange(count) / count
+    ring = [0.5, 0.375] + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)])
+    points = np.concatenate([[[0.5, 0.375]], ring + 1e-4 * rng.random(ring.shape)])
+    moved = points + 1e-5 * rng.random(points.shape)
+    t, expected = carry(ctx, "float64", group_size, points, moved)
+    assert t.starts[1] == count
+    assert_same(t, expected)
