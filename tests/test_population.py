@@ -1,5 +1,7 @@
 """Insertion and deletion: who is chosen, what becomes of it, and that nothing is lost, on lattices made by hand."""
 
+import itertools
+
 import numpy as np
 import patch
 import pytest
@@ -113,6 +115,38 @@ def the_pair(sweep):
     (five,), (seven,) = (np.flatnonzero(middle & (sides == n)) for n in (5, 7))
     assert seven in sweep.neighbours(five)
     return five, seven
+
+
+def test_kinds_and_strain(engine):
+    """Charges, walls, and the strain over one ring and over two, of cells of all sorts: sums over neighbours."""
+    n = 80
+    points, h = patch.random_points(n, 41), np.random.default_rng(42).uniform(0.05, 0.2, n)
+    t = patch.tessellate(engine, points)
+    host, control = patch.fetch(t), PopulationControl(engine)
+    found = [array.get().reshape(n, -1) for array in control._measure(t, engine.upload(h))]
+    rows = [host.neighbours[a:b] for a, b in itertools.pairwise(host.starts)]
+    walls = np.array([(row < 0).sum() for row in rows])
+    sides = np.array([len(row) for row in rows])
+    assert np.array_equal(found[0], np.stack([sides - 6 + np.minimum(walls, 2), walls], axis=1))
+    strain = np.zeros((n, 4))
+    for i, row in enumerate(rows):
+        j = row[row >= 0]
+        d = points[j] - points[i]
+        # 1 in a hexagonal lattice: neighbours are at sqrt(2 / sqrt 3) h.
+        terms = 2 * np.array([d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2]) / (h[i] * h[j])
+        strain[i, :3] = terms.mean(axis=1) / (2 / np.sqrt(3))
+        strain[i, 3] = walls[i] == 0 and sides[i] == 6
+    assert 3 < strain[:, 3].sum() < n / 2
+    for expected in found[1:]:
+        mean = np.zeros((n, 4))
+        for i, row in enumerate(rows):
+            own = strain[[i, *row[row >= 0]]]
+            weight = own[:, 3].sum()
+            mean[i, :3] = own[:, :3].T @ own[:, 3] / weight if weight > 0 else [1, 0, 1]
+            mean[i, 3] = weight
+        strain = mean
+        # In single precision, sums of a few terms.
+        assert expected == pytest.approx(strain, rel=1e-5, abs=1e-5)
 
 
 A = 0.05
