@@ -105,7 +105,7 @@ def test_kernels_compile_for_gpus(ctx, dtype, gpu_like, monkeypatch, tmp_path):
     """Every program that small work of all kinds builds, for three kinds of GPU, without a warning."""
     programs = programs_of_all_kinds(ctx, dtype, monkeypatch)
     names = set(programs.values())
-    cpu_only = {"hulls.cl"}
+    cpu_only = {"hulls.cl", "walks.cl"}
     assert names == {p.name for p in _program.kernel_folder().glob("*.cl")} - cpu_only
     source, out = tmp_path / "program.cl", tmp_path / "program.s"
     for (text, defines), name in programs.items():
