@@ -1,14 +1,21 @@
 #include "common/domain.h"
+#if DIM == 2
+#include "common/corner.h"
+#else
+#include "common/clip.h"
+#endif
 
 /* Periodic boxes. The generators x in [0, P) are extended by their images x + c P, c in {-1, 0, 1}^d, that lie within a
    margin beyond the seams; the diagram of them all in a box around is made by kernels that know of no period, and its
    rows of the generators themselves are folded: images become their owners, with the code of c.
 
    Every seam is divided into blocks, each with a margin of its own, so that a large cell at one place of a seam does
-   not ask for images of all the small ones at others. A cell is right if each block has a margin as deep as the ball of
-   twice its reach around its generator goes there: nobody outside of the ball can cut. A margin of P is deep enough for
-   any ball: a cell is no longer than P, as it is cut by the images of its own generator, and so of every generator the
-   nearest image to one of its points lies within [-P, 2 P]. */
+   not ask for images of all the small ones at others. Whoever cuts a cell lies nearer to one of its vertices than its
+   generator does. So a cell is right if each block has a margin as deep as the balls around its vertices go there that
+   its generator lies on: they are empty then, and where sizes grow steeply the ball of a large cell passes the small
+   ones by, which a ball around the whole cell would not. A margin of P is deep enough for any ball: a cell is no longer
+   than P, as it is cut by the images of its own generator, and so of every generator the nearest image to one of its
+   points lies within [-P, 2 P]. */
 
 #ifndef PERIODIC
 #error "build with -DPERIODIC -DPERIOD_0=... -DPERIOD_1=... -DPERIOD_2=..."
@@ -25,6 +32,10 @@
 #define FLAG_DROPPED 1   /* a face that only one of its cells sees, of no size, is to be dropped */
 #define FLAG_FAR 2       /* a neighbour is not the nearest image; report[2] is the smallest index of one who has it */
 #define FLAG_COLLAPSED 4 /* a face that only one of its cells sees is no rounding; report[2] likewise */
+#define FLAG_FULL 8      /* a cell has more faces than there is room for */
+
+/* Share of a vertex's distance from the generator by which it rounds at most, and no cell grows that matters. */
+#define BALL_NOISE (IS_DOUBLE ? R(1e-5) : R(1e-4))
 
 inline int step_of(int code, int a)
 {
@@ -32,6 +43,7 @@ inline int step_of(int code, int a)
 }
 
 /* The axes along which seams across axis a are divided; the second one in space only. */
+#define PERIOD_ALONG(a) ((a) == 0 ? PERIOD(0) : (a) == 1 ? PERIOD(1) : PERIOD(2))
 #define FIRST_ALONG(a) ((a) == 0 ? 1 : 0)
 #define SECOND_ALONG(a) ((a) == 2 ? 1 : 2)
 
@@ -83,23 +95,37 @@ inline bool is_inside(const REAL *x, global const int *widest)
     return inside;
 }
 
-/* Per block: the margin that images are taken from next. needed is what cells needed, there and in the blocks around
-   it, as cells move; it is to be `factor` times as wide and, with `grow`, no less than it was. widest[a]
-   collects the largest along axis a, as bits of a float, which are in the order of floats >= 0. */
-kernel void next_margins(const int size, global const float *needed, const float factor, const int grow,
-                         global float *margins, global int *widest)
+/* How far the middles of blocks k and j of a seam are apart along an axis. */
+inline float block_spacing(int k, int j, REAL length)
+{
+    return (float)length * (float)abs(k - j);
+}
+
+/* Per block: the margin that images are taken from next, `factor` times what was needed there or, with `spread`, where
+   cells are others than then, within its own depth around. With `grow` it is no less than it was; then cells that
+   lacked images may have told of more than they need, and it becomes wide in steps. widest[a] collects the largest
+   along axis a, as bits of a float, which are in the order of floats >= 0. */
+kernel void next_margins(const int size, global const float *needed, const float factor, const int spread,
+                         const int grow, const REAL4 edge, global float *margins, global int *widest)
 {
     WORK_ITEM(k);
     const int per_seam = DIM == 2 ? BLOCKS : BLOCKS * BLOCKS;
     const int a = k / (2 * per_seam), seam = k / per_seam, along = k % per_seam;
     const int first = DIM == 2 ? along : along / BLOCKS, second = DIM == 2 ? 0 : along % BLOCKS;
-    const REAL period = a == 0 ? PERIOD(0) : a == 1 ? PERIOD(1) : PERIOD(2);
-    float margin = 0;
-    for (int i = max(first - 1, 0); i <= min(first + 1, BLOCKS - 1); ++i)
-        for (int j = max(second - 1, 0); j <= min(second + 1, DIM == 2 ? 0 : BLOCKS - 1); ++j)
-            margin = fmax(margin, factor * needed[block_place(seam / 2, seam % 2, i, j)]);
+    const REAL length[4] = {edge.s0, edge.s1, edge.s2, edge.s3};
+    const REAL period = PERIOD_ALONG(a);
+    float margin = needed[k];
+    for (int place = 0; spread && place < per_seam; ++place) {
+        const float other = needed[seam * per_seam + place];
+        const int i = DIM == 2 ? place : place / BLOCKS, j = DIM == 2 ? 0 : place % BLOCKS;
+        const float s = block_spacing(first, i, length[FIRST_ALONG(a)]);
+        const float t = DIM == 2 ? 0 : block_spacing(second, j, length[SECOND_ALONG(a)]);
+        if (s * s + t * t < factor * factor * other * other)
+            margin = fmax(margin, other);
+    }
+    margin *= factor;
     if (grow)
-        margin = fmax(margin, margins[k]);
+        margin = fmax(margins[k], fmin(margin, fmax(2 * margins[k], margin / 4)));
     if (margin > 0.99f * (float)period)
         margin = WHOLE; /* at least as deep as any image, whatever rounds */
     margins[k] = margin;
@@ -149,52 +175,171 @@ inline REAL block_distance(REAL x, REAL from, REAL length, int block)
     return fmax(fmax(below, above) - 16 * REAL_EPS, R(0));
 }
 
-/* Per place p in bin order: how deep the ball goes beyond each block of the seams whose radius reach[p] is twice the
-   reach of the cell of generator items[p]. needs collects the largest, as bits of floats. */
+/* Blocks: where they begin and how long they are, their margins, and the wishes that are collected of each: bits of
+   floats. */
+typedef struct {
+    REAL4 from, length;
+    global const float *margins;
+    float kept; /* share of a margin that it has next, whatever is wished */
+    global int *wishes, *report;
+} blocks_t;
+
+/* Look at a ball around x of this radius that a generator in the box lies on. report[0] is set where it leaves the
+   margins. The next ones have room for it where it may lie then: up to `sideways` along the seam and, until that
+   generator is at the seam, as much outwards; after that by `outwards` more. Does it take any more than there will be
+   anyway? Wishes are only told if `tell`. */
+inline bool look_at_ball(const REAL *x, REAL radius, REAL sideways, REAL outwards, bool tell, const blocks_t *in)
+{
+    const REAL starts[4] = {in->from.s0, in->from.s1, in->from.s2, 0};
+    const REAL lengths[4] = {in->length.s0, in->length.s1, in->length.s2, 1};
+    if (!(radius < WHOLE)) /* a NaN, too: vertices of a whole cell lie within the box around */
+        radius = WHOLE;
+    radius *= 1 + BALL_NOISE;
+    const REAL wide = radius + sideways;
+    bool more = false;
+    for (int seam = 0; seam < 2 * DIM; ++seam) {
+        const int a = seam / 2, b = FIRST_ALONG(a), c = DIM == 2 ? b : SECOND_ALONG(a);
+        const REAL period = PERIOD_ALONG(a);
+        const REAL to_seam = seam % 2 ? period - x[a] : x[a];
+        const REAL out = outwards + clamp(radius + to_seam, R(0), sideways);
+        if (!(period > 0 && to_seam < radius + out))
+            continue;
+        const int last_b = block_of(x[b] + wide, b, in->from, in->length);
+        const int first_c = DIM == 2 ? 0 : block_of(x[c] - wide, c, in->from, in->length);
+        const int last_c = DIM == 2 ? 0 : block_of(x[c] + wide, c, in->from, in->length);
+        for (int j = block_of(x[b] - wide, b, in->from, in->length); j <= last_b; ++j)
+            for (int k = first_c; k <= last_c; ++k) {
+                const int block = block_place(a, seam % 2, j, k);
+                const float margin = in->margins[block];
+                const REAL s = block_distance(x[b], starts[b], lengths[b], j);
+                const REAL t = DIM == 2 ? R(0) : block_distance(x[c], starts[c], lengths[c], k);
+                const REAL aside2 = s * s + t * t;
+                /* What the wish has to be more than, as seen from the ball's middle. */
+                const REAL known = fmax(in->kept * fmin(margin, (float)period) + to_seam - out, R(0));
+                const REAL nearer = sideways > 0 ? fmax(sqrt(aside2) - sideways, R(0)) : sqrt(aside2);
+                const REAL deep2 = radius * radius - nearer * nearer;
+                if (!(deep2 > known * known))
+                    continue;
+                more = true;
+                if (!tell)
+                    return true;
+                const float wish = 1.00001f * (float)(sqrt(deep2) - to_seam + out + 4 * REAL_EPS);
+                if (wish > 0)
+                    atomic_max(in->wishes + block, as_int(wish));
+                const REAL deep = sqrt(fmax(radius * radius - aside2, R(0))) - to_seam;
+                if (radius * radius > aside2 && margin < WHOLE && 1.00001f * (float)(deep + 4 * REAL_EPS) > margin)
+                    atomic_or(in->report, 1);
+            }
+    }
+    return more;
+}
+
+#if DIM == 3
+inline REAL4 vertex_at(const cell_t *cell, int v)
+{
+    return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
+}
+
+inline REAL square_of(REAL4 a)
+{
+    return a.s0 * a.s0 + a.s1 * a.s1 + a.s2 * a.s2;
+}
+#endif
+
+/* Per place p in bin order: the balls around the vertices of the cell of generator i = items[p]; reach[p] is twice the
+   reach of the cell. `sideways` and `outwards` are shares of the shortest way between generators about a vertex. In 3D
+   the cell is clipped once more, by its neighbours alone, if it may not have been when there was room for `tried`
+   faces. report[1] has FLAG_FULL where it has too many; when it is the `last` time, the ball that holds all others
+   stands for them. */
 kernel void measure_margins(const int size, global const int *items, global const float *reach,
-                            global const REAL *points, const int n, const REAL4 lower, const REAL4 edge,
-                            global int *needs)
+                            global const REAL *points, const int n, global const int *starts,
+                            global const int *neighbours, const REAL4 box_lower, const REAL4 box_upper,
+                            const REAL4 lower, const REAL4 edge, const REAL sideways, const REAL outwards,
+                            const float kept, const int tried, const int last, global const float *margins,
+                            global int *wishes, global int *report)
 {
     WORK_ITEM(p);
     const int i = items[p];
     if (i >= n)
         return;
-    const REAL from[4] = {lower.s0, lower.s1, lower.s2, lower.s3}, length[4] = {edge.s0, edge.s1, edge.s2, edge.s3};
-    const REAL radius = reach[p] * R(1.000001); /* it was rounded to a float */
+    const int begin = starts[i], end = starts[i + 1];
+    const REAL radius = reach[p] * (1 + BALL_NOISE);
     REAL x[DIM];
+    bool near = false;
     EACH_AXIS(a)
-    x[a] = points[DIM * i + a];
-    for (int seam = 0; seam < 2 * DIM; ++seam) {
-        const int a = seam / 2, b = FIRST_ALONG(a), c = DIM == 2 ? b : SECOND_ALONG(a);
-        const REAL period = a == 0 ? PERIOD(0) : a == 1 ? PERIOD(1) : PERIOD(2);
-        const REAL to_seam = seam % 2 ? period - x[a] : x[a];
-        if (!(period > 0 && to_seam < radius))
-            continue;
-        const int last_b = block_of(x[b] + radius, b, lower, edge);
-        const int last_c = DIM == 2 ? 0 : block_of(x[c] + radius, c, lower, edge);
-        for (int j = block_of(x[b] - radius, b, lower, edge); j <= last_b; ++j)
-            for (int k = DIM == 2 ? 0 : block_of(x[c] - radius, c, lower, edge); k <= last_c; ++k) {
-                const REAL s = block_distance(x[b], from[b], length[b], j);
-                const REAL t = DIM == 2 ? R(0) : block_distance(x[c], from[c], length[c], k);
-                const REAL deep = sqrt(fmax(radius * radius - s * s - t * t, R(0))) - to_seam;
-                const float need = 1.00001f * (float)(deep + 4 * REAL_EPS);
-                if (need > 0)
-                    atomic_max(needs + block_place(a, seam % 2, j, k), as_int(need));
-            }
+    {
+        x[a] = points[DIM * i + a];
+        near = near || (PERIOD(a) > 0 && fmin(x[a], PERIOD(a) - x[a]) < (1 + sideways + outwards) * radius);
     }
+    if (!near || (tried > 0 && end - begin + 2 * DIM <= tried))
+        return;
+    const blocks_t blocks = {lower, edge, margins, kept, wishes, report};
+    /* The ball that holds all others: in 2D, where diagrams are few and far between, with as much as any of them may
+       move, and else with as much as they do in a step. */
+    const REAL moved = DIM == 2 ? radius : R(0);
+    if (!look_at_ball(x, radius + (DIM == 2 ? R(0) : radius / 8), sideways * moved, outwards * moved, false, &blocks))
+        return;
+#if DIM == 2
+    BOX_CORNERS(low, high);
+    int before = neighbours[end - 1];
+    for (int k = begin; k < end; ++k) {
+        const int after = neighbours[k];
+        const REAL2 v = corner(i, x, before, after, points, low, high);
+        REAL2 u[2] = {2 * v, 2 * v};
+        if (before >= 0)
+            u[0] = direction_of(x, before, points);
+        if (after >= 0)
+            u[1] = direction_of(x, after, points);
+        REAL least2 = fmin(dot(u[0], u[0]), dot(u[1], u[1]));
+        if (before >= 0 && after >= 0)
+            least2 = fmin(least2, dot(u[1] - u[0], u[1] - u[0]));
+        const REAL y[2] = {x[0] + v.s0, x[1] + v.s1}, way = sqrt(least2);
+        look_at_ball(y, sqrt(dot(v, v)), sideways * way, outwards * way, true, &blocks);
+        before = after;
+    }
+#else
+    const REAL4 place = (REAL4)(x[0], x[1], x[2], 0);
+    cell_t cell;
+    start_cell(&cell, place, box_lower, box_upper);
+    const int what = clip_by_row(&cell, i, place, starts, neighbours, points);
+    if (what == CLIP_FULL && !last) {
+        atomic_or(report + 1, FLAG_FULL);
+        return;
+    }
+    if (what != CLIP_CUT) {
+        look_at_ball(x, radius, sideways * radius, outwards * radius, true, &blocks);
+        return;
+    }
+    for (int v = 0; v < cell.n; ++v) {
+        const REAL4 at = vertex_at(&cell, v);
+        const REAL r2 = square_of(at);
+        const INDEX4 f = cell.faces[v];
+        const int faces[3] = {f.s0, f.s1, f.s2};
+        REAL least2 = 4 * r2;
+        for (int k = 0; k < 3; ++k) {
+            const int one = faces[k], other = faces[k == 2 ? 0 : k + 1];
+            if (cell.labels[one] < 0)
+                continue;
+            const REAL4 d = cell.planes[one];
+            least2 = fmin(least2, square_of(d));
+            if (cell.labels[other] >= 0)
+                least2 = fmin(least2, square_of(d - cell.planes[other]));
+        }
+        const REAL y[3] = {x[0] + at.s0, x[1] + at.s1, x[2] + at.s2}, way = sqrt(least2);
+        look_at_ball(y, sqrt(r2), sideways * way, outwards * way, true, &blocks);
+    }
+#endif
 }
 
-/* Per block: is its margin as deep as was needed? needed takes what was, and needs begins anew. report[0] is set where
-   one is not. */
-kernel void compare_margins(const int size, global const float *margins, global int *needs, global float *needed,
-                            global int *report)
+/* Per block: what is needed, as is wished, or else the share `kept` of its margin: cells that move to and fro do not
+   make it too narrow in turn. Wishes begin anew. */
+kernel void note_margins(const int size, global const float *margins, const float kept, global int *wishes,
+                         global float *needed)
 {
     WORK_ITEM(k);
-    const float need = as_float(needs[k]);
-    needs[k] = 0;
-    needed[k] = need;
-    if (!(need <= margins[k]) && margins[k] < WHOLE)
-        atomic_or(report, 1);
+    const int a = k / (2 * (DIM == 2 ? BLOCKS : BLOCKS * BLOCKS));
+    needed[k] = fmax(as_float(wishes[k]), kept * fmin(margins[k], (float)PERIOD_ALONG(a)));
+    wishes[k] = 0;
 }
 
 /* Per generator i: its row of the extended diagram with the owners of images, and each face's code. kept[k]: does the

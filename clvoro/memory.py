@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from ._program import Engine
 from .domain import Domain
 from .errors import MemoryLimitError
-from .seam import BLOCKS, SLACK
+from .seam import BLOCKS
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
@@ -20,8 +19,10 @@ OUTPUT = {2: (30, 25), 3: (13, 950)}
 """The same while the finished diagram is read, corners, loops and all."""
 FOLDED = {2: (40, 21), 3: (69, 30)}
 """What comes to the peak of a run in a periodic box, where graphs are folded: per cell, but not per image."""
-IMAGE_REACH = 1.65
-"""Sizes of a cell that its neighbours and those who could be lie within, for most of the largest cells around."""
+IMAGE_REACH = {2: 1.55, 3: 1.75}
+"""How deep margins of equal cells are, in their sizes."""
+DEPTHS = 6
+"""Places in the depth of a margin where the density of cells is looked at."""
 
 
 def images_expected(
@@ -29,7 +30,8 @@ def images_expected(
 ) -> float:
     """Return how many images of generators a periodic box of `n` cells takes, per generator.
 
-    These are the cells beyond each block of the seams, as deep as balls around cells at the seam go there (`seam.py`).
+    These are the cells beyond each block of the seams, as deep as balls around places of the seam go there (`seam.py`).
+    A ball is as large as cells are at its middle, but goes no farther into smaller ones than cells of their size do.
 
     Parameters
     ----------
@@ -44,21 +46,29 @@ def images_expected(
     for axis in np.flatnonzero(domain.periodic):
         along = [a for a in range(d) if a != axis]
         unit = np.stack(np.meshgrid(*[places] * (d - 1), indexing="ij"), axis=-1).reshape(-1, d - 1)
-        # Of block from block, squared.
-        apart = np.zeros((len(unit), len(unit)))
+        apart = np.zeros((len(unit), len(unit)))  # block from block
         for column, a in zip(unit.T, along, strict=True):
             away = np.abs(column[:, None] - column)
             if domain.periodic[a]:
                 away = np.minimum(away, 1 - away)
             apart += (away * domain.extent[a]) ** 2
+        apart = np.sqrt(apart)
         images = 0.0
         for end in (0.0, 1.0):
-            points = np.array(domain.lower) + np.insert(unit, axis, end, axis=1) * domain.extent
-            h = factor * size(points)
-            deep = np.sqrt(((IMAGE_REACH * h) ** 2 - apart).max(axis=1).clip(0))
-            deep = SLACK * maximum_filter(deep.reshape([count] * (d - 1)), 3).reshape(-1)
+            places_at = np.insert(unit, axis, end, axis=1) * domain.extent + domain.lower
+            h = factor * size(places_at)
+            radius = (IMAGE_REACH[d] * h + apart).min(axis=1)
+            deep = np.sqrt((radius**2 - apart**2).max(axis=1).clip(0))
             deep = np.minimum(deep, domain.extent[axis])
-            images += float((deep * h**-d).mean()) * domain.measure / domain.extent[axis]
+            # What lies beyond one end lies within the other one.
+            places_at[:, axis] = (domain.upper if end == 0 else domain.lower)[axis]
+            for part in (np.arange(DEPTHS) + 0.5) / DEPTHS:
+                inside = places_at.copy()
+                inside[:, axis] += part * deep * (-1 if end == 0 else 1)
+                density = (factor * size(inside)) ** -d
+                images += (
+                    float((deep * density).mean()) * domain.measure / domain.extent[axis] / DEPTHS
+                )
         share *= 1 + images / n
     return share - 1
 
@@ -73,7 +83,9 @@ def memory_needed(
     cells, folded = n, 0.0
     if domain is not None and any(domain.periodic):
         if images is None:
-            images = images_expected(domain, lambda x: np.ones(len(x)), max(n, 1.0), domain.measure)
+            deep = IMAGE_REACH[domain.dim] * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
+            seams = [2 * min(deep / length, 1.0) for length in domain.extent[list(domain.periodic)]]
+            images = float(np.prod(1 + np.array(seams))) - 1
         cells, folded = n * (1 + images), n
 
     def bytes_of(figures: tuple[int, int]) -> int:

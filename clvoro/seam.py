@@ -8,18 +8,26 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._primitives import Room, Scan
-from ._program import Engine
+from ._program import Engine, Kernels
 from .bins import BinnedPoints
 from .domain import Box
 from .tessellation import Tessellation
 
-DROPPED, FAR, COLLAPSED = 1, 2, 4
+DROPPED, FAR, COLLAPSED, FULL = 1, 2, 4, 8
 """Bits of a report: see `seam.cl`."""
 BLOCKS = {2: 128, 3: 32}
 """Blocks per axis along a seam by dimension."""
 
-SLACK = 1.5
-"""Margins of a diagram over what the one before needed. Less, and in early steps diagrams have to be made again."""
+SIDEWAYS, OUTWARDS = 0.7, 0.2
+"""What the next margins have room for, in ways between the generators about a vertex: that the ball around it moves
+along the seam, or outwards until the generator on it is at the seam; and what it grows beyond that. With less, diagrams
+have to be made again more often."""
+KEPT = 0.9
+"""Share that margins keep, from diagram to diagram, of what they were."""
+OTHER_CELLS = 0.1
+"""Share by which the spacing of generators changes where cells are others than before."""
+FACE_CAPACITY, MOST_FACES = 64, 512
+"""Faces that a cell in 3D may have while it is looked at: doubled for those that have more, but no further."""
 
 
 def block_count(dim: int) -> int:
@@ -35,7 +43,7 @@ class Margins:
     Attributes
     ----------
     needed : (blocks,) float32, device
-        How deep balls around the cells of the latest diagram went.
+        How deep balls around the vertices of the latest diagram go that are a little wider than they need be.
     cells : int
         Generators of that diagram; 0 before the first one.
     widths : (blocks,) float32, device
@@ -47,7 +55,7 @@ class Margins:
         self.needed = engine.zeros(count, np.float32)
         self.cells = 0
         self.widths = engine.zeros(count, np.float32)
-        self.needs = engine.zeros(count, np.int32)
+        self.wishes = engine.zeros(count, np.int32)
         self.widest = engine.empty(4, np.int32)
 
     def fill(self, margin: float, cells: int) -> None:
@@ -150,9 +158,15 @@ class Seam:
         self.engine = engine
         self._scan = Scan(engine)
         self._room = Room(engine, spare=1 / 16)  # sizes change a little from step to step
-        self._kernels = engine.kernels("seam", {"BLOCKS": BLOCKS[engine.dim]})
+        self._kernels = self._built(FACE_CAPACITY)
         self._report = engine.empty(3, np.int32)
         self._turn = 0
+
+    def _built(self, capacity: int) -> Kernels:
+        defines: dict[str, object] = {"BLOCKS": BLOCKS[self.engine.dim]}
+        if self.engine.dim == 3:
+            defines["FACE_CAPACITY"] = capacity
+        return self.engine.kernels("seam", defines)
 
     def extend(
         self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
@@ -173,8 +187,9 @@ class Seam:
         blocks = blocks.astype(engine.real)
         margins.widest.fill(0)
         engine.run_each(
-            k.next_margins, block_count(d), margins.needed, np.float32(factor), np.int32(grow),
-            margins.widths, margins.widest,
+            k.next_margins, block_count(d), margins.needed, np.float32(factor),
+            np.int32(abs(factor - 1) > OTHER_CELLS), np.int32(grow), blocks[1], margins.widths,
+            margins.widest,
         )  # fmt: skip
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
         engine.run_each(k.count_images, n, points, margins.widths, margins.widest, *blocks, firsts)
@@ -204,6 +219,26 @@ class Seam:
             images.points, images.margins.widths, images.margins.widest, *images.blocks, images.firsts, neighbours,
         )  # fmt: skip
         return Rows(images.n, previous.starts, neighbours)
+
+    def _measure(self, images: Images, binned: BinnedPoints, t: Tessellation) -> None:
+        """Note what the cells of `t` need, and what they may."""
+        engine, margins = self.engine, images.margins
+        capacity, tried = FACE_CAPACITY, 0
+        while True:
+            # Private arrays of a whole group lie on the stack of a CPU's thread.
+            group = None if capacity == FACE_CAPACITY else 1
+            engine.run_each(
+                self._built(capacity).measure_margins, images.count, binned.items, binned.reach,
+                images.points, np.int32(images.n), t.starts, t.neighbours,
+                *images.box.device_corners(engine.real), *images.blocks, engine.real.type(SIDEWAYS),
+                engine.real.type(OUTWARDS), np.float32(KEPT), np.int32(tried),
+                np.int32(capacity >= MOST_FACES), margins.widths, margins.wishes, self._report,
+                group=group,
+            )  # fmt: skip
+            if engine.dim == 2 or not int(self._report.get()[1]) & FULL:
+                return
+            self._report[1:2].fill(0)
+            capacity, tried = 2 * capacity, capacity
 
     def fold(
         self,
@@ -236,13 +271,10 @@ class Seam:
         engine, k, n = self.engine, self._kernels, images.n
         self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         margins = images.margins
+        self._measure(images, binned, t)
         engine.run_each(
-            k.measure_margins, images.count, binned.items, binned.reach, images.points, np.int32(n),
-            *images.blocks, margins.needs,
-        )  # fmt: skip
-        engine.run_each(
-            k.compare_margins, block_count(engine.dim), margins.widths, margins.needs,
-            margins.needed, self._report,
+            k.note_margins, block_count(engine.dim), margins.widths, np.float32(KEPT),
+            margins.wishes, margins.needed,
         )  # fmt: skip
         margins.cells = n
         m = int(t.starts[n].get())

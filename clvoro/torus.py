@@ -12,7 +12,7 @@ from ._primitives import Summaries
 from .domain import Box
 from .errors import InputError
 from .polyhedra import Polyhedra
-from .seam import COLLAPSED, FAR, SLACK, ExtendedBox, Folded, Images, Margins
+from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images, Margins
 from .tessellation import EXACT_SHARE, ROUGH_SHARE, Tessellation
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class Torus:
         if margins.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             margins.fill(FIRST_MARGIN * (volume / n) ** (1 / dim), n)
-        factor, grow = SLACK * (margins.cells / n) ** (1 / dim), False
+        factor, grow = (margins.cells / n) ** (1 / dim), False
         while True:
             images = seam.extend(self.domain, points, n, margins, factor, grow)
             binned = stages.bins.build(images.box, images.points, images.count)
@@ -117,7 +117,7 @@ class Torus:
             folded, enough, flags, generator = seam.fold(images, binned, t, points, share, nearest)
             if enough:
                 break
-            factor, grow = SLACK, True
+            factor, grow = 1.0, True
             # Room for what is made anew.
             del images, binned, args, t, folded
         if flags & COLLAPSED:
