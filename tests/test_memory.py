@@ -57,6 +57,8 @@ def test_figures_are_what_runs_hold(monkeypatch, dim, field, n):
 PERIODIC = {
     "alike": (2, 8000, sizing.Constant(1.0)),
     "waves": (2, 8000, sizing.Expression("1 + 0.9 * sin(6.2831853 * x)")),
+    "steep waves": (2, 8000, sizing.Expression("1 + 0.97 * sin(6.2831853 * x)")),
+    "waves in space": (3, 6000, sizing.Expression("1 + 0.7 * sin(6.2831853 * x)")),
     "space": (3, 6000, sizing.Expression("0.02 + 0.25 * fabs(y - 0.5)")),
 }
 
