@@ -49,9 +49,9 @@ class Motion:
         self, u: cla.Array, v: cla.Array, h: cla.Array, u_speed: cla.Array, v_speed: cla.Array
     ) -> None:
         """Write |u| / h to `u_speed` (n,) and |v| / h to `v_speed` (n,)."""
-        self.engine.run_each(
-            self._kernels.measure_displacements, h.shape[0], u, v, h, u_speed, v_speed
-        )
+        kernel, n = self._kernels.measure_displacement, h.shape[0]
+        self.engine.run_each(kernel, n, u, h, u_speed)
+        self.engine.run_each(kernel, n, v, h, v_speed)
 
     def move_generators(
         self,
