@@ -22,9 +22,9 @@ from .layers import Layers
 from .loop import Loop
 from .made_by import describe
 from .memory import check_memory
-from .mesh import Stages
 from .preparation import Options, Preparation, check_options
 from .results import Diagram, Result
+from .stages import Stages
 from .tessellator import Tessellator
 from .torus import FewCellsError
 

@@ -18,14 +18,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .cells import Cells, Tessellation
+from .cells import Cells
 from .errors import InputError
 from .made_by import named
-from .mesh import SUMMARIES, Mesh, Stages
+from .mesh import SUMMARIES, Mesh
 from .plans import Action, Step
 from .polygon import Polygon
 from .results import HISTORY_DTYPE, Displacements
 from .seam import block_count
+from .stages import Stages
+from .tessellation import Tessellation
 
 if TYPE_CHECKING:
     from .domain import Domain
