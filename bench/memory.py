@@ -39,7 +39,7 @@ import clvoro
 from clvoro.start import count_cells
 
 PACKAGE = Path(clvoro.__file__).parent
-PLUMBING = {"_program", "_arrays", "_primitives"}
+PLUMBING = {"_program", "_arrays", "_device_array", "_primitives"}
 """Modules that make buffers for others."""
 
 

@@ -154,6 +154,8 @@ def fetch(queue: cl.CommandQueue, buffer: cl.Buffer) -> bytes:
 def signatures(ctx: cl.Context, text: str, defines) -> dict[str, list[tuple[str, str]]]:
     """Return the address space and the type of every argument of every kernel."""
     options = [f"-D{key}={value}" for key, value in sorted(defines.items())]
+    # A program from PyOpenCL's cache is a binary, in which some runtimes do not know of arguments.
+    program = cl.Program(ctx, text).build([*options, "-cl-kernel-arg-info"], cache_dir=False)
     info, spaces = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
     names = {
         spaces.GLOBAL: "global",
@@ -169,7 +171,7 @@ def signatures(ctx: cl.Context, text: str, defines) -> dict[str, list[tuple[str,
             )
             for k in range(kernel.num_args)
         ]
-        for kernel in cl.Program(ctx, text).build([*options, "-cl-kernel-arg-info"]).all_kernels()
+        for kernel in program.all_kernels()
     }
 
 
