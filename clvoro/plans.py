@@ -111,6 +111,9 @@ EFFORTS_3D = {
 
 SINGLE_AIM = 0.0017
 """Mean |log(L / h)| that polishing aims at most at, where there is one level only."""
+SINGLE_LENIENCE = 0.15
+"""-log Q from which on a cell may be off its size for its shape, there, at least. Measured on F1 (600 cells), thirty
+starts: the largest error is 0.010 (median; at most 0.018) in the place of 0.013 (0.031), for 0.01 of the least Q."""
 COUNT_SHARE = 0.03
 """Share of the generators by which the count may be off before the climb takes care of it."""
 COUNT_LEAST = 1e-3
@@ -281,6 +284,8 @@ def _adaptive_2d(
             yield Reorganise()
     yield Settle()
     yield Rest()
+    if levels == 0:
+        effort = replace(effort, lenience=max(effort.lenience, SINGLE_LENIENCE))
     yield from _finish_2d(effort, exact, aim, effort.eps)
 
 
