@@ -58,7 +58,9 @@ def test_moved_again_and_again(adapter, first, method):
         result = adapter.run(BOXES[2], field(2, 0.012 * k), points, method=method)
         points = result.points
         assert steps_to_tolerance(result.history) <= 5
-    assert result.quality.mean() > first[2].quality.mean() - 0.004
+    # The exact projection costs some 0.002 in itself (default and exact in bench/convergence.py).
+    lost = 0.004 if method == "adaptive" else 0.006
+    assert result.quality.mean() > first[2].quality.mean() - lost
     if method == "exact":
         assert np.abs(result.error).max() < 0.002
 
