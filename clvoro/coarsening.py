@@ -110,8 +110,9 @@ class Coarsening:
     def _kernels_from(self, source: np.dtype) -> Kernels:
         """Kernels that convert from another precision."""
         if source not in self._converters:
-            name = "double" if source == np.float64 else "float"
-            self._converters[source] = self.engine.kernels("coarsening", {"SOURCE": name})
+            self._converters[source] = self.engine.kernels(
+                "coarsening", {"SOURCE": self.engine.name_of(source)}
+            )
         return self._converters[source]
 
     def _run(self, kernel: cl.Kernel, size: int, *args: object) -> None:

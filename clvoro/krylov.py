@@ -91,8 +91,9 @@ class ConjugateGradient:
 
     def _kernels_in(self, store: np.dtype) -> Kernels:
         if store not in self._kernels:
-            name = "double" if store == np.float64 else "float"
-            self._kernels[store] = self.engine.kernels("krylov", {"STORE": name})
+            self._kernels[store] = self.engine.kernels(
+                "krylov", {"STORE": self.engine.name_of(store)}
+            )
         return self._kernels[store]
 
     @framed

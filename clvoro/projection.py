@@ -31,10 +31,9 @@ class Projection:
     hardly sees.
 
     Conjugate gradients with the diagonal as a preconditioner, from y = 0 or along the last solution first, in two
-    kernels an iteration. The host
-    enqueues as many as the last solve took and then reads their record; the iterate is frozen on the device when the
-    tolerance is met, so the result does not depend on when the host looks. Where cells are few, one kernel of one
-    work-group does all of that alone.
+    kernels an iteration. The host enqueues as many as the last solve took and then reads their record; the iterate is
+    frozen on the device when the tolerance is met, so the result does not depend on when the host looks. Where cells
+    are few, one kernel of one work-group does all of that alone.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -47,8 +46,9 @@ class Projection:
 
     def _kernels_in(self, store: np.dtype) -> SimpleNamespace:
         if store not in self._kernels:
-            name = "double" if store == np.float64 else "float"
-            self._kernels[store] = self.engine.kernels("projection", {"STORE": name})
+            self._kernels[store] = self.engine.kernels(
+                "projection", {"STORE": self.engine.name_of(store)}
+            )
         return self._kernels[store]
 
     def _reserve(self, n: int, m: int, store: np.dtype, most: int) -> SimpleNamespace:

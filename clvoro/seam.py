@@ -158,15 +158,19 @@ class Seam:
         self.engine = engine
         self._scan = Scan(engine)
         self._room = Room(engine, spare=1 / 16)  # sizes change a little from step to step
-        self._kernels = self._built(FACE_CAPACITY)
+        self._built: dict[int, Kernels] = {}
+        self._kernels = self._kernels_for(FACE_CAPACITY)
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
-    def _built(self, capacity: int) -> Kernels:
-        defines: dict[str, object] = {"BLOCKS": BLOCKS[self.engine.dim]}
-        if self.engine.dim == 3:
-            defines["FACE_CAPACITY"] = capacity
-        return self.engine.kernels("seam", defines)
+    def _kernels_for(self, capacity: int) -> Kernels:
+        """Return the kernels for cells, in 3D, of up to so many faces."""
+        if capacity not in self._built:
+            defines: dict[str, object] = {"BLOCKS": BLOCKS[self.engine.dim]}
+            if self.engine.dim == 3:
+                defines["FACE_CAPACITY"] = capacity
+            self._built[capacity] = self.engine.kernels("seam", defines)
+        return self._built[capacity]
 
     def extend(
         self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
@@ -228,7 +232,7 @@ class Seam:
             # Private arrays of a whole group lie on the stack of a CPU's thread.
             group = None if capacity == FACE_CAPACITY else 1
             engine.run_each(
-                self._built(capacity).measure_margins, images.count, binned.items, binned.reach,
+                self._kernels_for(capacity).measure_margins, images.count, binned.items, binned.reach,
                 images.points, np.int32(images.n), t.starts, t.neighbours,
                 *images.box.device_corners(engine.real), *images.blocks, engine.real.type(SIDEWAYS),
                 engine.real.type(OUTWARDS), np.float32(KEPT), np.int32(tried),
