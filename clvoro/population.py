@@ -120,7 +120,7 @@ class PopulationControl:
             kinds, strain_1, strain_2 = self._measure(t, h)
             if nuclei:
                 self._nucleate(t, kinds, strain_1, marks, nuclei)
-            gained = self._climb(t, reach, kinds, strain_2, marks, need, theta)
+            gained = self._climb(t, reach, kinds, strain_2, marks, need, theta, nuclei > 0)
             # Memory is scarce here, where generators are there twice in the end.
             del kinds, strain_1, strain_2
             self._room.clear("kinds", "strain", "partners", "pull")
@@ -174,8 +174,12 @@ class PopulationControl:
         marks: _Marks,
         need: int,
         theta: float,
+        nucleated: bool,
     ) -> int:
-        """Mark the pairs that climb, with thresholds shifted to bring the count nearest to `need`; return the gain."""
+        """Mark the pairs that climb, with thresholds shifted to bring the count nearest to `need`; return the gain.
+
+        Not near those that have been `nucleated`.
+        """
         engine, k, n = self.engine, self._kernels, t.n
         real = engine.real.type
         partners = self._room("partners", size=n, dtype=np.int32)
@@ -186,7 +190,8 @@ class PopulationControl:
             np.int32(theta <= THETA), partners, pull, keys,
         )  # fmt: skip
         self._exempt(t, keys, around=True)
-        engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
+        if nucleated:
+            engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
         engine.run_each(k.tally_pairs, n, chosen, pull, kinds, partners, real(theta), tally)
@@ -239,10 +244,11 @@ class PopulationControl:
         engine, k, n = self.engine, self._kernels, t.n
         chosen = self._room.zeros("chosen", size=n, dtype=np.uint64)
         latest = self._room("latest", size=n, dtype=np.uint64)
-        for _ in range(ROUNDS):
+        for turn in range(ROUNDS):
+            if turn > 0:
+                engine.run_each(k.drop_sites, n, self._spread(t, latest, rings), keys)
             spread = self._spread(t, keys, rings)
             engine.run_each(k.choose_sites, n, keys, spread, chosen, latest)
-            engine.run_each(k.drop_sites, n, self._spread(t, latest, rings), keys)
         return chosen
 
     def _limit(self, chosen: cla.Array, n: int, most: int) -> None:
