@@ -16,9 +16,10 @@ BOX = Box((0, 0), (1, 0.75))
 """Its frame is the unit square's: normalised coordinates are physical ones."""
 
 
-def make_engine(ctx, real="float64", dim=2, group_size=None):
-    """Return an engine; with `group_size` as on a GPU also where the device is a CPU."""
-    engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
+def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
+    """Return an engine for `box`; with `group_size` as on a GPU also where the device is a CPU."""
+    real = np.dtype(real)
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, real, box.defines(real))
     if group_size is not None:
         object.__setattr__(engine, "group_size", group_size)
     return engine
