@@ -60,8 +60,7 @@ inline float penalty_of(float penalty, float lenience, float worst, float bound,
    columns[k] = dr_j/dx_i h_i, axis by axis in arrays of `room`; eps; the inverse of the diagonal of B B^T + eps; and
    r = b = excess + J displacement with the first direction, z = start if `warm`, else D^-1 r. Walls have derivatives of
    0. Generators of labels less than `fixed` do not move. Lengths are divided by h before they are rounded, so that any
-   size is in
-   range. */
+   size is in range. */
 kernel void assemble(int n, const int room, global const int *starts, global const int *neighbours,
                      global const FACE *face_measures, global const FACE *face_centroids, global const REAL *volumes,
                      global const REAL *points, global const REAL *gradient, global const REAL *h,
@@ -184,9 +183,8 @@ inline void go_down(int k, const iteration_t *it, local REAL *scratch)
     const REAL norm = total_sum(ROW(NORM(k)), scratch), gamma = total_sum(ROW(GAMMA(k)), scratch);
     const REAL target = it->tolerance * it->tolerance * (k > 0 ? it->record[RECORD_NORM] : norm);
     const int running = !over && k < it->most && norm > target && norm <= REAL_MAX && (gamma > 0 || k < start);
-    if (first)
+    if (first) {
         now[RECORD_RUNNING] = running;
-    if (first && !over) {
         now[RECORD_NORM] = norm;
         now[RECORD_GAMMA] = gamma;
     }
