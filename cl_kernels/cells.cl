@@ -12,18 +12,19 @@
    square of bins that it has seen covers that circle. Its radius is left in reach[p], which begins as a guess of it.
    Only the first `rows_wanted` generators get cells.
 
-   rows[i * ROW_CAPACITY ...]  neighbours j, or -1 - wall; |row_counts[i]| of them, negative if rounding leaves a doubt
+   With s = places[i], which is i for all but the longest:
+   rows[s * SLOT ...]  neighbours j, or -1 - wall; |row_counts[s]| of them, negative if rounding leaves a doubt
 
-   If `wrapped`, rows that have faces are there already (`hulls.cl`). */
+   If `some`, rows that have faces are there already (`hulls.cl`, or where others had too many). */
 kernel void clip_cells(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
                        global float *reach, global const int2 *bins, global const FRAME *grid_frames,
                        global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
-                       const REAL4 box_upper, const int wrapped, global int *rows, global int *row_counts,
+                       const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
                        global int *places, global int *flags)
 {
     WORK_ITEM(p);
     const int i = items[p];
-    if (i >= rows_wanted || (wrapped && row_counts[i] > 0))
+    if (i >= rows_wanted || (some && row_counts[i]))
         return;
     const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -43,8 +44,7 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
     /* A search that is to be repeated begins with a guess as before: from 0 it would never widen. */
     if (flag == 0 && cell.reach2 > 0)
         reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
-    store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
-    places[i] = i;
+    places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 
 /* Twice the area of the cell of generator j by the faces that it lists. */
@@ -66,7 +66,7 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
     return area;
 }
 
-/* Per generator i: bit k of keep[KEEP_WORDS * its slot ...] marks a neighbour that also lists i. Rounding may let one
+/* Per generator i: bit k of keep[its first slot ...] marks a neighbour that also lists i. Rounding may let one
    of two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so
    that the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two
    cells, generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is
@@ -91,7 +91,7 @@ kernel void match_faces(const int size, global const int *places, global const i
     if (repaired ? fits[i] : !some) {
         /* All its faces are seen from both sides, as it fits its neighbours', or every new row is certain. */
         for (int left = n, k = 0; left > 0; left -= 32, ++k)
-            keep[place * KEEP_WORDS + k] = left < 32 ? (1u << left) - 1 : ~0u;
+            keep[place + k] = left < 32 ? (1u << left) - 1 : ~0u;
         counts[i] = n;
         if (n < 3)
             raise_flag(flags, FLAG_COLLAPSED, i);
@@ -137,7 +137,7 @@ kernel void match_faces(const int size, global const int *places, global const i
             }
         }
         if (k % 32 == 31 || k == n - 1) {
-            keep[place * KEEP_WORDS + k / 32] = word;
+            keep[place + k / 32] = word;
             word = 0;
         }
     }

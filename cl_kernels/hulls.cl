@@ -76,7 +76,7 @@ inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, g
             const int place = LANE((const int *)hull->places, k, lane);
             labels[k] = place < 0 ? place : items[place];
         }
-        write_labels(labels, count, rows + i * ROW_CAPACITY);
+        write_labels(labels, count, rows + i * SLOT);
         row_counts[i] = count;
         reach[own + lane] = (float)radii[lane];
     }

@@ -226,22 +226,23 @@ kernel void clip_marked(const int size, global const int *listed, const int base
         if (cell.faces[k] < 0 && FOLD((-1 - cell.faces[k]) / 2) > 0)
             flag = FLAG_FULL;
 #endif
-    store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags);
+    const int to = store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags),
+              count = abs(slot_counts[to]);
     if (places[i] < 0)
         return;
     /* Clipped once more, it may leave some that have been found to fit it. */
     for (int k = 0; k < n; ++k)
-        if (row[k] >= 0 && place_in_row(slots + (base + w) * ROW_CAPACITY, abs(slot_counts[base + w]), row[k]) ==
-                               abs(slot_counts[base + w]))
+        if (row[k] >= 0 && place_in_row(slots + to * SLOT, count, row[k]) == count)
             atomic_and(fits + row[k], 0);
 }
 
 /* Per listed generator: put its new row in the place of the old one. It fits until a neighbour says otherwise. */
-kernel void place_clipped(const int size, global const int *listed, const int base, global int *places,
-                          global int *marks, global int *fits)
+kernel void place_clipped(const int size, global const int *listed, const int base, global const int *slots,
+                          global const int *slot_counts, global int *places, global int *marks, global int *fits)
 {
     WORK_ITEM(w);
-    places[listed[w]] = base + w;
+    const int place = base + w;
+    places[listed[w]] = slot_counts[place] == ELSEWHERE ? slots[place * SLOT] : place;
     marks[listed[w]] = 0;
     fits[listed[w]] = 1;
 }

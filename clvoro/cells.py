@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
@@ -16,41 +16,18 @@ from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
+from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 from .tessellation import COINCIDE, DOUBT, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
 
 CELL_CAPACITY = 24
 """Faces that a cell may have while it is clipped."""
-ROW_CAPACITY = 20
+ROW_CAPACITY = SLOT
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
 LARGEST_ROW = 512
 LANES, EIGHTS = 8, 16
 """Cells that a CPU's work-item makes at a time, in lanes of vectors, and how many times `hulls.cl` does so."""
 FIRST_REACH = 1.9
 """How far it looks for neighbours at first, or less, in units of the spacing that the bins know."""
-
-
-@dataclass
-class FaceRows:
-    """Lists of faces while a diagram is made, on the device and of the workspace; see `common/face_rows.h`.
-
-    Attributes
-    ----------
-    slots : (>= s * row_capacity,) int32
-    counts : (n,) int32
-        Faces in each slot; negative where rounding leaves a doubt.
-    keep : uint32
-        Bits of the faces that both cells see.
-    places : (n,) int32
-        Slot of each row, or -1 if it is as before.
-    flags : (4,) int32
-        What went wrong, the first generator concerned, whether any cell is doubtful, and the faces of all rows.
-    """
-
-    slots: cla.Array
-    counts: cla.Array
-    keep: cla.Array
-    places: cla.Array
-    flags: cla.Array
 
 
 class Cells:
@@ -68,9 +45,8 @@ class Cells:
         self.engine = engine
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
-        self._flags = engine.empty(4, np.int32)
-        # Copied on the device: the host would have to wait for a transfer.
-        self._no_flags = engine.upload([0, 2**31 - 1, 0, 0], np.int32)
+        self._flags = engine.empty(6, np.int32)
+        self._no_flags: dict[tuple[int, int], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -80,12 +56,17 @@ class Cells:
         self._kernels = engine.kernels("cells", {**defines, "IN_LANES": int(self.lanes > 1)})
         self._wrap = None
         if self.lanes > 1 and self.searches:
-            self._wrap = engine.kernels("hulls", {**defines, "EIGHTS": EIGHTS}).wrap_cells
+            hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
+            self._wrap = engine.kernels("hulls", hulls).wrap_cells
 
     @property
     def defines(self) -> dict[str, object]:
         """The capacities, as kernels that work on the rows must be built with."""
-        return {"CELL_CAPACITY": self.cell_capacity, "ROW_CAPACITY": self.row_capacity}
+        return {
+            "CELL_CAPACITY": self.cell_capacity,
+            "ROW_CAPACITY": self.row_capacity,
+            "SLOT": SLOT,
+        }
 
     def _reserve(self, n: int) -> None:
         """Make room for the diagrams of `n` generators, but for their faces."""
@@ -158,33 +139,55 @@ class Cells:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
         self._reserve(n)
+        spare = spare_slots(n)
         while True:
-            rows = self.take_rows(n)
-            corners = box.device_corners(engine.real)
-            search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
-            if self._wrap is not None:
-                engine.run_each(
-                    self._wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
-                    binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
-                    rows.slots, rows.counts, rows.places, group=1,
-                )  # fmt: skip
+            with engine.workspace.frame():
+                rows = self.take_rows(n, spare=spare)
+                flags, generator, m = self._clip(rows, box, points, total, n, binned, exact)
+                if not flags & CROWDED:
+                    if flags & ~DOUBT:
+                        self._refuse(flags, generator)
+                    old = rows.places, rows.places
+                    t, flags, generator = self._measure(rows, box, points, n, *old, m, flags, exact)
+                    if t is None:
+                        self._refuse(flags, generator)
+                    return t
+                # All anew: as many as have been asked for by now, and more by those that were not yet.
+                spare = 2 * (int(rows.flags.get()[4]) - n)
+
+    def _clip(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        total: int,
+        n: int,
+        binned: BinnedPoints,
+        exact: bool,
+    ) -> tuple[int, int, int]:
+        """Make the rows of the first `n` of `total` generators and match them: see `_match` for what is returned."""
+        engine, corners = self.engine, box.device_corners(self.engine.real)
+        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+        some = self._wrap is not None
+        if some:
+            engine.run_each(
+                self._wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
+                binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
+                rows.slots, rows.counts, rows.places, group=1,
+            )  # fmt: skip
+        while True:
             engine.run_each(
                 self._kernels.clip_cells, total, np.int32(n), binned.points, binned.items, *search,
-                points, *corners, np.int32(self._wrap is not None), rows.slots, rows.counts,
-                rows.places, rows.flags,
+                points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags,
             )  # fmt: skip
             # Every row is new: there are none from before.
-            old = rows.places, rows.places
-            flags, generator, m, starts = self._match(rows, box, points, n, *old, exact)
-            if not flags & FULL:
-                break
+            found = self._match(rows, box, points, n, rows.places, rows.places, exact)
+            if not found[0] & FULL or found[0] & CROWDED:
+                return found
             self._enlarge(n)
-        if flags & ~DOUBT:
-            self._refuse(flags, generator)
-        t, flags, generator = self._measure(rows, box, points, n, *old, starts, m, flags, exact)
-        if t is None:
-            self._refuse(flags, generator)
-        return t
+            # Only the cells that had too many faces, whose rows are empty; doubts about others stay.
+            some = True
+            self._reset_flags(n, len(rows.counts), byte_count=8)
 
     def complete(
         self,
@@ -200,10 +203,10 @@ class Cells:
         between the right two; 0 is put where a face that rounding has made is left out.
         """
         n, old = previous.n, (previous.starts, previous.neighbours)
-        flags, _, m, starts = self._match(rows, box, points, n, *old, exact=False, fits=fits)
+        flags, _, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
         if flags & ~DOUBT:
             return None
-        return self._measure(rows, box, points, n, *old, starts, m, flags, exact=False)[0]
+        return self._measure(rows, box, points, n, *old, m, flags, exact=False)[0]
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with what is known of faces in full precision, in arrays of its own."""
@@ -218,9 +221,13 @@ class Cells:
         return replace(t, face_measures=measures, face_centroids=centroids)
 
     def _read_flags(self) -> tuple[int, int, int]:
-        """Read what has gone wrong, with `DOUBT` where any cell is doubtful, the first generator concerned, and m."""
-        wrong, generator, doubtful, m = (int(v) for v in self._flags.get())
-        return wrong | (DOUBT if doubtful else 0), generator, m
+        """Read what has gone wrong, the first generator concerned, and m.
+
+        With `DOUBT` where any cell is doubtful, and `CROWDED` where there were too few spare slots.
+        """
+        wrong, generator, doubtful, m, spare, slots = (int(v) for v in self._flags.get())
+        wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
+        return wrong, generator, m
 
     def _match(
         self,
@@ -232,9 +239,9 @@ class Cells:
         old_neighbours: cla.Array,
         exact: bool,
         fits: cla.Array | None = None,
-    ) -> tuple[int, int, int, cla.Array]:
-        """Make the rows symmetric; return the flags, the first generator concerned, the faces and where rows start."""
-        engine, starts = self.engine, self.engine.scratch(n + 1, np.int32)
+    ) -> tuple[int, int, int]:
+        """Make the rows symmetric; return the flags, the first generator concerned and the number of faces."""
+        engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, old_starts,
             old_neighbours, points, *box.device_corners(engine.real),
@@ -248,7 +255,7 @@ class Cells:
             engine.queue, buffer_of(rows.flags), buffer_of(starts), byte_count=word, src_offset=n * word,
             dst_offset=3 * word,
         )  # fmt: skip
-        return *self._read_flags(), starts
+        return self._read_flags()
 
     def _measure(
         self,
@@ -258,13 +265,12 @@ class Cells:
         n: int,
         old_starts: cla.Array,
         old_neighbours: cla.Array,
-        starts: cla.Array,
         m: int,
         flags: int,
         exact: bool,
     ) -> tuple[Tessellation | None, int, int]:
         """Write graph and measures of the rows; None if its doubtful cells do not fit. Return the flags, too."""
-        engine, corners = self.engine, box.device_corners(self.engine.real)
+        engine, corners, starts = self.engine, box.device_corners(self.engine.real), rows.starts
         self._reserve_faces(n, m)
         new, faces = self._views, self._of_faces
         # The previous graph is read meanwhile, or stays if this call is broken off: unless no row is from there, and
@@ -301,22 +307,35 @@ class Cells:
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
-    def take_rows(self, n: int, slots: int | None = None) -> FaceRows:
-        """Return `n` rows of faces of the present capacity, of which `slots` (by default all) may be new; no flags."""
+    def take_rows(self, n: int, slots: int | None = None, spare: int = 0) -> FaceRows:
+        """Return `n` rows of faces, of which as many as `slots` (by default all) may be new; no flags.
+
+        `spare` are the slots, behind these, for rows that are longer than one.
+        """
         engine, slots = self.engine, n if slots is None else slots
-        entries = slots * self.row_capacity
-        if entries >= 2**31:
+        first, slots = slots, slots + spare
+        if slots * SLOT >= 2**31:
             raise MemoryLimitError(
-                f"{n} cells of up to {self.row_capacity} faces need {entries:.3g} entries, expected "
-                "fewer than 2^31, which 32-bit indices can tell apart; use fewer cells, or perturb "
-                "generators that lie on a common circle"
+                f"the faces of {n} cells need {slots * SLOT:.3g} entries, expected fewer than 2^31, which "
+                "32-bit indices can tell apart; use fewer cells, or perturb generators that lie on a common circle"
             )
-        cl.enqueue_copy(engine.queue, buffer_of(self._flags), buffer_of(self._no_flags))
+        self._reset_flags(first, slots)
         return FaceRows(
-            engine.scratch(entries, np.int32), engine.scratch(slots, np.int32),
-            engine.scratch(slots * ((self.row_capacity + 31) // 32), np.uint32),
-            engine.scratch(n, np.int32), self._flags,
+            engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32),
+            engine.scratch(slots, np.uint32), engine.scratch(n, np.int32), engine.scratch(n + 1, np.int32),
+            self._flags,
         )  # fmt: skip
+
+    def _reset_flags(self, first: int, slots: int, **part: int) -> None:
+        """Take the flags back, or a part of them, where `slots` from the `first` on are to spare."""
+        if (first, slots) not in self._no_flags:
+            if len(self._no_flags) >= 4:
+                self._no_flags.clear()
+            # To be copied on the device: the host would have to wait for a transfer.
+            start = self.engine.upload([0, 2**31 - 1, 0, 0, first, slots], np.int32)
+            self._no_flags[first, slots] = start
+        start = self._no_flags[first, slots]
+        cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for `n` cells."""

@@ -14,6 +14,7 @@ from ._primitives import Scan
 from ._program import Engine
 from .cells import Cells
 from .domain import ClipBox
+from .face_rows import spare_slots
 from .tessellation import Tessellation
 
 MAX_ROUNDS = 6
@@ -71,7 +72,7 @@ class Repair:
         if self._last is None or self._last() is not previous:
             self._fits.fill(0)
         first_most, most = int(MAX_SHARE * n), int((MAX_SHARE + AGAIN_SHARE) * n)
-        rows = cells.take_rows(n, most)
+        rows = cells.take_rows(n, most, spare_slots(n))
         marks, listed = engine.scratch(n, np.int32), engine.scratch(most, np.int32)
         sums = engine.scratch(n + 1, np.int32)
         corners = box.device_corners(engine.real)
@@ -101,8 +102,8 @@ class Repair:
                 rows.counts, *old, points, *corners, self._fits, rows.flags,
             )  # fmt: skip
             engine.run_each(
-                k.place_clipped, count, listed, np.int32(base), rows.places, marks,
-                self._fits,
+                k.place_clipped, count, listed, np.int32(base), rows.slots, rows.counts, rows.places,
+                marks, self._fits,
             )  # fmt: skip
             engine.run_each(
                 k.check_clipped, count, listed, rows.places, rows.slots, rows.counts, *old,

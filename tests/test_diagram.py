@@ -11,6 +11,7 @@ import clvoro
 from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import ROW_CAPACITY, Cells
+from clvoro.face_rows import SLOT
 from clvoro.tessellation import DOUBT
 
 BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
@@ -284,7 +285,7 @@ def test_enlarged_capacity_is_for_those_that_need_it(adapter64):
     tessellate(POINTS["graded"])
     assert cells.row_capacity == ROW_CAPACITY
     with pytest.raises(clvoro.ClvoroError, match="32-bit"):
-        cells.take_rows(2**31 // ROW_CAPACITY + 1)
+        cells.take_rows(2**31 // SLOT + 1)
 
 
 @settings(max_examples=60, deadline=None)
@@ -323,7 +324,7 @@ def test_what_has_two_faces_is_no_cell(ctx, doubtful):
     for two in (True, False):
         lists = [[1, 2] if two else [1, 2, -1], [0, -3, 2], [0, 1, -4]]
         rows, n = cells.take_rows(3), len(lists)
-        slots = np.zeros((n, cells.row_capacity), np.int32)
+        slots = np.zeros((n, SLOT), np.int32)
         for i, labels in enumerate(lists):
             slots[i, : len(labels)] = labels
         rows.slots.set(slots.ravel())
@@ -331,9 +332,9 @@ def test_what_has_two_faces_is_no_cell(ctx, doubtful):
         # A doubt has all rows compared, and none is found wanting.
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
-        rows.flags.set(np.array([0, n, doubtful, 0], np.int32))
+        rows.flags.set(np.array([0, n, doubtful, 0, n, n], np.int32))
         old = rows.places, rows.places
-        flags, generator, m, _ = cells._match(rows, BOX, points, n, *old, exact=True)
+        flags, generator, m = cells._match(rows, BOX, points, n, *old, exact=True)
         assert m == 9 - two
         assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)
         if two:

@@ -30,7 +30,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
         int n;
         face_row(rows, i, &n);
         /* A row that has lost a face is left to `measure_cell`, too. */
-        counts[lane] = n >= 3 && (place < 0 || keeps_all(keep + place * KEEP_WORDS, n)) ? n : 0;
+        counts[lane] = n >= 3 && (place < 0 || keeps_all(keep + place, n)) ? n : 0;
         most = max(most, (int)counts[lane]);
         xs[lane] = points[2 * i];
         ys[lane] = points[2 * i + 1];

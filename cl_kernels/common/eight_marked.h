@@ -3,7 +3,7 @@
 #include "common/hull.h"
 
 #define WRAPPED_CAPACITY 32 /* candidates */
-#if WRAPPED_CAPACITY > LIST_CAPACITY || ROW_CAPACITY < HULL_CAPACITY
+#if WRAPPED_CAPACITY > LIST_CAPACITY || SLOT < HULL_CAPACITY
 #error "there is no room for the candidates, or for what becomes of them"
 #endif
 
@@ -102,7 +102,7 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
         int labels[HULL_CAPACITY];
         for (int k = 0; k < count; ++k)
             labels[k] = LANE((const int *)hull.places, k, lane);
-        write_labels(labels, count, slots + w * ROW_CAPACITY);
+        write_labels(labels, count, slots + w * SLOT);
         slot_counts[w] = count;
     }
 }

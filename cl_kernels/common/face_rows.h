@@ -1,14 +1,19 @@
 /* Rows of faces while a diagram is made: those that stay as they were lie in the previous graph, the others in slots of
-   ROW_CAPACITY. */
+   SLOT. A row that is longer takes several which follow each other, from spare ones: few cells are, and all would need
+   as much room. */
 #include "common/polygon.h"
 
 #ifndef ROW_CAPACITY
 #error "build with -DROW_CAPACITY=faces that a cell may have in the end"
 #endif
+#if !defined(SLOT) || SLOT > 32
+#error "build with -DSLOT=faces that have room in a slot, whose bits in a word"
+#endif
 
-/* Bits of flags[0], in which kernels report what went wrong; flags[2] is not 0 where there are doubtful cells. */
-#define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY */
-#define FLAG_COINCIDE 2  /* two generators at the same place; flags[1] is the smallest index of one */
+/* Bits of flags[0], in which kernels report what went wrong; flags[2] is not 0 where there are doubtful cells. The next
+   spare slot is flags[4], and flags[5] how many slots there are. */
+#define FLAG_FULL 1     /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than spare slots are left for */
+#define FLAG_COINCIDE 2 /* two generators at the same place; flags[1] is the smallest index of one */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
 
 inline void raise_flag(global int *flags, int flag, int generator)
@@ -17,10 +22,11 @@ inline void raise_flag(global int *flags, int flag, int generator)
     atomic_min(flags + 1, generator);
 }
 
-#define KEEP_WORDS ((ROW_CAPACITY + 31) / 32)
+#define ELSEWHERE INT_MAX
 
-/* places[i]  slot of row i, or -1 if it is the previous graph's
-   counts[s]  faces in slot s, negative if rounding leaves a doubt */
+/* places[i]  first slot of row i, or -1 if it is the previous graph's
+   counts[s]  faces from slot s on, negative if rounding leaves a doubt; ELSEWHERE: they begin in the slot that this one
+              names */
 typedef struct {
     global const int *places, *slots, *counts, *old_starts, *old_neighbours;
 } face_rows_t;
@@ -42,7 +48,7 @@ inline global const int *face_row(const face_rows_t *rows, int i, int *n)
         return rows->old_neighbours + start;
     }
     *n = abs(rows->counts[place]);
-    return rows->slots + place * ROW_CAPACITY;
+    return rows->slots + place * SLOT;
 }
 
 /* Is row i new, and has its cell left a doubt? */
@@ -52,18 +58,29 @@ inline bool is_doubtful_row(const face_rows_t *rows, int i)
     return place >= 0 && rows->counts[place] < 0;
 }
 
-/* Write the faces of a clipped cell to its slot, the least label first: a row depends on the cell alone, not on the
-   order in which it was clipped. Its count is negative if rounding might let a neighbour see the faces otherwise. */
-inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
-                       global int *counts, global int *flags)
+/* Write the faces of a clipped cell to its slot, or to spare ones, the least label first: a row depends on the cell
+   alone, not on the order in which it was clipped. Its count is negative if rounding might let a neighbour see the
+   faces otherwise. Returns the first slot. */
+inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
+                      global int *counts, global int *flags)
 {
     bool doubtful = false;
+    int to = place;
     if (flag == 0) {
         doubtful = is_doubtful(cell, x, points);
         if (doubtful)
             drop_short_faces(cell, x, points);
         if (cell->n > ROW_CAPACITY)
             flag = FLAG_FULL;
+    }
+    if (flag == 0 && cell->n > SLOT) {
+        /* Which of them is chance; what they will hold is not. */
+        const int taken = (cell->n + SLOT - 1) / SLOT;
+        to = atomic_add(flags + 4, taken);
+        if (to + taken > flags[5]) {
+            flag = FLAG_FULL;
+            to = place;
+        }
     }
     if (flag) {
         raise_flag(flags, flag, cell->generator);
@@ -74,8 +91,13 @@ inline void store_cell(cell_t *cell, int flag, const REAL *x, global const REAL 
     for (int k = 1; k < n; ++k)
         first = cell->faces[k] < cell->faces[first] ? k : first;
     for (int k = 0; k < n; ++k)
-        slots[place * ROW_CAPACITY + k] = cell->faces[first + k < n ? first + k : first + k - n];
-    counts[place] = doubtful ? -n : n;
+        slots[to * SLOT + k] = cell->faces[first + k < n ? first + k : first + k - n];
+    if (to != place) {
+        slots[place * SLOT] = to;
+        counts[place] = ELSEWHERE;
+    }
+    counts[to] = doubtful ? -n : n;
     if (doubtful)
         atomic_or(flags + 2, 1);
+    return to;
 }

@@ -17,7 +17,7 @@ inline int kept_faces(int *faces, const face_rows_t *rows, global const uint *ke
     const int place = rows->places[i];
     global const int *row = face_row(rows, i, &listed);
     for (int k = 0; k < listed; ++k)
-        if (place < 0 || ((keep[place * KEEP_WORDS + k / 32] >> (k % 32)) & 1u))
+        if (place < 0 || ((keep[place + k / 32] >> (k % 32)) & 1u))
             faces[n++] = row[k];
     return n;
 }
