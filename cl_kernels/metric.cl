@@ -1,33 +1,12 @@
 #include "common/outline.h"
-
-#if DIM == 2
-/* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Nearly all cells have so few sides that it need not be
-   evaluated. */
-constant REAL ROUNDNESS[12] = {0,
-                               0,
-                               0,
-                               R(20.784609690826521),
-                               R(15.999999999999998),
-                               R(14.530850560107218),
-                               R(13.856406460551018),
-                               R(13.484089326610802),
-                               R(13.254833995939041),
-                               R(13.102928433583283),
-                               R(12.996787849316252),
-                               R(12.919565689288136)};
-
-inline REAL regular_roundness(int n)
-{
-    return n < 12 ? ROUNDNESS[n] : 4 * n * tan(R(3.14159265358979324) / n);
-}
-#endif
+#include "common/roundness.h"
 
 /* Per generator i: metric error and quality of its cell.
 
    error    e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
    reach    min(L, h): the length that limits a generator's motion, also where the target has only just grown or shrunk
    energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
-   quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1)
+   quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1; trimmed cells come with theirs)
             3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
                             global const FACE *face_measures, global const REAL *offsets,
@@ -36,21 +15,23 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
+#if DIM == 2
+    const REAL length = sqrt(volume);
+#else
+    const REAL length = cbrt(volume);
+#endif
+#ifdef POLYGON
+    quality[i] = outlines[i].s0;
+#else
     const int begin = starts[i], end = starts[i + 1];
     REAL surface = 0;
     for (int k = begin; k < end; ++k)
         surface += face_measures[k];
 #if DIM == 2
-    const REAL length = sqrt(volume);
-#ifdef POLYGON
-    const int sides = outlines[i].s0;
+    quality[i] = polygon_quality(end - begin, volume, surface);
 #else
-    const int sides = end - begin;
-#endif
-    quality[i] = regular_roundness(max(sides, 3)) * volume / (surface * surface);
-#else
-    const REAL length = cbrt(volume);
     quality[i] = R(113.09733552923255) * volume * volume / (surface * surface * surface);
+#endif
 #endif
     REAL square = 0;
     for (int a = 0, diagonal = 0; a < DIM; ++a) {

@@ -1,4 +1,5 @@
 #include "common/moments.h"
+#include "common/roundness.h"
 #include "common/segments.h"
 #include "common/sides.h"
 #include "common/trimmed.h"
@@ -284,7 +285,7 @@ kernel void copy_whole(const int size, global const int *starts, global const in
                        global const REAL *face_measures, global const REAL2 *face_centroids, SEGMENT_ARGS,
                        global const int *slots, global const int *roots, global const int *marks,
                        global const int *new_starts, global int *new_neighbours, global REAL *new_measures,
-                       global REAL2 *new_centroids, global REAL2 *outlines)
+                       global REAL2 *new_centroids, global const REAL *volumes, global REAL2 *outlines)
 {
     WORK_ITEM(i);
     if (slots[i] != UNTOUCHED)
@@ -292,7 +293,7 @@ kernel void copy_whole(const int size, global const int *starts, global const in
     const segments_t s = SEGMENTS;
     const int shift = new_starts[i] - starts[i];
     const bool marked = marks[i];
-    outlines[i] = (REAL2)(starts[i + 1] - starts[i], 6);
+    REAL perimeter = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         int j = neighbours[k];
         if (marked && j >= 0 && slots[j] != UNTOUCHED) {
@@ -304,13 +305,15 @@ kernel void copy_whole(const int size, global const int *starts, global const in
         new_neighbours[k + shift] = j;
         new_measures[k + shift] = face_measures[k];
         new_centroids[k + shift] = face_centroids[k];
+        perimeter += face_measures[k];
     }
+    outlines[i] = (REAL2)(polygon_quality(starts[i + 1] - starts[i], volumes[i], perimeter), 6);
 }
 
 /* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that
    have changed cells, in order; place_cells[place] is the touched cell that they lie in.
 
-   outlines[i] = (sides, neighbours that a hexagonal lattice would have here) */
+   outlines[i] = (quality, neighbours that a hexagonal lattice would have here) */
 kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *points, global const int *touched,
                           global const int *slots, global const int *roots, global const int *orphans,
                           const int orphan_count, global const int *place_cells, global const int *new_starts,
@@ -322,7 +325,8 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
     const segments_t s = SEGMENTS;
     const int i = touched[u];
     moments_t m = {0, 0, 0, 0, 0, 0};
-    outline_t o = {0, 0, 0, 0};
+    outline_t o = no_outline();
+    REAL perimeter = 0;
     int at = new_starts[i];
     for (int turn = -1; turn < orphan_count; ++turn) {
         /* First the pieces in this cell, then those that have come to it. */
@@ -332,9 +336,13 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
         const int v = turn < 0 ? u : place_cells[place];
         const int home = touched[v];
         const REAL2 shift = points[home] - points[i];
+        int piece = place;
         for (int k = s.starts[v]; k < s.starts[v + 1]; ++k) {
             if (turn < 0 ? roots[s.places[k]] != i : s.places[k] != place)
                 continue;
+            if (s.places[k] != piece)
+                end_piece(&o);
+            piece = s.places[k];
             const REAL2 p = s.p[k] + shift, q = s.q[k] + shift, e = q - p;
             add_triangle(&m, p, q);
             int other;
@@ -344,17 +352,26 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
                     join_runs(&o);
                 continue;
             }
-            if (other >= 0 || s.to[k] != ISLAND)
-                add_side(&o, other < 0 ? BOUNDARY_TANGENT(other) : e, other < 0);
+            if (other >= 0)
+                add_face(&o, p, q);
+            else if (s.to[k] != ISLAND)
+                add_chord(&o, p, q, BOUNDARY_TANGENT(other));
+            else
+                add_straight(&o, p, q);
+            perimeter += sqrt(dot(e, e));
             new_neighbours[at] = other;
             new_measures[at] = sqrt(dot(e, e));
             new_centroids[at] = (p + q) / 2;
             face_segments[at] = k;
             ++at;
         }
+        end_piece(&o);
     }
     write_moments(&m, i, volumes, offsets, covariances);
-    outlines[i] = (REAL2)(o.sides, 6 - o.missing);
+    /* Two sides, of which one is bent, are no polygon. */
+    const REAL quality =
+        o.sides < 3 ? polygon_quality(3, m.area / 2, perimeter) : polygon_quality(o.sides, o.area / 2, o.perimeter);
+    outlines[i] = (REAL2)(fmax(quality, R(0)), 6 - o.missing);
 }
 
 /* Per touched cell: the places of its loops are its own. */

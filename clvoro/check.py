@@ -7,7 +7,8 @@ of a search tree over all generators.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +23,7 @@ from .check_polygon import (
 )
 from .faces import face_keys
 from .findings import Check, MisfitError, Report
-from .outlines import SIDE_TURN, count_sides, face_ends, next_faces
+from .outlines import SIDE_TURN, Straightened, face_ends, straighten
 from .polygon import Polygon
 from .rebuilt import Doubts, Rebuilt
 from .walls import surface, wall_count, wall_distance
@@ -325,7 +326,7 @@ def _check_result(check: Check, result: Result) -> None:
         counts = np.diff(d.neighbour_starts)
         perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
         if dim == 2:
-            quality = _quality_2d(d, perimeter, q, eps, g.unit)
+            quality = _quality_2d(d, q, eps, g.unit)
         else:
             quality = 36 * np.pi * d.volumes**2 / perimeter**3
     check.note(
@@ -345,32 +346,38 @@ def _check_result(check: Check, result: Result) -> None:
     )  # fmt: skip
 
 
-def _quality_2d(
-    d: Diagram, perimeter: np.ndarray, q: np.ndarray, eps: float, unit: float
-) -> np.ndarray:
+def _quality_2d(d: Diagram, q: np.ndarray, eps: float, unit: float) -> np.ndarray:
     """Return the quality (4.1) of each cell (n,).
 
-    Where rounding decides how many sides the boundary is, as many are taken as suit the quality `q` best.
+    Where rounding decides which sides the boundary has, those are taken that suit the quality `q` best.
     """
-    few, many = (count_sides(d, SIDE_TURN * (1 + k * eps)) for k in (64, -64))
-    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
-    on_wall = d.neighbours < 0
-    if isinstance(d.domain, Polygon):
-        # So does the corner in which the count begins, where a cell is a whole piece of the domain. Where parts of a
-        # cell come together amid an edge, or in a corner of several rings, turning is summed up anew, which may make a
-        # side more or less.
-        alone = np.bincount(owner, ~on_wall, len(d)) == 0
-        meets = on_wall & (d.neighbours[next_faces(d)] == d.neighbours)
-        ends = d.vertices[face_ends(d)[:, 1]]
-        meets |= on_wall & near_shared_corners(d.domain, ends, ROUNDINGS * unit)
-        joints = np.bincount(owner, meets, len(d)).astype(int)
-        # And a face no longer than a rounding is a side or none, as where pieces touch.
+    quality = np.full(len(q), np.inf)
+    for polygons in _straightened(d, eps, unit):
+        # A face no longer than a rounding is a side or none, as where pieces touch.
+        owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
         points = np.bincount(owner, d.face_measures <= ROUNDINGS * unit, len(d)).astype(int)
-        few, many = few - joints - points, many + joints + points + alone
-    few, many = np.maximum(few, 3), np.maximum(many, 3)
-    quality = np.zeros(len(q))
-    for more in range(int((many - few).max(initial=0)) + 1):
-        sides = np.minimum(few + more, many)
-        found = 4 * d.volumes * sides * np.tan(np.pi / sides) / perimeter**2
-        quality = np.where(np.abs(found - q) < np.abs(quality - q), found, quality)
+        for more in range(-int(points.max(initial=0)), 1):
+            sides = polygons.sides + np.maximum(more, -points)
+            found = dataclasses.replace(polygons, sides=sides).quality()
+            quality = np.where(np.abs(found - q) < np.abs(quality - q), found, quality)
     return quality
+
+
+def _straightened(d: Diagram, eps: float, unit: float) -> Iterator[Straightened]:
+    """Go through the polygons that the cells may be, as rounding will have it."""
+    if not isinstance(d.domain, Polygon):
+        yield straighten(d)
+        return
+    # In a corner of several rings parts of a cell may come together, with which a side ends.
+    on_wall = d.neighbours < 0
+    corners = on_wall & near_shared_corners(
+        d.domain, d.vertices[face_ends(d)[:, 1]], ROUNDINGS * unit
+    )
+    # And a cell that is a whole piece of the domain has no corner in which to begin.
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
+    alone = np.bincount(owner, ~on_wall, len(d)) == 0
+    begins = int(np.diff(d.neighbour_starts)[alone].max(initial=1))
+    for turn in (SIDE_TURN * (1 + k * eps) for k in (64, -64)):
+        for ends_at in (None, corners) if corners.any() else (None,):
+            for begins_at in range(begins):
+                yield straighten(d, turn, ends_at, begins_at)

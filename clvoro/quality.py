@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .faces import face_owners
-from .outlines import count_sides
+from .outlines import straighten
 from .polygon import Polygon
 from .results import Diagram
 from .walls import wall_planes
@@ -24,8 +24,9 @@ class Measures:
     Attributes
     ----------
     quality : (n,) float
-        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon; n is the number of faces, of which
-        those on the boundary of a polygonal domain count as one as long as they turn by no more than 30 degrees.
+        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon, less for all others; n is the number of
+        faces. Those on the boundary of a polygonal domain are taken together and straightened as long as they turn by
+        no more than 30 degrees: Q is that of the polygon with these sides.
         3D: the isoperimetric quotient 36 pi V^2 / S^3, 1 for a ball, .753 for a truncated octahedron, .524 for a cube.
     skewness : (m,) float
         Distance from the centroid of the face to the point where the line between the generators meets its
@@ -135,8 +136,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
     surface = np.add.reduceat(areas, starts[:-1])
     largest, smallest = (f.reduceat(areas, starts[:-1]) for f in (np.maximum, np.minimum))
     if diagram.domain.dim == 2:
-        sides = np.maximum(count_sides(diagram), 3)
-        quality = 4 * volumes * sides * np.tan(np.pi / sides) / surface**2
+        quality = straighten(diagram).quality()
     else:
         quality = 36 * np.pi * volumes**2 / surface**3
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])

@@ -275,8 +275,8 @@ class Result:
         Signed metric error, the paper's (3.1).
     quality : (n,) float
         Cell quality, the paper's (4.1), 1 for a regular polygon; in 3D the isoperimetric quotient 36 pi V^2 / S^3. In a
-        polygonal domain faces on the boundary count as one side as long as they turn by no more than 30 degrees in
-        sum, and holes within a cell as none; with a bent side the quality may be a little above 1.
+        polygonal domain it is that of the polygon in which faces on the boundary are one straight side as long as they
+        turn by no more than 30 degrees in sum; holes within a cell are no sides.
     history : structured array of `HISTORY_DTYPE`
         One row per step: ``history["mean_error"]``, ...
     converged : bool

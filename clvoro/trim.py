@@ -169,7 +169,7 @@ class Trim:
         engine.run_each(
             k.copy_whole, n, convex.starts, convex.neighbours, convex.face_measures,
             convex.face_centroids, *segments, chords.slots, roots, marks, starts, neighbours, measures,
-            centroids, outlines,
+            centroids, convex.volumes, outlines,
         )  # fmt: skip
         place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
         engine.run_each(k.name_places, u, chords.list_starts, place_cells)

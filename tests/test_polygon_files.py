@@ -242,30 +242,78 @@ def test_faces_are_the_outlines_of_cells(result) -> None:
     assert sorted(following.tolist()) == list(range(len(following)))
 
 
-def sides_by_hand(diagram, i: int) -> int:
-    """Walk around a cell, face by face."""
+def corners_by_hand(diagram, i: int) -> tuple[np.ndarray, bool]:
+    """Walk around a cell, face by face; return where its sides begin, and whether nothing else belongs to it.
+
+    The boundary is one side as long as it turns by no more than 30 degrees, and is on other edges than before.
+    """
     rows = range(diagram.neighbour_starts[i], diagram.neighbour_starts[i + 1])
     ends, x = face_ends(diagram), diagram.vertices
     after = {f: g for f in rows for g in rows if ends[f, 1] == ends[g, 0]}
-    inner = [f for f in rows if diagram.neighbours[f] >= 0]
-    count = len(inner)
-    for f in inner:
-        f, turned, before = after[f], 0.0, None
-        while diagram.neighbours[f] < 0:
-            e = complex(*(x[ends[f, 1]] - x[ends[f, 0]]))
+    first = f = next(f for f in rows if diagram.neighbours[f] >= 0)
+    corners, walked, turned, before, edge = [], 0, 0.0, None, None
+    while walked == 0 or f != first:
+        e = complex(*(x[ends[f, 1]] - x[ends[f, 0]]))
+        if diagram.neighbours[f] >= 0:
+            corners.append(ends[f, 0])
+            before = None
+        else:
             turned += np.angle(e / before) if before is not None else 0.0
-            if before is None or abs(turned) > np.pi / 6:
-                count, turned = count + 1, 0.0
-            before, f = e, after[f]
-    return count
+            if before is None or abs(turned) > np.pi / 6 or diagram.neighbours[f] == edge:
+                corners.append(ends[f, 0])
+                turned = 0.0
+            before = e
+        edge = diagram.neighbours[f]
+        f, walked = after[f], walked + 1
+    return x[corners], walked == len(rows)
 
 
-def test_sides(ctx) -> None:
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_quality_is_that_of_the_cell_with_straight_sides(ctx, dtype: str) -> None:
+    eps, straightened, joined = float(np.finfo(dtype).eps), 0, 0
     for domain in (comb(), Polygon(ring().rings[0])):
-        diagram = mesh(ctx, domain, 150).diagram
-        counts = count_sides(diagram)
-        assert counts.tolist() == [sides_by_hand(diagram, i) for i in range(150)]
-        assert (counts < np.diff(diagram.neighbour_starts)).any()
+        result = mesh(ctx, domain, 150, dtype)
+        diagram = result.diagram
+        counts, faces = count_sides(diagram), np.diff(diagram.neighbour_starts)
+        for i in range(150):
+            corners, whole = corners_by_hand(diagram, i)
+            if not whole:  # islands
+                continue
+            n = len(corners)
+            assert counts[i] == n
+            straightened += n < faces[i]
+            x, y = (corners - diagram.points[i]).T
+            area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+            perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
+            expected = 4 * max(area, 0) * n * np.tan(np.pi / n) / perimeter**2
+            # Corners round by eps of the domain, four wide at most, where cells are a tenth as wide as that.
+            assert result.quality[i] == pytest.approx(expected, abs=4096 * eps)
+            edges = diagram.neighbours[
+                diagram.neighbour_starts[i] : diagram.neighbour_starts[i + 1]
+            ]
+            joined += len(set(edges[edges < 0].tolist())) < (edges < 0).sum()
+    assert straightened > 30
+    assert joined > 10
+
+
+def test_a_bent_side_is_no_better_than_a_straight_one(ctx) -> None:
+    """A regular pentagon, a corner of which is but the bend of a wall: as four sides it would have Q = 1.10."""
+    angle = np.arange(5) * 2 * np.pi / 5
+    pentagon = np.column_stack([np.cos(angle), np.sin(angle)])
+    # The wall's corner is made as flat as a side may be; the other corners are where they were.
+    a, b = pentagon[1], pentagon[4]
+    flat = (a + b) / 2 + (0.5 * np.linalg.norm(a - b) * np.tan(np.radians(14.9)), 0)
+    domain = Polygon([flat, a, pentagon[2], pentagon[3], b])
+    result = clvoro.Adapter(ctx).run(
+        domain, 1.0, points=np.array([(0.0, 0.0)]), method="lloyd", max_steps=0
+    )
+    corners = domain.vertices[(domain.vertices != flat).any(axis=1)]
+    x, y = corners.T
+    area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+    perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
+    assert len(corners) == 4
+    assert result.quality[0] == pytest.approx(16 * area / perimeter**2, rel=1e-14)
+    assert result.check()
 
 
 def test_a_cell_without_neighbours_has_the_sides_of_its_piece(ctx) -> None:

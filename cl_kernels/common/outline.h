@@ -1,9 +1,10 @@
 /* The boundary as a cell of a trimmed diagram has it. OUTLINE_ARGS come last in a kernel's signature and are empty in
    boxes.
 
-   outlines[i]  (sides of the cell, those of the boundary that turn by less than 30 degrees counted as one; neighbours
-   that a hexagonal lattice would have there) tangents[e]  unit vector along edge e of the boundary, the domain on its
-   left: the face of label -1 - e */
+   outlines[i]  (quality of the cell by the paper's 4.1, as the polygon whose sides are its faces, those on the boundary
+                taken together and straightened as long as they turn by no more than 30 degrees: see sides.h;
+                neighbours that a hexagonal lattice would have there)
+   tangents[e]  unit vector along edge e of the boundary, the domain on its left: the face of label -1 - e */
 #include "common/real.h"
 
 #ifdef POLYGON
