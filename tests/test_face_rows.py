@@ -52,7 +52,8 @@ def test_wheels_are_right(engine):
     points = wheels().astype(engine.real)
     diagram = clvoro.Adapter(engine.ctx, engine.real).diagram(BOX, points)
     sides = np.diff(diagram.neighbour_starts)
-    assert (sides[:4] == SPOKES).all() and (sides[4:] <= SLOT).all()
+    assert (sides[:4] == SPOKES).all()
+    assert (sides[4:] <= SLOT).all()
     expected = reference.box_voronoi(BOX.lower, BOX.upper, np.asarray(points, float))
     areas = np.array([cell.area for cell in expected])
     # A corner is known as well as positions, and there are some ten to a cell; cells are 0.03 wide.
@@ -83,7 +84,7 @@ def test_room_is_taken_for_long_rows_alone(engine):
 def test_repair_has_room_for_long_rows(engine, monkeypatch):
     """And gives up where it has none, as for whatever else it cannot do."""
     points = wheels()
-    cells, x, t = make(engine, points)
+    cells, _, t = make(engine, points)
     moved = engine.upload(points + np.random.default_rng(6).uniform(-1, 1, points.shape) * 1e-5)
     repaired = Repair(engine).follow(cells, BOX, moved, t)
     assert repaired is not None
