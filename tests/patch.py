@@ -11,9 +11,18 @@ from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
 from clvoro.domain import Box
+from clvoro.stages import Stages
+from clvoro.tessellator import Tessellator
 
 BOX = Box((0, 0), (1, 0.75))
 """Its frame is the unit square's: normalised coordinates are physical ones."""
+BOXES = {
+    "plane": BOX,
+    "space": Box((0, 0, 0), (1, 0.75, 0.9)),
+    "torus": Box((0, 0), (1, 0.75), periodic=True),
+    "slab": Box((0, 0, 0), (1, 0.75, 0.9), periodic=(True, False, True)),
+}
+"""Of all kinds, each with the frame of the unit square or cube."""
 
 
 def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
@@ -32,6 +41,12 @@ def tessellate(engine, points, box=BOX):
     return Cells(engine).tessellate(box, on_device, n, binned)
 
 
+def tessellate_box(engine, box, n, seed):
+    """Return the tessellation of any box by `n` random generators, some 250 for five across a period in space."""
+    on_device = engine.upload(box.place(random_points(n, seed, box), engine.real))
+    return Tessellator(Stages(engine), box).tessellate(on_device, n)
+
+
 def fetch(t):
     """Return the arrays of `t` as NumPy's, faces cut to their number, and `owners` (m,) of the faces."""
     starts = t.starts.get()
@@ -43,6 +58,14 @@ def fetch(t):
     }
     owners = np.repeat(np.arange(t.n), np.diff(starts))
     return SimpleNamespace(n=t.n, starts=starts, owners=owners, **faces, **cells)
+
+
+def ways(host, box):
+    """Return the way from each face's generator to the nearest image of its neighbour, (m, d); of walls nothing."""
+    across = host.points[host.neighbours].astype(float) - host.points[host.owners]
+    across[host.neighbours < 0] = 0
+    periods = np.where(box.periodic, box.extent, 1)
+    return across - np.rint(across / periods) * np.where(box.periodic, periods, 0)
 
 
 def hexagons(a, box=BOX):
