@@ -160,8 +160,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("files", nargs="*", metavar="FILE")
     parser.add_argument(
-        "--tests", nargs="+", required=True, help="as pytest takes them, options too"
-    )
+        "--tests", nargs="+", required=True, help='as pytest takes them; options in one word: "-k one or other"'
+    )  # fmt: skip
     parser.add_argument("--count", type=int, default=50, help="mutants in all, drawn by chance")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=[], metavar="PLACE")

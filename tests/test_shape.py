@@ -108,6 +108,41 @@ def test_gradient_in_a_polygon(ctx):
     assert out.get() == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("periodic", [True, (False, True)])
+def test_gradient_across_seams(ctx, periodic):
+    """Generators at a seam look at the nearest images of their neighbours; diagrams are the device's own."""
+    box, adapter = clvoro.Box((0, 0), (1, 0.75), periodic=periodic), clvoro.Adapter(ctx)
+    rng = np.random.default_rng(2116)
+    grid = np.stack(np.meshgrid(np.arange(7) / 7, np.arange(6) / 8, indexing="ij"), -1)
+    points = box.wrap(grid.reshape(-1, 2) + rng.uniform(0, 0.06, (42, 2)))
+    n, q, h = len(points), rng.uniform(0.5, 1, 42), rng.uniform(0.05, 0.2, 42)
+    some = np.flatnonzero((points < 0.1).any(axis=1))[:10]
+    assert (points[some] < 0.1).any(axis=0).all()
+    engine = patch.make_engine(ctx, box=box)
+    placed = engine.upload(box.place(points, engine.real))
+    t, out = Tessellator(Stages(engine), box).tessellate(placed, n), engine.empty((n, 2))
+    Shape(engine).descend(
+        t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
+    )
+    omega, step = 1 - 5 * np.log(q), 1e-5
+
+    def energy(points):
+        d = adapter.diagram(box, points)
+        perimeter = np.add.reduceat(d.face_measures, d.neighbour_starts[:-1])
+        return float((omega * (2 * np.log(perimeter) - np.log(d.volumes))).sum())
+
+    gradient = np.zeros((n, 2))
+    for i in some:
+        for a in range(2):
+            by = np.zeros((n, 2))
+            by[i, a] = step
+            gradient[i, a] = (energy(points + by) - energy(points - by)) / (2 * step)
+    expected = -0.3 * h[:, None] ** 2 * gradient
+    # As above; what is known of faces while generators move is in single precision.
+    scale = np.abs(expected).max()
+    assert out.get()[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
+
+
 def test_descends(ctx):
     """A step of the real size lowers E."""
     points = patch.relaxed_points(N, 2113, steps=3)
