@@ -3,8 +3,12 @@
 import numpy as np
 import patch
 import pytest
+import shapely
+from shores import POLYGONS, scattered
 
 from clvoro.refinement import SHORT_FACE, Refinement
+from clvoro.stages import Stages
+from clvoro.tessellator import Tessellator
 
 BOX = patch.BOX
 
@@ -49,6 +53,64 @@ def test_children(ctx, real, n):
     eps = float(np.finfo(real).eps)
     assert as_sorted(finer[n:]) == pytest.approx(as_sorted(expected), abs=2 * eps)
     assert BOX.contains(finer).all()
+
+
+def children_in(shape, tangents, host, h, labels, fixed):
+    """Middles that a longer common face has not given yet, if in sight, else those of faces; by shapely."""
+
+    def leaves(x, y):
+        """When the way from x to y leaves the domain; 1 if it does not."""
+        inside = shapely.LineString([x, y]).intersection(shape)
+        if inside.geom_type == "MultiLineString":
+            inside = min(inside.geoms, key=shapely.Point(x).distance)
+        t = inside.length / np.hypot(*(y - x))
+        return 1 if t > 1 - 1e-9 else t
+
+    def kept(x, y):
+        t = leaves(x, y)
+        return y if t == 1 else x + t / 2 * (y - x)
+
+    children, sizes = [], host.face_measures
+    for k, (i, j) in enumerate(zip(host.owners, host.neighbours, strict=True)):
+        x, m, row = host.points[i], host.face_centroids[k], np.flatnonzero(host.owners == i)
+        if labels[i] < fixed or (j >= 0 and labels[j] < fixed):
+            continue
+        if 0 <= j < i or sizes[k] <= SHORT_FACE * np.sqrt(host.volumes[i]):
+            continue
+        alike = row[host.neighbours[row] == j] if j >= 0 else row[host.neighbours[row] < 0]
+        longest = k == alike[sizes[alike].argmax()]  # the first of several
+        if j >= 0:
+            middle = (x + host.points[j]) / 2
+            seen = longest and leaves(x, middle) == 1
+            children.append(middle if seen else kept(x, x + m))
+        elif longest:
+            inwards = np.array([-tangents[-1 - j, 1], tangents[-1 - j, 0]])
+            gap = -m @ inwards
+            way = min(gap / 2, h[i] / 4) if gap > 0 else h[i] / 4
+            children.append(kept(x, x + m + way * inwards))
+    return np.array(children)
+
+
+@pytest.mark.parametrize("fixed", [0, 30])
+@pytest.mark.parametrize("name", ["star", "holes", "islands", "comb", "fine comb", "corner"])
+def test_children_in_polygons(ctx, name, fixed):
+    domain, n = POLYGONS[name](), 80
+    engine = patch.make_engine(ctx, box=domain)
+    points = domain.place(scattered(domain, n, 5801), engine.real)
+    t = Tessellator(Stages(engine), domain).tessellate(engine.upload(points), n)
+    rng = np.random.default_rng(5802)
+    labels, h = rng.permutation(n), rng.uniform(0.02, 0.2, n)
+    given = [engine.upload(labels, np.int32), fixed] if fixed else []
+    finer = Refinement(engine).refine(domain, t, engine.upload(h), *given).get()
+    assert np.array_equal(finer[:n], points)
+    origin, scale = domain.frame
+    shape = shapely.transform(domain.geometry, lambda y: (y - origin) / scale)
+    along = domain.vertices[domain.next_vertex] - domain.vertices
+    tangents = along / np.hypot(*along.T)[:, None]
+    expected = children_in(shape, tangents, patch.fetch(t), h, labels, fixed)
+    assert len(expected) > n
+    # The children of a generator follow in the order of its faces; crossings round by their angle's cosecant.
+    assert finer[n:] == pytest.approx(expected, rel=0, abs=1e-12)
 
 
 def test_count_is_four_times(ctx):
