@@ -205,6 +205,38 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
     assert sum(rounds[1:]) < 0.1 * rounds[0]
 
 
+@pytest.mark.parametrize("group_size", [None, 128])
+def test_who_is_clipped_has_changed(ctx, group_size, monkeypatch):
+    """At first those whose neighbours are others than before, and hardly anybody else; later hardly anybody."""
+    engine, rng = patch.make_engine(ctx, group_size=group_size), np.random.default_rng(40971)
+    points = patch.random_points(3000, 40972)
+    carried, rounds, run = Carried(engine, points), [], Engine.run_each
+
+    def watched(self, kernel, size, *args, **kwargs):
+        if kernel.function_name == "clip_marked":
+            rounds.append(args[0].get()[:size])
+        return run(self, kernel, size, *args, **kwargs)
+
+    monkeypatch.setattr(Engine, "run_each", watched)
+    for share in (0.0, 0.01, 0.1):
+        before = patch.fetch(carried.t)
+        points = points + share * spacing(points) * (rng.random(points.shape) - 0.5)
+        points = np.clip(points, 0, [1, 0.75])
+        rounds.clear()
+        after, was = carried.move(points)
+        assert was
+        pairs = [
+            set(zip(t.owners.tolist(), t.neighbours.tolist(), strict=True)) for t in (before, after)
+        ]
+        changed = {i for i, _ in pairs[0] ^ pairs[1]}
+        first, *others = [*rounds, np.zeros(0, int)]
+        assert set(first.tolist()) <= changed
+        # Two changes beside each other are found out one after the other.
+        assert len(changed) - len(first) <= 0.02 * len(changed)
+        assert sum(map(len, others)) <= 0.05 * len(changed)
+        assert (share > 0) == (len(changed) > 20)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.2, 2.0])
 def test_sample_first(engine, share, monkeypatch):
     """Checked in two parts rows lead to the same bits; where the sample is mostly wrong, the rest is not looked at."""
