@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from os import fsdecode, fspath
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,28 +25,9 @@ def check_points(points: object, domain: Domain) -> np.ndarray:
     InputError
         If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
     """
-    if np.ma.is_masked(points):
-        raise InputError(
-            f"points has {np.ma.count_masked(points)} masked numbers, expected all to be there; pass "
-            "numpy.ma.compress_rows(points)"
-        )
-    try:
-        array = np.asarray(points)
-    except ValueError as error:
-        raise InputError(
-            f"points is no array ({error}), expected shape (n, {domain.dim})"
-        ) from error
-    if array.dtype.kind not in "fiu":
-        raise InputTypeError(
-            f"points has dtype {array.dtype}, expected real numbers; convert with points.astype(float)"
-        )
-    d = domain.dim
-    if array.ndim != 2 or array.shape[1] != d:
-        remedy = "pass points.T" if array.ndim == 2 and array.shape[0] == d else "reshape it"
-        raise InputError(f"points has shape {array.shape}, expected (n, {d}); {remedy}")
+    array = check_rows("points", points, domain.dim)
     if len(array) == 0:
         raise InputError(f"points has shape {array.shape}, expected at least one generator")
-    array = array.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise InputError(
@@ -57,6 +41,84 @@ def check_points(points: object, domain: Domain) -> np.ndarray:
             "points are); move or remove them, or enlarge the domain"
         )
     return array
+
+
+def check_rows(name: str, value: object, d: int) -> np.ndarray:
+    """Return `value`, an array_like of real numbers, as a float64 array (n, d); n may be 0.
+
+    Raises
+    ------
+    InputTypeError
+        If it holds something else than real numbers.
+    InputError
+        If its shape is another one, or numbers are masked.
+    """
+    if np.ma.is_masked(value):
+        raise InputError(
+            f"{name} has {np.ma.count_masked(value)} masked numbers, expected all to be there; pass "
+            "numpy.ma.compress_rows(array)"
+        )
+    expected = f"expected an array of real numbers of shape (n, {d}), one row per point"
+    try:
+        array = np.asarray(value)
+    except Exception as error:  # whatever an array of another library says
+        kind = InputError if isinstance(error, ValueError) else InputTypeError
+        raise kind(f"{name} is no array ({error}); {expected}") from error
+    if array.ndim == 0:
+        inner = getattr(value, "points", None)
+        hint = f"; pass its points, {name}.points" if isinstance(inner, np.ndarray) else ""
+        raise InputTypeError(f"{name} is a {type(value).__name__}, {expected}{hint}")
+    if array.size == 0 and array.ndim < 3:
+        return np.empty((0, d))
+    if array.dtype.kind not in "fiu":
+        hint = "convert with astype(float)"
+        if array.dtype.kind == "c":
+            hint = "pass numpy.column_stack([z.real, z.imag])"
+        if array.dtype.names:
+            hint = "pass numpy.lib.recfunctions.structured_to_unstructured(array)"
+        raise InputTypeError(f"{name} has dtype {array.dtype}, expected real numbers; {hint}")
+    if array.ndim != 2 or array.shape[1] != d:
+        remedy = "reshape it"
+        if array.ndim == 2:
+            remedy = "pass its transpose, array.T"
+            if array.shape[0] != d:
+                remedy = f"pass its coordinates, array[:, :{d}]"
+        if array.ndim == 2 and array.shape[1] < d:
+            remedy = f"points have {d} coordinates here"
+        if array.ndim == 1 and len(array) != d:
+            remedy = "pass numpy.column_stack([x, y]), say"
+        raise InputError(f"{name} has shape {array.shape}, expected (n, {d}); {remedy}")
+    return array.astype(np.float64)
+
+
+def check_path(name: str, value: object) -> str:
+    """Return `value`, the name of a file, as a string."""
+    try:
+        path = fspath(value)  # type: ignore[call-overload]
+    except TypeError:
+        raise InputTypeError(
+            f"{name} is {value!r} of type {type(value).__name__}, expected the name of a file"
+        ) from None
+    path = fsdecode(path)
+    if "\0" in path:
+        raise InputError(f"{name} is {path!r}, expected the name of a file, without zero bytes")
+    return path
+
+
+def check_callable(name: str, value: Callable[..., object], argument: str, hint: str) -> None:
+    """Refuse a callable that cannot be called with one argument, before it is; most tell what they take."""
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # that of many built-in functions is not known
+        return
+    try:
+        signature.bind(None)
+    except TypeError:
+        kind = "class " if isinstance(value, type) else ""
+        raise InputTypeError(
+            f"{name} is the {kind}{getattr(value, '__name__', type(value).__name__)}{signature}, expected what takes "
+            f"one argument, {argument}; {hint}"
+        ) from None
 
 
 def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:

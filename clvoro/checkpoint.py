@@ -12,12 +12,13 @@ import dataclasses
 import hashlib
 import json
 import time
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ._arrays import check_path
 from .cells import Cells
 from .errors import InputError
 from .made_by import named
@@ -77,6 +78,7 @@ class Checkpointer:
     ) -> None:
         from .io import check_writable
 
+        path = check_path("checkpoint", path)
         if Path(path).is_dir():
             raise InputError(f"checkpoint is {str(path)!r}, a folder, expected the name of a file")
         check_writable(path)
@@ -154,8 +156,8 @@ class Saved:
     def __init__(self, path: str | PathLike[str]) -> None:
         from .io.arrays import read_arrays
 
-        self.name = fspath(path)
-        self.arrays = read_arrays(path, FORMAT, VERSION)
+        self.name = check_path("resume", path)
+        self.arrays = read_arrays(self.name, FORMAT, VERSION)
         version = self.arrays["version"].item()
         if version != VERSION:
             raise InputError(

@@ -154,7 +154,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from .jobs import Job
 
     case = load_case(arguments.case)
-    methods = arguments.method.split(",") if arguments.method else []
+    methods = [] if arguments.method is None else arguments.method.split(",")
     case = case.with_run(
         method=methods[0] if len(methods) == 1 else None,
         methods=methods if len(methods) > 1 else None,

@@ -171,7 +171,7 @@ class Box(Domain):
         if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
             raise InputError(
                 f"Box got lower {self.lower} and upper {self.upper}, expected finite numbers with "
-                "lower < upper in every direction; exchange or correct the corners"
+                "lower < upper in every direction; exchange or correct the corners, as in Box((0, 0), (2.5, 1.5))"
             )
         with np.errstate(over="ignore"):
             extent = upper - lower

@@ -382,14 +382,18 @@ class Polygon(Domain):
         """
         from .sizing.shapes import Edges
 
-        rows = np.arange(len(self.vertices))
+        rows = every = np.arange(len(self.vertices))
         if edges is not None:
             try:
-                rows = np.atleast_1d(rows[edges])  # type: ignore[call-overload]
+                rows = np.atleast_1d(every[edges])  # type: ignore[call-overload]
             except IndexError as error:
                 raise InputError(
-                    f"edges is {edges!r:.60} ({error}), expected numbers below {len(rows)}"
+                    f"edges is {edges!r:.60} ({error}), expected numbers below {len(every)}"
                 ) from error
+            if not rows.size:
+                raise InputError(
+                    f"edges is {edges!r:.60}, expected at least one number below {len(every)}"
+                )
         return Edges(self.vertices[rows], self.vertices[self.next_vertex[rows]])
 
     # The device's view: the polygon never touches the box that cells are clipped by.

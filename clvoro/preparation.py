@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 
@@ -80,7 +81,10 @@ def check_options(
     check_choice("start", start, STARTS)
     check_choice("effort", effort, tuple(EFFORTS))
     if not isinstance(layers, Layers | Sequence):
-        raise InputTypeError(f"layers is {layers!r}, expected clvoro.Layers or a sequence of them")
+        hint = f"; write clvoro.Layers({layers!r})" if isinstance(layers, Real) else ""
+        raise InputTypeError(
+            f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}"
+        )
     return Options(
         method=method,
         start=start,
@@ -155,6 +159,11 @@ class Preparation:
                 place_layers(domain, options.layers),
                 free_domain(domain, options.layers),
             )
+            if n_cells is not None and n_cells < len(self.rows) + self.free.n_pieces:
+                raise InputError(
+                    f"n_cells is {n_cells}, of which layers take {len(self.rows)}, expected at least "
+                    f"{len(self.rows) + self.free.n_pieces}; leave n_cells out, or make the layers' cells wider"
+                )
             field = bounded(given_field, domain, options.layers)
         self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
         self._tree: DensityTree | None = None

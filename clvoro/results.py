@@ -129,7 +129,7 @@ class Diagram:
 
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in Diagram._NAMES:
-            raise AttributeError(name)
+            raise AttributeError(f"a Diagram has no {name!r}", name=name, obj=self)
         if name == "shifts" and name not in self._arrays:
             self._arrays[name] = np.zeros((len(self.neighbours), self.domain.dim), np.int8)
         if name not in self._arrays:

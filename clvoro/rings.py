@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from ._arrays import check_rows
 from .domain import LARGEST_EDGE
 from .errors import InputError, InputTypeError, MisfitWarning
 
@@ -104,19 +106,17 @@ def _halves(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _cleaned(given: object, name: str) -> Ring:
     """Take a ring as it was given; drop vertices that are the same as the next."""
-    try:
-        array = np.asarray(given)
-    except ValueError as error:
-        raise InputError(
-            f"Polygon's {name} is no array ({error}), expected shape (k, 2)"
-        ) from error
-    if array.dtype.kind not in "fiu":
-        raise InputTypeError(f"Polygon's {name} has dtype {array.dtype}, expected real numbers")
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise InputError(
-            f"Polygon's {name} has shape {array.shape}, expected (k, 2): one row per vertex"
+    hint = _other_maker(given)
+    if hint:
+        raise InputTypeError(
+            f"Polygon's {name} is a {type(given).__name__}, expected its vertices (k, 2); {hint}"
         )
-    array = array.astype(np.float64) + 0.0  # which makes -0.0 0.0: equal polygons have equal bytes
+    try:
+        array = check_rows(f"Polygon's {name}", given, 2)
+    except (InputError, InputTypeError) as error:
+        hint = _other_nesting(given, name)
+        raise type(error)(f"{error}{hint}") from error
+    array = array + 0.0  # which makes -0.0 0.0: equal polygons have equal bytes
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise InputError(
@@ -131,6 +131,33 @@ def _cleaned(given: object, name: str) -> Ring:
             f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
         )
     return Ring(vertices, np.flatnonzero(long), len(array), name)
+
+
+def _other_maker(given: object) -> str:
+    """Tell how a Polygon is made of something that is no ring, but known."""
+    if isinstance(given, str | PathLike):
+        geojson = str(given).lstrip().startswith("{") or Path(given).suffix.endswith("json")
+        return f"write clvoro.Polygon.{'from_geojson' if geojson else 'from_wkt'}(...)"
+    if type(given).__module__.startswith("shapely"):
+        return "write clvoro.Polygon.from_shapely(...)"
+    if isinstance(given, Mapping) or hasattr(given, "__geo_interface__"):
+        return "write clvoro.Polygon.from_geojson(...)"
+    return ""
+
+
+def _other_nesting(given: object, name: str) -> str:
+    """Tell what is to be done with rings that are in too many lists, or in too few."""
+    if not isinstance(given, list | tuple | np.ndarray) or not len(given):
+        return ""
+    if isinstance(given[0], Real):
+        return (
+            ""
+            if name.startswith("outer") or len(given) != 2
+            else " (holes is a list of rings: of one, [ring])"
+        )
+    first = given[0]
+    nested = isinstance(first, list | tuple | np.ndarray) and len(first) and np.ndim(first[0]) == 1
+    return " (of several rings, write clvoro.Polygon(rings[0], rings[1:]))" if nested else ""
 
 
 def _check_lengths(rings: Sequence[Ring]) -> None:
@@ -177,10 +204,11 @@ def _shape(piece: Sequence[Ring]) -> Any:
     return shapely.Polygon(piece[0].vertices, [hole.vertices for hole in piece[1:]])
 
 
+_UNITE = "unite the pieces (shapely.union_all)"
 _REMEDIES = {
     "Hole lies outside shell": "leave the hole out, or make it a piece of its own",
     "Holes are nested": "unite the holes, or make what lies in a hole a piece of its own",
-    "Nested shells": "unite the pieces (shapely.union_all)",
+    "Nested shells": _UNITE,
     "Interior is disconnected": "give the parts as pieces of their own",
 }
 
@@ -204,7 +232,10 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
         for ring, (d, e) in zip(rings, away, strict=True)
         if d <= close
     )
-    remedy = _REMEDIES.get(reason, "correct it (shapely.make_valid shows what can be made of it)")
+    remedy = "correct it (shapely.make_valid shows what can be made of it)"
+    if shape.geom_type == "MultiPolygon":  # each piece of which is valid
+        remedy = _UNITE
+    remedy = _REMEDIES.get(reason, remedy)
     raise InputError(f"Polygon is not valid: {reason} at {_at(place)}, {where}; {remedy}")
 
 
@@ -239,7 +270,11 @@ def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
     """Return the rings of a shapely Polygon or MultiPolygon, piece by piece."""
     kind = getattr(geometry, "geom_type", type(geometry).__name__)
     if kind not in ("Polygon", "MultiPolygon"):
-        raise InputTypeError(f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon")
+        several = isinstance(geometry, list | tuple | np.ndarray) or kind == "GeometryCollection"
+        hint = "; pass shapely.union_all(polygons)" if several else ""
+        raise InputTypeError(
+            f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon{hint}"
+        )
     parts = geometry.geoms if kind == "MultiPolygon" else [geometry]
     found = [
         [np.asarray(ring.coords)[:, :2] for ring in (part.exterior, *part.interiors)]
@@ -254,6 +289,8 @@ def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
 def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[list[object]]:
     """Return the rings of the polygons in a GeoJSON file, text or object, piece by piece."""
     name = "GeoJSON"
+    # What shapely, geopandas and their kin make of themselves.
+    source = getattr(source, "__geo_interface__", source)
     if isinstance(source, Mapping):
         found: Any = source
     else:
@@ -265,7 +302,7 @@ def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[l
         if text is None:
             name = str(source)
             try:
-                text = Path(source).read_text(encoding="utf-8")
+                text = Path(source).read_text(encoding="utf-8-sig")
             except (OSError, UnicodeDecodeError) as error:
                 raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
         try:
@@ -321,7 +358,9 @@ def _pieces(node: object, name: str) -> Iterator[list[object]]:
             yield from _pieces(member, name)
     elif kind == "Feature":
         if node.get("geometry") is None:
-            raise InputError(f"{name} holds a Feature without geometry, expected Polygons only")
+            raise InputError(
+                f"{name} holds a Feature without geometry, expected Polygons only; leave it out"
+            )
         yield from _pieces(node["geometry"], name)
     elif kind == "Polygon":
         yield [_flat(ring, name) for ring in _list(node, "coordinates", name)]
@@ -331,7 +370,9 @@ def _pieces(node: object, name: str) -> Iterator[list[object]]:
                 raise InputError(f"{name} has a MultiPolygon of {piece!r:.40}, expected lists")
             yield [_flat(ring, name) for ring in piece]
     else:
-        raise InputError(f"{name} holds a {kind!r:.40}, expected Polygon or MultiPolygon only")
+        raise InputError(
+            f"{name} holds a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out"
+        )
 
 
 def _flat(ring: object, name: str) -> object:

@@ -206,7 +206,7 @@ def test_duplicates_are_named(adapter):
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (np.zeros((2, 100)), r"shape \(2, 100\), expected \(n, 2\); pass points.T"),
+        (np.zeros((2, 100)), r"shape \(2, 100\), expected \(n, 2\); pass its transpose"),
         (np.zeros((3, 3)), r"shape \(3, 3\), expected \(n, 2\)"),
         (np.zeros(4), r"shape \(4,\)"),
         (np.zeros((0, 2)), "at least one"),
@@ -214,7 +214,7 @@ def test_duplicates_are_named(adapter):
         ([[0.1, 0.1], [3.0, 0.1]], r"points\[1\] is .*outside"),
         ([["a", "b"]], "dtype"),
         ([[1j, 0.2]], "dtype"),
-        (None, "dtype"),
+        (None, "points is a NoneType"),
     ],
 )
 def test_bad_points(adapter64, points, message):

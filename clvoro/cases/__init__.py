@@ -197,7 +197,7 @@ def load_case(name: str | Path) -> Case:
         return Case.from_toml(known[str(name)], str(name))
     path = Path(name)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         near = difflib.get_close_matches(str(name), list(known), 1, 0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -114,7 +114,9 @@ def list_of(check_item: Check, least: int = 1) -> Check:
 
     def check(value: object, place: str) -> list[object]:
         if not isinstance(value, (list, tuple)) or len(value) < least:
-            raise refuse(place, value, f"a list with {least} or more entries")
+            single = isinstance(value, Mapping) and least == 1
+            hint = "; put it in [ ], or under a heading in double brackets" if single else ""
+            raise refuse(place, value, f"a list with {least} or more entries{hint}")
         return [check_item(v, f"{place}[{i}]") for i, v in enumerate(value)]
 
     return check

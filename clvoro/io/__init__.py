@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 
+from .._arrays import check_path
 from ..errors import InputError, InputTypeError
 from ..results import Result
 from .atomic import check_writable
@@ -48,6 +49,7 @@ def load(path: str | PathLike[str]) -> Result:
         wrong.
 
     """
+    path = check_path("path", path)
     return (load_vtu if Path(path).suffix.lower() == ".vtu" else load_npz)(path)
 
 
@@ -84,7 +86,7 @@ def save(
             f"result is a {type(result).__name__}, expected a clvoro.Result; pass what "
             "Adapter.run returned"
         )
-    path = Path(path)
+    path = Path(check_path("path", path))
     if path.name == "polyMesh" or path.suffix.lower() == ".foam":
         write_foam(result, path, patches)
         return

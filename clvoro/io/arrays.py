@@ -99,7 +99,9 @@ def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str,
     number = read_member(archive, members["version"])
     if number.dtype.kind not in "iu" or number.shape != ():
         raise FileError(f"its version is {number!r:.60}, expected an integer")
-    if not 1 <= number.item() <= version:
+    if number.item() < 1:
+        raise FileError(f"its version is {number.item()}, expected 1 to {version}")
+    if number.item() > version:
         raise FileError(
             f"its version is {number.item()}, expected at most {version}; install a newer clvoro"
         )

@@ -1,5 +1,14 @@
 """Pictures of meshes and runs, and a page that shows them (needs Matplotlib, extra `plot`)."""
 
+from ..errors import ClvoroError
+
+try:
+    import matplotlib  # noqa: F401
+except ModuleNotFoundError as error:
+    raise ClvoroError(
+        "pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'"
+    ) from error
+
 from .cells import plot_cells, plot_size
 from .curves import plot_displacements, plot_history
 from .page import write_report

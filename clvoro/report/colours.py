@@ -137,8 +137,8 @@ _SOLID_COLOURINGS = {
 def colouring(name: str, dim: int = 2) -> Colouring:
     """Return the colouring of that name for cells in `dim` dimensions, or raise InputError."""
     known = COLOURINGS if dim == 2 else _SOLID_COLOURINGS
-    if name not in known:
-        raise InputError(f"colour is {name!r}, expected one of {', '.join(known)}")
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"colour is {name!r:.60}, expected one of {', '.join(known)}")
     return known[name]
 
 

@@ -6,18 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from ..errors import ClvoroError
 from ..results import Result
-
-try:
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-except ModuleNotFoundError as error:
-    raise ClvoroError(
-        "pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'"
-    ) from error
 
 WIDTH = 7.0
 """Width of a full-width picture, inches."""

@@ -74,6 +74,11 @@ class Distance(Field):
         h_max: float = math.inf,
         slope: float | None = None,
     ):
+        if not isinstance(shapes, (Shape, Iterable)):
+            raise InputTypeError(
+                f"Distance got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
+                "such as Distance(Circle((0.5, 0.5), 0.1), h_min=0.01, growth=1.2)"
+            )
         self.shapes = (shapes,) if isinstance(shapes, Shape) else tuple(shapes)
         for shape in self.shapes:
             if not isinstance(shape, Shape):

@@ -220,7 +220,8 @@ class _Parser:
         number = re.match(r"\.?\d[\w.]*", rest, re.ASCII)
         if number:
             self._fail(f"{number[0]!r} is no number; write 0.5 or 5e-1, without suffix", column)
-        self._fail(f"unexpected character {rest[0]!r}", column)
+        power = "; write pow(a, b) for a power" if rest[0] == "^" else ""
+        self._fail(f"unexpected character {rest[0]!r}{power}", column)
 
     def _kind(self) -> str:
         return self.tokens[self.at][0]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError, InputTypeError
+from .._arrays import check_callable
+from ..errors import ClvoroError, InputError, InputTypeError, SizeFieldError
 
 if TYPE_CHECKING:
     from ..domain import Domain
@@ -179,19 +180,51 @@ class Function(Field):
                 f"Function got {type(function).__name__}, expected a callable "
                 "h(points (n, d)) -> (n,)"
             )
+        check_callable(
+            "size", function, "points (n, d)",
+            "write lambda points: h(points[:, 0], points[:, 1]) around a function of x and y",
+        )  # fmt: skip
         self.function = function
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
-        sizes = np.asarray(self.function(np.ascontiguousarray(points)))
-        if sizes.dtype.kind not in "fiu":
+        n = len(points)
+        try:
+            # A copy: what the function does to its argument is its own affair.
+            given = self.function(np.array(points, dtype=float, order="C"))
+        except (TypeError, ValueError) as error:
+            if isinstance(error, ClvoroError):
+                raise
+            # Formulas for a single point end so, most likely.
+            kind = InputTypeError if isinstance(error, TypeError) else InputError
+            raise kind(
+                f"{self!r} failed for points of shape {points.shape} ({error}), expected sizes of shape ({n},); it "
+                "must be vectorised: points[:, 0] are all x, numpy.sqrt takes arrays, and numpy.where stands for if"
+            ) from error
+        try:
+            sizes = np.asarray(given)
+        except Exception as error:  # whatever an array of another library says
             raise InputTypeError(
-                f"{self!r} returned values of type {sizes.dtype}, expected real numbers of shape "
-                f"({len(points)},)"
+                f"{self!r} returned a {type(given).__name__} that is no array ({error}), expected real numbers of "
+                f"shape ({n},)"
+            ) from error
+        if np.ma.is_masked(given):
+            raise SizeFieldError(
+                f"{self!r} returned {np.ma.count_masked(given)} masked sizes for {n} points, expected all to be there; "
+                "fill them, by numpy.ma.filled(sizes, value)"
             )
-        if sizes.shape != (len(points),):
+        if sizes.dtype.kind not in "fiu":
+            what = "None" if given is None else f"values of type {sizes.dtype}"
+            raise InputTypeError(f"{self!r} returned {what}, expected real numbers of shape ({n},)")
+        if sizes.shape != (n,):
+            hint = "it must be vectorised, h(points (n, d)) -> (n,)"
+            if sizes.shape == ():
+                hint = "it must be vectorised; of a size that is the same everywhere give the number itself"
+            elif sizes.shape == (n, 1):
+                hint = "return its only column, sizes[:, 0]"
+            elif sizes.shape == points.shape[1:]:
+                hint = "it must be vectorised: points[:, 0] are all x, points[0] is a point"
             raise InputError(
-                f"{self!r} returned shape {sizes.shape} for {len(points)} points, expected "
-                f"({len(points)},); it must be vectorised, h(points (n, d)) -> (n,)"
+                f"{self!r} returned shape {sizes.shape} for {n} points, expected ({n},); {hint}"
             )
         return sizes.astype(float)
 
@@ -326,11 +359,17 @@ def as_field(size: object) -> Field:
         return Constant(float(size))
     if callable(size):
         return Function(size)
+    from .distance import Shape  # which stands on this
+
     hint = ""
     if isinstance(size, str):
         hint = f"; write sizing.Expression({size!r})"
     elif isinstance(size, (np.ndarray, list, tuple)):
-        hint = "; write sizing.Raster(values, lower, upper)"
+        hint = (
+            "; write sizing.Raster(values, lower, upper), and points= for generators to start from"
+        )
+    elif isinstance(size, Shape):
+        hint = "; write sizing.Distance(shape, h_min, growth) for cells that grow away from it"
     raise InputTypeError(
         f"size is {type(size).__name__}, expected a number, a callable h(points (n, d)) -> (n,) "
         f"or a field of clvoro.sizing{hint}"

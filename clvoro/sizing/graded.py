@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .bind import Binder
 
 _MOST = 1 << 22  # nodes
+_MOST_GIVEN = 2**31 - 1  # nodes of a resolution that the caller gives
 _BATCH = 1 << 18  # nodes evaluated at once
 _PROBES = {2: 129, 3: 33}  # nodes along the longest side of the grid that looks for the least size
 
@@ -203,7 +204,13 @@ class Graded(Field):
             return np.array(self.resolution)
         longest = box.extent.max()
         if self.resolution is not None:
-            return _along(box, longest / (self.resolution - 1))
+            counts = _along(box, longest / (self.resolution - 1))
+            if np.prod(counts, dtype=float) > _MOST_GIVEN:
+                raise InputError(
+                    f"Graded resolution is {self.resolution}, which makes {np.prod(counts, dtype=float):.3g} nodes of "
+                    f"{box!r}, expected fewer than 2^31; leave it out, or give less"
+                )
+            return counts
         coarse = longest / (_PROBES[box.dim] - 1)
         counts = _along(box, coarse)
         grid = _axes(box, counts)
@@ -262,8 +269,7 @@ def _checked(resolution: int | Sequence[int], dim: int | None) -> int | tuple[in
         raise InputError(
             f"Graded resolution has shape {given.shape}, expected one number of nodes or one per axis"
         )
-    most = 2**31 - 1
-    if given.min() < 2 or np.prod(given, dtype=float) > most:
+    if given.min() < 2 or np.prod(given, dtype=float) > _MOST_GIVEN:
         raise InputError(
             f"Graded resolution is {resolution!r}, expected at least 2 nodes along each axis and "
             "fewer than 2^31 in all"
