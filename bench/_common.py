@@ -10,6 +10,7 @@ import json
 import math
 import statistics
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
@@ -88,6 +89,32 @@ def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
         return clvoro.Adapter(clvoro.create_context(options.device), dtype=options.dtype)
     except clvoro.ClvoroError as error:
         raise SystemExit(f"{type(error).__name__}: {error}") from error
+
+
+def clock_of(
+    options: argparse.Namespace, adapter: clvoro.Adapter | None = None
+) -> Callable[[], float]:
+    """Return the clock; with `--processor-time` the time that this process has had of the processors.
+
+    That is divided by the compute units of the adapter's device, as if all of them had worked: of one that is quiet
+    both are the same.
+    """
+    if not options.processor_time:
+        return time.perf_counter
+    units = 1 if adapter is None else adapter.ctx.devices[0].max_compute_units
+    return lambda: time.process_time() / units
+
+
+def best(
+    repeat: int, function: Callable[[], Any], clock: Callable[[], float] = time.perf_counter
+) -> tuple[float, Any]:
+    """Return the least of `repeat` times of `function` by `clock`, and its last result."""
+    times = []
+    for _ in range(repeat):
+        start = clock()
+        result = function()
+        times.append(clock() - start)
+    return min(times), result
 
 
 def device_name(adapter: clvoro.Adapter) -> str:

@@ -39,12 +39,11 @@ import argparse
 import math
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import Report, counts, heading, make_adapter, markdown, names, parser
+from _common import Report, best, clock_of, counts, heading, make_adapter, markdown, names, parser
 
 import clvoro
 from clvoro._hooks import watching
@@ -280,10 +279,8 @@ def measure(
     """Return the records of one set: cold and warm."""
     rng = np.random.default_rng(SEED + n)
     points = sets_of(options)[name](n, rng).astype(adapter.dtype)
-    repeat, clock, kernel_clock = options.repeat, time.perf_counter, None
-    if options.processor_time:
-        units = adapter.ctx.devices[0].max_compute_units
-        clock = kernel_clock = lambda: time.process_time() / units
+    repeat, clock = options.repeat, clock_of(options, adapter)
+    kernel_clock = clock if options.processor_time else None
     plain = Tessellator(Engine(adapter.ctx, adapter.queue, options.dim, adapter.dtype), points)
     queue = plain.engine.queue
     order = median_time(queue, repeat, plain.order, clock)
@@ -314,18 +311,15 @@ def measure(
             record |= {"order": order, "whole_rate": n / (order + seconds)}
         records.append(record)
     if options.scipy and n <= options.scipy_up_to:
-        records[0]["scipy"] = scipy_time(points, options.processor_time)
+        records[0]["scipy"] = scipy_time(points, clock_of(options))
         records[0]["over_scipy"] = records[0]["scipy"] * records[0]["whole_rate"] / n
     return records
 
 
-def scipy_time(points: np.ndarray, processor_time: bool) -> float:
+def scipy_time(points: np.ndarray, clock: Callable[[], float]) -> float:
     from scipy.spatial import Voronoi
 
-    clock = time.process_time if processor_time else time.perf_counter
-    start = clock()
-    Voronoi(points)
-    return clock() - start
+    return best(1, lambda: Voronoi(points), clock)[0]
 
 
 def shown(figure: str, scale: float, form: str) -> Callable[[dict[str, Any]], str]:

@@ -43,6 +43,7 @@ from _common import (
     BOX,
     FIRST_SEED,
     Report,
+    best,
     cell_quality,
     counts,
     figures,
@@ -104,15 +105,6 @@ class MissingPeerError(Exception):
     """A peer is not there; says what to install."""
 
 
-def best_of(repeat: int, function: Callable[[], object]) -> float:
-    times = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 # Diagrams.
 
 
@@ -122,7 +114,7 @@ def diagram_clvoro(adapter: clvoro.Adapter, points: np.ndarray) -> float:
         adapter.queue.finish()
 
     run()
-    return best_of(2, run)
+    return best(2, run)[0]
 
 
 def diagram_fetched(adapter: clvoro.Adapter, points: np.ndarray) -> float:
@@ -133,13 +125,13 @@ def diagram_fetched(adapter: clvoro.Adapter, points: np.ndarray) -> float:
             getattr(diagram, name)
 
     run()
-    return best_of(2, run)
+    return best(2, run)[0]
 
 
 def diagram_scipy(_: clvoro.Adapter, points: np.ndarray) -> float:
     from scipy.spatial import Voronoi
 
-    return best_of(1, lambda: Voronoi(points))
+    return best(1, lambda: Voronoi(points))[0]
 
 
 def diagram_voropp(_: clvoro.Adapter, points: np.ndarray) -> float:

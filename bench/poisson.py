@@ -13,15 +13,13 @@ units: what the wall clock shows on a machine without other work.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
-from _common import Report, counts, heading, make_adapter, parser
+from _common import Report, best, clock_of, counts, heading, make_adapter, parser
 
 import clvoro
 from clvoro._program import Engine
@@ -60,16 +58,6 @@ def make_graph(adapter: clvoro.Adapter, n: int, mesh: str) -> clvoro.Diagram:
     return adapter.diagram(box, points[morton_order(points)])
 
 
-def best(repeat: int, clock: Callable[[], float], function: Callable[[], Any]) -> tuple[float, Any]:
-    """Least of `repeat` times of `function` by `clock`, and its last result."""
-    times = []
-    for _ in range(repeat):
-        start = clock()
-        result = function()
-        times.append(clock() - start)
-    return min(times), result
-
-
 def ours(
     engine: Engine,
     diagram: clvoro.Diagram,
@@ -78,7 +66,6 @@ def ours(
     tolerance: float,
     repeat: int,
     clock: Callable[[], float],
-    cores: int,
 ) -> Outcome:
     poisson = Poisson(engine)
     arrays = (
@@ -103,10 +90,10 @@ def ours(
         )
 
     set_up()
-    seconds_set_up, laplacian = best(repeat, clock, set_up)
+    seconds_set_up, laplacian = best(repeat, set_up, clock)
     solve()
-    seconds, solution = best(repeat, clock, solve)
-    return solution.iterations, solution.residual, seconds_set_up / cores, seconds / cores
+    seconds, solution = best(repeat, solve, clock)
+    return solution.iterations, solution.residual, seconds_set_up, seconds
 
 
 def matrix(diagram: clvoro.Diagram) -> sp.csr_matrix:
@@ -127,22 +114,22 @@ def with_pyamg(
     # One addition to the diagonal makes the matrix definite, as pyamg needs it, and leaves x_0 = 0.
     A = A.copy()
     A[0, 0] *= 2
-    set_up, ml = best(repeat, clock, lambda: pyamg.smoothed_aggregation_solver(A))
+    set_up, ml = best(repeat, lambda: pyamg.smoothed_aggregation_solver(A), clock)
     residuals = []
 
     def solve():
         residuals.clear()
         return ml.solve(b, tol=tolerance, accel="cg", residuals=residuals, maxiter=300)
 
-    seconds, x = best(repeat, clock, solve)
+    seconds, x = best(repeat, solve, clock)
     residual = np.linalg.norm(b - A @ x) / np.linalg.norm(b)
     return len(residuals) - 1, residual, set_up, seconds
 
 
 def with_scipy(A: sp.csr_matrix, b: np.ndarray, clock: Callable[[], float]) -> Outcome:
-    set_up, lu = best(1, clock, lambda: sla.splu(sp.csc_matrix(A[1:, 1:])))
+    set_up, lu = best(1, lambda: sla.splu(sp.csc_matrix(A[1:, 1:])), clock)
     x = np.zeros(len(b))
-    seconds, x[1:] = best(1, clock, lambda: lu.solve(b[1:]))
+    seconds, x[1:] = best(1, lambda: lu.solve(b[1:]), clock)
     return 1, np.linalg.norm(b - A @ x) / np.linalg.norm(b), set_up, seconds
 
 
@@ -171,9 +158,7 @@ def main() -> None:
     adapter = make_adapter(options)
     engine = Engine(adapter.ctx, cl.CommandQueue(adapter.ctx), 2, adapter.dtype)
     tolerance = 1e-8 if options.dtype == "float64" else 1e-5
-    clock, cores = time.perf_counter, 1
-    if options.processor_time:
-        clock, cores = time.process_time, adapter.ctx.devices[0].max_compute_units
+    clock, clock_of_peers = clock_of(options, adapter), clock_of(options)
     report = Report(options.json, COLUMNS)
     for n in options.sizes:
         diagram = make_graph(adapter, n, options.mesh)
@@ -181,13 +166,13 @@ def main() -> None:
         b -= b.mean()
         rows = {}
         for method in ["multigrid"] + ["jacobi"] * (n <= options.jacobi_up_to):
-            rows[method] = ours(engine, diagram, b, method, tolerance, options.repeat, clock, cores)
+            rows[method] = ours(engine, diagram, b, method, tolerance, options.repeat, clock)
         if n <= options.peers_up_to:
             A = matrix(diagram)
             if pyamg is not None:
-                rows["pyamg"] = with_pyamg(A, b, tolerance, 1 if n > 2e5 else 2, clock)
+                rows["pyamg"] = with_pyamg(A, b, tolerance, 1 if n > 2e5 else 2, clock_of_peers)
             if n <= options.peers_up_to / 10:
-                rows["SciPy LU"] = with_scipy(A, b, clock)
+                rows["SciPy LU"] = with_scipy(A, b, clock_of_peers)
         total = sum(rows["multigrid"][2:])
         for method, (iterations, residual, set_up, solve) in rows.items():
             record = {

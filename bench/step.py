@@ -21,7 +21,6 @@ faces, a division as four.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -29,7 +28,18 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import BOX, Report, counts, heading, make_adapter, markdown, names, parser, test_field
+from _common import (
+    BOX,
+    Report,
+    clock_of,
+    counts,
+    heading,
+    make_adapter,
+    markdown,
+    names,
+    parser,
+    test_field,
+)
 
 import clvoro
 from clvoro._program import Engine
@@ -242,14 +252,14 @@ def main() -> None:
     options_of.add_argument("--repeat", type=int, default=7)
     options_of.add_argument(
         "--processor-time", action="store_true",
-        help="half the process's processor time in the place of the clock's, where others use the machine's two cores",
+        help="the process's processor time over the device's units in the place of the clock's, where others use them",
     )  # fmt: skip
     options = options_of.parse_args()
     if unknown := set(options.kinds) - set(KINDS):
         options_of.error(f"no step {', '.join(unknown)}; there are {', '.join(KINDS)}")
 
-    clock = (lambda: time.process_time() / 2) if options.processor_time else time.perf_counter
     adapter = make_adapter(options)
+    clock = clock_of(options, adapter)
     report = Report(options.json, COLUMNS)
     for n in options.sizes:
         field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5

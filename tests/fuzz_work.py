@@ -6,6 +6,7 @@ import contextlib
 import io
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,24 +66,29 @@ def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
             raise Wrong("; ".join([*found, f"{outside.sum()} outside"]))
 
 
+# Boxes that are tried: for diagrams and for runs.
+
+Boxes = Callable[[np.random.Generator, bool], clvoro.Box]
+
+
+def in_plane(rng: np.random.Generator, wild: bool) -> clvoro.Box:
+    return some_box(rng, 2, wild)
+
+
+def in_space(rng: np.random.Generator, wild: bool) -> clvoro.Box:
+    return some_box(rng, 3, wild)
+
+
+def with_seams(rng: np.random.Generator, wild: bool) -> clvoro.Box:
+    return some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild)
+
+
 # Diagrams.
 
 
-def try_diagram(rng: np.random.Generator) -> str:
-    return diagram_of(rng, lambda wild: some_box(rng, 2, wild))
-
-
-def try_solid(rng: np.random.Generator) -> str:
-    return diagram_of(rng, lambda wild: some_box(rng, 3, wild))
-
-
-def try_periodic(rng: np.random.Generator) -> str:
-    return diagram_of(rng, lambda wild: some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild))
-
-
-def diagram_of(rng: np.random.Generator, domain: Callable[[bool], clvoro.Box]) -> str:
+def try_diagram(boxes: Boxes, rng: np.random.Generator) -> str:
     wild, real = rng.random() < 2 * WILD, some_real(rng)
-    box = domain(wild)
+    box = boxes(rng, wild)
     diagram = adapter(real).diagram(box, placed(rng, box, real, wild))
     demand(diagram, real)
     if rng.random() < 0.1 and len(adapter(real).diagram(box, diagram.points)) != len(diagram):
@@ -102,21 +108,9 @@ def try_polygon(rng: np.random.Generator) -> str:
 # Runs.
 
 
-def try_run(rng: np.random.Generator) -> str:
-    return try_box(rng, lambda wild: some_box(rng, 2, wild))
-
-
-def try_solid_run(rng: np.random.Generator) -> str:
-    return try_box(rng, lambda wild: some_box(rng, 3, wild))
-
-
-def try_periodic_run(rng: np.random.Generator) -> str:
-    return try_box(rng, lambda wild: some_periodic_box(rng, int(rng.choice([2, 2, 3])), wild))
-
-
-def try_box(rng: np.random.Generator, domain: Callable[[bool], clvoro.Box]) -> str:
+def try_run(boxes: Boxes, rng: np.random.Generator) -> str:
     wild = rng.random() < WILD
-    return run(rng, domain(wild), wild)
+    return run(rng, boxes(rng, wild), wild)
 
 
 def try_polygon_run(rng: np.random.Generator) -> str:
@@ -411,14 +405,14 @@ def try_file(rng: np.random.Generator) -> str:
 
 
 WORK = {
-    "diagram": (try_diagram, 0.3),
-    "solid": (try_solid, 0.12),
+    "diagram": (partial(try_diagram, in_plane), 0.3),
+    "solid": (partial(try_diagram, in_space), 0.12),
     "polygon": (try_polygon, 0.15),
-    "periodic": (try_periodic, 0.12),
-    "run": (try_run, 0.15),
-    "solid-run": (try_solid_run, 0.08),
+    "periodic": (partial(try_diagram, with_seams), 0.12),
+    "run": (partial(try_run, in_plane), 0.15),
+    "solid-run": (partial(try_run, in_space), 0.08),
     "polygon-run": (try_polygon_run, 0.1),
-    "periodic-run": (try_periodic_run, 0.12),
+    "periodic-run": (partial(try_run, with_seams), 0.12),
     "layers": (try_layers, 0.1),
     "resumed": (try_resumed, 0.06),
     "moved": (try_moved, 0.05),

@@ -42,6 +42,17 @@ def descend(engine, points, h, emphasis, rate=0.1, longest=0.2, quality=None):
     return out.get()
 
 
+def gradient_of(energy, points, some=None, step=1e-5):
+    """Return dE/dx (n, 2) of generators, of `some` or all, by central differences."""
+    gradient = np.zeros(points.shape)
+    for i in range(len(points)) if some is None else some:
+        for a in range(2):
+            by = np.zeros(points.shape)
+            by[i, a] = step
+            gradient[i, a] = (energy(points + by) - energy(points - by)) / (2 * step)
+    return gradient
+
+
 @pytest.mark.parametrize("emphasis", [0.0, 20.0])
 def test_gradient(ctx, emphasis):
     """Every generator, those at walls and in corners included, moves by -rate h^2 dE/dx."""
@@ -49,14 +60,7 @@ def test_gradient(ctx, emphasis):
     h = np.random.default_rng(6).uniform(0.05, 0.2, N)
     u = descend(patch.make_engine(ctx), points, h, emphasis, rate=0.3, longest=1e9)
     omega = 1 - emphasis * np.log(qualities(points)[:, 0])
-    step = 1e-5
-    gradient = np.zeros((N, 2))
-    for i in range(N):
-        for a in range(2):
-            ahead, behind = points.copy(), points.copy()
-            ahead[i, a] += step
-            behind[i, a] -= step
-            gradient[i, a] = (energy(ahead, omega) - energy(behind, omega)) / (2 * step)
+    gradient = gradient_of(lambda x: energy(x, omega), points)
     expected = -0.3 * h[:, None] ** 2 * gradient
     # Central differences: rounding of E (about 100 (1 + emphasis)) over the step, curvature times its square.
     assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
@@ -87,7 +91,7 @@ def test_gradient_in_a_polygon(ctx):
     )
     # E is the same in any unit.
     unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
-    omega, step = 1 - 5 * np.log(q), 1e-5
+    omega = 1 - 5 * np.log(q)
 
     def energy(points):
         cells = polygon_voronoi(domain, points)
@@ -96,14 +100,7 @@ def test_gradient_in_a_polygon(ctx):
             perimeter[i] += length
         return float((omega * (2 * np.log(perimeter) - np.log(cells.areas))).sum())
 
-    gradient = np.zeros((n, 2))
-    for i in range(n):
-        for a in range(2):
-            ahead, behind = points.copy(), points.copy()
-            ahead[i, a] += step
-            behind[i, a] -= step
-            gradient[i, a] = (energy(ahead) - energy(behind)) / (2 * step)
-    expected = -0.3 * (h[:, None]) ** 2 * gradient * unit
+    expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points) * unit
     # As above.
     assert out.get() == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
@@ -124,20 +121,14 @@ def test_gradient_across_seams(ctx, periodic):
     Shape(engine).descend(
         t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
     )
-    omega, step = 1 - 5 * np.log(q), 1e-5
+    omega = 1 - 5 * np.log(q)
 
     def energy(points):
         d = adapter.diagram(box, points)
         perimeter = np.add.reduceat(d.face_measures, d.neighbour_starts[:-1])
         return float((omega * (2 * np.log(perimeter) - np.log(d.volumes))).sum())
 
-    gradient = np.zeros((n, 2))
-    for i in some:
-        for a in range(2):
-            by = np.zeros((n, 2))
-            by[i, a] = step
-            gradient[i, a] = (energy(points + by) - energy(points - by)) / (2 * step)
-    expected = -0.3 * h[:, None] ** 2 * gradient
+    expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points, some)
     # As above; what is known of faces while generators move is in single precision.
     scale = np.abs(expected).max()
     assert out.get()[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
