@@ -1,5 +1,6 @@
 #include "common/graph.h"
 #include "common/row_counts.h"
+#include "common/seams.h"
 #include "common/search.h"
 
 inline void raise_flag(global int *report, int flag, int generator)
@@ -23,13 +24,29 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
     return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
 }
 
+#ifdef SEAMS
+/* Look at the balls around the vertices of the cell of generator i. */
+inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *seams)
+{
+    const REAL x[3] = {place.s0, place.s1, place.s2};
+    const REAL reach = sqrt(cell->reach2);
+    const int count = reaches_beyond(x, reach + widest_of(seams) * reach, seams) ? cell->n : 0;
+    for (int v = 0; v < count; ++v) {
+        const INDEX4 f = cell->faces[v];
+        const REAL4 ways[3] = {cell->planes[f.s0], cell->planes[f.s1], cell->planes[f.s2]};
+        const int labels[3] = {cell->labels[f.s0], cell->labels[f.s1], cell->labels[f.s2]};
+        look_at_vertex(x, i, vertex_at(cell, v), ways, labels, seams);
+    }
+}
+#endif
+
 /* Per place p in bin order: the cell of generator i = items[p], its faces and its measures.
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
    cube of bins that it has seen covers that ball. Its radius is left in reach[p], which begins as a guess of it. With
    `warm` the neighbours of an earlier, similar diagram are clipped first, and the search only has to confirm them. Only
-   the first `rows` generators get cells.
+   the first `rows` generators get cells; of those in a periodic box the balls around their vertices are looked at.
 
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
@@ -45,7 +62,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
                        global const int *old_neighbours, const int again, const int room, const REAL share,
                        global int *row_places, global int *row_counts, global int *labels, global REAL *measures,
                        global REAL *centroids, global REAL *volumes, global REAL *offsets, global REAL *covariances,
-                       global int *report)
+                       global int *report SEAM_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -78,6 +95,11 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
     /* A search that is to be repeated begins with a guess as before: from 0 it would never widen. */
     if (flag == 0 && cell.reach2 > 0)
         reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+#ifdef SEAMS
+    SEAMS_GIVEN;
+    if (i < seams.own)
+        look_at_cell(&cell, i, x, &seams);
+#endif
 
     /* A vertex of every face. */
     INDEX start[FACE_CAPACITY];

@@ -30,8 +30,9 @@ inline int4 first_of_cube(int cube, int4 shape)
     return CUBE * (int4)(cube % across, cube / across % deep, cube / across / deep, 0);
 }
 
-/* Per cube: the number of generators there. */
-kernel void count_cubes(const int size, global const int2 *bins, global const int4 *grid_shapes, global int *counts)
+/* Per cube: the number of generators there that get cells, the first `rows`. */
+kernel void count_cubes(const int size, const int rows, global const int *items, global const int2 *bins,
+                        global const int4 *grid_shapes, global int *counts)
 {
     WORK_ITEM(cube);
     const int4 shape = grid_shapes[0], first = first_of_cube(cube, shape);
@@ -41,16 +42,17 @@ kernel void count_cubes(const int size, global const int2 *bins, global const in
     for (int z = first.s2; z < end_z; ++z)
         for (int y = first.s1; y < end_y; ++y) {
             global const int2 *row = bins + (z * shape.s2 + y) * shape.s1;
-            count += row[end_x].s0 - row[first.s0].s0;
+            for (int place = row[first.s0].s0; place < row[end_x].s0; ++place)
+                count += items[place] < rows;
         }
     counts[cube] = count;
 }
 
-/* Per cube: the places of its generators, from order[starts[cube]] on, so that those which follow each other are near
+/* Per cube: the places of those generators, from order[starts[cube]] on, so that those which follow each other are near
    each other: along Morton's curve through its bins, and through those of a divided bin before the next. Rows of bins,
    in whose order places are, are long where generators are sparse. */
-kernel void order_places(const int size, global const int2 *bins, global const int4 *grid_shapes,
-                         global const int *starts, global int *order)
+kernel void order_places(const int size, const int rows, global const int *items, global const int2 *bins,
+                         global const int4 *grid_shapes, global const int *starts, global int *order)
 {
     WORK_ITEM(cube);
     int n = starts[cube];
@@ -71,26 +73,31 @@ kernel void order_places(const int size, global const int2 *bins, global const i
             if (from.s1 != to.s1)
                 child = from.s1;
             for (int place = from.s0; place < to.s0 && child < 0; ++place)
-                order[n++] = place;
+                if (items[place] < rows)
+                    order[n++] = place;
         }
         leave_grid(&way, child, (int4)(code, 0, 0, 0), (int4)(0));
     }
 }
 
-/* Per stretch of places in bin order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
+/* Per stretch of that order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
    UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in units of
-   `spacing`. Only the first `rows` generators get cells. */
-kernel void wrap_cells(const int size, const int n, const int rows, global const int *order,
-                       global const double *binned, global const int *items, global const float *spacing,
-                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
-                       global const int4 *grid_shapes, const double4 box_lower, const double4 box_upper,
-                       const double first_reach, const int room, global int *row_places, global int *row_counts,
-                       global int *labels, global double *measures, global double *centroids, global double *volumes,
-                       global double *offsets, global double *covariances, global int *report)
+   `spacing`. In a periodic box the balls around the vertices of the generators' own cells are looked at. */
+kernel void wrap_cells(const int size, const int rows, global const int *order, global const double *binned,
+                       global const int *items, global const float *spacing, global float *reach,
+                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                       const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
+                       global int *row_places, global int *row_counts, global int *labels, global double *measures,
+                       global double *centroids, global double *volumes, global double *offsets,
+                       global double *covariances, global int *report SEAM_ARGS)
 {
     WORK_ITEM(stretch);
-    const output_t out = {room,   items,    reach,     row_places, row_counts, labels,
-                          report, measures, centroids, volumes,    offsets,    covariances};
+    output_t out = {room,   items,    reach,     row_places, row_counts, labels,
+                    report, measures, centroids, volumes,    offsets,    covariances};
+#ifdef SEAMS
+    SEAMS_GIVEN;
+    out.seams = seams;
+#endif
     const search_t in = {binned, bins, grid_frames, grid_shapes, box_lower, box_upper};
     runs_t runs;
     near_t near;
@@ -99,7 +106,7 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
     walk_t walk;
     later_t later;
     later.n = 0;
-    const int end = min(n, (stretch + 1) * STRETCH);
+    const int end = min(rows, (stretch + 1) * STRETCH);
     int next = stretch * STRETCH, tried = 0, made = 0;
     double xs[LANES], ys[LANES], zs[LANES], rs[LANES];
     int places[LANES], ranks[LANES], rounds[LANES];
@@ -114,8 +121,6 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
         for (int lane = 0; lane < LANES; ++lane) {
             if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
                 continue;
-            while (next < end && items[order[next]] >= rows)
-                ++next;
             wanted[lane] = guessed[lane] = next < end ? -1 : 0;
             if (next < end) {
                 const int place = order[next];
@@ -169,14 +174,14 @@ kernel void wrap_cells(const int size, const int n, const int rows, global const
                 while (later.n == LANES)
                     walk_later(&later, &runs, &in, &out);
             }
-        made += write_cells(&cells, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need, &out);
+        made += write_cells(&cells, &walk, &m, vload8(0, whole) & certain_cells(&cells, &m, &list), places, need,
+                            binned, &out);
         vstore8(vload8(0, wanted) | (lost & ~vload8(0, open)), 0, wanted);
         vstore8(vload8(0, open) | lost, 0, open);
         vstore8(fresh & ~chosen, 0, guessed);
     }
     for (; next < end; ++next)
-        if (items[order[next]] < rows)
-            row_counts[items[order[next]]] = UNFINISHED;
+        row_counts[items[order[next]]] = UNFINISHED;
     while (later.n > 0)
         walk_later(&later, &runs, &in, &out);
 }

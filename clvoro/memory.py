@@ -9,7 +9,7 @@ import numpy as np
 from ._program import Engine
 from .domain import Domain
 from .errors import MemoryLimitError
-from .seam import BLOCKS
+from .margins import block_counts
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
@@ -40,7 +40,7 @@ def images_expected(
     integral : float
         Of h^-d over the domain.
     """
-    d, count = domain.dim, BLOCKS[domain.dim]
+    d, count = domain.dim, int(block_counts(domain.extent, n)[: domain.dim].max())
     factor, share = (integral / n) ** (1 / d), 1.0
     places = (np.arange(count) + 0.5) / count
     for axis in np.flatnonzero(domain.periodic):

@@ -16,6 +16,7 @@ from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
+from .margins import seam_defines
 from .tessellation import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
 
 FACE_CAPACITY = 64
@@ -44,7 +45,9 @@ class Polyhedra:
         self._kernels(FACE_CAPACITY)
         self._wrap = None
         if engine.group_size == 1 and engine.real == np.float64:
-            defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS}
+            defines = {
+                "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **seam_defines(engine),
+            }  # fmt: skip
             self._walks = engine.kernels("walks", defines)
             self._wrap = self._walks.wrap_cells
         self._report = engine.empty(3, np.int32)
@@ -52,7 +55,9 @@ class Polyhedra:
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
-            defines = {"FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS}
+            defines = {
+                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **seam_defines(self.engine),
+            }  # fmt: skip
             self._programs[capacity] = self.engine.kernels("polyhedra", defines)
         return self._programs[capacity]
 
@@ -102,6 +107,7 @@ class Polyhedra:
         previous: Tessellation | None = None,
         exact: bool = True,
         rows: int | None = None,
+        seams: tuple[object, ...] = (),
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
 
@@ -114,6 +120,9 @@ class Polyhedra:
             their common faces. Without it only by more than `ROUGH_SHARE`.
         rows : int, optional
             Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
+        seams : tuple, optional
+            What balls around the vertices of cells are held against, in a periodic box, and only there: SEAM_ARGS
+            (common/seams.h).
 
         Raises
         ------
@@ -155,16 +164,16 @@ class Polyhedra:
             )  # fmt: skip
             if self._wrap is not None and not again:
                 with engine.workspace.frame():
-                    order = self._ordered(binned, n)
+                    order = self._ordered(binned, rows)
                     engine.run_each(
-                        self._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), order,
-                        binned.points, binned.items, binned.spacing, *search, lower, upper,
-                        first_reach, room, *written, group=1,
+                        self._wrap, -(-rows // STRETCH), np.int32(rows), order, binned.points,
+                        binned.items, binned.spacing, *search, lower, upper, first_reach, room,
+                        *written, *seams, group=1,
                     )  # fmt: skip
             some = np.int32(again or self._wrap is not None)
             engine.run_each(
                 self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items,
-                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written,
+                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *seams,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
@@ -216,12 +225,12 @@ class Polyhedra:
             offsets=cells["offsets"], covariances=cells["covariances"], narrow=bool(flags & NARROW),
         )  # fmt: skip
 
-    def _ordered(self, binned: BinnedPoints, n: int) -> cla.Array:
-        """Return the places of `n` generators so that those which follow each other are near each other."""
+    def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
+        """Return the places of the first `rows` generators, so that those which follow each other are near."""
         engine, k = self.engine, self._walks
         cubes = math.prod(-(-side // CUBE) for side in binned.sides)
-        starts, order = engine.scratch(cubes + 1, np.int32), engine.scratch(n, np.int32)
-        bins = binned.bins, binned.grid_shapes
+        starts, order = engine.scratch(cubes + 1, np.int32), engine.scratch(rows, np.int32)
+        bins = np.int32(rows), binned.items, binned.bins, binned.grid_shapes
         engine.run_each(k.count_cubes, cubes, *bins, starts, group=1)
         self._scan.exclusive(starts, starts, cubes)
         engine.run_each(k.order_places, cubes, *bins, starts, order, group=1)

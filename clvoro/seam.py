@@ -8,16 +8,14 @@ import numpy as np
 import pyopencl.array as cla
 
 from ._primitives import Room, Scan
-from ._program import Engine, Kernels
+from ._program import Engine
 from .bins import BinnedPoints
 from .domain import Box
+from .margins import Margins, block_count, block_counts, seam_defines
 from .tessellation import Tessellation
 
-DROPPED, FAR, COLLAPSED, FULL = 1, 2, 4, 8
+DROPPED, FAR, COLLAPSED = 1, 2, 4
 """Bits of a report: see `seam.cl`."""
-BLOCKS = {2: 128, 3: 32}
-"""Blocks per axis along a seam by dimension."""
-
 SIDEWAYS, OUTWARDS = 0.7, 0.2
 """What the next margins have room for, in ways between the generators about a vertex: that the ball around it moves
 along the seam, or outwards until the generator on it is at the seam; and what it grows beyond that. With less, diagrams
@@ -26,42 +24,6 @@ KEPT = 0.9
 """Share that margins keep, from diagram to diagram, of what they were."""
 OTHER_CELLS = 0.1
 """Share by which the spacing of generators changes where cells are others than before."""
-FACE_CAPACITY, MOST_FACES = 64, 512
-"""Faces that a cell in 3D may have while it is looked at: doubled for those that have more, but no further."""
-
-
-def block_count(dim: int) -> int:
-    """Return the number of blocks of all seams, those across axes with walls included."""
-    return 2 * dim * BLOCKS[dim] ** (dim - 1)
-
-
-class Margins:
-    """How far beyond the seams of a periodic box images are taken, block by block; see `seam.cl`.
-
-    Blocks are in the order of axes, ends (lower, upper) and places along the seam.
-
-    Attributes
-    ----------
-    needed : (blocks,) float32, device
-        How deep balls around the vertices of the latest diagram go that are a little wider than they need be.
-    cells : int
-        Generators of that diagram; 0 before the first one.
-    widths : (blocks,) float32, device
-        Within which its images were taken, if it had any.
-    """
-
-    def __init__(self, engine: Engine) -> None:
-        count = block_count(engine.dim)
-        self.needed = engine.zeros(count, np.float32)
-        self.cells = 0
-        self.widths = engine.zeros(count, np.float32)
-        self.wishes = engine.zeros(count, np.int32)
-        self.widest = engine.empty(4, np.int32)
-
-    def fill(self, margin: float, cells: int) -> None:
-        """Have `margin` needed everywhere by the diagram of `cells` generators."""
-        self.needed.fill(margin)
-        self.cells = cells
 
 
 @dataclass(frozen=True)
@@ -95,8 +57,8 @@ class Images:
     box : ExtendedBox
     margins : Margins
         Within which images were taken.
-    blocks : (2, 4) real, host
-        Where blocks of the seams begin along each axis, and how long they are there.
+    seams : tuple
+        What kernels that look at the balls around the vertices of cells take as SEAM_ARGS (common/seams.h).
     points : (>= count, d) real
         Generators first, then images in the order of owners and codes.
     firsts : (n + 1,) int32
@@ -110,7 +72,7 @@ class Images:
     count: int
     box: ExtendedBox
     margins: Margins
-    blocks: np.ndarray
+    seams: tuple[object, ...]
     points: cla.Array
     firsts: cla.Array
     owners: cla.Array
@@ -158,19 +120,9 @@ class Seam:
         self.engine = engine
         self._scan = Scan(engine)
         self._room = Room(engine, spare=1 / 16)  # sizes change a little from step to step
-        self._built: dict[int, Kernels] = {}
-        self._kernels = self._kernels_for(FACE_CAPACITY)
+        self._kernels = engine.kernels("seam", seam_defines(engine))
         self._report = engine.empty(3, np.int32)
         self._turn = 0
-
-    def _kernels_for(self, capacity: int) -> Kernels:
-        """Return the kernels for cells, in 3D, of up to so many faces."""
-        if capacity not in self._built:
-            defines: dict[str, object] = {"BLOCKS": BLOCKS[self.engine.dim]}
-            if self.engine.dim == 3:
-                defines["FACE_CAPACITY"] = capacity
-            self._built[capacity] = self.engine.kernels("seam", defines)
-        return self._built[capacity]
 
     def extend(
         self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
@@ -187,16 +139,21 @@ class Seam:
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
         corners = np.array(domain.device_corners(engine.real))
-        blocks = np.stack([corners[0], np.maximum((corners[1] - corners[0]) / BLOCKS[d], 1e-30)])
-        blocks = blocks.astype(engine.real)
-        margins.widest.fill(0)
+        counts = block_counts(corners[1, :d] - corners[0, :d], n)
+        was = block_counts(corners[1, :d] - corners[0, :d], margins.cells)
+        lengths = np.maximum((corners[1] - corners[0]) / counts, 1e-30).astype(engine.real)
+        blocks = corners[0], lengths, counts
+        others = abs(factor - 1) > OTHER_CELLS or bool((was != counts).any())
+        margins.extremes.fill(0)
         engine.run_each(
-            k.next_margins, block_count(d), margins.needed, np.float32(factor),
-            np.int32(abs(factor - 1) > OTHER_CELLS), np.int32(grow), blocks[1], margins.widths,
-            margins.widest,
+            k.next_margins, block_count(d), margins.needed, was, np.float32(factor),
+            np.int32(others), np.int32(grow), *blocks, margins.widths, margins.extremes, margins.wishes,
         )  # fmt: skip
+        self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
-        engine.run_each(k.count_images, n, points, margins.widths, margins.widest, *blocks, firsts)
+        engine.run_each(
+            k.count_images, n, points, margins.widths, margins.extremes, *blocks, firsts
+        )
         self._scan.exclusive(firsts, firsts, n)
         ghosts = int(firsts[n].get())
         count = n + ghosts
@@ -204,15 +161,20 @@ class Seam:
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
-            k.place_images, n, points, margins.widths, margins.widest, *blocks, firsts, extended,
+            k.place_images, n, points, margins.widths, margins.extremes, *blocks, firsts, extended,
             owners, codes,
         )  # fmt: skip
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
         # On a coarse grid, so that the corners of the extended box are exact.
-        widest = np.ceil(margins.widest.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
+        widest = np.ceil(margins.extremes.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
         wide = np.minimum(periods, widest).astype(engine.real)
         box = ExtendedBox(lower - wide, upper + wide)
-        return Images(n, count, box, margins, blocks, extended, firsts, owners, codes)
+        seams = (
+            np.int32(n), np.append(periods, np.zeros(4 - d)).astype(engine.real), *blocks,
+            engine.real.type(SIDEWAYS), engine.real.type(OUTWARDS), np.float32(KEPT),
+            margins.widths, margins.extremes, margins.wishes, self._report,
+        )  # fmt: skip
+        return Images(n, count, box, margins, seams, extended, firsts, owners, codes)
 
     def unfold(self, images: Images, previous: Tessellation) -> Rows:
         """Return rows of the extended graph for the generators, from `previous`: the same ones at earlier positions."""
@@ -220,29 +182,9 @@ class Seam:
         neighbours = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
             self._kernels.unfold_rows, images.n, previous.starts, previous.neighbours,
-            images.points, images.margins.widths, images.margins.widest, *images.blocks, images.firsts, neighbours,
+            images.points, images.firsts, images.codes, neighbours,
         )  # fmt: skip
         return Rows(images.n, previous.starts, neighbours)
-
-    def _measure(self, images: Images, binned: BinnedPoints, t: Tessellation) -> None:
-        """Note what the cells of `t` need, and what they may."""
-        engine, margins = self.engine, images.margins
-        capacity, tried = FACE_CAPACITY, 0
-        while True:
-            # Private arrays of a whole group lie on the stack of a CPU's thread.
-            group = None if capacity == FACE_CAPACITY else 1
-            engine.run_each(
-                self._kernels_for(capacity).measure_margins, images.count, binned.items, binned.reach,
-                images.points, np.int32(images.n), t.starts, t.neighbours,
-                *images.box.device_corners(engine.real), *images.blocks, engine.real.type(SIDEWAYS),
-                engine.real.type(OUTWARDS), np.float32(KEPT), np.int32(tried),
-                np.int32(capacity >= MOST_FACES), margins.widths, margins.wishes, self._report,
-                group=group,
-            )  # fmt: skip
-            if engine.dim == 2 or not int(self._report.get()[1]) & FULL:
-                return
-            self._report[1:2].fill(0)
-            capacity, tried = 2 * capacity, capacity
 
     def fold(
         self,
@@ -273,9 +215,12 @@ class Seam:
             `FAR` and `COLLAPSED` where that is so, and the first generator concerned.
         """
         engine, k, n = self.engine, self._kernels, images.n
-        self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         margins = images.margins
-        self._measure(images, binned, t)
+        if engine.dim == 2:  # in 3D cells are looked at where they are made
+            engine.run_each(
+                k.measure_margins, images.count, binned.items, binned.reach, images.points, t.starts,
+                t.neighbours, *images.box.device_corners(engine.real), *images.seams,
+            )  # fmt: skip
         engine.run_each(
             k.note_margins, block_count(engine.dim), margins.widths, np.float32(KEPT),
             margins.wishes, margins.needed,
@@ -290,8 +235,8 @@ class Seam:
         starts = self._room("starts", self._turn, size=n + 1, dtype=np.int32)
         engine.run_each(
             k.fold_rows, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points,
-            images.owners, images.codes, engine.real.type(share), np.int32(nearest), *graph, kept,
-            starts, self._report,
+            images.firsts, images.owners, images.codes, engine.real.type(share), np.int32(nearest),
+            *graph, kept, starts, self._report,
         )  # fmt: skip
         words = self._report.get()
         flags, places = int(words[1]), None

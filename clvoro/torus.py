@@ -11,8 +11,9 @@ import pyopencl.array as cla
 from ._primitives import Summaries
 from .domain import Box
 from .errors import InputError
+from .margins import Margins
 from .polyhedra import Polyhedra
-from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images, Margins
+from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images
 from .tessellation import EXACT_SHARE, ROUGH_SHARE, Tessellation
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class Torus:
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
                 rows = None if previous is None else seam.unfold(images, previous)
-                t = cells.tessellate(*args, rows, exact, None if whole else n)  # type: ignore[arg-type]
+                t = cells.tessellate(*args, rows, exact, None if whole else n, images.seams)  # type: ignore[arg-type]
             else:
                 t = cells.tessellate(*args, exact, None if whole else n)
             share = EXACT_SHARE if exact else ROUGH_SHARE

@@ -83,7 +83,7 @@ def walked(engine, points, rows=None):
     sizes = [(40 * n,), (40 * n, 3), (rows,), (rows, 3), (rows, 6)]
     report = engine.upload(np.array([0, 2**31 - 1, 0]), np.int32)
     engine.run_each(
-        cells._wrap, -(-n // STRETCH), np.int32(n), np.int32(rows), cells._ordered(b, n), b.points, b.items,
+        cells._wrap, -(-rows // STRETCH), np.int32(rows), cells._ordered(b, rows), b.points, b.items,
         b.spacing, b.reach, b.bins, b.grid_frames, b.grid_shapes, *CUBE.device_corners(engine.real),
         engine.real.type(FIRST_REACH), np.int32(40 * n), places, counts, labels,
         *(engine.empty(size) for size in sizes), report, group=1,

@@ -168,6 +168,7 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
 /* Walk the cells that were put off; write them, or put them off again. */
 inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const output_t *out)
 {
+    global const double *binned = in->binned;
     list_t *list = &later->list;
     cells_t *cells = &later->cells;
     for (int lane = later->n; lane < LANES; ++lane)
@@ -205,5 +206,5 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
         if (whole[lane] && !(needs[lane] <= froms[lane]) &&
             find_more(later, runs, cells, &later->walk, lane, places[lane], froms[lane], needs[lane], in) != 0)
             whole[lane] = 0;
-    write_cells(cells, &m, vload8(0, whole) & certain, places, need, out);
+    write_cells(cells, &later->walk, &m, vload8(0, whole) & certain, places, need, binned, out);
 }

@@ -1,5 +1,6 @@
 /* Which cells of a walk are certain, and where they are written. */
 #include "common/row_counts.h"
+#include "common/seams.h"
 #include "common/walk.h"
 
 /* What is certain: least ratio of squares of the distances of the nearest generator and of the farthest vertex; least
@@ -15,12 +16,74 @@ typedef struct {
     global float *reach;
     global int *row_places, *row_counts, *labels, *report;
     global double *measures, *centroids, *volumes, *offsets, *covariances;
+#ifdef SEAMS
+    seams_t seams;
+#endif
 } output_t;
+
+#ifdef SEAMS
+/* Look at the ball around vertex v of one lane's cell, of generator i at x. */
+inline void look_at_corner(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
+                           const output_t *out)
+{
+    const uchar4 corner = walk->lanes[lane].corner_faces[v];
+    const int faces[3] = {corner.s0, corner.s1, corner.s2};
+    double4 ways[3];
+    int labels[3];
+    for (int k = 0; k < 3; ++k) {
+        const int place = LANE(cells->places, faces[k], lane);
+        labels[k] = place < 0 ? place : out->items[place];
+        ways[k] = PLANE_LANE(cells->planes, faces[k], 3, lane) *
+                  (double4)(PLANE_LANE(cells->planes, faces[k], 0, lane), PLANE_LANE(cells->planes, faces[k], 1, lane),
+                            PLANE_LANE(cells->planes, faces[k], 2, lane), 0);
+    }
+    look_at_vertex(x, i, corner_at(walk, v, lane), ways, labels, &out->seams);
+}
+
+/* Look at the balls around the vertices of some lanes' cells, as far as they are of generators in the box. */
+inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
+                           global const double *binned, const output_t *out)
+{
+    const seams_t *seams = &out->seams;
+    double x[LANES][3];
+    long own[LANES];
+    int most = 0;
+    vstore8(some, 0, own);
+    for (int lane = 0; lane < LANES; ++lane) {
+        own[lane] = own[lane] && out->items[places[lane]] < seams->own ? -1 : 0;
+        most = own[lane] ? max(most, cells->corners[lane]) : most;
+        for (int a = 0; a < 3; ++a)
+            x[lane][a] = binned[3 * places[lane] + a];
+    }
+#define ACROSS_LANES(a) (double8)(x[0][a], x[1][a], x[2][a], x[3][a], x[4][a], x[5][a], x[6][a], x[7][a])
+    const double8 low_x = seams->limits[0] + ACROSS_LANES(0), low_y = seams->limits[2] + ACROSS_LANES(1);
+    const double8 low_z = seams->limits[4] + ACROSS_LANES(2);
+    const double8 high_x = seams->limits[1] + seams->period.s0 - ACROSS_LANES(0);
+    const double8 high_y = seams->limits[3] + seams->period.s1 - ACROSS_LANES(1);
+    const double8 high_z = seams->limits[5] + seams->period.s2 - ACROSS_LANES(2);
+    const double widest = widest_of(seams);
+    const long8 mine = vload8(0, own), counts = convert_long8(vload8(0, cells->corners));
+    for (int v = 0; v < most; ++v) {
+        const planes_t *at = &walk->corners[v];
+        const double8 wide = widest * sqrt(fma(at->x, at->x, fma(at->y, at->y, at->z * at->z)));
+        const long8 inside = (wide - at->x <= low_x) & (wide + at->x <= high_x) & (wide - at->y <= low_y) &
+                             (wide + at->y <= high_y) & (wide - at->z <= low_z) & (wide + at->z <= high_z);
+        const long8 beyond = ~inside & mine & (v < counts);
+        if (!any(beyond))
+            continue;
+        long lanes[LANES];
+        vstore8(beyond, 0, lanes);
+        for (int lane = 0; lane < LANES; ++lane)
+            if (lanes[lane])
+                look_at_corner(cells, walk, v, lane, out->items[places[lane]], x[lane], out);
+    }
+}
+#endif
 
 /* Write the cells of some lanes, of generators at `places`, and return how many. `reach` is twice the distance of the
    farthest vertex. */
-inline int write_cells(const cells_t *cells, const moments_t *m, long8 done, const int *places, double8 reach,
-                       const output_t *out)
+inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t *m, long8 done, const int *places,
+                       double8 reach, global const double *binned, const output_t *out)
 {
     long lanes[LANES];
     double reaches[LANES];
@@ -33,6 +96,9 @@ inline int write_cells(const cells_t *cells, const moments_t *m, long8 done, con
     }
     if (made == 0)
         return 0;
+#ifdef SEAMS
+    look_at_walked(cells, walk, done, places, binned, out);
+#endif
     int place = atomic_add(out->report + 2, total);
     const bool fits = place + total <= out->room;
     for (int lane = 0; lane < LANES; ++lane) {
