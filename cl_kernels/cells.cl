@@ -234,7 +234,8 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         v = corner(i, x, j, after, points, lower, upper);
         if (j < 0) {
             /* Opposite walls never meet: what was between them is lost. */
-            right = right && !(after < 0 && (-1 - j) / 2 == (-1 - after) / 2);
+            if (after < 0 && (-1 - j) / 2 == (-1 - after) / 2)
+                right = false;
             continue;
         }
         if (j >= size)
@@ -252,7 +253,8 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             gap2 = corner_gap2(v, i, j, p, i, points, lower, upper);
         if (s != before)
             gap2 = fmax(gap2, corner_gap2(u, i, j, i, s, points, lower, upper));
-        right = right && gap2 * fmax(dot(u, u), dot(v, v)) <= least * least;
+        if (!(gap2 * fmax(dot(u, u), dot(v, v)) <= least * least))
+            right = false;
     }
     if (!right)
         raise_flag(flags, FLAG_COLLAPSED, i);
