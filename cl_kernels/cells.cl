@@ -228,6 +228,7 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     if (!any)
         return;
     REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
+    /* PoCL 6 with LLVM 18 dies of `right = right && ...` in this loop: conditions are written out. */
     for (int k = 0; k < n; ++k) {
         const int j = row[k], before = row[k == 0 ? n - 1 : k - 1], after = row[k == n - 1 ? 0 : k + 1];
         const REAL2 u = v;
