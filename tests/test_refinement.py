@@ -4,7 +4,7 @@ import numpy as np
 import patch
 import pytest
 import shapely
-from shores import POLYGONS, scattered
+from shores import POLYGONS, lattice, scattered
 
 from clvoro.refinement import SHORT_FACE, Refinement
 from clvoro.stages import Stages
@@ -111,6 +111,21 @@ def test_children_in_polygons(ctx, name, fixed):
     assert len(expected) > n
     # The children of a generator follow in the order of its faces; crossings round by their angle's cosecant.
     assert finer[n:] == pytest.approx(expected, rel=0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("side", "count"), [(1, 2), (2, 12), (4, 52)])
+def test_equally_long_walls_bring_one_child(ctx, side, count):
+    """Squares at the edges of a square; those at its corners have two walls there."""
+    domain = POLYGONS["square"]()
+    engine, n = patch.make_engine(ctx, box=domain), side**2
+    points = engine.upload(domain.place(lattice(side), engine.real))
+    t = Tessellator(Stages(engine), domain).tessellate(points, n)
+    h = engine.upload(np.full(n, 0.5 / side))
+    finer = Refinement(engine).refine(domain, t, h).get() * domain.frame[1] + domain.frame[0]
+    # Parents, middles between neighbours in rows and columns, and one for each square at an edge.
+    assert count == n + 2 * side * (side - 1) + n - max(side - 2, 0) ** 2
+    assert len(finer) == len(np.unique(finer, axis=0)) == count
+    assert domain.contains(finer).all()
 
 
 def test_count_is_four_times(ctx):

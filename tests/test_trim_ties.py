@@ -1,0 +1,68 @@
+"""Corners of polygons on faces and where faces meet, many at a time: ties that any edge and any cell must settle alike.
+
+Most such polygons do not tell whether they are; of those here some do, for each rule in chords.cl.
+"""
+
+import numpy as np
+import pytest
+import shapely
+from reference_polygon import faults
+from shores import blocks
+
+import clvoro
+
+RING = [(x, y) for x in range(-25, 26) for y in range(-25, 26) if x * x + y * y == 625]
+"""On a circle exactly, in whole numbers: all faces between neighbours on it meet in its centre."""
+
+
+@pytest.fixture(scope="module")
+def adapters(ctx):
+    return [clvoro.Adapter(ctx, real) for real in ("float64", "float32")]
+
+
+def check(adapters, shape, points):
+    domain = clvoro.Polygon.from_shapely(shape)
+    points = np.unique(points[domain.contains(points)], axis=0)
+    for adapter in adapters if len(points) else ():
+        diagram = adapter.diagram(domain, points)
+        assert faults(diagram, adapter.dtype.name) == []
+        # Some hundred corners of the unit square round.
+        eps = float(np.finfo(adapter.dtype).eps)
+        assert diagram.volumes.sum(dtype=float) == pytest.approx(domain.measure, abs=64 * eps)
+
+
+@pytest.mark.parametrize("seed", [*range(160, 190), 5215])
+def test_blocks_and_lattices(adapters, seed):
+    """Squares of a lattice, some cut in half, by generators of the same lattice or of a finer one, not all of it."""
+    rng = np.random.default_rng(seed)
+    side = int(rng.choice([2, 3, 4]))
+    shape = blocks(rng, side)
+    if seed % 3 == 1:
+        for i, j in np.argwhere(rng.random((side, side)) < 0.3) / side:
+            corner = shapely.Polygon([(i, j), (i + 1 / side, j), (i, j + 1 / side)])
+            shape = shape.difference(corner)
+    k = int(rng.choice([1, 2, 4])) * side
+    line = (np.arange(k) + 0.5) / k if rng.random() < 0.5 else np.arange(k + 1) / k
+    points = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+    check(adapters, shape, points[rng.random(len(points)) < rng.choice([0.3, 0.6, 1.0])])
+
+
+@pytest.mark.parametrize("seed", [*range(20), 111, 160, 211, 333, 385, 438, 5553])
+def test_corners_where_many_faces_meet(adapters, seed):
+    """A wedge out of the square, a hole, or a polygon, with a corner in the middle of generators on a circle."""
+    rng = np.random.default_rng(seed)
+    centre, ends = np.array([0.5, 0.5]), rng.integers(0, 9, (3, 2)) / 8
+    square = shapely.box(0, 0, 1, 1)
+    if seed % 3 == 0:
+        shape = square.difference(shapely.Polygon([centre, ends[0], ends[1]]))
+    elif seed % 3 == 1:
+        shape = square.difference(shapely.Polygon([centre, *(centre + (ends[:2] - 0.5) / 4)]))
+    else:
+        shape = shapely.Polygon([centre, *ends]).buffer(0)
+    if shape.area < 0.01:
+        pytest.skip("too little is left")
+    ring = centre + np.array(RING) / 64
+    points = ring[rng.random(len(ring)) < rng.choice([0.15, 0.3, 0.6])]
+    if rng.random() < 0.5:
+        points = np.concatenate([points, rng.integers(0, 9, (4, 2)) / 8])
+    check(adapters, shape, points)
