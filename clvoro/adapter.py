@@ -14,7 +14,7 @@ import pyopencl as cl
 from . import device
 from ._arrays import Naming, check_callable, check_number, check_points
 from ._program import Engine
-from .checkpoint import Checkpointer, Saved
+from .checkpoint import Checkpointer
 from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
@@ -24,6 +24,7 @@ from .made_by import describe
 from .memory import check_memory
 from .preparation import Options, Preparation, check_options
 from .results import Diagram, Result
+from .resume import Saved
 from .stages import Stages
 from .tessellator import Tessellator
 from .torus import FewCellsError
@@ -323,55 +324,6 @@ class Adapter:
         files = checkpoint, every, resume
         with self._alone():
             return self._run(domain, size, points, options, self._shown(callback), *files)
-
-    def memory_needed(
-        self,
-        domain: Domain,
-        size: object,
-        points: np.ndarray | None = None,
-        method: str = "adaptive",
-        n_cells: int | None = None,
-        *,
-        levels: int | str = "auto",
-        layers: Layers | Sequence[Layers] = (),
-    ) -> float:
-        """Return how many bytes `run` takes on the device with these arguments, as it is told before it begins.
-
-        It holds to a tenth; where sizes change several-fold from one cell to the next a run may take less, by a quarter
-        at most. Reading all arrays of the diagram afterwards is allowed for: in 3D it takes more than the run.
-
-        Parameters
-        ----------
-        domain, size, points, method, n_cells, levels, layers
-            As those of `run`.
-
-        Raises
-        ------
-        MemoryLimitError
-            If the device has not as much; says how much it would be.
-        InputError, InputTypeError, SizeFieldError
-            As `run` does.
-
-        Examples
-        --------
-        >>> adapter = clvoro.Adapter()
-        >>> bytes_ = adapter.memory_needed(clvoro.Box((0, 0), (1, 1)), 0.01)
-        >>> 4e6 < bytes_ < 5e6
-        True
-        """
-        options = check_options(
-            method=method, start="density", effort="default", levels=levels, seed=0, tol=0, k=1, alpha=None,
-            max_steps=None, n_cells=n_cells, error_target=None, layers=layers,
-        )  # fmt: skip
-        with self._alone():
-            return self._memory_needed(domain, size, points, options)
-
-    def _memory_needed(
-        self, domain: Domain, size: object, points: np.ndarray | None, options: Options
-    ) -> float:
-        stages = self._stages_for(domain)
-        host = None if points is None else check_points(points, domain)
-        return Preparation(stages, domain, size, host, options, MOST_LEVELS).memory
 
     def _run(
         self,

@@ -7,33 +7,22 @@ of a search tree over all generators.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from .check_polygon import (
-    check_cells,
-    check_edges,
-    check_outlines,
-    hidden,
-    near_shared_corners,
-)
+from .check_polygon import check_cells, check_edges, check_outlines, hidden
+from .check_values import check_values
 from .faces import face_keys
-from .findings import Check, MisfitError, Report
-from .outlines import SIDE_TURN, Straightened, face_ends, straighten
+from .findings import ROUNDINGS, Check, MisfitError, Report
 from .polygon import Polygon
 from .rebuilt import Doubts, Rebuilt
 from .walls import surface, wall_count, wall_distance
 
 if TYPE_CHECKING:
     from .results import Diagram, Result
-
-ROUNDINGS = 256
-"""How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be
-off by more, where the faces that meet there say so: see `Rebuilt.doubts`."""
 
 
 def check_diagram(diagram: Diagram) -> Report:
@@ -44,7 +33,7 @@ def check_diagram(diagram: Diagram) -> Report:
 def check_result(result: Result) -> Report:
     """Check a result: its diagram, sizes, error (the paper's 3.1), quality (4.1) and history; see `Result.check`."""
     check = Check(result.diagram)
-    return _finish(check, lambda: _check_result(check, result))
+    return _finish(check, lambda: check_values(check, result))
 
 
 def _finish(check: Check, more: Callable[[], None] | None = None) -> Report:
@@ -304,80 +293,3 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
         lambda k: f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by "
         f"{own[k] - nearest[k]:.3g}",
     )  # fmt: skip
-
-
-def _check_result(check: Check, result: Result) -> None:
-    d = result.diagram
-    n, dim = len(d), d.domain.dim
-    for name in ("size", "error", "quality"):
-        check.shape(name, getattr(result, name), (n,))
-    check.shape("points", result.points, (n, dim))
-    h, e, q = result.size, result.error, result.quality
-    check.note(
-        "points", (result.points != d.points).any(axis=1),
-        lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
-    )  # fmt: skip
-    check.note("size", ~(h > 0), lambda i: f"size[{i}] is {h[i]}, expected > 0", stop=True)
-    g = Rebuilt(d)
-    eps = float(np.finfo(g.real).eps)
-    length = np.maximum(d.volumes, 0) ** (1 / dim)
-    with np.errstate(all="ignore"):
-        error = (length - h) / np.minimum(length, h)
-        counts = np.diff(d.neighbour_starts)
-        perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
-        if dim == 2:
-            quality = _quality_2d(d, q, eps, g.unit)
-        else:
-            quality = 36 * np.pi * d.volumes**2 / perimeter**3
-    check.note(
-        "error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
-        lambda i: f"error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
-    )  # fmt: skip
-    # The faces' measures round as positions do, where they were made anew from a file's corners.
-    rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
-    check.note(
-        "quality", np.maximum(np.abs(q - quality) - 64 * eps * (1 + quality) - 3 * rounding, 0),
-        lambda i: f"quality[{i}] is {q[i]:.10g}, the cell gives {quality[i]:.10g}",
-    )  # fmt: skip
-    steps = result.history["step"]
-    check.note(
-        "history", np.diff(steps, prepend=-1) < 0,
-        lambda r: f"row {r} of the history is step {steps[r]}, after {steps[r - 1]}",
-    )  # fmt: skip
-
-
-def _quality_2d(d: Diagram, q: np.ndarray, eps: float, unit: float) -> np.ndarray:
-    """Return the quality (4.1) of each cell (n,).
-
-    Where rounding decides which sides the boundary has, those are taken that suit the quality `q` best.
-    """
-    quality = np.full(len(q), np.inf)
-    for polygons in _straightened(d, eps, unit):
-        # A face no longer than a rounding is a side or none, as where pieces touch.
-        owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
-        points = np.bincount(owner, d.face_measures <= ROUNDINGS * unit, len(d)).astype(int)
-        for more in range(-int(points.max(initial=0)), 1):
-            sides = polygons.sides + np.maximum(more, -points)
-            found = dataclasses.replace(polygons, sides=sides).quality()
-            quality = np.where(np.abs(found - q) < np.abs(quality - q), found, quality)
-    return quality
-
-
-def _straightened(d: Diagram, eps: float, unit: float) -> Iterator[Straightened]:
-    """Go through the polygons that the cells may be, as rounding will have it."""
-    if not isinstance(d.domain, Polygon):
-        yield straighten(d)
-        return
-    # In a corner of several rings parts of a cell may come together, with which a side ends.
-    on_wall = d.neighbours < 0
-    corners = on_wall & near_shared_corners(
-        d.domain, d.vertices[face_ends(d)[:, 1]], ROUNDINGS * unit
-    )
-    # And a cell that is a whole piece of the domain has no corner in which to begin.
-    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
-    alone = np.bincount(owner, ~on_wall, len(d)) == 0
-    begins = int(np.diff(d.neighbour_starts)[alone].max(initial=1))
-    for turn in (SIDE_TURN * (1 + k * eps) for k in (64, -64)):
-        for ends_at in (None, corners) if corners.any() else (None,):
-            for begins_at in range(begins):
-                yield straighten(d, turn, ends_at, begins_at)

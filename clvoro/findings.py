@@ -14,6 +14,10 @@ from .errors import ClvoroError
 if TYPE_CHECKING:
     from .results import Diagram
 
+ROUNDINGS = 256
+"""How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be
+off by more, where the faces that meet there say so: see `Rebuilt.doubts`."""
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -12,6 +12,7 @@ import numpy as np
 from ._arrays import Naming, check_choice, check_integer, check_number
 from .domain import Domain
 from .errors import CoarseSizeWarning, InputError, InputTypeError
+from .geojson import may_be_degrees
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
 from .memory import check_memory, images_expected
 from .mesh import Mesh
@@ -21,7 +22,6 @@ from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_st
 from .polygon import Polygon
 from .precision import check_precision
 from .quadrature import DensityTree
-from .rings import may_be_degrees
 from .sizing import Sizing, as_field
 from .stages import Stages
 from .start import density_tree, sample_density, sample_uniform

@@ -11,8 +11,8 @@ import numpy as np
 import clvoro
 from clvoro.cases import load_case
 from clvoro.cases.fields import load_array
-from clvoro.checkpoint import Saved
 from clvoro.io.vtu_read import load_vtu
+from clvoro.resume import Saved
 from clvoro.sizing import Surface
 
 CASE = b"""name = "fuzz"

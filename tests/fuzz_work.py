@@ -15,11 +15,11 @@ import shapely
 
 import clvoro
 from clvoro.cases import Case, toml
-from clvoro.checkpoint import Saved
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
 from clvoro.jobs import Job
 from clvoro.layers import count_rows, free_domain, place_layers
+from clvoro.resume import Saved
 from tests import fuzz_files as files
 from tests.fuzz_inputs import (
     placed,

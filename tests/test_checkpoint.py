@@ -14,9 +14,9 @@ import pytest
 
 import clvoro
 from clvoro import checkpoint, cli, poisson
-from clvoro.checkpoint import Saved
 from clvoro.errors import InputError
 from clvoro.made_by import identity
+from clvoro.resume import Saved
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")

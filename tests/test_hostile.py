@@ -15,9 +15,9 @@ import pytest
 import clvoro
 from clvoro.cases import load_case
 from clvoro.cases.fields import load_array
-from clvoro.checkpoint import Saved
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
+from clvoro.resume import Saved
 from clvoro.sizing import Expression
 from tests import fuzz_files as files
 

@@ -77,7 +77,7 @@ class Case:
         except RecursionError as error:
             raise InputError(f"{place} not a case: it is nested too deep") from error
         try:
-            checked = schema.CASE(content, place)
+            checked = schema.case(content, place)
         except (OverflowError, RecursionError) as error:
             raise InputError(
                 f"{place} not a case: a number is too large or the nesting too deep ({error})"
@@ -108,7 +108,7 @@ class Case:
         changes = {key: value for key, value in changes.items() if value is not None}
         dropped = {"method", "methods"} if {"method", "methods"} & set(changes) else set()
         run = {key: value for key, value in self.run.items() if key not in dropped}
-        return replace(self, run=schema.RUN({**run, **changes}, f"{self.name}: run"))
+        return replace(self, run=schema.run({**run, **changes}, f"{self.name}: run"))
 
     def size_field(self, time: float = 0.0) -> Any:
         """Build the size field (an object of `clvoro.sizing`), with `time` in the place of {t} in expressions."""
