@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from collections import deque
 from typing import Any, TextIO
 
 import numpy as np
@@ -13,6 +14,8 @@ EVERY = 5.0
 """Seconds between lines where the line cannot change in place (a file, a pipe)."""
 REFRESH = 0.1
 """Seconds between changes of a line that can."""
+PACED = 4
+"""Steps whose pace is known before the time left is told: the first ones build kernels."""
 
 
 class Progress:
@@ -32,8 +35,8 @@ class Progress:
         self.title, self.max_steps = title, max_steps
         self.stream = sys.stderr if stream is None else stream
         self.steps, self._cells = -1, 0
-        # Seconds and share that were done when the first step was: before, and in it, kernels may have been built.
-        self._first: tuple[float, float] | None = None
+        # Seconds, share that was done and cells that had been moved at each step of the latter half of the time.
+        self._past: deque[tuple[float, float, int]] = deque()
         self._shown, self._began = 0.0, time.monotonic()
         self._status = _rich_status(self.stream)
         self._live = self._status is not None or self.stream.isatty()
@@ -58,10 +61,11 @@ class Progress:
     def __call__(self, row: np.void) -> None:
         """Show `row`, a row of `HISTORY_DTYPE`, if the last one was shown long enough ago."""
         self.steps += 1
-        if self.steps > 1:
+        if self.steps > 0:
             self._cells += int(row["cells"])
-        elif self.steps == 1:
-            self._first = float(row["seconds"]), self._done(row)
+            self._past.append((float(row["seconds"]), self._done(row), self._cells))
+            while len(self._past) > PACED + 1 and self._past[1][0] <= row["seconds"] / 2:
+                self._past.popleft()
         now = time.monotonic()
         if now - self._shown < (REFRESH if self._live else EVERY):
             return
@@ -92,13 +96,14 @@ class Progress:
             f"|e| {row['mean_error']:.4f} max {row['max_error']:.2g}",
             f"Q {row['mean_quality']:.3f} min {row['min_quality']:.2f}",
         ]
-        if self._first is not None:
-            # The pace is that since the first step.
-            seconds, done = float(row["seconds"]) - self._first[0], self._done(row)
+        if len(self._past) > 1:
+            # The pace is that of the latter half: kernels are built in the first steps, and before.
+            began, done_then, cells = self._past[0]
+            seconds, done = float(row["seconds"]) - began, self._done(row) - done_then
             if seconds > 0:
-                parts.append(f"{_short(self._cells / seconds)} cells/s")
-            if seconds > 0 and done > self._first[1]:
-                parts.append(f"{_duration(seconds * (1 - done) / (done - self._first[1]))} left")
+                parts.append(f"{_short((self._cells - cells) / seconds)} cells/s")
+            if seconds > 0 and done > 0 and len(self._past) > PACED:
+                parts.append(f"{_duration(seconds * (1 - done - done_then) / done)} left")
         return "  ".join(parts)
 
     def _done(self, row: np.void) -> float:

@@ -313,35 +313,40 @@ def row(step, seconds, cells=1000, progress=0.1):
 
 def test_line_holds_the_numbers():
     shown = progress.Progress("paper lloyd", 10, io.StringIO())
-    for step in range(3):
+    for step in range(6):
         shown(row(step, 0.5 * step))
-    line = shown.line(row(2, 1.0))
+    line = shown.line(row(5, 2.5))
     assert len(line) < 80
-    for part in ["lloyd 2/10", "|e| 0.1250", "max 1.5", "min 0.50", "2k cells/s", "4 s left"]:
+    for part in ["lloyd 5/10", "|e| 0.1250", "max 1.5", "min 0.50", "2k cells/s", "2 s left"]:
         assert part in line
 
 
 def test_line_of_a_run_of_unknown_length():
     shown = progress.Progress("paper", None, io.StringIO())
-    for step, cells in enumerate([10, 10, 10, 40]):
+    for step, cells in enumerate([10, 10, 10, 40, 40, 40]):
         shown(row(step, float(step), cells, progress=step / 8))
-    line = shown.line(row(3, 3.0, 40, progress=0.375))
-    assert line.startswith("paper 3 (38%)")
-    assert "25 cells/s" in line  # 10 + 40 in two seconds
-    assert line.endswith("5 s left")
+    line = shown.line(row(5, 5.0, 40, progress=0.625))
+    assert line.startswith("paper 5 (62%)")
+    assert "32.5 cells/s" in line  # 10 and 40 three times in four seconds
+    assert line.endswith("3 s left")
 
 
-def test_the_pace_is_that_since_the_first_step():
-    """Which may have taken long: kernels are built in it, and before."""
+def test_the_time_left_is_told_by_the_pace_of_the_latter_half():
+    """Kernels are built before the first step, in it and in the next: then, four steps do not tell the pace."""
     shown = progress.Progress("paper", None, io.StringIO())
-    first, second = row(1, 100.0, progress=0.1), row(2, 101.0, progress=0.2)
-    shown(row(0, 90.0, progress=0.0))
-    shown(first)
-    assert "left" not in shown.line(first)
-    assert "cells/s" not in shown.line(first)
-    shown(second)
-    assert "1k cells/s" in shown.line(second)
-    assert shown.line(second).endswith("8 s left")
+    seconds = [90, 100, 110, 111, 112, 113, 114, 115, *range(116, 300)]
+    lines = []
+    for step, at in enumerate(seconds):
+        values = row(step, float(at), progress=step / 400)
+        shown(values)
+        lines.append(shown.line(values))
+    assert not any("left" in line for line in lines[: progress.PACED + 1])
+    assert "cells/s" not in lines[1]
+    assert "100 cells/s" in lines[2]
+    assert all("left" in line for line in lines[progress.PACED + 1 :])
+    # 192 steps done, one a second since the third: 208 to go.
+    assert lines[-1].endswith("3 min 29 s left")
+    assert "1k cells/s" in lines[-1]
 
 
 def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
