@@ -271,18 +271,10 @@ inline void longest_axis(global const REAL *moments, REAL *axis)
 }
 #endif
 
-/* Per chosen site: split the cell across its longest axis, or delete it. */
-kernel void mark_excess(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
-                        global const REAL *covariances, global const REAL *volumes, global int *kept,
-                        global REAL *shifts, global int *born, global REAL *births)
+/* Split cell i across its longest axis. */
+inline void split_cell(int i, global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
+                       global REAL *shifts, global int *born, global REAL *births)
 {
-    WORK_ITEM(i);
-    if (chosen[i] == 0)
-        return;
-    if (sign < 0) {
-        kept[i] = 0;
-        return;
-    }
     REAL axis[DIM];
     longest_axis(covariances + DIM * (DIM + 1) / 2 * i, axis);
     const REAL quarter = (DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i])) / 4;
@@ -292,6 +284,51 @@ kernel void mark_excess(const int size, global const ulong *chosen, const REAL s
         births[DIM * i + a] = offsets[DIM * i + a] - quarter * axis[a];
     }
 }
+
+/* Per chosen site: split the cell, or delete it. */
+kernel void mark_excess(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
+                        global const REAL *covariances, global const REAL *volumes, global int *kept,
+                        global REAL *shifts, global int *born, global REAL *births)
+{
+    WORK_ITEM(i);
+    if (chosen[i] == 0)
+        return;
+    if (sign < 0)
+        kept[i] = 0;
+    else
+        split_cell(i, offsets, covariances, volumes, shifts, born, births);
+}
+
+#if DIM == 2
+/* Per inner cell i: 1 - Q, where it is above `flaw`, as a site to mend. Cells of four sides or eight come first,
+   whatever their Q: with their neighbours they are a generator too many or too few. */
+kernel void score_flaws(const int size, global const int *starts, global const int *neighbours,
+                        global const REAL *quality, const REAL flaw, global ulong *keys)
+{
+    WORK_ITEM(i);
+    const int n = starts[i + 1] - starts[i];
+    const bool odd = n < 5 || n > 7;
+    const REAL own = 1 - quality[i];
+    bool site = odd || own > flaw;
+    for (int k = starts[i]; k < starts[i + 1] && site; ++k)
+        site = neighbours[k] >= 0;
+    keys[i] = site ? site_key(odd ? 1 + own : own, i) : 0;
+}
+
+/* Per chosen site: split a cell of at least `split_from` sides, delete any other. */
+kernel void mark_flaws(const int size, global const ulong *chosen, global const int *starts, const int split_from,
+                       global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
+                       global int *kept, global REAL *shifts, global int *born, global REAL *births)
+{
+    WORK_ITEM(i);
+    if (chosen[i] == 0)
+        return;
+    if (starts[i + 1] - starts[i] < split_from)
+        kept[i] = 0;
+    else
+        split_cell(i, offsets, covariances, volumes, shifts, born, births);
+}
+#endif
 
 /* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
    generators go behind all kept rows, with new labels. */

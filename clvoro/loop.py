@@ -11,7 +11,7 @@ import numpy as np
 from .checkpoint import Checkpointer
 from .krylov import Solution
 from .mesh import Mesh
-from .plans import Action, Refine, Reorganise, Rest, Settle, Step, work_of
+from .plans import Action, Mend, Refine, Reorganise, Rest, Settle, Step, work_of
 from .results import HISTORY_DTYPE, Displacements, Result
 
 SAMPLING_GAIN = 0.36
@@ -89,6 +89,8 @@ class Loop:
                     stop = self.record(progress)
                 elif isinstance(action, Reorganise):
                     self.reorganise(action)
+                elif isinstance(action, Mend):
+                    self.mend(action)
                 elif isinstance(action, Settle):
                     self.settle(action.share, action.ahead)
                 elif isinstance(action, Refine):
@@ -149,6 +151,13 @@ class Loop:
         self.mesh.stages.clear("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
         inserted, deleted = self.mesh.reorganise(nuclei, self.held, theta=action.theta)
+        self.inserted += inserted
+        self.deleted += deleted
+
+    def mend(self, action: Mend) -> None:
+        """Delete or split the worst cells."""
+        self.mesh.stages.clear("poisson")
+        inserted, deleted = self.mesh.mend(action.flaw, action.split)
         self.inserted += inserted
         self.deleted += deleted
 

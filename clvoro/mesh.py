@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pyopencl.array as cla
@@ -293,22 +294,35 @@ class Mesh:
         with self.engine.workspace.frame():
             w = self.stages.density.weigh(self.t, self.h)
             total = self.missing(w) if n_cells is None else float(n_cells - self.n)
-            rows = Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
             new = self.stages.population.reorganise(
-                self.free, self.t, self.h, self.reach, w.excess, rows, total, self.next_label,
+                self.free, self.t, self.h, self.reach, w.excess, self._rows(), total, self.next_label,
                 nuclei, climb, theta, self.fixed,
             )  # fmt: skip
-        del rows, w
+        rows = _take_apart(new)
+        del new, w
+        return self._repopulate(rows)
+
+    def mend(self, flaw: float, split: bool) -> tuple[int, int]:
+        """Delete or split the worst cells (see `PopulationControl.mend`); return how many came and went."""
         self.engine.workspace.clear()
-        if new is None:
-            return 0, 0
-        self.next_label += new.inserted
-        inserted, deleted = new.inserted, new.deleted
-        rows = {
-            name: getattr(new, name)
-            for name in ("points", "labels", "velocity", "signatures", "ever")
-        }
+        new = self.stages.population.mend(
+            self.free, self.t, self.quality, self._rows(), self.next_label, flaw, split, self.fixed
+        )
+        rows = _take_apart(new)
         del new
+        return self._repopulate(rows)
+
+    def _rows(self) -> Population:
+        """Return the present generators."""
+        return Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
+
+    def _repopulate(self, rows: dict[str, Any]) -> tuple[int, int]:
+        """Take other generators, which are used up, if there are any; return how many came and went."""
+        self.engine.workspace.clear()
+        if not rows:
+            return 0, 0
+        inserted, deleted = rows.pop("inserted"), rows.pop("deleted")
+        self.next_label += inserted
         self.stages.population.clear()
         self.adopt(rows)
         return inserted, deleted
@@ -373,3 +387,8 @@ class Mesh:
         return fetch_diagram(
             self.engine, self.domain, self.t, self.labels, copy=False, unfolded=self._unfolded
         )
+
+
+def _take_apart(new: Population | None) -> dict[str, Any]:
+    """Return what `new` has, if there is one, by name, so that each can be let go of on its own."""
+    return {} if new is None else dict(vars(new))

@@ -7,7 +7,8 @@
 *reorganise*  insert and delete generators: dislocations climb, the count meets the field
 *glide*       weighted Lloyd with momentum, softly projected: defects move and annihilate
 *settle*      where a count was asked for: exactly that many
-*polish*      descent of cell quality, projected; the penalty is steered to the error that is aimed at
+*polish*      descent of cell quality, projected; the penalty is steered to the error that is aimed at; now and then the
+              worst cells are deleted or split, where the descent has nowhere to go
 *project*     the same with next to no penalty: every cell the size that was asked for
 
 In 3D there is no lattice whose defects could climb, and a mesh that has been coupled long enough loses next to no
@@ -45,6 +46,14 @@ STEP_CELLS = 3000
 
 
 @dataclass(frozen=True)
+class Mend:
+    """Delete or split the worst cells: those with 1 - Q above `flaw`; see `PopulationControl.mend`."""
+
+    flaw: float
+    split: bool = False
+
+
+@dataclass(frozen=True)
 class Effort:
     """How much work a run takes.
 
@@ -69,6 +78,8 @@ class Effort:
     emphasis, lenience, bound : float
         Of the polishing: weight of bad cells; -log Q from which on a cell may be off its size for its shape; and
         excess, over the mean that is aimed at, from which on it may not.
+    mends : tuple of (int, Mend)
+        Of the worst cells, each before that step of polishing; the last ones leave steps to get into shape.
     flaw : float
         1 - mean Q up to which a mesh is as good as this effort makes it, in 2D, walls apart.
     """
@@ -87,6 +98,7 @@ class Effort:
     emphasis: float = 20.0
     lenience: float = 0.03
     bound: float = 12.0
+    mends: tuple[tuple[int, Mend], ...] = ()
     flaw: float = 0.012
 
 
@@ -94,11 +106,12 @@ EFFORTS = {
     "fast": Effort(20, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
     "default": Effort(
         30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, aim=0.0025, lenience=0.02,
-        bound=11.0,
+        bound=11.0, mends=((5, Mend(0.06)), (9, Mend(0.06)), (13, Mend(0.07))),
     ),
     "best": Effort(
         60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, aim=0.0039, relaxation=1.5, momentum=0.8,
-        eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0, flaw=0.006,
+        eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0,
+        mends=((30, Mend(0.037)), (50, Mend(0.037, split=True)), (70, Mend(0.037))), flaw=0.006,
     ),
 }  # fmt: skip
 
@@ -185,7 +198,7 @@ class Settle:
     ahead: bool = False
 
 
-Action = Step | Reorganise | Refine | Rest | Settle
+Action = Step | Reorganise | Mend | Refine | Rest | Settle
 
 
 def auto_levels(n: float, dim: int) -> int:
@@ -300,6 +313,8 @@ def _correction(dim: int, effort: Effort, exact: bool, aim: float) -> Iterator[A
     yield Step(correct)
     yield Settle()
     yield Rest()
+    # What is there stays where it can: the worst cells are as good as they were.
+    effort = replace(effort, mends=())
     yield from (_finish_2d if dim == 2 else _finish_3d)(effort, exact, aim, NEAR_EPS)
 
 
@@ -309,9 +324,13 @@ def _finish_2d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[
         "shape", eps=eps, lenience=effort.lenience, bound=effort.bound * aim, k=0.3, aim=aim,
         emphasis=effort.emphasis, tolerance=POLISH_TOLERANCE,
     )  # fmt: skip
+    mends = dict(effort.mends)
     for step in range(effort.polish):
         if step == 3:
             yield Reorganise(theta=COUNT_THETA, least=COUNT_LEAST)
+            yield Settle()
+        if step in mends:
+            yield mends[step]
             yield Settle()
         yield Step(polish)
     if exact:

@@ -30,6 +30,8 @@ SPLIT_DISTANCE = 0.3
 """Half the distance over h at which the two halves of a split cell start."""
 LARGEST_CHANGE = 0.05
 """Share of the generators that one call may insert or delete to correct the count."""
+MENDED_SHARE = 1e-3
+"""Share of the cells that are mended at a time."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,60 @@ class PopulationControl:
         elif need:
             self._split_or_delete(t, excess, marks, need)
         self._room.clear("keys", "spread", "chosen", "latest", "ranks")
+        return self._apply(domain, t, rows, marks, next_label)
+
+    def mend(
+        self,
+        domain: Domain,
+        t: Tessellation,
+        quality: cla.Array,
+        rows: Population,
+        next_label: int,
+        flaw: float,
+        split: bool = False,
+        fixed: int = 0,
+        share: float = MENDED_SHARE,
+    ) -> Population | None:
+        """Delete or split the worst inner cells of a mesh in 2D.
+
+        A cell that is far worse than the others sits where the lattice's defects have come to lie badly. One generator
+        less, or more, shakes them into another arrangement there, which most often is a better one.
+
+        Parameters
+        ----------
+        quality : (n,) real
+        rows, next_label, fixed
+            As for `reorganise`.
+        flaw : float
+            1 - Q from which on a cell is mended.
+        split : bool
+            Split cells of six sides; else they are deleted. Those of more are split, those of fewer deleted.
+        share : float
+            Of the cells, at most so many are mended: a mesh so small that it is less than one stays as it is.
+
+        Returns
+        -------
+        Population or None
+            None if nothing is to change.
+        """
+        engine, k, n = self.engine, self._kernels, t.n
+        most = int(share * n)
+        if most == 0:
+            return None
+        marks = _Marks.clean(self._room, n, engine.dim)
+        self._labels, self._fixed = rows.labels, fixed
+        keys = self._room("keys", size=n, dtype=np.uint64)
+        engine.run_each(
+            k.score_flaws, n, t.starts, t.neighbours, quality, engine.real.type(flaw), keys
+        )
+        self._exempt(t, keys, around=True)
+        chosen = self._choose(t, keys, PAIR_RINGS)
+        self._limit(chosen, n, most)
+        engine.run_each(
+            k.mark_flaws, n, chosen, t.starts, np.int32(6 if split else 7), t.offsets,
+            t.covariances, t.volumes, *marks.arrays,
+        )  # fmt: skip
+        self._room.clear("keys", "spread", "chosen", "latest")
         return self._apply(domain, t, rows, marks, next_label)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:

@@ -314,7 +314,7 @@ def multigrid(adapter: clvoro.Adapter) -> None:
 
 
 def nuclei(adapter: clvoro.Adapter) -> None:
-    """Pairs of dislocations that are made where the lattice is strained: runs get there late."""
+    """Pairs of dislocations made where the lattice is strained, and cells that are mended: runs get there late."""
     engine, stretch = stages_of(adapter).engine, 1.15
     x = hexagons(0.08, clvoro.Box((-1, -1), (2, 2))) * (stretch, 1 / stretch) + 0.1
     t = tessellate(engine, x := x[PATCH.contains(x)])
@@ -324,11 +324,14 @@ def nuclei(adapter: clvoro.Adapter) -> None:
         engine.zeros(n),
     )  # fmt: skip
     sizes, excess = engine.upload(np.full(n, h)), engine.zeros(n)
-    found = PopulationControl(engine).reorganise(
-        PATCH, t, sizes, sizes, excess, rows, 0.0, n, nuclei=2
-    )
+    control = PopulationControl(engine)
+    found = control.reorganise(PATCH, t, sizes, sizes, excess, rows, 0.0, n, nuclei=2)
     assert found is not None
     assert found.inserted + found.deleted >= 2
+    quality = engine.upload(np.linspace(0.8, 1, n))
+    found = control.mend(PATCH, t, quality, rows, n, flaw=0.1, split=True, share=0.5)
+    assert found is not None
+    assert found.inserted >= 1
 
 
 def scan(adapter: clvoro.Adapter) -> None:

@@ -10,7 +10,9 @@ from clvoro.domain import Box
 from clvoro.population import (
     EXCESS_RINGS,
     LARGEST_CHANGE,
+    MENDED_SHARE,
     NUCLEUS_RINGS,
+    PAIR_RINGS,
     SPLIT_DISTANCE,
     THETA,
     Population,
@@ -26,7 +28,7 @@ def engine(ctx):
 
 
 class Sweep:
-    """One call of `reorganise`, and what it has done, by labels."""
+    """One call of `reorganise`, or of `mend` where the quality is given, and what it has done, by labels."""
 
     def __init__(self, engine, points, h, total, control=None, **options):
         n, rng = len(points), np.random.default_rng(808)
@@ -44,10 +46,15 @@ class Sweep:
             engine.upload(self.signatures, np.uint64), engine.upload(self.ever),
         )  # fmt: skip
         self.first_new = 5 * n
-        self.new = (control or PopulationControl(engine)).reorganise(
-            patch.BOX, self.t, engine.upload(self.h), engine.upload(reach), engine.upload(self.excess), rows,
-            total, self.first_new, **options,
-        )  # fmt: skip
+        control = control or PopulationControl(engine)
+        if "quality" in options:
+            quality = engine.upload(options.pop("quality"))
+            self.new = control.mend(patch.BOX, self.t, quality, rows, self.first_new, **options)
+        else:
+            self.new = control.reorganise(
+                patch.BOX, self.t, engine.upload(self.h), engine.upload(reach), engine.upload(self.excess), rows,
+                total, self.first_new, **options,
+            )  # fmt: skip
         if self.new is not None:
             self.account()
 
@@ -355,3 +362,99 @@ def test_repeats_bit_by_bit(ctx, real):
         assert sweep.new.inserted == sweeps[0].new.inserted > 3
         assert np.array_equal(sweep.new.points.get(), sweeps[0].new.points.get())
         assert np.array_equal(sweep.new.labels.get(), sweeps[0].new.labels.get())
+
+
+SPOTS = {(0.2, 0.2): 0.9, (0.8, 0.2): 0.8, (0.2, 0.6): 0.93, (0.8, 0.6): 0.95}
+
+
+class TestMend:
+    """Cells of poor quality are deleted or split, the worst first."""
+
+    def lattice(self, spots):
+        """A lattice with a dislocation, of quality 1 but at the inner cells nearest to `spots` {place: quality}."""
+        points = dislocated(0.025, 0.0)
+        quality, sites = np.ones(len(points)), []
+        for place, q in spots.items():
+            i = np.linalg.norm(points - place, axis=1).argmin()
+            quality[i] = q
+            sites.append(i)
+        return points, quality, sites
+
+    @pytest.mark.parametrize("split", [False, True])
+    def test_those_below_the_bound_are_mended(self, engine, split):
+        points, quality, sites = self.lattice(SPOTS)
+        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, split=split, share=0.1)
+        changed, others = (sweep.moved, sweep.deleted) if split else (sweep.deleted, sweep.moved)
+        assert sorted(changed) == sorted(sites[:3])
+        assert len(others) == 0
+        for i, there in zip(sweep.moved, sweep.moved_to, strict=True):
+            part = np.sqrt(sweep.host.volumes[i]) / 4
+            centroid = points[i] + sweep.host.offsets[i]
+            assert np.linalg.norm(there - centroid) == pytest.approx(part, rel=1e-6)
+
+    @pytest.mark.parametrize("split", [False, True])
+    def test_five_go_and_seven_are_split_either_way(self, engine, split):
+        points, quality, _ = self.lattice({})
+        five, seven = the_pair(Sweep(engine, points, 0.02, 0.0, theta=QUIET))
+        for i in (five, seven):
+            poor = quality.copy()
+            poor[i] = 0.9
+            sweep = Sweep(
+                engine, points, 0.02, 0.0, quality=poor, flaw=0.06, split=split, share=0.1
+            )
+            assert (sweep.deleted.tolist(), sweep.moved.tolist()) == (
+                ([five], []) if i == five else ([], [seven])
+            )
+
+    def test_the_worst_come_first_and_no_more_than_a_share(self, engine):
+        points, quality, sites = self.lattice(SPOTS)
+        n = len(points)
+        for most in (1, 2):
+            sweep = Sweep(
+                engine, points, 0.02, 0.0, quality=quality, flaw=0.01, share=(most + 0.5) / n
+            )
+            assert sorted(sweep.deleted) == sorted([sites[1], sites[0]][:most])
+        assert n * MENDED_SHARE > 1
+        assert (
+            Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.01, share=0.9 / n).new is None
+        )
+
+    def test_good_meshes_and_walls_are_left_alone(self, engine):
+        points, quality, _ = self.lattice({})
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0).new is None
+        host = patch.fetch(patch.tessellate(engine, points))
+        quality[host.owners[host.neighbours < 0]] = 0.5
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0).new is None
+
+    def test_four_sides_go_and_eight_are_split_whatever_their_quality(self, engine):
+        """Those that are far from all others; every other one has such a one within a few rings."""
+        points = patch.relaxed_points(600, 71, steps=1)
+        sweep = Sweep(engine, points, 0.04, 0.0, quality=np.ones(600), flaw=0.5, share=1.0)
+        sides = np.diff(sweep.host.starts)
+        inner = np.ones(600, bool)
+        inner[sweep.host.owners[sweep.host.neighbours < 0]] = False
+        few, many = (set(np.flatnonzero(inner & odd)) for odd in (sides < 5, sides > 7))
+        assert set(sweep.deleted) <= few
+        assert set(sweep.moved) <= many
+        assert len(sweep.deleted) > 2 < len(sweep.moved)
+        sites = {*sweep.deleted, *sweep.moved}
+        assert sweep.rings_between(list(sites)) > PAIR_RINGS
+
+    def test_generators_that_stay(self, engine):
+        """Neither they nor their neighbours are touched."""
+        points, quality, sites = self.lattice(SPOTS)
+        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0)
+        beside = min(j for j in sweep.neighbours(sites[1]) if j >= 0)
+        for held in (sites[1], beside):
+            fixed = int(sweep.labels[held]) + 1
+            again = Sweep(
+                engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0, fixed=fixed
+            )
+            still = again.labels < fixed
+            free = [
+                i
+                for i in sites[:3]
+                if not still[[i, *(j for j in again.neighbours(i) if j >= 0)]].any()
+            ]
+            assert sites[1] not in free
+            assert sorted([] if again.new is None else again.deleted) == sorted(free)

@@ -17,6 +17,7 @@ from clvoro.errors import (
     MemoryLimitError,
     SizeFieldError,
 )
+from clvoro.plans import EFFORTS
 from clvoro.preparation import METHODS
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
@@ -388,6 +389,22 @@ def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
     assert np.abs(result.error).mean() < 1e-3
     assert result.quality.mean() > 0.96
     check(result, F1)
+
+
+@pytest.mark.parametrize(("seed", "n_cells"), [(2, None), (3, 4500)])
+def test_worst_cells_are_mended(adapter, seed, n_cells):
+    """Off the walls none is below the default's 0.92, by generators that come or go while cells are polished.
+
+    Without them the worst have 0.902 and 0.927; the count is held nevertheless.
+    """
+    size = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.008, slope=0.1)
+    result = adapter.run(BOX, size, seed=seed, n_cells=n_cells)
+    assert n_cells in (None, len(result.points))
+    diagram = result.diagram
+    at_wall = np.logical_or.reduceat(diagram.neighbours < 0, diagram.neighbour_starts[:-1])
+    assert result.quality[~at_wall].min() >= 0.92
+    late = result.history[-EFFORTS["default"].polish + 3 :]
+    assert late["deleted"].sum() > 0
 
 
 def test_n_cells_is_held_when_stopped(adapter):

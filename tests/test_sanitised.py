@@ -89,7 +89,8 @@ def test_other_results_are_found(harmless, built):
 
 FUNCTIONS = {
     "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "population.mark_excess",
-    "projection.assemble", "shape.load_cells", "sizing.evaluate", "sizing.evaluate_with_gradient",
+    "population.mark_flaws", "projection.assemble", "shape.load_cells", "sizing.evaluate",
+    "sizing.evaluate_with_gradient",
 }  # fmt: skip
 """Kernels with functions that OpenCL does not ask to be rounded correctly (log, pow, cbrt, hypot): libraries differ."""
 ROUNDINGS = 64
