@@ -52,8 +52,9 @@ inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some,
     for (int lane = 0; lane < LANES; ++lane) {
         own[lane] = own[lane] && out->items[places[lane]] < seams->own ? -1 : 0;
         most = own[lane] ? max(most, cells->corners[lane]) : most;
+        /* Lanes without a cell have no place. */
         for (int a = 0; a < 3; ++a)
-            x[lane][a] = binned[3 * places[lane] + a];
+            x[lane][a] = own[lane] ? binned[3 * places[lane] + a] : 0;
     }
 #define ACROSS_LANES(a) (double8)(x[0][a], x[1][a], x[2][a], x[3][a], x[4][a], x[5][a], x[6][a], x[7][a])
     const double8 low_x = seams->limits[0] + ACROSS_LANES(0), low_y = seams->limits[2] + ACROSS_LANES(1);
