@@ -28,16 +28,19 @@ class Given:
         self.displacement[self.held] = 0
 
     def project(self, **options):
-        """Return the solution, its correction, and what it leaves as the next start."""
+        """Return the solution, its correction, what it leaves as the next start, and the iteration's arrays."""
         u, start = self.engine.empty((self.n, self.box.dim)), self.engine.empty(self.n, np.float32)
         names = ("h", "gradient", "excess", "displacement")
         given = [self.engine.upload(getattr(self, name)) for name in names]
-        solution = Projection(self.engine).project(
+        stage, taken = Projection(self.engine), []
+        reserve = stage._reserve
+        stage._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
+        solution = stage.project(
             self.t, *given, u, self.engine.upload(self.quality), eps=EPS, lenience=LENIENCE,
             bound=BOUND, labels=self.engine.upload(self.labels, np.int32), fixed=self.fixed,
             start=start, **options,
         )  # fmt: skip
-        return solution, u.get(), start.get()
+        return solution, u.get(), start.get(), taken[0]
 
     def operator(self):
         """J = d excess / dx (n, n, d) by the diagram's faces, and eps (n,)."""
@@ -74,6 +77,7 @@ def kind(ctx, request):
 def test_correction(kind, share, monkeypatch):
     """u = -W J^T y with (J W J^T + eps) y = r + J Ld, by dense algebra; in many launches and in one."""
     given = Given(*kind, share)
+    host = patch.fetch(given.t)
     J, eps = given.operator()
     B = (J * given.h[None, :, None]).reshape(given.n, -1)
     b = given.excess + np.einsum("ija,ja->i", J, given.displacement)
@@ -82,9 +86,14 @@ def test_correction(kind, share, monkeypatch):
     tolerance = 1e-6 if given.engine.real == np.float32 else 1e-11
     for alone in (0, 1000):
         monkeypatch.setattr(projection, "most_alone", lambda engine, most=alone: most)
-        solution, u, start = given.project(max_iterations=500, tolerance=tolerance)
+        solution, u, start, v = given.project(max_iterations=500, tolerance=tolerance)
         assert solution.converged
         # Derivatives in single precision, in a system whose condition number is a thousand.
         assert u == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
         assert start == pytest.approx(y, abs=1e-5 * np.abs(y).max())
         assert not u[given.held].any()
+        # Single precision; across a face to a held generator there is nothing.
+        assert v.inverse.get() == pytest.approx(1 / ((B**2).sum(axis=1) + eps), rel=1e-5)
+        beyond = host.neighbours >= 0
+        beyond[beyond] = given.held[host.neighbours[beyond]]
+        assert not v.rows.get()[:, : len(beyond)][:, beyond].any()
