@@ -2,12 +2,14 @@
 
     python bench/memory.py [--sizes 1e5] [--fields F2,S1] [--methods exact] [--efforts default]
                            [--device NAME] [--dtype float32] [--json]
+    python bench/memory.py --sizes 1e4 --fields jump,stripes,disc,kink,chequers,wall
 
 Every buffer that is made meanwhile is counted until it is freed, by the module of clvoro that
 asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in turn; `fetch` and
 `loops`: the finished diagram). Each field is scaled to the count. The figures are bytes per cell of
 the finished mesh; "output" is the peak while all arrays of the diagram are fetched, which comes
-after the run's own.
+after the run's own; "told" is what `Adapter.memory_needed` says before, and "held" the larger of the
+two over that. In the fields of the second line sizes change several-fold from one cell to the next.
 `clvoro.memory.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
 """
 
@@ -17,7 +19,7 @@ import sys
 import traceback
 import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,8 +38,19 @@ from _common import (
 )
 
 import clvoro
+from clvoro import sizing
 from clvoro.start import count_cells
 
+SQUARE, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
+STEEP = {
+    "jump": (SQUARE, "x < 0.5 ? 1.0 : 19.0"),
+    "stripes": (SQUARE, "sin(25 * x) < 0 ? 1.0 : 10.0"),
+    "disc": (SQUARE, "hypot(x - 0.5, y - 0.5) < 0.25 ? 1.0 : 12.0"),
+    "kink": (SQUARE, "0.001 + fabs(x - 0.5)"),
+    "chequers": (SQUARE, "sin(20 * x) * sin(20 * y) < 0 ? 1.0 : 8.0"),
+    "wall": (CUBE, "x < 0.5 ? 1.0 : 8.0"),
+}
+"""Fields that sizes at generators tell badly, by name: domain and formula."""
 PACKAGE = Path(clvoro.__file__).parent
 PLUMBING = {"_program", "_arrays", "_device_array", "_primitives"}
 """Modules that make buffers for others."""
@@ -94,22 +107,43 @@ def counted_buffers(ledger: Ledger) -> Iterator[None]:
         cl.Buffer = plain  # type: ignore[misc]
 
 
-def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[str, Any]:
-    """Run once by a new adapter and return the peaks, bytes per cell."""
-    domain, field = domain_of(name), test_field(name)
-    field = field * (count_cells(field, domain) / n) ** (1 / domain.dim)
+def peaks(
+    options: Any, work: Callable[[clvoro.Adapter], clvoro.Diagram]
+) -> tuple[clvoro.Diagram, dict[str, int], int]:
+    """Return the diagram that `work` has a new adapter make, and two peaks in bytes.
+
+    That until it is made, by stage, and that while all its arrays are read.
+    """
     ledger = Ledger()
     with counted_buffers(ledger):
-        adapter = make_adapter(options)
-        result = adapter.run(domain, field, method=method, effort=effort, seed=FIRST_SEED)
+        diagram = work(make_adapter(options))
         run = {stage: size for stage, size in ledger.at_peak.items() if size}
         ledger.begin()
-        for array in result.diagram._NAMES:
-            getattr(result.diagram, array, None)
-    cells = len(result.points)
+        for array in diagram._NAMES:
+            getattr(diagram, array, None)
+    return diagram, run, ledger.peak
+
+
+def case_of(name: str, n: int) -> tuple[clvoro.Box, sizing.Field]:
+    """Return domain and size field, which asks for `n` cells."""
+    if name in STEEP:
+        domain, field = STEEP[name][0], sizing.Expression(STEEP[name][1])
+    else:
+        domain, field = domain_of(name), test_field(name)
+    return domain, field * (count_cells(field, domain) / n) ** (1 / domain.dim)
+
+
+def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[str, Any]:
+    """Run once by a new adapter and return the peaks, bytes per cell."""
+    domain, field = case_of(name, n)
+    given = {"method": method, "effort": effort, "seed": FIRST_SEED}
+    diagram, run, output = peaks(options, lambda a: a.run(domain, field, **given).diagram)
+    cells, run_peak = len(diagram), sum(run.values())
+    told = make_adapter(options).memory_needed(domain, field, method=method)
     return {
         "field": name, "dim": domain.dim, "cells": cells, "method": method, "effort": effort,
-        "run": sum(run.values()) / cells, "output": ledger.peak / cells,
+        "run": run_peak / cells, "output": output / cells, "told": told / cells,
+        "held": max(run_peak, output) / told,
         "stages": {stage: size / cells for stage, size in Counter(run).most_common()},
     }  # fmt: skip
 
@@ -135,6 +169,8 @@ def main() -> int:
         "method": lambda r: f"{r['method']}, {r['effort']}",
         "run": lambda r: f"{r['run']:.0f}",
         "output": lambda r: f"{r['output']:.0f}",
+        "told": lambda r: f"{r['told']:.0f}",
+        "held": lambda r: f"{r['held']:.2f}",
         **{f"`{s}`": lambda r, s=s: f"{r['stages'].get(s, 0):.0f}" for s in stages},
     }
     report = Report(options.json, columns)

@@ -22,6 +22,8 @@ random sets (Poisson, mean 2) stay on one level."""
 SPACING_COUNT = 8
 """Generators at least, where a grid has them, from whose number the spacing about a leaf is told."""
 _ZERO = np.zeros(1, np.int32)
+_WORK = ("_keys", "_counts", "_grid_of", "_grid_items", "_starts", "_flags", "_sizes")
+"""Buffers of what nobody asks for once generators are in their bins."""
 MAX_CHILD_SIDE = 64
 MAX_LEVELS = 8
 """Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
@@ -113,9 +115,15 @@ class Bins:
 
     def clear(self) -> None:
         """Let go of all buffers."""
-        for name in list(vars(self)):
-            if isinstance(getattr(self, name), cla.Array):
-                delattr(self, name)
+        self._let_go([name for name in vars(self) if isinstance(getattr(self, name), cla.Array)])
+
+    def clear_work(self) -> None:
+        """Let go of what only `build` takes; the next one makes all anew."""
+        self._let_go([name for name in _WORK if hasattr(self, name)])
+
+    def _let_go(self, names: list[str]) -> None:
+        for name in names:
+            delattr(self, name)
         self._capacity = (0, 0)
 
     def build(self, box: ClipBox, points: cla.Array, n: int) -> BinnedPoints:
@@ -128,6 +136,8 @@ class Bins:
         edge = float(np.prod(upper - lower) * OCCUPANCY / n) ** (1 / d)
         sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
         root_bins = int(np.prod(sides)) + 1
+        if not self._capacity[0]:
+            self.clear()
         self._reserve(n, root_bins + n // 2)
         self._clear(self._counts, 0, root_bins)
         frame, shape = np.zeros(4, engine.real), np.ones(4, np.int32)

@@ -7,6 +7,7 @@ import json
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -32,6 +33,8 @@ _REPEATED = (
 
 _MANY = 5000
 """Cells from which files and pictures take so long that one says so."""
+_MUCH = 2**26
+"""Bytes on the device from which on one says how many."""
 
 
 @dataclass
@@ -98,6 +101,7 @@ class Job:
         with self._stopping_cleanly():
             try:
                 for method in self.case.methods:  # the same seed gives all the same start
+                    self._tell_memory(adapter, size, method, arguments)
                     profile = Profile(adapter) if self.profile else None
                     with profile or nullcontext():
                         result = self._run_one(adapter, size, method, dict(arguments))
@@ -124,6 +128,24 @@ class Job:
         if frames and not self.quiet and not self.as_json:
             print(frames_line(frames))
         return self.interrupted
+
+    def _tell_memory(
+        self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
+    ) -> None:
+        """Say what the run is going to take on the device."""
+        if self.quiet:
+            return
+        known = inspect.signature(adapter.memory_needed).parameters
+        given = {name: value for name, value in arguments.items() if name in known}
+        if method is not None:
+            given["method"] = method
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the run will warn
+            needed = adapter.memory_needed(self.case.domain, size, **given)
+        if sys.stderr.isatty() or needed >= _MUCH:
+            there = adapter.ctx.devices[0].global_mem_size
+            text = f"takes {needed / 2**20:.3g} MiB of the device's {there / 2**20:.3g}"
+            print(f"{self.case.name}: {text}", file=sys.stderr, flush=True)
 
     def _run_one(
         self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]

@@ -148,6 +148,7 @@ class Mesh:
         stages, first = self.stages, not hasattr(self, "tessellation")
         n = len(rows["points"])
         binned = stages.bins.build(self.domain, rows["points"], n)
+        stages.bins.clear_work()
         items = binned.items[:n].copy()
         # One after the other, so that each is let go of when it has been sorted.
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}

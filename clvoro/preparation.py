@@ -14,7 +14,7 @@ from .domain import Domain
 from .errors import CoarseSizeWarning, InputError, InputTypeError
 from .geojson import may_be_degrees
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
-from .memory import check_memory, images_expected
+from .memory import check_memory, images_expected, surplus_expected
 from .mesh import Mesh
 from .methods import PUBLISHED, Relaxation, make_method
 from .misfits import warn_of_misfits
@@ -128,6 +128,8 @@ class Preparation:
         On the size field, so that it asks for `target` cells.
     levels : int
         Coarser levels that a plan begins with.
+    memory : float
+        Bytes that the run takes on the device, or reading its diagram, as far as can be told.
 
     Raises
     ------
@@ -187,7 +189,9 @@ class Preparation:
         most, images = max(self.target, 0 if points is None else len(points)), None
         if any(domain.periodic) and not given:
             images = images_expected(domain, self.sizing, most, asked)
-        check_memory(stages.engine, most, domain, images)
+        data = self.sizing.data
+        held = 0 if data is None else data.nbytes
+        self.memory = check_memory(stages.engine, most, domain, images, held=held)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
@@ -195,6 +199,11 @@ class Preparation:
             self.levels = self._count_levels()
             if options.levels == "auto":
                 self.levels = min(self.levels, most_levels)
+        if options.planned and self._tree is not None:
+            # A coarser level has steeper sizes, and hands its generators on to the next.
+            reach = self.factor * (2 if self.levels else 1)
+            surplus = surplus_expected(domain, self.sizing, self._tree, reach)
+            self.memory = check_memory(stages.engine, most, domain, images, surplus, held)
 
     def _count_levels(self) -> int:
         """Return the number of coarser levels that lead to the cells, from the caller's points or from a sample."""

@@ -95,5 +95,9 @@ def tessellate_box(
         t = stages.repair.follow(stages.cells, domain, points, previous)
         if t is not None:
             return t
-    binned = stages.bins.build(domain, points, n) if binned is None else binned
+        # What steps have worked on is of no use here, where bins need room.
+        stages.engine.workspace.clear()
+    if binned is None:
+        binned = stages.bins.build(domain, points, n)
+        stages.bins.clear_work()
     return stages.cells.tessellate(domain, points, n, binned, exact)

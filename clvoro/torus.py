@@ -101,6 +101,8 @@ class Torus:
             if t is not None:
                 self.latest = None
                 return t
+            # What steps have worked on is of no use here, where images and their bins need room.
+            stages.engine.workspace.clear()
         if margins.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
             margins.fill(FIRST_MARGIN * (volume / n) ** (1 / dim), n)
@@ -108,6 +110,8 @@ class Torus:
         while True:
             images = seam.extend(self.domain, points, n, margins, factor, grow)
             binned = stages.bins.build(images.box, images.points, images.count)
+            if dim == 2:
+                stages.bins.clear_work()
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
                 rows = None if previous is None else seam.unfold(images, previous)
