@@ -103,7 +103,7 @@ kernel void next_margins(const int size, global const float *needed, const int4 
     const int count_b = count_along(&blocks, b), count_c = DIM == 2 ? 1 : count_along(&blocks, c);
     const REAL period = PERIOD_ALONG(a);
     wishes[k] = 0;
-    if (first >= count_b || second >= count_c) {
+    if ((first >= count_b) | (second >= count_c)) {
         margins[k] = 0;
         return;
     }
@@ -123,11 +123,11 @@ kernel void next_margins(const int size, global const float *needed, const int4 
     if (grow)
         margin = fmax(margins[k], fmin(margin, fmax(2 * margins[k], margin / 4)));
     if (margin > 0.99f * (float)period)
-        margin = WHOLE; /* at least as deep as any image, whatever rounds */
+        margin = WHOLE_PERIOD; /* at least as deep as any image, whatever rounds */
     margins[k] = margin;
     if (period > 0) {
         atomic_max(extremes + a, as_int(margin));
-        atomic_max(extremes + EXTREMES_LEAST + seam, as_int(WHOLE) - as_int(margin));
+        atomic_max(extremes + EXTREMES_LEAST + seam, as_int(WHOLE_PERIOD) - as_int(margin));
     }
 }
 
@@ -254,8 +254,10 @@ kernel void fold_rows(const int size, global const int *starts, global const int
             code = codes[label - size];
             mutual = false;
             const int seen = find_image(i, CODES - 1 - code, size, firsts, codes);
-            for (int q = starts[j]; q < starts[j + 1] && !mutual; ++q)
-                mutual = seen >= 0 && neighbours[q] == seen;
+            int times = 0;
+            for (int q = starts[j]; q < starts[j + 1] && seen >= 0; ++q)
+                times += neighbours[q] == seen;
+            mutual = times > 0;
         }
         if (label >= 0 && (!mutual || nearest)) {
             REAL d2 = 0;
@@ -263,8 +265,7 @@ kernel void fold_rows(const int size, global const int *starts, global const int
             EACH_AXIS(a)
             {
                 const REAL d = points[DIM * label + a] - points[DIM * i + a];
-                if (2 * fabs(d) >= PERIOD(a))
-                    far = far || DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) != d;
+                far = far || DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) != d;
                 d2 += d * d;
             }
             const REAL cone = face_measures[k] * sqrt(d2) / (2 * DIM);

@@ -10,7 +10,7 @@ BLOCKS = {2: 128, 3: 32}
 """Blocks per axis along a seam by dimension, at most."""
 FEWEST_BLOCKS = 4
 """The same, at least."""
-FINENESS = 1.0
+FINENESS = 2.0
 """Blocks in 3D to a cell, each way: every ball is held against all blocks that it meets."""
 
 
@@ -49,6 +49,8 @@ class Margins:
         How deep balls around the vertices of the latest diagram go that are a little wider than they need be.
     cells : int
         Generators of that diagram; 0 before the first one.
+    guessed : bool
+        Whether that diagram is still to be made.
     widths : (blocks,) float32, device
         Within which its images were taken, if it had any.
     wishes : (blocks,) int32, device
@@ -60,7 +62,7 @@ class Margins:
     def __init__(self, engine: Engine) -> None:
         count = block_count(engine.dim)
         self.needed = engine.zeros(count, np.float32)
-        self.cells = 0
+        self.cells, self.guessed = 0, False
         self.widths = engine.zeros(count, np.float32)
         self.wishes = engine.zeros(count, np.int32)
         self.extremes = engine.empty(10, np.int32)
@@ -68,4 +70,4 @@ class Margins:
     def fill(self, margin: float, cells: int) -> None:
         """Have `margin` needed everywhere by the diagram of `cells` generators."""
         self.needed.fill(margin)
-        self.cells = cells
+        self.cells, self.guessed = cells, True

@@ -71,19 +71,21 @@ def images_expected(
     for axis in np.flatnonzero(domain.periodic):
         along = [a for a in range(d) if a != axis]
         unit = np.stack(np.meshgrid(*[places] * (d - 1), indexing="ij"), axis=-1).reshape(-1, d - 1)
-        apart = np.zeros((len(unit), len(unit)))  # block from block
-        for column, a in zip(unit.T, along, strict=True):
-            away = np.abs(column[:, None] - column)
+        away2 = []  # squares of how far blocks are apart: along one axis, then along both
+        for a in along:
+            away = np.abs(places[:, None] - places)
             if domain.periodic[a]:
                 away = np.minimum(away, 1 - away)
-            apart += (away * domain.extent[a]) ** 2
-        apart = np.sqrt(apart)
+            away2.append(((away * domain.extent[a]) ** 2).astype(np.float32))
+        apart2 = away2[0] if d == 2 else away2[0][:, None, :, None] + away2[1][:, None, :]
+        apart2 = apart2.reshape(len(unit), len(unit))
+        apart = np.sqrt(apart2)
         images = 0.0
         for end in (0.0, 1.0):
             places_at = np.insert(unit, axis, end, axis=1) * domain.extent + domain.lower
             h = factor * size(places_at)
-            radius = (IMAGE_REACH[d] * h + apart).min(axis=1)
-            deep = np.sqrt((radius**2 - apart**2).max(axis=1).clip(0))
+            radius = ((IMAGE_REACH[d] * h).astype(np.float32) + apart).min(axis=1)
+            deep = np.sqrt((radius**2 - apart2).max(axis=1).clip(0))
             deep = np.minimum(deep, domain.extent[axis])
             # What lies beyond one end lies within the other one.
             places_at[:, axis] = (domain.upper if end == 0 else domain.lower)[axis]

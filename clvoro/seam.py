@@ -20,8 +20,9 @@ SIDEWAYS, OUTWARDS = 0.7, 0.2
 """What the next margins have room for, in ways between the generators about a vertex: that the ball around it moves
 along the seam, or outwards until the generator on it is at the seam; and what it grows beyond that. With less, diagrams
 have to be made again more often."""
-KEPT = 0.9
-"""Share that margins keep, from diagram to diagram, of what they were."""
+KEPT, KEPT_GUESS = {2: 0.9, 3: 0.97}, {2: 0.9, 3: 0.7}
+"""Share that margins keep, from diagram to diagram, of what they were, and of what was a guess, by dimension. In 3D,
+where nothing is repaired, diagrams follow each other closely; the more is kept, the fewer balls have a wish."""
 OTHER_CELLS = 0.1
 """Share by which the spacing of generators changes where cells are others than before."""
 
@@ -57,6 +58,8 @@ class Images:
     box : ExtendedBox
     margins : Margins
         Within which images were taken.
+    kept : float32
+        Share that they keep at least, whatever the cells need.
     seams : tuple
         What kernels that look at the balls around the vertices of cells take as SEAM_ARGS (common/seams.h).
     points : (>= count, d) real
@@ -72,6 +75,7 @@ class Images:
     count: int
     box: ExtendedBox
     margins: Margins
+    kept: np.float32
     seams: tuple[object, ...]
     points: cla.Array
     firsts: cla.Array
@@ -144,6 +148,7 @@ class Seam:
         lengths = np.maximum((corners[1] - corners[0]) / counts, 1e-30).astype(engine.real)
         blocks = corners[0], lengths, counts
         others = abs(factor - 1) > OTHER_CELLS or bool((was != counts).any())
+        kept = np.float32((KEPT_GUESS if others or margins.guessed else KEPT)[d])
         margins.extremes.fill(0)
         engine.run_each(
             k.next_margins, block_count(d), margins.needed, was, np.float32(factor),
@@ -171,10 +176,10 @@ class Seam:
         box = ExtendedBox(lower - wide, upper + wide)
         seams = (
             np.int32(n), np.append(periods, np.zeros(4 - d)).astype(engine.real), *blocks,
-            engine.real.type(SIDEWAYS), engine.real.type(OUTWARDS), np.float32(KEPT),
+            engine.real.type(SIDEWAYS), engine.real.type(OUTWARDS), kept,
             margins.widths, margins.extremes, margins.wishes, self._report,
         )  # fmt: skip
-        return Images(n, count, box, margins, seams, extended, firsts, owners, codes)
+        return Images(n, count, box, margins, kept, seams, extended, firsts, owners, codes)
 
     def unfold(self, images: Images, previous: Tessellation) -> Rows:
         """Return rows of the extended graph for the generators, from `previous`: the same ones at earlier positions."""
@@ -222,10 +227,10 @@ class Seam:
                 t.neighbours, *images.box.device_corners(engine.real), *images.seams,
             )  # fmt: skip
         engine.run_each(
-            k.note_margins, block_count(engine.dim), margins.widths, np.float32(KEPT),
-            margins.wishes, margins.needed,
+            k.note_margins, block_count(engine.dim), margins.widths, images.kept, margins.wishes,
+            margins.needed,
         )  # fmt: skip
-        margins.cells = n
+        margins.cells, margins.guessed = n, False
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
         graph = [

@@ -8,7 +8,7 @@
 #error "build with -DBLOCKS=most blocks per axis along a seam"
 #endif
 
-#define WHOLE 4.0f /* more than any depth: positions lie in the unit box */
+#define WHOLE_PERIOD 4.0f /* more than any depth: positions lie in the unit box */
 
 /* Share of a vertex's distance from the generator by which it rounds at most, and no cell grows that matters. */
 #define BALL_NOISE (IS_DOUBLE ? R(1e-5) : R(1e-4))
@@ -49,7 +49,7 @@ typedef struct {
     find_limits(&seams, seam_extremes)
 
 /* Of margins, as bits of floats, which are in the order of floats >= 0: the largest along each axis, and from
-   EXTREMES_LEAST on WHOLE's less those of the least at either end. All are sought by atomic_max. */
+   EXTREMES_LEAST on WHOLE_PERIOD's less those of the least at either end. All are sought by atomic_max. */
 #define EXTREMES_LEAST 4
 
 inline void find_limits(seams_t *in, global const int *extremes)
@@ -57,7 +57,7 @@ inline void find_limits(seams_t *in, global const int *extremes)
     const REAL periods[3] = {in->period.s0, in->period.s1, in->period.s2};
     for (int seam = 0; seam < 2 * DIM; ++seam) {
         const REAL period = periods[seam / 2];
-        const float least = as_float(as_int(WHOLE) - extremes[EXTREMES_LEAST + seam]);
+        const float least = as_float(as_int(WHOLE_PERIOD) - extremes[EXTREMES_LEAST + seam]);
         in->limits[seam] = period > 0 ? (REAL)(in->kept * fmin(least, (float)period)) : REAL_MAX;
     }
 }
@@ -108,8 +108,8 @@ inline bool look_at_ball(const REAL *x, REAL radius, REAL sideways, REAL outward
 {
     const blocks_t *blocks = &in->blocks;
     const REAL periods[4] = {in->period.s0, in->period.s1, in->period.s2, 0};
-    if (!(radius < WHOLE)) /* a NaN, too: vertices of a whole cell lie within the box around */
-        radius = WHOLE;
+    if (!(radius < WHOLE_PERIOD)) /* a NaN, too: vertices of a whole cell lie within the box around */
+        radius = WHOLE_PERIOD;
     radius *= 1 + BALL_NOISE;
     const REAL wide = radius + sideways;
     bool more = false;
@@ -128,12 +128,16 @@ inline bool look_at_ball(const REAL *x, REAL radius, REAL sideways, REAL outward
         const int last_b = block_of(x[b] + wide, b, blocks);
         const int first_c = DIM == 2 ? 0 : block_of(x[c] - wide, c, blocks);
         const int last_c = DIM == 2 ? 0 : block_of(x[c] + wide, c, blocks);
-        for (int j = first_b; j <= last_b; ++j) {
-            const REAL aside_b2 = block_distance2(x[b], b, j, blocks);
+        /* Nor need it be looked at where they are deep enough for the middle of the ball. */
+        const float enough = most <= in->kept * period ? 1.00001f * (float)(most / in->kept) : INFINITY;
+        for (int j = first_b; j <= last_b; ++j)
             for (int k = first_c; k <= last_c; ++k) {
                 const int block = block_place(a, seam % 2, j, k);
                 const float margin = in->margins[block];
-                const REAL aside2 = aside_b2 + (DIM == 2 ? R(0) : block_distance2(x[c], c, k, blocks));
+                if (margin >= enough)
+                    continue;
+                const REAL aside2 =
+                    block_distance2(x[b], b, j, blocks) + (DIM == 2 ? R(0) : block_distance2(x[c], c, k, blocks));
                 /* What the wish has to be more than, as seen from the ball's middle. */
                 const REAL known = fmax(in->kept * fmin(margin, (float)period) + to_seam - out, R(0));
                 const REAL nearer = sideways > 0 ? fmax(sqrt(aside2) - sideways, R(0)) : sqrt(aside2);
@@ -147,10 +151,10 @@ inline bool look_at_ball(const REAL *x, REAL radius, REAL sideways, REAL outward
                 if (wish > 0)
                     atomic_max(in->wishes + block, as_int(wish));
                 const REAL deep = sqrt(fmax(radius * radius - aside2, R(0))) - to_seam;
-                if (radius * radius > aside2 && margin < WHOLE && 1.00001f * (float)(deep + 4 * REAL_EPS) > margin)
+                if (radius * radius > aside2 && margin < WHOLE_PERIOD &&
+                    1.00001f * (float)(deep + 4 * REAL_EPS) > margin)
                     atomic_or(in->lacking, 1);
             }
-        }
     }
     return more;
 }

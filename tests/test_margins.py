@@ -1,0 +1,201 @@
+"""Margins of periodic boxes: what cells tell of them against all balls around the vertices of all images."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+import clvoro
+from clvoro.margins import BLOCKS, FEWEST_BLOCKS, FINENESS, Margins, block_counts
+from clvoro.seam import KEPT, OUTWARDS, SIDEWAYS, Seam
+from clvoro.torus import Torus
+
+BOXES = {
+    2: clvoro.Box((0, 0), (1, 0.7), periodic=True),
+    3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=True),
+}
+NOISE = {"float64": 1e-5, "float32": 1e-4}
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def adapter(ctx, request):
+    return clvoro.Adapter(ctx, request.param)
+
+
+def lattice(box, count, rng):
+    """Places of a body-centred lattice, each some way off: no four nearly in a plane, or on a circle."""
+    cubes = np.indices((count,) * box.dim).reshape(box.dim, -1).T
+    points = np.concatenate([cubes, cubes + 0.5]) / count
+    points += 0.12 / count * rng.uniform(-1, 1, points.shape)
+    return np.array(box.lower) + box.extent * (points % 1)
+
+
+def balls(points, periods):
+    """Centres and radii of balls with generators on them, of which one is in the box, and their shortest distance."""
+    shifts = sorted(
+        itertools.product((-1, 0, 1), repeat=len(periods)), key=np.abs(1j).__mul__ and any
+    )
+    images = np.concatenate([points + np.array(s) * periods for s in shifts])
+    simplices = Delaunay(images).simplices
+    corners = images[simplices[(simplices < len(points)).any(axis=1)]]
+    edges = corners[:, 1:] - corners[:, :1]
+    centres = np.linalg.solve(edges, (edges**2).sum(axis=2)[..., None] / 2)[..., 0]
+    pairs = itertools.combinations(range(len(periods) + 1), 2)
+    ways = [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in pairs]
+    return corners[:, 0] + centres, np.linalg.norm(centres, axis=1), np.min(ways, axis=0)
+
+
+def outside(x, lower, upper):
+    """How far x (k,) are from blocks, (k, blocks); the outermost ones go on for ever."""
+    below, above = lower - x[:, None], x[:, None] - upper
+    below[:, 0] = above[:, -1] = 0
+    return np.maximum(np.maximum(below, above), 0)
+
+
+def needs(points, periods, counts, sideways, outwards, noise):
+    """What balls need of each block of each seam, {(axis, end): (blocks, ...)}; balls may move by shares of ways."""
+    centres, radii, ways = balls(points, periods)
+    radii = radii * (1 + noise)
+    found = {}
+    for axis, end in itertools.product(range(len(periods)), (0, 1)):
+        to_seam = periods[axis] - centres[:, axis] if end else centres[:, axis]
+        aside2 = 0.0
+        for a in (a for a in range(len(periods)) if a != axis):
+            ends = np.arange(counts[a] + 1) * periods[a] / counts[a]
+            away = outside(centres[:, a], ends[:-1], ends[1:])
+            aside2 = (
+                aside2 + away**2
+                if np.ndim(aside2) == 0
+                else aside2[..., None] + away[:, None, :] ** 2
+            )
+        shape = (-1,) + (1,) * (aside2.ndim - 1)
+        radius, side = radii.reshape(shape), (sideways * ways).reshape(shape)
+        out = outwards * ways + np.clip(radii + to_seam, 0, sideways * ways)
+        deep2 = radius**2 - np.maximum(np.sqrt(aside2) - side, 0) ** 2
+        depth = np.sqrt(np.maximum(deep2, 0)) + (out - to_seam).reshape(shape)
+        found[axis, end] = np.where(deep2 > 0, depth, 0).max(axis=0).clip(0)
+    return found
+
+
+def blocks_of(array, dim, counts):
+    """The same of an array of the device."""
+    whole = array.get().reshape(dim, 2, *(BLOCKS[dim],) * (dim - 1))
+    found = {}
+    for axis, end in itertools.product(range(dim), (0, 1)):
+        along = [counts[a] for a in range(dim) if a != axis]
+        found[axis, end] = whole[(axis, end, *(slice(k) for k in along))]
+    return found
+
+
+@pytest.mark.parametrize("walks", [True, False])
+@pytest.mark.parametrize(("dim", "count"), [(2, 7), (3, 4)])
+def test_margins_follow_the_balls_around_vertices(adapter, dim, count, walks):
+    box, rng = BOXES[dim], np.random.default_rng(2206)
+    points, real = lattice(box, count, rng), adapter.dtype
+    n, stages = len(points), adapter._stages_for(box)
+    if not walks:
+        if dim == 2 or stages.cells._wrap is None:
+            pytest.skip("cells are made in one way only")
+        stages.cells._wrap = None
+    x = stages.engine.upload(box.place(points, real))
+    torus = Torus(stages, box)
+    for _ in range(5):  # margins come near to what is needed
+        torus.tessellate(x, n)
+    stages.release()
+    periods, place = box.periods(real), x.get().astype(float)
+    counts = block_counts(periods, n)[:dim]
+    noise = NOISE[real.name]
+    needed = blocks_of(torus.margins.needed, dim, counts)
+    widths = blocks_of(torus.margins.widths, dim, counts)
+    wished = needs(place, periods, counts, SIDEWAYS, OUTWARDS, noise)
+    least = needs(place, periods, counts, 0, 0, 0)
+    spacing, told = (np.prod(periods) / n) ** (1 / dim), 0
+    for seam, wish in wished.items():
+        kept = KEPT[dim] * np.minimum(widths[seam], periods[seam[0]])
+        told += (wish > kept).sum()
+        # Vertices round, and a wish is a little more than is needed.
+        assert np.abs(needed[seam] - np.maximum(wish, kept)).max() < 3 * noise * spacing
+        assert (widths[seam] >= least[seam] * (1 - noise)).all()
+    assert told > 30
+
+
+@pytest.mark.parametrize("short", [0.6, 0.9])
+def test_margins_that_are_too_narrow_are_found_out(adapter, short):
+    """Wherever one block of many is narrower than a ball needs it, and only there."""
+    box, rng = BOXES[3], np.random.default_rng(2207)
+    points, real = lattice(box, 4, rng), adapter.dtype
+    n, stages = len(points), adapter._stages_for(box)
+    x, seam = stages.engine.upload(box.place(points, real)), stages.seam
+    periods = box.periods(real)
+    counts = block_counts(periods, n)[:3]
+    least = needs(x.get().astype(float), periods, counts, 0, 0, 0)
+    found = []
+    for factor in (1.001, short):
+        for axis, end in itertools.product(range(3), (0, 1)):
+            margins, widths = Margins(stages.engine), {}
+            whole = np.zeros((3, 2, BLOCKS[3], BLOCKS[3]), np.float32)
+            for (a, e), need in least.items():
+                widths[a, e] = 1.001 * need
+                if (a, e) == (axis, end):
+                    worst = np.unravel_index(need.argmax(), need.shape)
+                    widths[a, e][worst] = factor * need.max()
+                whole[a, e, : need.shape[0], : need.shape[1]] = widths[a, e]
+            margins.needed.set(whole.ravel())
+            margins.cells = n
+            found.append(is_enough(stages, seam, box, x, n, margins))
+    assert found == [True] * 6 + [False] * 6
+
+
+def is_enough(stages, seam: Seam, box, x, n, margins):
+    """Whether a diagram within these margins is said to be right."""
+    images = seam.extend(box, x, n, margins, 1.0, False)
+    binned = stages.bins.build(images.box, images.points, images.count)
+    t = stages.cells.tessellate(
+        images.box, images.points, images.count, binned, None, False, n, images.seams
+    )
+    return seam.fold(images, binned, t, x, 0.5, True)[1]
+
+
+def test_blocks_are_twice_as_many_as_cells():
+    assert (block_counts(np.array([1.0, 0.5]), 10) == BLOCKS[2]).all()
+    for n in (1, 700, 5000, 40_000, 10**7):
+        counts = block_counts(np.array([1.0, 0.3, 2.0]), n)[:3]
+        across = FINENESS * np.array([1.0, 0.3, 2.0]) * (n / 0.6) ** (1 / 3)
+        assert (counts <= np.maximum(across, FEWEST_BLOCKS)).all()
+        assert ((2 * counts > across) | (counts == BLOCKS[3])).all()
+    assert (block_counts(np.array([1.0, 1.0, 0.0]), 100)[:2] == BLOCKS[3]).all()
+
+
+@pytest.mark.parametrize(("before", "after"), [(600, 5000), (5000, 600), (5000, 40_000)])
+def test_margins_of_other_blocks(adapter, before, after):
+    """Where blocks are others than before, margins are those of all that lie within their own depth."""
+    box, rng = BOXES[3], np.random.default_rng(2208)
+    stages = adapter._stages_for(box)
+    margins, periods = Margins(stages.engine), box.periods(adapter.dtype)
+    was, counts = (block_counts(periods, n)[:3] for n in (before, after))
+    assert (was != counts).any()
+    old = np.zeros((3, 2, BLOCKS[3], BLOCKS[3]), np.float32)
+    for axis in range(3):
+        along = [was[a] for a in range(3) if a != axis]
+        old[axis, :, : along[0], : along[1]] = 0.02 * (1 + rng.random((2, *along)))
+    margins.needed.set(old.ravel())
+    margins.cells = before
+    factor = (before / after) ** (1 / 3)
+    points = np.array(box.lower) + box.extent * rng.random((after, 3))
+    x = stages.engine.upload(box.place(points, adapter.dtype))
+    stages.seam.extend(box, x, after, margins, factor, False)
+    found = blocks_of(margins.widths, 3, counts)
+    for axis, end in itertools.product(range(3), (0, 1)):
+        b, c = (a for a in range(3) if a != axis)
+        gaps = []
+        for a in (b, c):
+            one, other = (periods[a] / k[a] for k in (counts, was))
+            middles = one * (np.arange(counts[a]) + 0.5), other * (np.arange(was[a]) + 0.5)
+            apart = np.abs(middles[0][:, None] - middles[1]) - abs(one - other) / 2
+            gaps.append(np.maximum(apart, 0))
+        depths = factor * old[axis, end, : was[b], : was[c]]
+        apart2 = gaps[0][:, None, :, None] ** 2 + gaps[1][None, :, None, :] ** 2
+        expected = np.where(apart2 < depths**2, depths, 0).max(axis=(2, 3))
+        # Rounding may decide whether a block is as near as its margin is deep: random depths are not that near.
+        assert np.abs(found[axis, end] - expected).max() < 1e-6
