@@ -9,6 +9,7 @@ from functools import cached_property
 from itertools import pairwise
 from os import PathLike
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import shapely
@@ -21,6 +22,7 @@ from .rings import make_rings, signed_area
 
 if TYPE_CHECKING:
     from ._program import Engine
+    from ._workspace import Workspace
 
 _MARGIN = 1 / 64  # of the clip box around the domain, of the bounding box's longest edge
 
@@ -297,21 +299,22 @@ class Polygon(Region):
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the corners of the clip box, and the edges in bins; see common/edges.h."""
-        key = engine.queue.int_ptr, engine.real
-        if key not in self._on_device:
+        there = self._on_device.setdefault(engine.workspace, {})
+        if engine.real not in there:
             origin, scale = self.frame
             begins = (self.vertices - origin) / scale
             ends = begins[self.next_vertex]
             frame, shape, starts, listed = bin_edges(begins, ends)
-            self._on_device[key] = (
+            there[engine.real] = (
                 frame.astype(engine.real), shape, engine.upload(starts, np.int32),
                 engine.upload(np.concatenate([begins, ends], axis=1)[listed].ravel()),
             )  # fmt: skip
-        return *self.device_corners(engine.real), *self._on_device[key]
+        return *self.device_corners(engine.real), *there[engine.real]
 
     @cached_property
-    def _on_device(self) -> dict[tuple[object, ...], tuple[object, ...]]:
-        return {}
+    def _on_device(self) -> WeakKeyDictionary[Workspace, dict[np.dtype, tuple[object, ...]]]:
+        """What `device_args` has made, by the workspace of the engine, with which it goes, and precision."""
+        return WeakKeyDictionary()
 
 
 def _described(values: dict[str, Any]) -> Polygon:
