@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
@@ -30,6 +31,12 @@ BOX = clvoro.Box((-1, 2), (1, 3))
 
 def size(x):
     return 0.08 + 0.2 * np.hypot(x[:, 0], x[:, 1] - 2.5)
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays_open():
+    yield
+    pyplot.close("all")
 
 
 @pytest.fixture(scope="module")

@@ -332,6 +332,9 @@ INFEASIBLE = ("jump", "jump of 100", "steep", "peak")
 """No mesh can follow h that grows by a cell's length within the cell."""
 
 
+@pytest.mark.filterwarnings(
+    "ignore::clvoro.errors.CoarseSizeWarning"
+)  # one is larger than the domain
 @pytest.mark.parametrize("name", FIELDS)
 def test_fields(adapter, name):
     field = FIELDS[name]()
