@@ -98,36 +98,34 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
     EACH_AXIS(p)
     {
         b[p] = SUM(REAL, rises[p]);
-        g[p] = 0;
         EACH_AXIS(q)
         if (q >= p)
             m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
-    /* Too few or collinear neighbours leave the gradient undetermined: take none. */
+    /* Too few or collinear neighbours leave the gradient undetermined: take none. Divided by infinity, as PoCL 6 with
+       LLVM 18 dies of a branch here. */
     const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);
     const REAL least = sqrt(REAL_EPS);
 #if DIM == 2
     const REAL det = m[0][0] * m[1][1] - m[0][1] * m[1][0];
-    if (det > least * trace * trace) {
-        g[0] = (b[0] * m[1][1] - b[1] * m[0][1]) / det;
-        g[1] = (m[0][0] * b[1] - m[1][0] * b[0]) / det;
-    }
+    const REAL over = det > least * trace * trace ? det : INFINITY;
+    g[0] = (b[0] * m[1][1] - b[1] * m[0][1]) / over;
+    g[1] = (m[0][0] * b[1] - m[1][0] * b[0]) / over;
 #else
     const REAL c0 = m[1][1] * m[2][2] - m[1][2] * m[2][1];
     const REAL c1 = m[1][2] * m[2][0] - m[1][0] * m[2][2];
     const REAL c2 = m[1][0] * m[2][1] - m[1][1] * m[2][0];
     const REAL det = m[0][0] * c0 + m[0][1] * c1 + m[0][2] * c2;
-    if (det > least * trace * trace * trace) {
-        g[0] = (b[0] * c0 + b[1] * (m[0][2] * m[2][1] - m[0][1] * m[2][2]) +
-                b[2] * (m[0][1] * m[1][2] - m[0][2] * m[1][1])) /
-               det;
-        g[1] = (b[0] * c1 + b[1] * (m[0][0] * m[2][2] - m[0][2] * m[2][0]) +
-                b[2] * (m[0][2] * m[1][0] - m[0][0] * m[1][2])) /
-               det;
-        g[2] = (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) +
-                b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
-               det;
-    }
+    const REAL over = det > least * trace * trace * trace ? det : INFINITY;
+    g[0] =
+        (b[0] * c0 + b[1] * (m[0][2] * m[2][1] - m[0][1] * m[2][2]) + b[2] * (m[0][1] * m[1][2] - m[0][2] * m[1][1])) /
+        over;
+    g[1] =
+        (b[0] * c1 + b[1] * (m[0][0] * m[2][2] - m[0][2] * m[2][0]) + b[2] * (m[0][2] * m[1][0] - m[0][0] * m[1][2])) /
+        over;
+    g[2] =
+        (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) + b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
+        over;
 #endif
     EACH_AXIS(a)
     gradient[DIM * i + a] = g[a];

@@ -262,11 +262,10 @@ def test_every_truncation_and_flipped_byte_is_noticed(result, tmp_path):
 
 
 @pytest.mark.parametrize("compress", [True, False])
-def test_vtu_as_meshio_reads_it(result, tmp_path, compress):
-    meshio = pytest.importorskip("meshio")
+def test_vtu_as_meshio_reads_it(result, tmp_path, compress, meshio_for_vtu):
     path = tmp_path / "mesh.vtu"
     write_vtu(result, path, compress)
-    mesh = meshio.read(path)
+    mesh = meshio_for_vtu.read(path)
     d = result.diagram
     np.testing.assert_array_equal(mesh.points[:, :2], d.vertices)
     # meshio puts runs of cells with equally many sides into a block; their order is kept.
@@ -304,13 +303,12 @@ def test_vtu_as_vtk_reads_it(result, tmp_path):
     np.testing.assert_array_equal(vtk_to_numpy(data.GetArray("error")), result.error)
 
 
-def test_vtu_of_many_blocks(tmp_path, result, monkeypatch):
-    meshio = pytest.importorskip("meshio")
+def test_vtu_of_many_blocks(tmp_path, result, monkeypatch, meshio_for_vtu):
     # 40 sizes are 320 bytes: full blocks only, a partial last block, a single block.
     for block in (32, 96, 320, 1000):
         monkeypatch.setattr("clvoro.io.vtu._BLOCK", block)
         io.save(result, tmp_path / "mesh.vtu")
-        mesh = meshio.read(tmp_path / "mesh.vtu")
+        mesh = meshio_for_vtu.read(tmp_path / "mesh.vtu")
         np.testing.assert_array_equal(np.concatenate(mesh.cell_data["size"]), result.size)
 
 
