@@ -320,11 +320,11 @@ class Mesh:
     def _repopulate(self, rows: dict[str, Any]) -> tuple[int, int]:
         """Take other generators, which are used up, if there are any; return how many came and went."""
         self.engine.workspace.clear()
+        self.stages.population.clear()
         if not rows:
             return 0, 0
         inserted, deleted = rows.pop("inserted"), rows.pop("deleted")
         self.next_label += inserted
-        self.stages.population.clear()
         self.adopt(rows)
         return inserted, deleted
 

@@ -152,6 +152,17 @@ def test_steps_allocate_nothing(engine, made, method):
     assert counts[3:] == counts[3:4] * 4
 
 
+def test_nothing_to_mend_leaves_no_memory(engine, made):
+    """What the search takes is not kept beside the next diagram."""
+    size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
+    points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
+    mesh = Mesh(Stages(engine), patch.BOX, size, points)
+    before = len(made)
+    assert mesh.mend(flaw=2.0, split=False) == (0, 0)
+    assert len(made) > before  # it has looked
+    assert not mesh.stages.population._room._arrays
+
+
 def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
     """At once, not when Python looks for references in circles: a launch that refers to its stage would make one."""
     alive, plain = weakref.WeakSet(), cl.Buffer
