@@ -157,8 +157,8 @@ def test_nothing_to_mend_leaves_no_memory(engine, made):
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
     points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
     mesh = Mesh(Stages(engine), patch.BOX, size, points)
-    before = len(made)
-    assert mesh.mend(flaw=2.0, split=False) == (0, 0)
+    mesh.fixed, before = mesh.n, len(made)  # all stay where they are
+    assert mesh.mend(flaw=0.06, split=False) == (0, 0)
     assert len(made) > before  # it has looked
     assert not mesh.stages.population._room._arrays
 
