@@ -21,7 +21,7 @@ from .fetch import fetch_diagram
 from .layers import Layers
 from .loop import Loop
 from .made_by import describe
-from .memory import check_memory
+from .memory import check_memory, memory_needed
 from .preparation import Options, Preparation, check_options
 from .results import Diagram, Result
 from .resume import Saved
@@ -50,6 +50,8 @@ class Adapter:
     ----------
     ctx, queue : pyopencl.Context, pyopencl.CommandQueue
     dtype : numpy.dtype
+    told : callable, optional
+        What a run calls with the bytes that it takes on the device, before it begins; see `memory_needed`.
 
     Raises
     ------
@@ -88,6 +90,7 @@ class Adapter:
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
+        self.told: Callable[[float], object] | None = None
 
     def __repr__(self) -> str:
         return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
@@ -191,7 +194,7 @@ class Adapter:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
-        check_memory(engine, n, domain, run=False)
+        check_memory(engine, n, memory_needed(engine, n, domain, run=False))
         binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with Naming(host, domain, self.dtype):
@@ -394,9 +397,12 @@ class Adapter:
             made_by = describe(domain, vars(options), self.dtype, host)
         if saved is not None:
             saved.fit(made_by)
-        most = MOST_LEVELS if saved is None else saved.levels
+        most, told = MOST_LEVELS if saved is None else saved.levels, self.told
         while True:
             prepared = Preparation(stages, domain, size, host, options, most)
+            if told is not None:
+                told(prepared.memory)
+                told = None
             try:
                 loop = self._begin(prepared, made_by, saved, checkpoint, every, callback)
                 return loop.run(

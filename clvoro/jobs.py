@@ -7,7 +7,6 @@ import json
 import signal
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -101,7 +100,6 @@ class Job:
         with self._stopping_cleanly():
             try:
                 for method in self.case.methods:  # the same seed gives all the same start
-                    self._tell_memory(adapter, size, method, arguments)
                     profile = Profile(adapter) if self.profile else None
                     with profile or nullcontext():
                         result = self._run_one(adapter, size, method, dict(arguments))
@@ -129,23 +127,12 @@ class Job:
             print(frames_line(frames))
         return self.interrupted
 
-    def _tell_memory(
-        self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
-    ) -> None:
+    def _memory_line(self, adapter: Any, needed: float) -> str:
         """Say what the run is going to take on the device."""
-        if self.quiet:
-            return
-        known = inspect.signature(adapter.memory_needed).parameters
-        given = {name: value for name, value in arguments.items() if name in known}
-        if method is not None:
-            given["method"] = method
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the run will warn
-            needed = adapter.memory_needed(self.case.domain, size, **given)
-        if sys.stderr.isatty() or needed >= _MUCH:
-            there = adapter.ctx.devices[0].global_mem_size
-            text = f"takes {needed / 2**20:.3g} MiB of the device's {there / 2**20:.3g}"
-            print(f"{self.case.name}: {text}", file=sys.stderr, flush=True)
+        there = adapter.ctx.devices[0].global_mem_size
+        return (
+            f"{self.case.name}: takes {needed / 2**20:.3g} MiB of the device's {there / 2**20:.3g}"
+        )
 
     def _run_one(
         self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
@@ -164,7 +151,15 @@ class Job:
                     shown(row)
                 return self.interrupted
 
-            result: Result = adapter.run(self.case.domain, size, callback=callback, **arguments)
+            def told(needed: float) -> None:
+                if shown is not None and (shown.live or needed >= _MUCH):
+                    shown.tell(self._memory_line(adapter, needed))
+
+            adapter.told = told
+            try:
+                result: Result = adapter.run(self.case.domain, size, callback=callback, **arguments)
+            finally:
+                adapter.told = None
         if result.stop_reason == "interrupted":
             self.interrupted = True
         return replace(result, stop_reason="interrupted") if self.interrupted else result

@@ -175,17 +175,8 @@ def memory_needed(
     return max(peak, output) + held
 
 
-def check_memory(
-    engine: Engine,
-    n: float,
-    domain: Domain | None = None,
-    images: float | None = None,
-    surplus: float = 0.0,
-    held: float = 0.0,
-    *,
-    run: bool = True,
-) -> float:
-    """Return the bytes that a mesh of `n` cells of `domain` takes, if there are as many; see `memory_needed`.
+def check_memory(engine: Engine, n: float, needed: float) -> float:
+    """Return `needed`, the bytes that a mesh of `n` cells takes (`memory_needed`), if there are as many.
 
     Nothing has been allocated yet.
 
@@ -194,7 +185,6 @@ def check_memory(
     MemoryLimitError
         Saying how many cells were asked for, how much memory they need and how much there is.
     """
-    needed = memory_needed(engine, n, domain, images, surplus, held, run=run)
     available = engine.queue.device.global_mem_size
     if n > MOST_CELLS:
         raise MemoryLimitError(

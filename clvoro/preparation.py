@@ -14,7 +14,7 @@ from .domain import Domain
 from .errors import CoarseSizeWarning, InputError, InputTypeError
 from .geojson import may_be_degrees
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
-from .memory import check_memory, images_expected, surplus_expected
+from .memory import check_memory, images_expected, memory_needed, surplus_expected
 from .mesh import Mesh
 from .methods import PUBLISHED, Relaxation, make_method
 from .misfits import warn_of_misfits
@@ -156,7 +156,7 @@ class Preparation:
         self.rows, self.free = np.empty((0, d)), domain
         field = given_field = as_field(size)
         if options.layers:
-            check_memory(stages.engine, count_rows(domain, options.layers), domain)
+            self._check_memory(count_rows(domain, options.layers))
             self.rows, self.free = (
                 place_layers(domain, options.layers),
                 free_domain(domain, options.layers),
@@ -191,7 +191,7 @@ class Preparation:
             images = images_expected(domain, self.sizing, most, asked)
         data = self.sizing.data
         held = 0 if data is None else data.nbytes
-        self.memory = check_memory(stages.engine, most, domain, images, held=held)
+        self.memory = self._check_memory(most, images, held=held)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
@@ -203,7 +203,7 @@ class Preparation:
             # A coarser level has steeper sizes, and hands its generators on to the next.
             reach = self.factor * (2 if self.levels else 1)
             surplus = surplus_expected(domain, self.sizing, self._tree, reach)
-            self.memory = check_memory(stages.engine, most, domain, images, surplus, held)
+            self.memory = self._check_memory(most, images, surplus, held)
 
     def _count_levels(self) -> int:
         """Return the number of coarser levels that lead to the cells, from the caller's points or from a sample."""
@@ -220,8 +220,16 @@ class Preparation:
                 f"level has {2**d} times fewer"
             )
         begun = 0 if points is None else len(points) * 2.0 ** (d * min(count, 99))
-        check_memory(self.stages.engine, begun, self.domain)
+        self._check_memory(begun)
         return count
+
+    def _check_memory(
+        self, n: float, images: float | None = None, surplus: float = 0.0, held: float = 0.0
+    ) -> float:
+        """Return the bytes that a run of `n` cells takes, if there are as many."""
+        engine = self.stages.engine
+        needed = memory_needed(engine, n, self.domain, images, surplus, held)
+        return check_memory(engine, n, needed)
 
     def generators(self) -> np.ndarray:
         """Return the first ones, (n, d): the caller's or a random sample of the coarsest level, after those of layers.

@@ -39,14 +39,14 @@ class Progress:
         self._past: deque[tuple[float, float, int]] = deque()
         self._shown, self._began = 0.0, time.monotonic()
         self._status = _rich_status(self.stream)
-        self._live = self._status is not None or self.stream.isatty()
+        self.live = self._status is not None or self.stream.isatty()
 
     def __enter__(self) -> Progress:
         text = f"{self.title}: preparing (a first run builds its kernels)"
         if self._status is not None:
             self._status.start()
             self._status.update(text)
-        elif self._live:
+        elif self.live:
             self._replace(text)
             self._shown = time.monotonic() - REFRESH
         return self
@@ -54,7 +54,7 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         if self._status is not None:
             self._status.stop()
-        elif self._live and self._shown:
+        elif self.live and self._shown:
             self.stream.write("\r\x1b[K")
             self.stream.flush()
 
@@ -67,18 +67,26 @@ class Progress:
             while len(self._past) > PACED + 1 and self._past[1][0] <= row["seconds"] / 2:
                 self._past.popleft()
         now = time.monotonic()
-        if now - self._shown < (REFRESH if self._live else EVERY):
+        if now - self._shown < (REFRESH if self.live else EVERY):
             return
-        if not self._live and now - self._began < EVERY:
+        if not self.live and now - self._began < EVERY:
             return  # a short run needs no lines of progress in a log
         self._shown = now
         text = self.line(row)
         if self._status is not None:
             self._status.update(text)
-        elif self._live:
+        elif self.live:
             self._replace(text)
         else:
             self.stream.write(text + "\n")
+        self.stream.flush()
+
+    def tell(self, text: str) -> None:
+        """Write a line that stays, above the one that changes."""
+        if self._status is not None:
+            self._status.tell(text)
+            return
+        self.stream.write(f"\r{text}\x1b[K\n" if self.live else f"{text}\n")
         self.stream.flush()
 
     def _replace(self, text: str) -> None:
@@ -128,6 +136,9 @@ class _Status:
 
     def stop(self) -> None:
         self._live.stop()
+
+    def tell(self, text: str) -> None:
+        self._live.console.print(self._text(text))
 
     def update(self, text: str) -> None:
         line = self._text(text, no_wrap=True, overflow="ellipsis")

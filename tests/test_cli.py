@@ -373,6 +373,20 @@ def test_terminal_with_rich(monkeypatch):
     assert "[x] 1/5" in stream.getvalue()
 
 
+@pytest.mark.parametrize("kind", ["log", "terminal", "rich"])
+def test_a_line_that_stays(monkeypatch, kind):
+    if kind == "rich":
+        pytest.importorskip("rich")
+    else:
+        monkeypatch.setitem(sys.modules, "rich.console", None)
+    stream = io.StringIO() if kind == "log" else Terminal()
+    with progress.Progress("x", 5, stream) as shown:
+        shown.tell("takes [1] MiB")
+    text = stream.getvalue()
+    assert re.search(r"takes \[1\] MiB\S*\s*\n", text)
+    assert kind != "log" or text == "takes [1] MiB\n"
+
+
 def test_log_gets_a_line_now_and_then(monkeypatch):
     stream = io.StringIO()
     clock = iter(range(0, 1000, 2))

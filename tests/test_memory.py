@@ -217,6 +217,15 @@ def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
     json.loads(shown.out)
 
 
+def test_a_run_tells_what_it_takes(ctx):
+    """Once, before its first row, and what `memory_needed` says."""
+    adapter, calls = clvoro.Adapter(ctx), []
+    adapter.told = calls.append
+    adapter.run(SQUARE, 0.1, max_steps=2, callback=lambda row: calls.append(None))
+    assert calls[0] == adapter.memory_needed(SQUARE, 0.1)
+    assert calls.count(None) == len(calls) - 1 > 0
+
+
 PERIODIC = {
     "alike": (2, 8000, sizing.Constant(1.0)),
     "waves": (2, 8000, sizing.Expression("1 + 0.9 * sin(6.2831853 * x)")),
@@ -258,9 +267,9 @@ def test_what_does_not_fit_is_refused(ctx, dim, real):
     reals, integers = PEAK[dim]
     most = max(reals * size + 4 * integers, OUTPUT[dim][size])
     fits = min(room / most, MOST_CELLS)
-    check_memory(engine, 0.99 * fits)
+    check_memory(engine, 0.99 * fits, memory_needed(engine, 0.99 * fits))
     with pytest.raises(MemoryLimitError, match="GiB"):
-        check_memory(engine, 1.01 * fits)
+        check_memory(engine, 1.01 * fits, memory_needed(engine, 1.01 * fits))
     with pytest.raises(MemoryLimitError, match="GiB"):
         clvoro.Adapter(ctx, real).run(
             clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits)
