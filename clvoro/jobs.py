@@ -18,6 +18,7 @@ import numpy as np
 from .cases import Case
 from .errors import Aborted, ClvoroError, InputError
 from .io import check_writable, save, write_history
+from .memory import in_bytes
 from .polygon import Polygon
 from .profile import Profile
 from .results import Result
@@ -127,13 +128,6 @@ class Job:
             print(frames_line(frames))
         return self.interrupted
 
-    def _memory_line(self, adapter: Any, needed: float) -> str:
-        """Say what the run is going to take on the device."""
-        there = adapter.ctx.devices[0].global_mem_size
-        return (
-            f"{self.case.name}: takes {needed / 2**20:.3g} MiB of the device's {there / 2**20:.3g}"
-        )
-
     def _run_one(
         self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
     ) -> Result:
@@ -152,8 +146,10 @@ class Job:
                 return self.interrupted
 
             def told(needed: float) -> None:
+                there = adapter.ctx.devices[0].global_mem_size
+                text = f"{title}: takes {in_bytes(needed)} of the device's {in_bytes(there)}"
                 if shown is not None and (shown.live or needed >= _MUCH):
-                    shown.tell(self._memory_line(adapter, needed))
+                    shown.tell(text)
 
             adapter.told = told
             try:

@@ -175,6 +175,12 @@ def memory_needed(
     return max(peak, output) + held
 
 
+def in_bytes(amount: float) -> str:
+    """Return a number of bytes as people read it: 258 KiB, 1.47 GiB."""
+    power = 0 if amount < 2**10 else 1 if amount < 2**20 else 2 if amount < 2**30 else 3
+    return f"{amount / 2 ** (10 * power):.3g} {('bytes', 'KiB', 'MiB', 'GiB')[power]}"
+
+
 def check_memory(engine: Engine, n: float, needed: float) -> float:
     """Return `needed`, the bytes that a mesh of `n` cells takes (`memory_needed`), if there are as many.
 
@@ -189,14 +195,14 @@ def check_memory(engine: Engine, n: float, needed: float) -> float:
     if n > MOST_CELLS:
         raise MemoryLimitError(
             f"the run asks for {n:.3g} cells, expected at most {MOST_CELLS:.3g}, which the device's 32-bit "
-            f"indices can tell apart (and they would need {needed / 2**30:.3g} GiB of "
-            f"{available / 2**30:.3g} GiB). Are h and the domain in the same unit of length? Otherwise use a larger "
+            f"indices can tell apart (and they would need {in_bytes(needed)} of "
+            f"{in_bytes(available)}). Are h and the domain in the same unit of length? Otherwise use a larger "
             "size or n_cells"
         )
     if needed > available:
         raise MemoryLimitError(
-            f"the size field asks for {n:.3g} cells, which need {needed / 2**30:.3g} GiB on the device; "
-            f"{engine.queue.device.name.strip()} has {available / 2**30:.3g} GiB. Are h and the domain in the same "
+            f"the size field asks for {n:.3g} cells, which need {in_bytes(needed)} on the device; "
+            f"{engine.queue.device.name.strip()} has {in_bytes(available)}. Are h and the domain in the same "
             "unit of length? Otherwise use a larger size, n_cells, dtype='float32' or another device"
         )
     return needed

@@ -207,13 +207,11 @@ def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
     )
     call = ["run", str(case), "--out", str(tmp_path / "out"), "--no-report", "--steps", "1"]
     assert cli.main(call) == 0
-    assert "MiB" not in capsys.readouterr().err
+    assert "takes" not in capsys.readouterr().err
     monkeypatch.setattr(jobs, "_MUCH", 0)
     assert cli.main([*call, "--json"]) == 0
     shown = capsys.readouterr()
-    assert (
-        f"takes {adapter.memory_needed(SQUARE, 0.1) / 2**20:.3g} MiB of the device's" in shown.err
-    )
+    assert f"takes {adapter.memory_needed(SQUARE, 0.1) / 2**10:.3g} KiB of the dev" in shown.err
     json.loads(shown.out)
 
 
