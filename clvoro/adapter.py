@@ -431,6 +431,7 @@ class Adapter:
         plan = prepared.plan(mesh)
         writer = None if checkpoint is None else Checkpointer(checkpoint, every, made_by, plan)
         if saved is not None:
+            mesh = None  # and with it the room that the one from there takes
             mesh = saved.restore(
                 prepared.stages, prepared.domain, prepared.sizing, plan, prepared.free, len(prepared.rows)
             )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NoReturn
 
@@ -17,7 +18,15 @@ from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
-from .tessellation import COINCIDE, DOUBT, EXACT_SHARE, FULL, ROUGH_SHARE, Tessellation
+from .tessellation import (
+    COINCIDE,
+    DOUBT,
+    EXACT_SHARE,
+    FULL,
+    ROUGH_SHARE,
+    Tessellation,
+    restored,
+)
 
 CELL_CAPACITY = 24
 """Faces that a cell may have while it is clipped."""
@@ -104,6 +113,16 @@ class Cells:
                 "face_centroids": engine.empty((most, d), engine.face),
             }
             self._room = most
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
+    ) -> Tessellation:
+        """Return the diagram of `points` (n, d) that was `saved`, as it was: with room for so many more faces."""
+        n, m = len(points), len(saved["neighbours"])
+        self._reserve(n)
+        self._reserve_faces(n, m + spare)
+        faces = {name: array[: m + spare] for name, array in self._of_faces.items()}
+        return restored(points, {**self._views, **faces}, saved)
 
     @framed
     def tessellate(

@@ -103,27 +103,48 @@ class Mesh:
     ) -> None:
         if labels is None:
             labels = stages.engine.upload(np.arange(len(points)), np.int32)
-        rows = {"points": points, "labels": labels}
-        self._set_up(stages, domain, sizing, rows, coarsening, free, fixed)
+        self._set_up(stages, domain, sizing, coarsening, free, fixed)
+        self._begin({"points": points, "labels": labels})
+
+    @classmethod
+    def saved(
+        cls,
+        stages: Stages,
+        domain: Domain,
+        sizing: Sizing,
+        arrays: dict[str, cla.Array],
+        coarsening: float,
+        free: Domain | None,
+        fixed: int,
+    ) -> Mesh:
+        """Return a mesh of `arrays` by name as another one had them, but for its diagram, which is yet to be set."""
+        mesh = cls.__new__(cls)
+        mesh._set_up(stages, domain, sizing, coarsening, free, fixed)
+        n = len(arrays["points"])
+        mesh.__dict__.update({**dict.fromkeys(_DERIVED), **_UNKNOWN, **arrays, "n": n})
+        mesh._make_room()
+        return mesh
 
     def _set_up(
         self,
         stages: Stages,
         domain: Domain,
         sizing: Sizing,
-        rows: dict[str, cla.Array],
         coarsening: float,
         free: Domain | None,
         fixed: int,
         coarser: Tessellator | None = None,
     ) -> None:
-        """Make the mesh of generators in `rows`, which is used up: its points and labels."""
+        """Make what is not of any generators."""
         self.engine, self.fixed = stages.engine, fixed
         self.free = domain if free is None else free
         self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
         self.tessellator = Tessellator(stages, domain, self._spacing, coarser)
         self.summaries = Summaries(self.engine, SUMMARIES)
         self._ordered: cla.Array | None = None
+
+    def _begin(self, rows: dict[str, cla.Array]) -> None:
+        """Take the first generators, in `rows`, which is used up: their points and labels."""
         n = self.next_label = len(rows["points"])
         rows["velocity"] = self.engine.zeros(rows["points"].shape)
         rows["signatures"] = self.engine.zeros(n, np.uint64)
@@ -360,9 +381,10 @@ class Mesh:
         # Not by its constructor, whose caller would hold on to the arrays.
         mesh = Mesh.__new__(Mesh)
         mesh._set_up(
-            self.stages, self.domain, self.sizing, rows, self.coarsening / 2, self.free, self.fixed,
+            self.stages, self.domain, self.sizing, self.coarsening / 2, self.free, self.fixed,
             self.tessellator,
         )  # fmt: skip
+        mesh._begin(rows)
         mesh.next_label = self.next_label + n - self.n
         return mesh
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +18,16 @@ from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
 from .errors import ClvoroError, InputError, MemoryLimitError
 from .margins import seam_defines
-from .tessellation import COINCIDE, DOUBT, EXACT_SHARE, FULL, NARROW, ROUGH_SHARE, Tessellation
+from .tessellation import (
+    COINCIDE,
+    DOUBT,
+    EXACT_SHARE,
+    FULL,
+    NARROW,
+    ROUGH_SHARE,
+    Tessellation,
+    restored,
+)
 
 FACE_CAPACITY = 64
 """Faces that a cell may have while it is clipped; doubled for those cells that have more."""
@@ -96,6 +106,18 @@ class Polyhedra:
             faces["face_measures"] = engine.empty(m)
             faces["face_centroids"] = engine.empty((m, 3))
         return faces
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
+    ) -> Tessellation:
+        """Return the diagram of `points` (n, 3) that was `saved`, as it was: with room for so many more faces."""
+        n, m = len(points), len(saved["neighbours"]) + spare
+        self._reserve_cells(n)
+        cells = {
+            name: a[: n + 1] if name == "starts" else a[:n] for name, a in self._of_cells.items()
+        }
+        faces = {name: array[:m] for name, array in self._faces(m).items()}
+        return restored(points, {**cells, **faces}, saved)
 
     @framed
     def tessellate(

@@ -16,7 +16,6 @@ from .checkpoint import (
     DIAGRAM,
     FORMAT,
     MESH,
-    PER_FACE,
     VERSION,
     capacities_of,
     fingerprint,
@@ -31,7 +30,6 @@ from .polygon import Polygon
 from .results import HISTORY_DTYPE, Displacements
 from .seam import block_count
 from .stages import Stages
-from .tessellation import Tessellation
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -195,36 +193,30 @@ class Saved:
                 f"cannot resume from {self.name}: its plan is another, as of another version of clvoro; begin anew"
             )
         _set_capacities(stages, state["capacities"])
-        points = engine.upload(a["mesh.points"])
-        labels = engine.upload(a["mesh.labels"], np.int32)
-        # Makes room in all stages, too: the arrays that it computes are then replaced.
-        mesh = Mesh(stages, domain, sizing, points, labels, self.coarsening, free, fixed)
-        sizes = engine.empty(mesh.n)
-        sizing.evaluate(points, mesh.n, sizes)
-        moving = self.arrays["mesh.labels"] >= fixed
+        arrays = {name: engine.upload(a[f"mesh.{name}"], a[f"mesh.{name}"].dtype) for name in MESH}
+        points, n = arrays["points"], len(arrays["points"])
+        sizes = engine.empty(n)
+        sizing.evaluate(points, n, sizes)
+        moving = a["mesh.labels"] >= fixed
         self._compare_sizes(sizes.get().astype(float) * self.coarsening, domain, moving)
-        for name in MESH:
-            array = a[f"mesh.{name}"]
-            setattr(mesh, name, engine.upload(array, array.dtype))
+        del sizes
         if "multipliers" in a:
-            mesh.multipliers = engine.upload(a["multipliers"], np.float32)
-        t = {}
-        for name in DIAGRAM:
-            array = a[f"diagram.{name}"]
-            if name in PER_FACE:  # as much spare room as there was
-                array = np.concatenate(
-                    [array, np.zeros((state["spare"], *array.shape[1:]), array.dtype)]
-                )
-            t[name] = engine.upload(array, array.dtype)
+            arrays["multipliers"] = engine.upload(a["multipliers"], np.float32)
+        mesh = Mesh.saved(stages, domain, sizing, arrays, self.coarsening, free, fixed)
+        # Into the arrays of the stage that makes the next one: those of a run take much of the device's memory.
         if isinstance(domain, Polygon):
             # Trimmed from another diagram, which is not kept: made anew, it has the same bits.
-            mesh.tessellation = mesh.tessellator.tessellate(mesh.points, mesh.n)
-        elif t["face_measures"].dtype != engine.face:
+            mesh.tessellation = mesh.tessellator.tessellate(points, n)
+            stages.bins.clear()
+        elif a["diagram.face_measures"].dtype != engine.face:
             raise InputError(
-                f"cannot resume from {self.name}: it is damaged (faces are {t['face_measures'].dtype})"
+                f"cannot resume from {self.name}: it is damaged (faces are {a['diagram.face_measures'].dtype})"
             )
         else:
-            mesh.tessellation = Tessellation(n=mesh.n, points=mesh.points, **t)
+            folded = engine.dim == 2 and any(domain.periodic)
+            cells = stages.folded if folded else stages.cells
+            t = {name: a[f"diagram.{name}"] for name in DIAGRAM}
+            mesh.tessellation = cells.restore(points, t, state["spare"])
         mesh.next_label = state["next_label"]
         torus = mesh.tessellator.torus
         if torus is not None:

@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING
 import pyopencl.array as cla
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+
     from .trim import Trimmed
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
@@ -55,3 +59,18 @@ class Tessellation:
     outlines: tuple[cla.Array, ...] = ()
     trimmed: Trimmed | None = None
     narrow: bool = False
+
+
+def restored(
+    points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]
+) -> Tessellation:
+    """Return the diagram of `points` of which `arrays` are to hold what was `saved`, by the names of its fields.
+
+    Arrays may have more rows, which are filled with zeros.
+    """
+    for name, array in arrays.items():
+        known = len(saved[name])
+        array[:known].set(saved[name])
+        if len(array) > known:
+            array[known:].fill(0)
+    return Tessellation(n=len(points), points=points, **arrays)
