@@ -65,6 +65,8 @@ class Effort:
         Sweeps (reorganise, then glide) on the finest level, on the next coarser one, ...; the last holds for all above.
     glide : int
         Steps in a sweep.
+    first : int
+        Sweeps on the coarsest level, at most, where there are others.
     polish : int
         Steps of polishing, at the end.
     aim : float
@@ -95,6 +97,7 @@ class Effort:
     momentum: float = 0.7
     eps: float = 0.3
     nuclei: float = 0.0
+    first: int = 99
     emphasis: float = 20.0
     lenience: float = 0.03
     bound: float = 12.0
@@ -103,7 +106,7 @@ class Effort:
 
 
 EFFORTS = {
-    "fast": Effort(20, 2, 3, (0, 1, 4, 8), glide=6, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
+    "fast": Effort(8, 2, 3, (0, 1, 4, 8), glide=6, first=4, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
     "default": Effort(
         30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, aim=0.0025, lenience=0.02,
         bound=11.0, mends=((5, Mend(0.06)), (9, Mend(0.06)), (13, Mend(0.07))),
@@ -292,6 +295,8 @@ def _adaptive_2d(
         if levels == 0:
             # The only level has no coarser one to have done the work.
             sweeps = max(sweeps, effort.sweeps[-1])
+        elif level == levels:
+            sweeps = min(sweeps, effort.first)
         for sweep in range(sweeps):
             quiet = sweep % 3 or sweep >= sweeps - 8
             yield Reorganise(0.0 if quiet else effort.nuclei)
