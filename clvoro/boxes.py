@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -99,11 +99,22 @@ class Boxes:
         """Return the physical edge lengths (m, d)."""
         return self.root * _HALVED[self.level[chosen]][:, None]
 
+    def longest(self) -> np.ndarray:
+        """Return each box's longest edge (m,)."""
+        return reduce(np.maximum, self.edges().T)
+
+    def volumes(self, chosen: slice | np.ndarray = _ALL) -> np.ndarray:
+        """Return the boxes' areas or volumes (m,)."""
+        return reduce(np.multiply, self.edges(chosen).T)
+
     def points(self, at: np.ndarray, chosen: slice | np.ndarray = _ALL) -> np.ndarray:
         """Return the points (m, p, d) at relative positions `at` (p, d) or (m, p, d) in [0, 1]."""
-        step = _HALVED[self.level[chosen]][:, None, None]
-        x = self.origin + self.root * (self.corner[chosen][:, None, :] + step * at)
-        return np.clip(x, self.origin, self.upper)
+        step, corner = _HALVED[self.level[chosen]][:, None], self.corner[chosen]
+        found = np.empty((len(corner), *at.shape[-2:]))
+        for a in range(self.dim):  # NumPy is slow along short axes
+            x = self.origin[a] + self.root[a] * (corner[:, a, None] + step * at[..., a])
+            np.clip(x, self.origin[a], self.upper[a], out=found[..., a])
+        return found
 
     @property
     def deepest(self) -> int:

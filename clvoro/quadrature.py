@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -152,10 +152,9 @@ class DensityTree:
         points = self.cover.keep(self.boxes.points(at, chosen), chosen)
         m, p, dim = points.shape
         h = self.sizes(points.reshape(-1, dim)).reshape(m, p)
-        edges = self.boxes.edges(chosen)
         with np.errstate(over="ignore"):
             # The cells that the box would hold at each sample's size.
-            density = np.prod(edges[:, None, :] / h[:, :, None], axis=2)
+            density = reduce(np.multiply, (e[:, None] / h for e in self.boxes.edges(chosen).T))
         if not np.isfinite(density).all():
             i, j = np.argwhere(~np.isfinite(density))[0]
             where = ", ".join(f"{c:.6g}" for c in points[i, j])
@@ -165,7 +164,8 @@ class DensityTree:
             )
         offset = at - 0.5
         self.cells[chosen] = self.cover.weigh(density @ weight, chosen)
-        self._low[chosen], self._high[chosen] = h.min(axis=1), h.max(axis=1)
+        samples = np.ascontiguousarray(h.T)  # NumPy is slow along short axes
+        self._low[chosen], self._high[chosen] = samples.min(axis=0), samples.max(axis=0)
         self.slopes[chosen] = -dim * (np.log(h) @ offset) / (offset[:, 0] ** 2).sum()
 
     def _mark(self, domain: Domain) -> None:
@@ -203,7 +203,7 @@ class DensityTree:
         # (a) All but the small errors whose sum is within the tolerance. What a jump cuts off
         # between two samples goes unseen by the rule; up to 0.056 of the box lies beyond the last
         # sample.
-        volumes = self.cover.weigh(np.prod(boxes.edges(), axis=1), np.ones(len(boxes), bool))
+        volumes = self.cover.weigh(boxes.volumes(), np.ones(len(boxes), bool))
         reached = self.cover.reached
         jumps = reached & (high > _JUMP * low)
         sliver = np.zeros(len(boxes))
@@ -214,8 +214,7 @@ class DensityTree:
         chosen = np.zeros(len(boxes), bool)
         chosen[by_error[~within]] = True
         # (b) Dips that are not resolved.
-        longest = boxes.edges().max(axis=1)
-        chosen |= (longest > low) & (high > _STEEP * low)
+        chosen |= (boxes.longest() > low) & (high > _STEEP * low)
         # (c) Neighbours of much smaller boxes.
         chosen[there[boxes.level[there] < boxes.level[here] - 1]] = True
         chosen &= reached & (boxes.level < boxes.deepest)

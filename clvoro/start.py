@@ -290,7 +290,7 @@ def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.
     if not isinstance(cover, PolygonCover):
         return lambda n: domain.lower + domain.extent * rng.random((n, domain.dim))
     while True:
-        areas = np.where(cover.reached, np.prod(boxes.edges(), axis=1), 0)
+        areas = np.where(cover.reached, boxes.volumes(), 0)
         if areas.sum() <= 2 * domain.measure or len(boxes) >= _MOST_COVER:
             break
         cover.split(cover.reached & (cover.share < 1))
