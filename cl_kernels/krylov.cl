@@ -195,25 +195,42 @@ kernel void direction(int k, int n, REAL tolerance, global const STORE *u, globa
     turn(k, n, tolerance, u, p, partial, state, record, scratch);
 }
 
-/* x += alpha p, r -= alpha q. */
-kernel void update(int k, int n, int centre, global const STORE *p, global const STORE *q, global REAL *x,
-                   global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
+/* How far iteration k goes along its direction: alpha, and the same for x, which is not scaled as the residual is; the
+   mean that is taken from the residual; the unknowns that are concerned, none once the iteration is over. */
+typedef struct {
+    int end;
+    REAL alpha, alpha_x, mean;
+} Stride;
+
+inline Stride stride_of(int k, int n, int centre, global const REAL *partial, global REAL *state, global REAL *record,
+                        local REAL *scratch)
 {
-    local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
-    const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
+    Stride s;
+    const REAL curvature = total_sum(ROW(CURVATURE), scratch);
     if (running && get_global_id(0) == 0) {
         now[RECORD_CURVATURE] = curvature;
         if (k == 0)
             state[0] = state[3];
     }
-    const int end = running && curvature > 0 ? n : 0;
-    const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
+    s.end = running && curvature > 0 ? n : 0;
+    s.alpha = now[RECORD_GAMMA] / curvature;
+    s.alpha_x = s.alpha * state[1];
+    s.mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
+    return s;
+}
+
+/* x += alpha p, r -= alpha q. */
+kernel void update(int k, int n, int centre, global const STORE *p, global const STORE *q, global REAL *x,
+                   global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
+{
+    local REAL scratch[GROUP_SIZE];
+    const Stride s = stride_of(k, n, centre, partial, state, record, scratch);
     Sum norm = SUM_ZERO, sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, end)) {
-        const STORE ri = r[i] - mean - alpha * q[i];
-        x[i] += alpha_x * p[i];
+    for (BLOCK_LOOP(i, s.end)) {
+        const STORE ri = r[i] - s.mean - s.alpha * q[i];
+        x[i] += s.alpha_x * p[i];
         r[i] = ri;
         sum_add(&norm, (REAL)ri * ri);
         sum_add(&sum, ri);
@@ -227,20 +244,11 @@ inline void advance(int k, int n, int centre, global const STORE *inverse_diagon
                     global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
                     global REAL *state, global REAL *record, local REAL *scratch)
 {
-    global REAL *now = record + 4 * k;
-    const int running = now[RECORD_RUNNING] != 0;
-    const REAL curvature = total_sum(ROW(CURVATURE), scratch), alpha = now[RECORD_GAMMA] / curvature;
-    if (running && get_global_id(0) == 0) {
-        now[RECORD_CURVATURE] = curvature;
-        if (k == 0)
-            state[0] = state[3];
-    }
-    const int end = running && curvature > 0 ? n : 0;
-    const REAL alpha_x = alpha * state[1], mean = centre ? total_sum(ROW(SUM_R(k)), scratch) / n : 0;
+    const Stride s = stride_of(k, n, centre, partial, state, record, scratch);
     Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, end)) {
-        const STORE ri = r[i] - mean - alpha * q[i], ui = inverse_diagonal[i] * ri;
-        x[i] += alpha_x * p[i];
+    for (BLOCK_LOOP(i, s.end)) {
+        const STORE ri = r[i] - s.mean - s.alpha * q[i], ui = inverse_diagonal[i] * ri;
+        x[i] += s.alpha_x * p[i];
         r[i] = ri;
         u[i] = ui;
         sum_add(&norm, (REAL)ri * ri);
