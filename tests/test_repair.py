@@ -10,6 +10,7 @@ from clvoro import repair
 from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
+from clvoro.face_rows import SLOT
 from clvoro.repair import Repair
 
 N = 700
@@ -205,6 +206,30 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
     assert sum(rounds[1:]) < 0.1 * rounds[0]
 
 
+def no_longer_convex(t, points):
+    """Who is to be marked: around which face the rows of `t` make no convex cells of `points`."""
+    after = np.arange(len(t.neighbours)) + 1
+    after[t.starts[1:] - 1] = t.starts[:-1]
+    before = np.argsort(after)
+    walls = np.flatnonzero(t.neighbours < 0)
+    axis, side = divmod(-1 - t.neighbours[walls], 2)
+    ways = points[np.maximum(t.neighbours, 0)] - points[t.owners]
+    ways[walls] = 0  # to the image behind the wall
+    levels = np.array([patch.BOX.lower, patch.BOX.upper])[side, axis]
+    ways[walls, axis] = 2 * (levels - points[t.owners[walls], axis])
+    # Corners are as far from either neighbour as from the generator.
+    pairs = np.stack([ways, ways[after]], axis=1)
+    corners = np.linalg.solve(pairs, (pairs**2).sum(axis=2)[..., None] / 2)[..., 0]
+    edges = corners - corners[before]
+    bad = np.flatnonzero(np.minimum(cross(ways, ways[after]), cross(ways, edges)) <= 0)
+    around = np.stack([t.neighbours[k] for k in (bad, before[bad], after[bad])])
+    return np.union1d(t.owners[bad], around[around >= 0]).tolist()
+
+
+def cross(a, b):
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
 @pytest.mark.parametrize("group_size", [None, 128])
 def test_who_is_clipped_has_changed(ctx, group_size, monkeypatch):
     """At first those whose neighbours are others than before, and hardly anybody else; later hardly anybody."""
@@ -230,11 +255,96 @@ def test_who_is_clipped_has_changed(ctx, group_size, monkeypatch):
         ]
         changed = {i for i, _ in pairs[0] ^ pairs[1]}
         first, *others = [*rounds, np.zeros(0, int)]
+        assert first.tolist() == no_longer_convex(before, points)
         assert set(first.tolist()) <= changed
         # Two changes beside each other are found out one after the other.
         assert len(changed) - len(first) <= 0.02 * len(changed)
         assert sum(map(len, others)) <= 0.05 * len(changed)
         assert (share > 0) == (len(changed) > 20)
+
+
+class Rows:
+    """Rows while a diagram is repaired, as NumPy's; `marks` and `fits` as a round of clipping has to leave them."""
+
+    def __init__(self, places, slots, counts, starts, neighbours):
+        self.places, self.slots, self.counts = places.get(), slots.get(), counts.get()
+        self.starts, self.neighbours = starts.get(), neighbours.get()
+
+    def old(self, i):
+        return self.neighbours[self.starts[i] : self.starts[i + 1]].tolist()
+
+    def row(self, i):
+        place = self.places[i]
+        if place < 0:
+            return self.old(i)
+        return self.slots[place * SLOT :][: abs(self.counts[place])].tolist()
+
+    def is_doubtful(self, i):
+        return self.places[i] >= 0 and self.counts[self.places[i]] < 0
+
+
+def around(row, j):
+    """Return the neighbours before and behind `j` in a row; None if it is not there."""
+    if j not in row:
+        return None
+    k = row.index(j)
+    return row[k - 1], row[(k + 1) % len(row)]
+
+
+def checked(before, after, listed, fits):
+    """Return who is to be marked after `listed` were clipped, and who is known to fit."""
+    marks, fits = np.zeros(len(fits), int), fits.copy()
+    for i in listed:
+        if before.places[i] >= 0:  # clipped once more: whom it leaves may have been found to fit it
+            fits[[j for j in before.row(i) if j >= 0 and j not in after.row(i)]] = 0
+    fits[listed] = 1
+    for i in listed:
+        row = after.row(i)
+        for j in row:
+            if j >= 0 and around(after.row(j), i) != around(row, j)[::-1]:
+                fits[[i, j]], marks[[i, j]] = 0, 1
+        for j in after.old(i):
+            if j >= 0 and j not in row and i in after.row(j):
+                fits[j] = 0
+                if not after.is_doubtful(j):
+                    marks[[i, j]] = 1
+    return marks, fits
+
+
+def test_rounds_of_clipping(ctx, monkeypatch):
+    """Who is marked after each round, and who is known to fit, of many small sets that change much, row by row."""
+    engine, rng = patch.make_engine(ctx), np.random.default_rng(40973)
+    run, rounds, state = Engine.run_each, [], {}
+
+    def watched(self, kernel, size, *args, **kwargs):
+        name = kernel.function_name
+        if name == "clip_marked":
+            state.update(rows=Rows(*args[3:8]), fits=args[-2].get())
+        event = run(self, kernel, size, *args, **kwargs)
+        if name == "check_clipped":
+            listed = args[0].get()[:size]
+            marks, fits = checked(state["rows"], Rows(*args[1:6]), listed, state["fits"])
+            assert np.array_equal(args[-2].get(), marks)
+            assert np.array_equal(args[-1].get(), fits)
+            rounds.append(size)
+        return event
+
+    monkeypatch.setattr(Engine, "run_each", watched)
+    monkeypatch.setattr(repair, "MAX_SHARE", 1.0)
+    monkeypatch.setattr(repair, "AGAIN_SHARE", 1.0)
+    points, most, times = patch.random_points(30, 40974), 0, 0
+    carried = Carried(engine, points)
+    for _ in range(60):
+        rounds.clear()
+        points = points + 1.5 * spacing(points) * (rng.random(points.shape) - 0.5)
+        points = np.clip(points, 0.01, [0.99, 0.74])
+        t, was = carried.move(points)
+        assert np.array_equal(t.neighbours, carried.reference(points).neighbours)
+        most, times = max(most, len(rounds)), times + was
+        if was and len(rounds) <= 1:
+            assert carried.repair._fits.get().all()
+    assert most >= 3
+    assert times > 40
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 2.0])
