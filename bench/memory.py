@@ -3,6 +3,7 @@
     python bench/memory.py [--sizes 1e5] [--fields F2,S1] [--methods exact] [--efforts default]
                            [--device NAME] [--dtype float32] [--json]
     python bench/memory.py --sizes 1e4 --fields jump,stripes,disc,kink,chequers,wall
+    python bench/memory.py --sizes 300,6000 --kinds all
 
 Every buffer that is made meanwhile is counted until it is freed, by the module of clvoro that
 asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in turn; `fetch` and
@@ -10,12 +11,16 @@ asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in
 the finished mesh; "output" is the peak while all arrays of the diagram are fetched, which comes
 after the run's own; "told" is what `Adapter.memory_needed` says before, and "held" the larger of the
 two over that. In the fields of the second line sizes change several-fold from one cell to the next.
+The third line has all kinds of runs (`_kinds.py`, or some of them by their first word), one that is
+resumed and a transfer: shares of what is told that are held while the run is prepared, by the run,
+and while its diagram is read.
 `clvoro.memory.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 import traceback
 import weakref
 from collections import Counter
@@ -24,6 +29,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyopencl as cl
 from _common import (
     FIRST_SEED,
@@ -36,12 +42,15 @@ from _common import (
     parser,
     test_field,
 )
+from _kinds import CUBE, KINDS, SQUARE, Kind
 
 import clvoro
 from clvoro import sizing
+from clvoro._program import Engine
+from clvoro.remap import transfer_values
 from clvoro.start import count_cells
+from clvoro.transfer import transfer_needed
 
-SQUARE, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
 STEEP = {
     "jump": (SQUARE, "x < 0.5 ? 1.0 : 19.0"),
     "stripes": (SQUARE, "sin(25 * x) < 0 ? 1.0 : 10.0"),
@@ -148,13 +157,104 @@ def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[s
     }  # fmt: skip
 
 
+def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
+    """Run once and return what was told, bytes per cell, and shares of it that were held."""
+    domain, size, given = kind
+    ledger, told, before = Ledger(), [], []
+    with counted_buffers(ledger):
+        adapter = make_adapter(options)
+
+        def begin(amount: float) -> None:
+            told.append(amount)
+            before.append(ledger.peak)
+            ledger.begin()
+
+        adapter.told = begin
+        diagram = adapter.run(domain, size, seed=FIRST_SEED, **given).diagram
+        run = ledger.peak
+        ledger.begin()
+        for array in diagram._NAMES:
+            getattr(diagram, array, None)
+    parts = {"preparation": before[0], "run": run, "output": ledger.peak}
+    shares = {name: part / told[0] for name, part in parts.items()}
+    cells = len(diagram)
+    return {"cells": cells, "told": told[0] / cells, **shares, "held": max(shares.values())}
+
+
+def resumed(options: Any, n: int) -> dict[str, Any]:
+    """Measure a run that goes on from the middle of its finest level."""
+    with tempfile.TemporaryDirectory() as folder:
+        file, size = Path(folder) / "state", n**-0.5
+        make_adapter(options).run(
+            SQUARE, size, seed=FIRST_SEED, checkpoint=file, checkpoint_every=1e9,
+            callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
+        )  # fmt: skip
+        return measure_kind(options, (SQUARE, size, {"resume": file, "checkpoint_every": 1e9}))
+
+
+def transferred(options: Any, n: int) -> dict[str, Any]:
+    """Measure a transfer of one column between meshes of random generators."""
+    adapter, rng = make_adapter(options), np.random.default_rng(1)
+    old, new = (adapter.diagram(SQUARE, rng.random((n, 2))) for _ in range(2))
+    sizes = [(n, len(mesh.neighbours)) for mesh in (old, new)]
+    values, ledger = old.volumes, Ledger()
+    with counted_buffers(ledger):
+        transfer_values(old, values, new, 2, adapter=adapter)
+    double = adapter.queue.device.double_fp_config
+    engine = Engine(adapter.ctx, adapter.queue, 2, np.dtype("float64" if double else "float32"))
+    told = transfer_needed(engine, *sizes, 1, 2)
+    held = ledger.peak / told
+    return {
+        "cells": n,
+        "told": told / n,
+        "preparation": 0.0,
+        "run": held,
+        "output": 0.0,
+        "held": held,
+    }
+
+
+OTHERS = {"resumed": resumed, "transfer": transferred}
+
+
+def show_kinds(options: Any) -> None:
+    """Show every kind of run."""
+    words = tuple(options.kinds)
+    columns = {
+        "kind": lambda r: r["kind"],
+        "cells": lambda r: r["cells"],
+        "told": lambda r: f"{r['told']:.0f}",
+        **{
+            name: lambda r, name=name: f"{r[name]:.2f}"
+            for name in ("preparation", "run", "output", "held")
+        },
+    }
+    report = Report(options.json, columns)
+    for name in (*KINDS, *OTHERS):
+        if "all" not in words and not name.startswith(words):
+            continue
+        for n in options.sizes:
+            if name in OTHERS:
+                found = OTHERS[name](options, n)
+            else:
+                found = measure_kind(options, KINDS[name](n))
+            report.add({"kind": name, **found}, name)
+    report.finish(
+        heading(make_adapter(options), "Device memory told, bytes per cell, and held over told")
+    )
+
+
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[100_000], help="cells (1e5)")
     options_of.add_argument("--fields", type=names, default=["F2", "S1"])
     options_of.add_argument("--methods", type=names, default=["exact"])
     options_of.add_argument("--efforts", type=names, default=["default"])
+    options_of.add_argument("--kinds", type=names, help="kinds of runs, or 'all'")
     options = options_of.parse_args()
+    if options.kinds:
+        show_kinds(options)
+        return 0
     records = [
         measure(options, name, n, method, effort)
         for name in options.fields

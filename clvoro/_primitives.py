@@ -21,13 +21,19 @@ AT_ONCE = 8
 """Arrays that are summarised by one launch, at most."""
 
 
+def scan_width(engine: Engine) -> int:
+    """Return the number of chunks whose sums a scan keeps."""
+    cpu = bool(engine.queue.device.type & cl.device_type.CPU)
+    return engine.queue.device.max_compute_units * 4 if cpu else 4096
+
+
 class Scan:
     """Exclusive prefix sums of int32 arrays."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         cpu = bool(engine.queue.device.type & cl.device_type.CPU)
-        self.width = engine.queue.device.max_compute_units * 4 if cpu else 4096
+        self.width = scan_width(engine)
         # On a CPU one work-item is through with so many before two launches are.
         self._few = 8192 if cpu else 0
         self._kernels = engine.kernels("primitives")
@@ -169,8 +175,11 @@ class Room:
         array = self._arrays.get(name)
         if array is None or len(array) < size:
             room = max(size + int(self._spare * size), 1)
-            array = self._arrays[name] = self._engine.empty(room, dtype)
+            # The old one is let go of first.
+            array = None
+            self._arrays.pop(name, None)
             self._parts.pop(name, None)
+            array = self._arrays[name] = self._engine.empty(room, dtype)
         part = self._parts.get(name)
         if part is None or len(part) != size:
             part = self._parts[name] = array[:size]

@@ -24,3 +24,8 @@ class FoldedCells(Cells):
     def reserve(self, n: int) -> None:
         """Make room for `n` cells."""
         self._reserve(n)
+
+    def clear(self) -> None:
+        """Let go of all buffers of cells and faces."""
+        self._of_cells, self._of_faces, self._views = {}, {}, {}
+        self._capacity, self._room, self._n = 0, 0, -1

@@ -6,10 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ._primitives import scan_width
 from ._program import Engine
 from .domain import Domain
 from .errors import MemoryLimitError
 from .margins import block_counts
+from .poisson import most_iterations
 from .polygon import Polygon
 from .quadrature import DensityTree
 
@@ -17,19 +19,21 @@ MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
 PEAK = {2: (21, 73), 3: (151, 102)}
 """Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
-TRIMMED_PEAK = (69, 84)
+TRIMMED_PEAK = (62, 75)
 """The same where a polygon's boundary trims the cells, and faces are in full precision."""
+SHORE_PEAK, EDGE_PEAK = (100, 187), (22, 20)
+"""What comes to that for each cell at the boundary, with the sentinels beyond it, and for each of its edges."""
 OUTPUT = {2: {8: 340, 4: 220}, 3: {8: 3600, 4: 4000}}
 """Bytes per cell while the finished diagram is read, corners, loops and all, by dimension and size of a real.
 
 In 3D single precision takes more: views of faces have to be brought together where double precision agrees at once."""
-TRIMMED_OUTPUT = {8: 600, 4: 370}
-"""The same of polygons."""
+TRIMMED_OUTPUT, SHORE_OUTPUT, EDGE_OUTPUT = {8: 535, 4: 330}, {8: 1200, 4: 780}, {8: 65, 4: 38}
+"""The same of polygons: per cell, and what comes to it as above."""
 DIAGRAM = {2: {8: 700, 4: 440}, 3: {8: 4400, 4: 4600}}
 """The same of one diagram, until it is made and read: of random generators, of which stages keep what they have."""
-TRIMMED_DIAGRAM = {8: 1160, 4: 770}
-"""The same of polygons."""
-FOLDED = {2: (40, 21), 3: (69, 30)}
+TRIMMED_DIAGRAM, SHORE_DIAGRAM, EDGE_DIAGRAM = {8: 1110, 4: 735}, {8: 750, 4: 530}, {8: 260, 4: 170}
+"""The same of polygons, likewise; there are no sentinels."""
+FOLDED = {2: (9, 57), 3: (40, 25)}
 """What comes to the peak of a run in a periodic box, where graphs are folded: per cell, but not per image."""
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
 """What comes to one diagram, likewise, in bytes by dimension and size of a real."""
@@ -43,8 +47,20 @@ MOST_SURPLUS, SURPLUS_RATE = 0.7, 2.0
 """Generators, over those that a size field asks for, that a run takes at most where cells are near something steep, and
 by how much more quickly than the mean of that it comes to as many. Measured on jumps of 1 : 5 to 1 : 20, kinks, stripes
 and chequers, 4000 to 30,000 cells: 0.02 to 0.6, nowhere more than 0.05 over what is told here."""
+STEEP_SHARE, STEEPEST, BEYOND_RATE = 0.25, 2.9, 3.2
+"""Where all but this share of the cells are near what is steeper still, as in a kink of few cells, up to which ratio
+that counts, and by how much: a coarse level there takes up to 2.5 times the generators that it is asked for."""
 SAMPLE = 1024
 """Places where that is looked at."""
+SHORE_SAMPLE = 4096
+"""Places of a polygon's boundary where the size of cells is looked at, at least."""
+ACROSS = 0.95
+"""Cells at a boundary to its length over their size, which is looked at half a size inside."""
+PARTIAL_SUMS, SCANS, ARRAYS = 80, 8, 64
+"""What there is whatever the number of cells: reals to each work-group of sums, scans, and arrays in the workspace, of
+each of which up to a unit is left."""
+FEW = 6000
+"""Cells from which on linear solves are by multigrid, whose iterations are few: there is room to record each one."""
 _STEPS = {2: (0.7548776662, 0.5698402910), 3: (0.8191725134, 0.6710436067, 0.5497004779)}
 """Whose multiples, less whole numbers, fill the unit square, or cube, evenly: powers of the inverse of the root of
 x^(d + 1) = x + 1."""
@@ -131,9 +147,44 @@ def surplus_expected(
     known, sizes = domain.contains(beside), np.repeat(h, 2 * d)
     if known.any():
         sizes[known] = size(beside[known])
-    largest = sizes.reshape(-1, 2 * d).max(axis=1)
-    steep = ((largest / h).clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean()
-    return MOST_SURPLUS * float(1 - np.exp(-SURPLUS_RATE * steep))
+    ratios = sizes.reshape(-1, 2 * d).max(axis=1) / h
+    steep = (ratios.clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean()
+    beyond = np.quantile(ratios, STEEP_SHARE).clip(STEEP_TO, STEEPEST) - STEEP_TO
+    return float(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * steep)) + BEYOND_RATE * beyond)
+
+
+def shore_expected(domain: Polygon, size: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Return how many cells are at the boundary of a polygon.
+
+    Parameters
+    ----------
+    size : callable
+        h(points (k, 2)) -> (k,), that of the cells.
+    """
+    begins = domain.vertices
+    along = begins[domain.next_vertex] - begins
+    lengths = np.hypot(*along.T)
+    parts = np.maximum(1, np.ceil(lengths / (lengths.sum() / SHORE_SAMPLE))).astype(int)
+    edge = np.repeat(np.arange(len(parts)), parts)
+    part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)
+    places = begins[edge] + ((part + 0.5) / parts[edge])[:, None] * along[edge]
+    h = np.array(size(places))
+    # Interior lies on the left of an edge.
+    inwards = np.column_stack([-along[:, 1], along[:, 0]])[edge] / lengths[edge, None]
+    inner = places + 0.5 * h[:, None] * inwards
+    known = domain.contains(inner)
+    if known.any():
+        h[known] = size(inner[known])
+    return ACROSS * float((lengths[edge] / parts[edge] / h).sum())
+
+
+def fixed_bytes(engine: Engine, n: float) -> float:
+    """Return the bytes of a run that do not grow with its number of cells, `n`, or hardly."""
+    real = engine.real.itemsize
+    unit = max(64, engine.queue.device.mem_base_addr_align // 8)
+    records = 8 * real * most_iterations(int(min(n, FEW)))
+    sums = PARTIAL_SUMS * engine.groups * real + SCANS * 4 * scan_width(engine)
+    return records + sums + ARRAYS * unit
 
 
 def memory_needed(
@@ -143,6 +194,7 @@ def memory_needed(
     images: float | None = None,
     surplus: float = 0.0,
     held: float = 0.0,
+    shore: float | None = None,
     *,
     run: bool = True,
 ) -> float:
@@ -150,29 +202,46 @@ def memory_needed(
 
     Without `run`, those that `Adapter.diagram` takes.
 
-    `images` per generator are what periodic boxes take (`images_expected`); None: as of cells that are all alike.
-    `surplus` are generators per one that is asked for (`surplus_expected`), `held` bytes that are there in any case.
+    `images` per generator are what periodic boxes take (`images_expected`), `shore` are the cells at the boundary of a
+    polygon (`shore_expected`); None: as of cells that are all alike. `surplus` are generators per one that is asked for
+    (`surplus_expected`), `held` bytes that are there in any case.
     """
     n *= 1 + surplus
-    cells, folded = n, 0.0
+    cells, folded, edges = n, 0.0, 0
     if domain is not None and any(domain.periodic):
         if images is None:
             deep = IMAGE_REACH[domain.dim] * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
             seams = [2 * min(deep / length, 1.0) for length in domain.extent[list(domain.periodic)]]
             images = float(np.prod(1 + np.array(seams))) - 1
         cells, folded = n * (1 + images), n
+    trimmed = isinstance(domain, Polygon)
+    if isinstance(domain, Polygon):
+        edges = len(domain.vertices)
+        if shore is None:
+            spacing = (domain.measure / max(n, 1.0)) ** 0.5
+            shore = shore_expected(domain, lambda p: np.full(len(p), spacing))
+        shore = min(shore, n)
 
-    d, real, trimmed = engine.dim, engine.real.itemsize, isinstance(domain, Polygon)
-    if not run:
-        per_cell = TRIMMED_DIAGRAM[real] if trimmed else DIAGRAM[d][real]
-        return cells * per_cell + folded * FOLDED_DIAGRAM[d][real] + held
+    d, real = engine.dim, engine.real.itemsize
+    at = n, shore or 0.0, edges
 
     def bytes_of(figures: tuple[int, int]) -> int:
         return figures[0] * real + figures[1] * 4
 
-    peak = cells * bytes_of(TRIMMED_PEAK if trimmed else PEAK[d]) + folded * bytes_of(FOLDED[d])
-    output = cells * (TRIMMED_OUTPUT[real] if trimmed else OUTPUT[d][real])
-    return max(peak, output) + held
+    def together(*figures: float) -> float:
+        return sum(f * count for f, count in zip(figures, at, strict=True))
+
+    if not run:
+        per_cell = (TRIMMED_DIAGRAM, SHORE_DIAGRAM, EDGE_DIAGRAM)
+        made = together(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[d][real]
+        return made + folded * FOLDED_DIAGRAM[d][real] + held
+    if trimmed:
+        peak = together(*(bytes_of(f) for f in (TRIMMED_PEAK, SHORE_PEAK, EDGE_PEAK)))
+        output = together(*(f[real] for f in (TRIMMED_OUTPUT, SHORE_OUTPUT, EDGE_OUTPUT)))
+    else:
+        peak = cells * bytes_of(PEAK[d]) + folded * bytes_of(FOLDED[d])
+        output = cells * OUTPUT[d][real]
+    return max(peak + fixed_bytes(engine, n), output) + held
 
 
 def in_bytes(amount: float) -> str:

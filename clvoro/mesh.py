@@ -401,6 +401,11 @@ class Mesh:
         """Let go of what only steps take, and evaluate what there is in full precision: for `finish`."""
         self.stages.clear("poisson")
         self.engine.workspace.clear()
+        if not self.tessellator.is_whole(self.t):
+            # Nothing follows from the present diagram any more, and the new one needs room.
+            self.tessellation = None
+            self.stages.clear("folded")
+            self.tessellation = self.tessellator.make_whole(self.points, self.n)
         self.tessellation, self._unfolded = self.tessellator.final(self.t)
         self._evaluate_metric()
 

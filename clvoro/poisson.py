@@ -47,6 +47,11 @@ def expected_costs(n: int, dim: int, tolerance: float, alone: bool = False) -> t
     return jacobi, multigrid
 
 
+def most_iterations(n: int) -> int:
+    """Return how many iterations Jacobi's method may take for `n` cells."""
+    return 500 + 30 * math.isqrt(n)
+
+
 @dataclass(frozen=True)
 class Laplacian:
     """The assembled operator A = -Laplacian, symmetric to the last bit: device arrays.
@@ -303,7 +308,7 @@ class Poisson:
             with self.engine.workspace.frame():
                 return run(self.inverse_diagonal(laplacian), most, 64)
 
-        default = 500 + 30 * math.isqrt(n)
+        default = most_iterations(n)
         if preconditioner == "auto":
             alone = n <= most_alone(self.engine)
             jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, alone)

@@ -14,7 +14,13 @@ from .domain import Domain
 from .errors import CoarseSizeWarning, InputError, InputTypeError
 from .geojson import may_be_degrees
 from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
-from .memory import check_memory, images_expected, memory_needed, surplus_expected
+from .memory import (
+    check_memory,
+    images_expected,
+    memory_needed,
+    shore_expected,
+    surplus_expected,
+)
 from .mesh import Mesh
 from .methods import PUBLISHED, Relaxation, make_method
 from .misfits import warn_of_misfits
@@ -189,9 +195,8 @@ class Preparation:
         most, images = max(self.target, 0 if points is None else len(points)), None
         if any(domain.periodic) and not given:
             images = images_expected(domain, self.sizing, most, asked)
-        data = self.sizing.data
-        held = 0 if data is None else data.nbytes
-        self.memory = self._check_memory(most, images, held=held)
+        held = self.sizing.held + self.sizing.taken_for(most)
+        self._check_memory(most, images, held=held)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
@@ -199,11 +204,16 @@ class Preparation:
             self.levels = self._count_levels()
             if options.levels == "auto":
                 self.levels = min(self.levels, most_levels)
+        surplus, shore = 0.0, None
         if options.planned and self._tree is not None:
             # A coarser level has steeper sizes, and hands its generators on to the next.
             reach = self.factor * (2 if self.levels else 1)
             surplus = surplus_expected(domain, self.sizing, self._tree, reach)
-            self.memory = self._check_memory(most, images, surplus, held)
+        if isinstance(domain, Polygon) and not given:
+            shore = shore_expected(domain, lambda p: (asked / most) ** 0.5 * self.sizing(p))
+        needed = self._check_memory(most, images, surplus, held, shore)
+        # Of few cells, what has been done so far may take more than the run.
+        self.memory = max(needed, float(self.sizing.taken))
 
     def _count_levels(self) -> int:
         """Return the number of coarser levels that lead to the cells, from the caller's points or from a sample."""
@@ -224,11 +234,16 @@ class Preparation:
         return count
 
     def _check_memory(
-        self, n: float, images: float | None = None, surplus: float = 0.0, held: float = 0.0
+        self,
+        n: float,
+        images: float | None = None,
+        surplus: float = 0.0,
+        held: float = 0.0,
+        shore: float | None = None,
     ) -> float:
         """Return the bytes that a run of `n` cells takes, if there are as many."""
         engine = self.stages.engine
-        needed = memory_needed(engine, n, self.domain, images, surplus, held)
+        needed = memory_needed(engine, n, self.domain, images, surplus, held, shore)
         return check_memory(engine, n, needed)
 
     def generators(self) -> np.ndarray:

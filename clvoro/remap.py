@@ -12,11 +12,12 @@ import pyopencl as cl
 from ._program import Engine
 from .bins import Bins
 from .device import create_context
-from .errors import ClvoroError, InputError, InputTypeError
+from .errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
+from .memory import in_bytes
 from .overlap import transfer_on_host
 from .polygon import Polygon
 from .results import Diagram, Result
-from .transfer import Content, Graph, Transfer
+from .transfer import Content, Graph, Transfer, transfer_needed
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -131,6 +132,15 @@ def _transferred(
     # Whatever the meshes were made in: parts of cells are differences.
     real = np.dtype(np.float64 if queue.device.double_fp_config else np.float32)
     engine, box = Engine(ctx, queue, source.domain.dim, real), source.domain
+    sizes = ((len(mesh), len(mesh.neighbours)) for mesh in (source, target))
+    needed = transfer_needed(engine, *sizes, columns.shape[1], order)
+    device = queue.device
+    if needed > device.global_mem_size:
+        raise MemoryLimitError(
+            f"carrying {columns.shape[1]} columns from {len(source)} cells to {len(target)} needs "
+            f"{in_bytes(needed)} on the device; {device.name.strip()} has {in_bytes(device.global_mem_size)}. Carry "
+            "fewer columns at a time, or use another device"
+        )
     bins, stage = Bins(engine), Transfer(engine)
     old, new = _upload(engine, source), _upload(engine, target)
     sequence = bins.build(box, new.points, new.n).items[: new.n].copy()

@@ -51,15 +51,22 @@ class Tessellator:
         """What the latest diagram was folded from, in a periodic box."""
         return None if self.torus is None else self.torus.latest
 
-    def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
-        """Return `t`, the latest diagram, with what is known of faces in full precision.
+    def is_whole(self, t: Tessellation) -> bool:
+        """Tell whether all is known that `t`, the latest diagram, was folded from, if it was."""
+        latest = self.unfolded
+        return self.torus is None or (latest is not None and latest.folded.tessellation is t)
 
-        Return also, in a periodic box, what it was folded from: made anew if it was not.
+    def make_whole(self, points: cla.Array, n: int) -> Tessellation:
+        """Tessellate a periodic box anew, so that it is."""
+        assert self.torus is not None
+        return self.torus.tessellate(points, n, whole=True)
+
+    def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
+        """Return `t`, the latest diagram, which `is_whole`, with what is known of faces in full precision.
+
+        Return also, in a periodic box, what it was folded from.
         """
         if self.torus is not None:
-            latest = self.unfolded
-            if latest is None or latest.folded.tessellation is not t:
-                self.torus.tessellate(t.points, t.n, whole=True)
             return self.torus.measure_faces(), self.unfolded
         if self._polygon is None and not isinstance(self.stages.cells, Polyhedra):
             t = self.stages.cells.measure_faces(self.domain, t)

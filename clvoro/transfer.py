@@ -19,6 +19,8 @@ VISITED = {2: 32, 3: 64}
 """Old cells that a new one may meet at first, by dimension."""
 SCRATCH = 1 << 23
 """Integers in the lists of old cells that are worked on at a time."""
+BINNED = {2: {8: 75, 4: 55}, 3: {8: 80, 4: 60}}
+"""Bytes per generator that bins take, by dimension and size of a real."""
 GROWTH = 8
 """Factor by which these lists grow."""
 DONE, LIST_FULL, PIECE_LARGE, FAILED = range(4)
@@ -82,6 +84,33 @@ class Transferred:
     high: np.ndarray
     volumes: np.ndarray
     found: np.ndarray
+
+
+def transfer_needed(
+    engine: Engine, old: tuple[int, int], new: tuple[int, int], width: int, order: int
+) -> float:
+    """Return the bytes that a transfer of `width` columns takes on the device.
+
+    As if all new cells met about as many old ones; the lists of these never take more than 12 `SCRATCH` bytes.
+
+    Parameters
+    ----------
+    old, new : (n, m)
+        Cells and faces of the meshes.
+    order : 1 or 2
+        With 2 there are slopes.
+    """
+    d, real = engine.dim, engine.real.itemsize
+    graphs = sum(n * (d * real + 4) + 4 * m for n, m in (old, new))
+    bins = BINNED[d][real] * max(old[0], new[0])
+    content = (width + d + (order - 1) * width * (2 + d)) * real * old[0]
+    found = (3 * width + 2) * real * new[0]
+    marks = 8 * new[0] + 4 * (order - 1) * old[0]
+    met, room = ((old[0] / new[0]) ** (1 / d) + 2) ** d, VISITED[d]
+    while room < met:
+        room *= GROWTH
+    lists = 12 * min(room * new[0], SCRATCH)
+    return graphs + bins + content + found + marks + lists
 
 
 class Transfer:
@@ -168,6 +197,7 @@ class Transfer:
         room = VISITED[engine.dim]
         while True:
             chunk = int(min(count, max(1, SCRATCH // room)))
+            queues = tables = None  # before there are longer ones
             queues = engine.empty(chunk * room, np.int32)
             tables = engine.empty(chunk * 2 * room, np.int32)
             for first in range(0, count, chunk):

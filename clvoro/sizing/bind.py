@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,12 +32,15 @@ class Binder:
     domain : Domain
     engine : Engine or None
         Where a field that has to be computed first is computed; None for the default device.
+    taken : int
+        Bytes that this has taken there.
     """
 
     def __init__(self, domain: Domain, real: np.dtype, engine: Engine | None = None):
         self.dim, self.domain, self.engine = domain.dim, domain, engine
         self.origin, self.scale = domain.frame
         self.real = np.dtype(real)
+        self.taken = 0
         self.statements: list[str] = []
         self._numbers: list[np.ndarray] = []
         self._stored = 0
@@ -105,6 +109,21 @@ def bind(
     InputError
         If the field is of another dimension than the domain, or has no device form.
     """
+    bound = bound_to(field, domain, real, engine)
+    return bound.prelude, bound.numbers
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What `bind` returns, and the bytes that the device has had `taken` for it."""
+
+    prelude: str
+    numbers: np.ndarray
+    taken: int
+
+
+def bound_to(field: Field, domain: Domain, real: DTypeLike, engine: Engine | None) -> Bound:
+    """Bind `field` to `domain`: see `bind`."""
     field.check_dim(domain.dim)
     binder = Binder(domain, np.dtype(real), engine)
     result = field._emit(binder)
@@ -119,4 +138,4 @@ def bind(
         "REAL size_at(const REAL *x, __global const REAL *data)\n"
         f"{{\n{body}\n    return {result};\n}}\n"
     )
-    return prelude, binder.data()
+    return Bound(prelude, binder.data(), binder.taken)

@@ -93,6 +93,7 @@ class Graded(Field):
         self.resolution = None if resolution is None else _checked(resolution, self.dim)
         self._rasters: dict[tuple, Raster] = {}
         self._latest: Domain | None = box
+        self._taken = 0  # bytes on the device, for the latest of these
 
     def raster(self, domain: Domain | None = None, engine: Engine | None = None) -> Raster:
         """Return the field as a `Raster` over its box, or else over `domain`, computing it if need be.
@@ -137,7 +138,11 @@ class Graded(Field):
         return self.raster()._evaluate(points)
 
     def _emit(self, binder: Binder) -> str:
-        return self.raster(binder.domain, binder.engine)._emit(binder)
+        known = len(self._rasters)
+        raster = self.raster(binder.domain, binder.engine)
+        if len(self._rasters) > known:
+            binder.taken = max(binder.taken, self._taken)
+        return raster._emit(binder)
 
     def _compute(self, box: Domain, engine: Engine) -> Raster:
         from ..gradation import Gradation
@@ -160,7 +165,11 @@ class Graded(Field):
         values[far] = values[~far].max(initial=0) + self.slope * box.extent.sum()
         self._seed(values, counts, axes, marks, at_marks)
         scale = box.frame[1]
+        # One after the other, so that there is room.
+        taken = evaluate.taken
+        del evaluate
         on_device = engine.upload(values / scale)
+        self._taken = max(taken, on_device.nbytes)
         spacing = box.extent / (counts - 1)
         Gradation(engine).sweep_tiles(
             on_device, counts.tolist(), (spacing / scale).tolist(), self.slope

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import SizeFieldError
-from .bind import bind
+from .bind import bound_to
 from .field import Constant, Field, as_field
 
 if TYPE_CHECKING:
@@ -70,9 +70,12 @@ class Sizing:
         self._walls = (np.array([domain.lower, domain.upper]) - self._origin) / self._scale
         self._gradient_step = gradient_step
         self.prelude, self.data, self._kernels = None, None, None
+        self._parts: list[Sizing] = []
+        self._taken = 0
         if self.field.on_device:
-            self.prelude, numbers = bind(self.field, domain, engine.real, engine)
-            self.data = engine.upload(numbers)
+            bound = bound_to(self.field, domain, engine.real, engine)
+            self.prelude, self._taken = bound.prelude, bound.taken
+            self.data = engine.upload(bound.numbers)
             self._bad = engine.upload([_NONE_BAD], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
@@ -182,16 +185,7 @@ class Sizing:
         """
         if self._kernels is None:
             return self._on_host(np.asarray(points, dtype=float))
-        points = np.asarray(points, dtype=float)
-        found = np.empty(len(points))
-        for first in range(0, len(points), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            normalised = (points[part] - self._origin) / self._scale
-            x, h = self.engine.upload(normalised), self.engine.empty(len(normalised))
-            self.evaluate(x, len(normalised), h)
-            self.check(x, h)
-            found[part] = h.get().astype(float) * self._scale
-        return found
+        return self._values(np.asarray(points, dtype=float), check=True)
 
     def _physical(self, normalised: np.ndarray) -> np.ndarray:
         """Return physical coordinates, kept inside the domain's bounding box against rounding."""
@@ -204,15 +198,40 @@ class Sizing:
             return field
         if field.on_device:
             self._host_step = self._step(self.engine.real)
-            return _DevicePart(Sizing(self.engine, self.domain, field))
+            self._parts.append(Sizing(self.engine, self.domain, field))
+            return _DevicePart(self._parts[-1])
         return field.with_parts(self._with_device_parts)
 
-    def _values(self, points: np.ndarray) -> np.ndarray:
-        """Return h at physical `points` by the device, unchecked."""
-        normalised = (points - self._origin) / self._scale
-        h = self.engine.empty(len(points))
-        self.evaluate(self.engine.upload(normalised), len(points), h)
-        return h.get().astype(float) * self._scale
+    @property
+    def held(self) -> int:
+        """Bytes that the field has on the device."""
+        own = 0 if self.data is None else self.data.nbytes
+        return own + sum(part.held for part in self._parts)
+
+    @property
+    def taken(self) -> int:
+        """Bytes that it has taken there at most so far, for points of the host's."""
+        return max(self._taken, *(self.held - p.held + p.taken for p in self._parts), self.held)
+
+    def taken_for(self, n: int) -> int:
+        """Return the bytes that evaluating it at `n` generators takes, beside what it holds."""
+        each = (self.domain.dim + 1) * self.real.itemsize
+        return min(n, AT_ONCE) * each if self._parts else 0
+
+    def _values(self, points: np.ndarray, check: bool = False) -> np.ndarray:
+        """Return h at physical `points` by the device; they need not be sizes where nobody is to `check`."""
+        found = np.empty(len(points))
+        for first in range(0, len(points), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            normalised = (points[part] - self._origin) / self._scale
+            x, h = self.engine.upload(normalised), self.engine.empty(len(normalised))
+            self._taken = max(self._taken, self.held + x.nbytes + h.nbytes)
+            self.evaluate(x, len(normalised), h)
+            if check:
+                self.check(x, h)
+            found[part] = h.get().astype(float) * self._scale
+            del x, h  # before there are others
+        return found
 
     def _on_host(self, points: np.ndarray) -> np.ndarray:
         sizes = self._host_field(points)

@@ -1,0 +1,105 @@
+"""Every kind of run that a user can ask for, by name: domain, size field and options for a number of cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import clvoro
+from clvoro import sizing
+from clvoro.start import count_cells
+
+Kind = tuple[clvoro.Box | clvoro.Polygon, Any, dict[str, Any]]
+
+SQUARE, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
+PERIODIC = clvoro.Box((0, 0), (1, 1), periodic=True)
+PERIODIC_CUBE = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
+METHODS = ("lloyd", "poisson", "coupled", "weighted", "weighted-lloyd")
+
+
+def blob(edges: int = 200) -> clvoro.Polygon:
+    """Return a polygon of five lobes with a hole."""
+    turn = np.linspace(0, 2 * np.pi, edges, endpoint=False)
+    radius = 0.4 + 0.08 * np.sin(5 * turn)
+    shore = 0.5 + radius[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    return clvoro.Polygon(shore, [[(0.5, 0.45), (0.6, 0.45), (0.55, 0.55)]])
+
+
+LAKE, COAST = blob(), blob(1500)
+
+
+def even(domain: Any, **options: Any) -> Callable[[int], Kind]:
+    """Of cells that are all alike."""
+    return lambda n: (domain, (domain.measure / n) ** (1 / domain.dim), options)
+
+
+def of(domain: Any, field: Any, **options: Any) -> Callable[[int], Kind]:
+    """Of a field, or a formula, scaled to the number of cells."""
+    field = sizing.Expression(field) if isinstance(field, str) else field
+    return lambda n: (domain, field * (count_cells(field, domain) / n) ** (1 / domain.dim), options)
+
+
+def layered(domain: Any) -> Callable[[int], Kind]:
+    """Of rows of cells along the boundary, finer than the others."""
+
+    def kind(n: int) -> Kind:
+        size = (domain.measure / n) ** 0.5
+        return domain, size, {"layers": clvoro.Layers(0.3 * size, count=3, growth=1.2)}
+
+    return kind
+
+
+def from_points(factor: float, **options: Any) -> Callable[[int], Kind]:
+    """From random points, `factor` times as many as cells are asked for."""
+
+    def kind(n: int) -> Kind:
+        points = np.random.default_rng(1).random((round(factor * n), 2))
+        return SQUARE, n**-0.5, {"points": points, **options}
+
+    return kind
+
+
+def of_callable(n: int) -> Kind:
+    """Of a function on the host, one with a raster on the device."""
+    raster = sizing.Raster(1 + RANDOM.random((200, 200)), (0, 0), (1, 1)) * n**-0.5
+    return SQUARE, sizing.minimum(raster, lambda p: np.full(len(p), 2 * n**-0.5)), {}
+
+
+def graded(domain: Any, formula: str) -> Callable[[int], Kind]:
+    """Of a jump that is made a ramp."""
+    plain = of(domain, formula)
+    return lambda n: (domain, sizing.Graded(plain(n)[1], 1.2), {})
+
+
+RANDOM = np.random.default_rng(1)
+CURVE = np.column_stack([np.linspace(0.1, 0.9, 500), 0.5 + 0.2 * np.sin(np.linspace(0, 9, 500))])
+SPHERE = sizing.Distance(sizing.Sphere((0.5, 0.5, 0.4), 0.25), h_min=0.045, slope=0.2)
+SHORE = sizing.Distance(COAST.boundary(), h_min=0.002, slope=0.5)
+JUMP = "x < 0.5 ? 1.0 : 10.0"
+
+KINDS: dict[str, Callable[[int], Kind]] = {
+    "square": even(SQUARE), "square, exact": even(SQUARE, method="exact"),
+    "square, best": even(SQUARE, effort="best"), "square, fast": even(SQUARE, effort="fast"),
+    "square, uniform start": even(SQUARE, start="uniform"),
+    **{f"square, {m}": even(SQUARE, method=m, max_steps=12) for m in METHODS},
+    "square, count held": lambda n: (SQUARE, sizing.Expression("0.01 + 0.1 * x"), {"n_cells": n}),
+    "square, from as many points": from_points(1), "square, from few points": from_points(1 / 16),
+    "square, from many points": from_points(2),
+    "square, points kept": from_points(1, method="coupled", max_steps=12),
+    "square, layers": layered(SQUARE), "square, callable": of_callable,
+    "square, raster": of(SQUARE, sizing.Raster(1 + 0.5 * RANDOM.random((400, 400)), (0, 0), (1, 1))),
+    "square, scattered": of(SQUARE, sizing.Scattered(RANDOM.random((20000, 2)), 1 + RANDOM.random(20000))),
+    "square, graded": graded(SQUARE, JUMP),
+    "square, polyline": of(SQUARE, sizing.Distance(sizing.Polyline(CURVE), h_min=0.004, slope=0.2)),
+    "lake": even(LAKE), "lake, coupled": even(LAKE, method="coupled", max_steps=12),
+    "lake, layers": layered(LAKE), "coast": even(COAST), "coast, fine at the shore": of(COAST, SHORE),
+    "periodic": even(PERIODIC), "periodic, coupled": even(PERIODIC, method="coupled", max_steps=12),
+    "periodic, jump at a seam": of(PERIODIC, JUMP),
+    "periodic, jumps beside seams": of(PERIODIC, "(x - 0.1) * (x - 0.6) < 0 ? 1.0 : 10.0"),
+    "cube": even(CUBE), "cube, exact": even(CUBE, method="exact"),
+    "cube, coupled": even(CUBE, method="coupled", max_steps=6),
+    "cube, fast": even(CUBE, effort="fast"), "cube, graded": graded(CUBE, "x < 0.5 ? 1.0 : 5.0"),
+    "cube, sphere": of(CUBE, SPHERE), "periodic cube": even(PERIODIC_CUBE),
+}  # fmt: skip
