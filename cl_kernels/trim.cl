@@ -15,8 +15,8 @@
 
 /* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
 
-   loop_chords   a chord with which each loop begins; -1: around the whole cell; -2: no loop
-   loop_pieces   place of the outer loop that the loop belongs to, itself if it is one
+   loop_chords   a chord with which each loop begins; -1: around the whole cell
+   loop_pieces   place of the outer loop that the loop belongs to, itself if it is one; -1: no loop
    loop_roots    of outer loops: the generator that the piece goes to, -1 if that is not known yet
    counts        segments of all loops of the cell */
 kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chord_loops, global int *loop_chords,
@@ -114,10 +114,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
                     loop_pieces[place] = other;
         }
     loop_roots[main] = cell.i;
-    for (int place = first + loops; place < list_starts[u + 1] + u + 1; ++place) {
-        loop_chords[place] = -2;
+    for (int place = first + loops; place < list_starts[u + 1] + u + 1; ++place)
         loop_pieces[place] = -1;
-    }
     counts[u] = total;
     if (outer > 1)
         atomic_or(flags, FLAG_ORPHANS);

@@ -32,6 +32,9 @@ def point_sets():
     corners = [[0, 0], [1, 0], [1, 0.75], [0, 0.75]]
     walls = np.column_stack([rng.random(30), np.full(30, 0.75)])
     turn = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    spokes = 2 * np.pi * (np.arange(20) + 0.3 * rng.random(20)) / 20
+    rings = np.concatenate([rng.uniform(0.2, 0.202, 20), rng.uniform(0.29, 0.3, 20)])
+    ring = np.tile(np.column_stack([np.cos(spokes), np.sin(spokes)]), (2, 1)) * rings[:, None]
     return {
         "random": random,
         "graded": random**3,
@@ -39,6 +42,8 @@ def point_sets():
         "hexagons": patch.hexagons(0.04),
         "lattice": square(20),
         "cocircular": 0.4 + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)]),
+        # More faces than are checked one by one, or found in lanes.
+        "wheel": np.concatenate([np.zeros((1, 2)), ring]) + np.array([0.5, 0.4]),
         "walls": np.concatenate([corners, walls, random[:200]]),
         "three": random[:3],
         "two": random[:2],
@@ -133,7 +138,8 @@ def test_is_the_diagram_itself(engine, name, share, monkeypatch):
                 faces = zip(a.owners.tolist(), a.neighbours.tolist(), a.face_measures, strict=True)
                 assert all(length < noise for i, j, length in faces if (i, j) not in known)
     if share <= 0.02 and name not in ("clusters", "lattice", "cocircular"):
-        assert times == 10
+        # Of few cells a change concerns too many to be worth a repair.
+        assert times == 10 if name != "wheel" else times >= 10 - 250 * share
 
 
 def fitting(t):
@@ -186,8 +192,8 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
     def watched(self, kernel, size, *args, **kwargs):
         event = run(self, kernel, size, *args, **kwargs)
         if kernel.function_name == "wrap_marked":
-            count, listed, counts = args[0], args[1], args[4]
-            found.append((listed.get()[:count], counts.get()[:count]))
+            count, listed, slots, counts = args[0], args[1], args[3], args[4]
+            found.append((listed.get()[:count], counts.get()[:count], slots.get()))
         elif kernel.function_name == "clip_marked":
             rounds.append(size)
         return event
@@ -195,15 +201,22 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
     monkeypatch.setattr(Engine, "run_each", watched)
     move = 0.2 * spacing(points) * (rng.random(points.shape) - 0.5)
     points = np.clip(points + move, 0, [1, 0.75])
-    _, was = carried.move(points)
+    t, was = carried.move(points)
     assert was
     assert rounds[0] > 500
-    (listed, counts), *others = found
+    (listed, counts, slots), *others = found
     assert not others
     # Within some spacings of .014 a cell may reach a wall.
     inner = (abs(points[listed] - [0.5, 0.375]) < [0.44, 0.315]).all(axis=1)
     assert (counts[inner] > 0).mean() > 0.95
     assert sum(rounds[1:]) < 0.1 * rounds[0]
+    # Those that have changed but once are right at once.
+    rows = np.split(t.neighbours, t.starts[1:-1])
+    right = [
+        np.array_equal(rows[i], slots[w * SLOT :][:n])
+        for w, (i, n) in enumerate(zip(listed, counts, strict=True))
+    ]
+    assert np.mean(np.array(right)[counts > 0]) > 0.97
 
 
 def no_longer_convex(t, points):
@@ -404,6 +417,29 @@ def test_turned_inside_out(engine):
     t, was = carried.move(mirrored)
     assert not was
     assert np.array_equal(t.volumes, carried.reference(mirrored).volumes)
+
+
+@pytest.mark.parametrize("name", ["lattice", "hexagons", "cocircular"])
+def test_onto_a_lattice(engine, name, monkeypatch):
+    """Where faces vanish nearly every row is in doubt: a diagram of faces that are longer than rounding, or none."""
+    monkeypatch.setattr(repair, "FEW", 1)
+    monkeypatch.setattr(repair, "MAX_SHARE", 1.0)
+    rng = np.random.default_rng(40975)
+    eps, there = float(np.finfo(engine.real).eps), POINTS[name].astype(engine.real)
+    points = there + (0.02 * spacing(there) * (rng.random(there.shape) - 0.5)).astype(engine.real)
+    carried, times = Carried(engine, points), 0
+    for noise in (0, 1, 4, 0):
+        points = (there + noise * eps * (rng.random(there.shape) - 0.5)).astype(engine.real)
+        t, was = carried.move(points)
+        times += was
+        check(t, eps)
+        expected = carried.reference(points)
+        assert t.volumes == pytest.approx(expected.volumes, abs=256 * eps)
+        for a, b in ((t, expected), (expected, t)):
+            known = set(zip(b.owners.tolist(), b.neighbours.tolist(), strict=True))
+            faces = zip(a.owners.tolist(), a.neighbours.tolist(), a.face_measures, strict=True)
+            assert all(length < 256 * eps for i, j, length in faces if (i, j) not in known)
+    assert times == 4
 
 
 def test_far_jump(engine):

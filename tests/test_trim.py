@@ -4,7 +4,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from reference_polygon import euler_excess, faults, polygon_voronoi
-from shores import POLYGONS, TOUCHING, coast, comb, koch, lattice, scattered, slit, spit
+from shores import POLYGONS, TOUCHING, UNIT, coast, comb, koch, lattice, scattered, slit, spit
 
 import clvoro
 from clvoro._program import Engine
@@ -174,6 +174,15 @@ def test_islands_in_a_lake_in_a_cell(adapters):
     # On the shore itself, and in the middle of nowhere: two generators, one on each shore.
     compare(adapters, domain, np.array([(0.4, 0.5), (0.2, 0.5)]))
     compare(adapters, domain, np.array([(0.5, 0.25), (0.05, 0.05), (0.95, 0.95), (0.05, 0.95)]))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_an_island_whose_shore_goes_to_another(adapters, order):
+    """Two pieces wind around the generator: its own is the nearer one, whichever comes first."""
+    pieces = [[UNIT, UNIT * 0.4 + 0.3], [UNIT * 0.2 + 0.4]]
+    domain = clvoro.Polygon.from_pieces(pieces[::order])
+    cells = compare(adapters, domain, np.array([(0.5, 0.5), (0.95, 0.5)]))
+    assert cells.areas == pytest.approx([0.04, 0.84])
 
 
 def test_what_is_thinner_than_rounding_is_refused_or_right(adapters):
