@@ -196,7 +196,7 @@ class Preparation:
         if any(domain.periodic) and not given:
             images = images_expected(domain, self.sizing, most, asked)
         held = self.sizing.held + self.sizing.taken_for(most)
-        self._check_memory(most, images, held=held)
+        self._check_memory(most, images, held=held, shore=0.0)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
