@@ -87,6 +87,23 @@ def test_scheme_is_solved(make_engine, shape):
     assert limit(engine, found, spacing, 0.4) == pytest.approx(found, rel=allowed)
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_least_of_each_tile(make_engine, shape):
+    """What tiles wait for; were it wrong, they would be swept too early, or too late, to the same end."""
+    engine = make_engine(len(shape))
+    stage, counts = Gradation(engine), (*shape[::-1], 1)[:3]
+    values = np.random.default_rng(sum(shape)).random(shape).astype(engine.real)
+    starts = [np.arange(0, n, stage._tile) for n in shape]
+    expected = values
+    for axis, start in enumerate(starts):
+        expected = np.minimum.reduceat(expected, start, axis)
+    lowest = engine.empty(expected.size)
+    engine.run_each(
+        stage._kernels.tile_minima, expected.size, *map(np.int32, counts), engine.upload(values.ravel()), lowest
+    )  # fmt: skip
+    assert np.array_equal(lowest.get(), expected.ravel())
+
+
 @pytest.mark.parametrize("shape", [(61, 41), (17, 13, 15)])
 @pytest.mark.parametrize("seeds", [1, 5, 400])
 def test_first_order_close_to_the_least_cone(make_engine, shape, seeds):

@@ -7,6 +7,7 @@ import pytest
 import solids
 from test_io import BOX, make_diagram
 
+import clvoro
 from clvoro.domain import Box
 from clvoro.faces import face_corners, face_owners
 from clvoro.quality import measure_mesh
@@ -137,6 +138,22 @@ def test_generator_on_a_wall(y, skewness):
     assert m.skewness[d.neighbours == -1] == skewness
     assert np.isfinite(m.skewness[d.neighbours != -1]).all()
     assert np.isfinite(m.centroid_angle).all()
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_cells_of_many_sides(ctx, real):
+    """On the device as on the host: regular polygons, beyond those whose measure is tabulated, and what is around."""
+    adapter, box = clvoro.Adapter(ctx, real), Box((0, 0), (1, 1))
+    for n in (3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 19):
+        turn = 2 * np.pi * (np.arange(n) + 0.2) / n
+        ring = 0.2 * np.column_stack([np.cos(turn), np.sin(turn)])
+        points = 0.5 + np.concatenate([np.zeros((1, 2)), ring])
+        result = adapter.run(box, 1.0, points=points, method="lloyd", max_steps=0)
+        # Corners, a tenth from the generator, are known to some roundings of positions.
+        allowed = 64 * float(np.finfo(real).eps)
+        assert np.diff(result.diagram.neighbour_starts)[0] == n
+        assert result.quality[0] == pytest.approx(1, abs=allowed)
+        assert result.quality == pytest.approx(measure_mesh(result.diagram).quality, abs=allowed)
 
 
 def test_result_measures_itself_once(solid):
