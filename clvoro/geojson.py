@@ -1,4 +1,4 @@
-"""Polygons of others, GeoJSON and shapely's, as rings, piece by piece."""
+"""Polygons of others, GeoJSON, well-known text and shapely's, as rings, piece by piece."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from .errors import InputError, InputTypeError, MisfitWarning
 
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
 _ALIKE = 0.95  # a degree of longitude over one of latitude, from which on they count as the same
+_DEEPEST = 8  # parentheses in each other: a MULTIPOLYGON has three, and GEOS calls itself for each
 
 
 def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
@@ -37,6 +39,27 @@ def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
     if not found:
         raise InputError(f"geometry is an empty {kind}, expected at least one ring")
     return found
+
+
+def pieces_of_wkt(text: str) -> list[list[np.ndarray]]:
+    """Return the rings of a POLYGON or MULTIPOLYGON in well-known text, piece by piece."""
+    if not isinstance(text, str):
+        raise InputTypeError(f"text is a {type(text).__name__}, expected well-known text")
+    letters = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
+    brackets = letters[(letters == ord("(")) | (letters == ord(")"))]
+    if np.where(brackets == ord("("), 1, -1).cumsum().max(initial=0) > _DEEPEST:
+        raise InputError(
+            f"text {text!r:.60} has more than {_DEEPEST} parentheses in each other, expected a POLYGON or MULTIPOLYGON"
+        )
+    try:
+        with np.errstate(all="ignore"):  # what is no number is refused below
+            geometry = shapely.from_wkt(text)
+    except shapely.errors.GEOSException as error:
+        numbers = " and finite numbers" if re.search(r"\bnan\b", text, re.IGNORECASE) else ""
+        raise InputError(
+            f"text {text!r:.60} is no well-known text ({error!s:.200}); expected closed rings{numbers}"
+        ) from error
+    return pieces_of_shape(geometry)
 
 
 def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[list[object]]:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import shapely
 
 from .edge_grid import bin_edges
 from .errors import InputError, InputTypeError
-from .geojson import pieces_of_geojson, pieces_of_shape
+from .geojson import pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .region import Region
 from .rings import make_rings, signed_area
 
@@ -114,13 +113,7 @@ class Polygon(Region):
         >>> clvoro.Polygon.from_wkt("POLYGON ((0 0, 2 0, 2 1, 0 1, 0 0))").measure
         2.0
         """
-        if not isinstance(text, str):
-            raise InputTypeError(f"text is a {type(text).__name__}, expected well-known text")
-        try:
-            geometry = shapely.from_wkt(text)
-        except shapely.errors.GEOSException as error:
-            raise InputError(f"text {text!r:.60} is no well-known text ({error})") from error
-        return cls.from_shapely(geometry)
+        return cls.from_pieces(pieces_of_wkt(text))
 
     @classmethod
     def from_geojson(cls, source: str | PathLike[str] | Mapping[str, Any]) -> Polygon:

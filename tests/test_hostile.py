@@ -223,6 +223,34 @@ def test_cases_that_are_none_are_refused(tmp_path, name):
         load_case(tmp_path / "c.toml").size_field()
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("GEOMETRYCOLLECTION(" * 100_000, "more than 8 parentheses"),
+        ("POLYGON (" + "(" * 9 + ")" * 9 + ")", "more than 8 parentheses"),
+        ("POLYGON ((nan 0, 1 0, 1 1, nan 0))", "finite numbers"),
+        ("POLYGON ((0 0, 1 0, 1 nan, 0 0))", "vertex 2 at .* expected finite numbers"),
+        ("POLYGON ((0 0, 1e400 0, 1 1, 0 0))", "vertex 1 at .* expected finite numbers"),
+        ("x" * 100_000, "no well-known text"),
+        ("POLYGON ((0 0\0, 1 0, 1 1, 0 0))", "no well-known text"),
+        ("POLYGON ((0 0, 1 0, 1 1, \udc80 0))", "no well-known text"),
+    ],
+    ids=["deep", "deeper", "nan", "nan within", "huge", "long", "zero byte", "no text"],
+)
+def test_well_known_text_that_is_none_is_refused(text, message):
+    """Without a warning, and before GEOS's stack is at its end."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match=message) as refused:
+            clvoro.Polygon.from_wkt(text)
+    assert len(str(refused.value)) < 500
+
+
+def test_well_known_text_may_have_many_parentheses_beside_each_other():
+    squares = ",".join(f"(({k} 0,{k}.5 0,{k}.5 1,{k} 0))" for k in range(40))
+    assert clvoro.Polygon.from_wkt(f"MULTIPOLYGON ({squares})").n_pieces == 40
+
+
 FORMATS = [
     "m.npz", "m.vtu", "a.npy", "state", "c.toml", "g.geojson", "w.wkt", "s.stl", "ascii.stl", "s.obj", "s.off", "s.ply",
 ]  # fmt: skip
