@@ -10,7 +10,7 @@ from ._primitives import scan_width
 from ._program import Engine
 from .domain import Domain
 from .errors import MemoryLimitError
-from .margins import block_counts
+from .margins import block_count, block_counts
 from .poisson import most_iterations
 from .polygon import Polygon
 from .quadrature import DensityTree
@@ -29,7 +29,7 @@ OUTPUT = {2: {8: 340, 4: 220}, 3: {8: 3600, 4: 4000}}
 In 3D single precision takes more: views of faces have to be brought together where double precision agrees at once."""
 TRIMMED_OUTPUT, SHORE_OUTPUT, EDGE_OUTPUT = {8: 535, 4: 330}, {8: 1200, 4: 780}, {8: 65, 4: 38}
 """The same of polygons: per cell, and what comes to it as above."""
-DIAGRAM = {2: {8: 700, 4: 440}, 3: {8: 4400, 4: 4600}}
+DIAGRAM = {2: {8: 700, 4: 440}, 3: {8: 4700, 4: 4600}}
 """The same of one diagram, until it is made and read: of random generators, of which stages keep what they have."""
 TRIMMED_DIAGRAM, SHORE_DIAGRAM, EDGE_DIAGRAM = {8: 1110, 4: 735}, {8: 750, 4: 530}, {8: 260, 4: 170}
 """The same of polygons, likewise; there are no sentinels."""
@@ -181,10 +181,16 @@ def shore_expected(domain: Polygon, size: Callable[[np.ndarray], np.ndarray]) ->
 def fixed_bytes(engine: Engine, n: float) -> float:
     """Return the bytes of a run that do not grow with its number of cells, `n`, or hardly."""
     real = engine.real.itemsize
-    unit = max(64, engine.queue.device.mem_base_addr_align // 8)
     records = 8 * real * most_iterations(int(min(n, FEW)))
-    sums = PARTIAL_SUMS * engine.groups * real + SCANS * 4 * scan_width(engine)
-    return records + sums + ARRAYS * unit
+    return records + PARTIAL_SUMS * engine.groups * real + spare_bytes(engine)
+
+
+def spare_bytes(engine: Engine) -> float:
+    """Return the part of these bytes that one diagram takes, too."""
+    unit = max(64, engine.queue.device.mem_base_addr_align // 8)
+    periodic = any(name == "PERIODIC" for name, _ in engine.domain_defines)
+    margins = 3 * 4 * block_count(engine.dim) if periodic else 0
+    return ARRAYS * unit + SCANS * 4 * scan_width(engine) + margins
 
 
 def memory_needed(
@@ -234,7 +240,7 @@ def memory_needed(
     if not run:
         per_cell = (TRIMMED_DIAGRAM, SHORE_DIAGRAM, EDGE_DIAGRAM)
         made = together(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[d][real]
-        return made + folded * FOLDED_DIAGRAM[d][real] + held
+        return made + folded * FOLDED_DIAGRAM[d][real] + held + spare_bytes(engine)
     if trimmed:
         peak = together(*(bytes_of(f) for f in (TRIMMED_PEAK, SHORE_PEAK, EDGE_PEAK)))
         output = together(*(f[real] for f in (TRIMMED_OUTPUT, SHORE_OUTPUT, EDGE_OUTPUT)))
