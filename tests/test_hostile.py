@@ -1,6 +1,7 @@
 """Files that mean harm - cut off, huge, with code in them - are refused with a clear error, and no harm is done."""
 
 import io
+import json
 import pickle
 import re
 import struct
@@ -221,6 +222,33 @@ def test_cases_that_are_none_are_refused(tmp_path, name):
     (tmp_path / "c.toml").write_bytes(CASES[name])
     with pytest.raises(InputError):
         load_case(tmp_path / "c.toml").size_field()
+
+
+PLAIN = b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='constant'\nvalue=0.3\n"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["/tmp/x", "../x", "..", ".", "a/b", "a\\b", "a/", "C:x", "a\0b", "a\nb", "\x1b[31m", "\u00e4" * 101, ""],
+)  # fmt: skip
+def test_names_of_cases_that_lead_elsewhere_are_refused(tmp_path, name):
+    path = tmp_path / "c.toml"
+    path.write_bytes(f"name = {json.dumps(name)}\n".encode() + PLAIN)
+    with pytest.raises(InputError, match=r"c\.toml: name is "):
+        load_case(path)
+
+
+@pytest.mark.parametrize("file", ["...toml", "..toml"])
+def test_files_of_cases_whose_names_lead_elsewhere_are_refused(tmp_path, file):
+    (tmp_path / file).write_bytes(PLAIN)
+    with pytest.raises(InputError, match="name is "):
+        load_case(tmp_path / file)
+
+
+@pytest.mark.parametrize("name", ["a b", "...x", ".x", "\u00e4: 1"])
+def test_names_of_cases_are_folders_in_out(tmp_path, name):
+    (tmp_path / "c.toml").write_bytes(f"name = {json.dumps(name)}\n".encode() + PLAIN)
+    assert load_case(tmp_path / "c.toml").name == name
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from ..domain import Domain
 from ..errors import InputError
 from ..io.atomic import atomic_file
 from . import schema, toml
+from .checks import file_name
 from .domains import build_domain, build_layers
 from .fields import build_size, load_array, named_files
 from .files import FOLDER, locate
@@ -85,7 +86,7 @@ class Case:
         run = checked.get("run", {})
         if "method" in run and "methods" in run:
             raise InputError(f"{place} run has both method and methods; keep one of them")
-        stem = str(checked.get("name", Path(name).stem))
+        stem = file_name(checked.get("name", Path(name).stem), f"{place} name")
         return cls(
             name=stem,
             title=str(checked.get("title", stem)),

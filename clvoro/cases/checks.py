@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import PureWindowsPath
 from typing import Any
 
 from ..errors import InputError
 
 Check = Callable[[object, str], Any]
 """Takes a value and its place in the file; returns it in its final type or raises InputError."""
+
+_LONGEST_NAME = 200  # bytes: systems take 255, and files beside it add an ending
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 class UnknownKeyError(InputError):
@@ -33,6 +38,20 @@ def text(value: object, place: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise refuse(place, value, "a text in quotes")
     return value
+
+
+def file_name(value: object, place: str) -> str:
+    """Check for what can name a file or folder here, and none elsewhere, on any system."""
+    name = text(value, place)
+    alone = PureWindowsPath(name).name == name != ".."  # it knows all separators, and drives
+    if not alone or len(name.encode("utf-8", "replace")) > _LONGEST_NAME or _CONTROL.search(name):
+        raise refuse(
+            place,
+            name[: _LONGEST_NAME + 1],
+            "a name without slashes, no '.' or '..' (results go to out/NAME; "
+            "--out chooses another folder)",
+        )
+    return name
 
 
 def number(value: object, place: str) -> float:

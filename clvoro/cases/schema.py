@@ -14,6 +14,7 @@ from .checks import (
     Table,
     UnknownKeyError,
     auto_or_whole,
+    file_name,
     list_of,
     not_negative,
     number,
@@ -217,7 +218,13 @@ LAYERS = Table(
 
 _CASE = Table(
     {"domain": domain, "size": size},
-    {"name": text, "title": text, "run": _RUN, "layers": list_of(LAYERS), "sequence": SEQUENCE},
+    {
+        "name": file_name,
+        "title": text,
+        "run": _RUN,
+        "layers": list_of(LAYERS),
+        "sequence": SEQUENCE,
+    },
 )
 
 _HOMES = {
