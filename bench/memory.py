@@ -234,10 +234,12 @@ def show_kinds(options: Any) -> None:
         if "all" not in words and not name.startswith(words):
             continue
         for n in options.sizes:
-            if name in OTHERS:
-                found = OTHERS[name](options, n)
-            else:
-                found = measure_kind(options, KINDS[name](n))
+            try:
+                other = OTHERS.get(name)
+                found = other(options, n) if other else measure_kind(options, KINDS[name](n))
+            except clvoro.ClvoroError as error:  # too few cells, say, across a period
+                print(f"{name}, {n} cells: {error}", file=sys.stderr)
+                continue
             report.add({"kind": name, **found}, name)
     report.finish(
         heading(make_adapter(options), "Device memory told, bytes per cell, and held over told")
