@@ -62,6 +62,10 @@ def _paste(name: str, seen: set[str]) -> str:
     return "\n".join(lines)
 
 
+CPU_GROUPS = 32
+"""Parts that sums are cut into on CPUs: as many whatever the number of cores, so that the bits do not depend on it."""
+
+
 class KernelPool:
     """Kernels of any program, each in one hand at a time.
 
@@ -230,7 +234,7 @@ class Engine:
         device = self.queue.device
         cpu = bool(device.type & cl.device_type.CPU)
         units = device.max_compute_units
-        object.__setattr__(self, "groups", min(512, units * (4 if cpu else 8)))
+        object.__setattr__(self, "groups", CPU_GROUPS if cpu else min(512, units * 8))
         object.__setattr__(self, "group_size", 1 if cpu else 128)
         object.__setattr__(self, "item_group", 64)
         object.__setattr__(self, "workspace", Workspace(self.queue))

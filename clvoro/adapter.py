@@ -389,6 +389,8 @@ class Adapter:
         resume: str | PathLike[str] | None,
     ) -> Result:
         """Prepare a run and carry it out, with fewer coarse levels where a periodic box has too few cells around it."""
+        for kept in self._stages.values():
+            kept.release()  # a diagram's buffers, or a failed run's, are not part of what this one takes
         stages = self._stages_for(domain)
         host = None if points is None else check_points(points, domain)
         saved = None if resume is None else Saved(resume)

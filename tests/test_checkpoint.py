@@ -149,6 +149,27 @@ def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     assert_same(clvoro.Adapter(ctx).run(square, 0.25, resume=path, **options), whole)
 
 
+@pytest.mark.parametrize("before", ["diagram", "failed run"])
+@pytest.mark.parametrize("square", [clvoro.Box((0, 0), (1, 1)), clvoro.Box((0,) * 3, (1,) * 3)])
+def test_after_something_larger(ctx, tmp_path, square, before):
+    """What an adapter has done before is no part of a run's state."""
+    path, size = tmp_path / "state", 0.29 if square.dim == 2 else 0.4
+    options = {"method": "coupled", "max_steps": 6, "tol": 0.0}
+    adapter = clvoro.Adapter(ctx)
+
+    def fail(row):
+        raise LookupError
+
+    if before == "diagram":
+        adapter.diagram(square, np.random.default_rng(0).random((8000, square.dim)))
+    else:
+        with pytest.raises(LookupError):
+            adapter.run(square, 8000 ** (-1 / square.dim), method="lloyd", callback=fail)
+    adapter.run(square, size, callback=stop_after(3), checkpoint=path, **options)
+    whole = clvoro.Adapter(ctx).run(square, size, **options)
+    assert_same(clvoro.Adapter(ctx).run(square, size, resume=path, **options), whole)
+
+
 @pytest.fixture(scope="module")
 def saved(ctx, tmp_path_factory):
     path = tmp_path_factory.mktemp("checkpoint") / "state"
