@@ -438,6 +438,7 @@ class TestMend:
         assert set(sweep.moved) <= many
         assert len(sweep.deleted) > 2 < len(sweep.moved)
         sites = {*sweep.deleted, *sweep.moved}
+        assert {4, 8} <= set(sides[list(sites)].tolist())
         assert sweep.rings_between(list(sites)) > PAIR_RINGS
 
     def test_generators_that_stay(self, engine):
