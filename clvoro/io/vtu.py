@@ -168,15 +168,17 @@ def _polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
 def cell_data(result: Result) -> dict[str, np.ndarray]:
     """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
     diagram = result.diagram
-    flat = diagram.domain.dim == 2
-    counts = count_sides(diagram) if flat else np.diff(diagram.neighbour_starts)
+    flat, n = diagram.domain.dim == 2, len(diagram)
+    # In 3D of the faces that are written: those with a loop.
+    seen = np.diff(face_corners(diagram)[0]) > 0
+    counts = count_sides(diagram) if flat else np.bincount(face_owners(diagram)[seen], minlength=n)
     return {
         "size": result.size,
         "error": result.error,
         "quality": result.quality,
         "volume": diagram.volumes,
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),
-        "label": np.arange(len(diagram), dtype=np.int32),
+        "label": np.arange(n, dtype=np.int32),
         "generator": in_space(result.points),
     }
 

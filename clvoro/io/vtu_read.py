@@ -23,6 +23,7 @@ from ..polygon import Polygon
 from ..rebuilt import rebuild
 from ..results import HISTORY_DTYPE, Diagram, Result
 from ..walls import wall_count
+from .vtu_more import check_repeated
 
 _LONGEST_HEAD = 1 << 22
 _MARK = b'<AppendedData encoding="raw">\n_'
@@ -224,6 +225,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         known |= {"face_vertex_starts": face_starts, "face_vertices": corners}
     # What the file does not hold is what its corners give.
     diagram = Diagram(domain, {**known, **rebuild(Diagram(domain, known))})
+    check_repeated(arrays, diagram)
     size, error, quality = (
         arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
     )

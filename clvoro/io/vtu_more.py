@@ -1,0 +1,45 @@
+"""What `.vtu` files say more than once, for other programs: all of it has to agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..faces import face_owners
+from ..outlines import count_sides
+from ..results import Diagram
+
+
+def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
+    """Check the `arrays` of a file, by group and name, that its `diagram` was made without: others read them.
+
+    Raises
+    ------
+    ValueError
+        Names the array that does not fit.
+    """
+    n, v = len(diagram), len(diagram.vertices)
+    given = {"CellData.label": arrays["CellData.label"]}
+    expected = {"CellData.label": np.arange(n)}
+    if diagram.domain.dim == 2:
+        for name in ("Points.", "CellData.generator"):
+            given[f"z of {name}"] = z = arrays[name][:, 2]
+            expected[f"z of {name}"] = np.zeros(len(z))
+        given["CellData.sides"] = arrays["CellData.sides"]
+        expected["CellData.sides"] = count_sides(diagram)
+    else:
+        expected["CellData.faces_of_cell"] = np.diff(diagram.neighbour_starts)
+        # Every corner of a cell once, in ascending order.
+        cell = np.repeat(face_owners(diagram).astype(np.int64), np.diff(diagram.face_vertex_starts))
+        keys = np.unique(cell * v + diagram.face_vertices)
+        expected["Cells.offsets"] = np.cumsum(np.bincount(keys // v, minlength=n))
+        expected["Cells.connectivity"] = keys % v
+        given = {name: arrays[name] for name in expected}
+    for name, values in expected.items():
+        if given[name].shape != values.shape:
+            raise ValueError(f"{name} has shape {given[name].shape}, expected {values.shape}")
+        wrong = np.flatnonzero(given[name] != values)
+        if len(wrong):
+            k = wrong[0]
+            raise ValueError(f"{name} is {given[name][k]} at {k}, expected {values[k]}")
