@@ -8,12 +8,12 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 
+from ._files import LONGEST_GEOMETRY, read_text
 from .errors import InputError, InputTypeError, MisfitWarning
 
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
@@ -78,7 +78,7 @@ def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[l
         if text is None:
             name = str(source)
             try:
-                text = Path(source).read_text(encoding="utf-8-sig")
+                text = read_text(source, LONGEST_GEOMETRY)
             except (OSError, UnicodeDecodeError) as error:
                 raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
         try:

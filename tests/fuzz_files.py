@@ -10,6 +10,7 @@ import numpy as np
 
 import clvoro
 from clvoro.cases import load_case
+from clvoro.cases.domains import build_domain
 from clvoro.cases.fields import load_array
 from clvoro.io.vtu_read import load_vtu
 from clvoro.resume import Saved
@@ -118,11 +119,7 @@ def read(path: Path) -> object:
     if path.suffix == ".geojson":
         return clvoro.Polygon.from_geojson(path)
     if path.suffix == ".wkt":
-        try:
-            text = path.read_text(encoding="utf-8")
-        except UnicodeDecodeError:  # is for who reads the file to see
-            text = ""
-        return clvoro.Polygon.from_wkt(text)
+        return build_domain({"kind": "polygon", "file": path.name}, path.parent)
     if path.suffix in (".stl", ".obj", ".off", ".ply"):
         surface = Surface.read(path)
         with np.errstate(all="ignore"):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import pickle
 import re
 import struct
@@ -9,12 +10,14 @@ import time
 import warnings
 import zipfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import clvoro
-from clvoro.cases import load_case
+from clvoro._files import read_text
+from clvoro.cases import load_case, toml
 from clvoro.cases.fields import load_array
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
@@ -330,6 +333,55 @@ def test_coordinates_that_are_no_numbers_are_refused_without_a_warning(valid, tm
         warnings.simplefilter("error")
         with pytest.raises(InputError, match="finite"):
             files.read(tmp_path / "s.stl")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes among the files")
+@pytest.mark.parametrize("name", [*FORMATS, "case of geojson", "case of wkt", "case of raster"])
+def test_pipes_and_devices_are_refused(tmp_path, name):
+    """None waits for somebody to write, or reads what has no end."""
+    for made in (os.mkfifo, lambda path: os.symlink("/dev/zero", path), os.mkdir):
+        folder = tmp_path / made.__name__.strip("<>")
+        folder.mkdir()
+        path = folder / name
+        if name.startswith("case"):
+            (folder / "c.toml").write_bytes(CASES_OF[name])
+            made(folder / re.search(rb"'(x\.\w+)'", CASES_OF[name])[1].decode())
+            path = folder / "c.toml"
+        else:
+            made(path)
+        with pytest.raises(InputError, match=r"no plain file|[Dd]irectory"):
+            files.read(path)
+
+
+CASES_OF = {
+    "case of geojson": PLAIN.replace(b"lower=[0,0]\nupper=[1,1]", b"polygon = 'x.geojson'"),
+    "case of wkt": PLAIN.replace(b"lower=[0,0]\nupper=[1,1]", b"polygon = 'x.wkt'"),
+    "case of raster": PLAIN.replace(b"'constant'\nvalue=0.3", b"'raster'\nfile = 'x.npy'"),
+}
+
+
+def test_texts_have_an_end(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_bytes(PLAIN + b"#" * toml.LONGEST)
+    with pytest.raises(InputError, match="longer than"):
+        load_case(path)
+    with open(tmp_path / "g.geojson", "wb") as file:  # of holes
+        file.truncate(1 << 40)
+    with pytest.raises(InputError, match="longer than"):
+        clvoro.Polygon.from_geojson(tmp_path / "g.geojson")
+    (tmp_path / "short").write_bytes(b"\xef\xbb\xbfab")
+    assert read_text(tmp_path / "short", 5) == "ab"
+    with pytest.raises(OSError, match="longer than 4"):
+        read_text(tmp_path / "short", 4)
+    if Path("/proc/self/status").exists():  # which says that it is empty
+        assert "Pid" in read_text("/proc/self/status", 1 << 20)
+        with pytest.raises(OSError, match="longer than 40"):
+            read_text("/proc/self/status", 40)
+
+
+def test_paths_with_zero_bytes_are_refused():
+    with pytest.raises(InputError, match="zero bytes"):
+        clvoro.Polygon.from_geojson("a\0b.geojson")
 
 
 @pytest.mark.parametrize("name", FORMATS)

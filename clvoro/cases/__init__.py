@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from .._files import read_text
 from ..domain import Domain
 from ..errors import InputError
 from ..io.atomic import atomic_file
@@ -198,7 +199,7 @@ def load_case(name: str | Path) -> Case:
         return Case.from_toml(known[str(name)], str(name))
     path = Path(name)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, toml.LONGEST)
     except (OSError, UnicodeDecodeError) as error:
         near = difflib.get_close_matches(str(name), list(known), 1, 0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._files import LONGEST_GEOMETRY, read_text
 from ..domain import Box, Domain
 from ..errors import InputError
 from ..layers import Layers
@@ -35,7 +36,7 @@ def build_domain(node: Mapping[str, Any], folder: Path) -> Domain:
     if path.suffix.lower() not in (".wkt", ".txt"):
         return Polygon.from_geojson(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LONGEST_GEOMETRY)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path} ({error}), expected well-known text") from error
     return Polygon.from_wkt(text)

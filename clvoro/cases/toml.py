@@ -15,6 +15,8 @@ except ModuleNotFoundError:  # Python 3.10
 
 __all__ = ["read", "write"]
 
+LONGEST = 1 << 22
+"""Bytes of a case file; polygons and arrays of any size have files of their own."""
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 

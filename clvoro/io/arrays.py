@@ -13,6 +13,7 @@ from typing import IO
 
 import numpy as np
 
+from .._files import open_plain
 from ..errors import InputError
 from .atomic import atomic_file
 
@@ -82,7 +83,11 @@ def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str,
     InputError
         If the file is missing, damaged, cut off, of another kind or of a newer version.
     """
-    with explained(path, f"a {kind}"), zipfile.ZipFile(path) as archive:
+    with (
+        explained(path, f"a {kind}"),
+        open_plain(path) as file,
+        zipfile.ZipFile(file) as archive,
+    ):
         members = list_members(archive, kind, version)
         return {name: read_member(archive, info) for name, info in members.items()}
 
@@ -130,7 +135,7 @@ def read_array(path: Path, member: str = "points") -> np.ndarray:
     InputError
         If there is no such file, or it holds no such array, or one of Python objects.
     """
-    with explained(path, "a .npy file"), open(path, "rb") as file:
+    with explained(path, "a .npy file"), open_plain(path) as file:
         if file.read(4) == b"PK\x03\x04":
             with zipfile.ZipFile(file) as archive:
                 check_expansion(archive)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from .._files import open_plain
 from ..domain import Box, Domain
 from ..polygon import Polygon
 from ..results import HISTORY_DTYPE, Diagram, Displacements, Result
@@ -89,7 +90,7 @@ def load(path: str | PathLike[str]) -> Result:
         file and what is wrong.
     """
     with explained(path, "a file written by Result.save"):
-        with zipfile.ZipFile(path) as archive:
+        with open_plain(path) as file, zipfile.ZipFile(file) as archive:
             members = list_members(archive, FORMAT, VERSION)
             missing = [name for name in _NEEDED if name not in members]
             if missing:

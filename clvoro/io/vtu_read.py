@@ -17,6 +17,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from .._files import open_plain
 from ..domain import Box, Domain
 from ..errors import InputError
 from ..polygon import Polygon
@@ -52,7 +53,7 @@ def load_vtu(path: str | PathLike[str]) -> Result:
     """
     name = fspath(path)
     try:
-        with open(path, "rb") as file:
+        with open_plain(path) as file:
             head = file.read(_LONGEST_HEAD)
             end = head.find(_MARK)
             if end < 0:

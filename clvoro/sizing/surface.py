@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._files import open_plain
 from ..errors import InputError, InputTypeError
 from .shapes import coordinates
 from .tree import Tree
@@ -110,7 +111,7 @@ class Surface:
                 f"{str(path)!r} ends in {path.suffix!r}, expected a surface file: "
                 + ", ".join(f".{f}" for f in _FORMATS)
             )
-        if not path.is_file():
+        if not path.exists():
             raise InputError(f"there is no surface file {str(path)!r}")
         try:
             import trimesh
@@ -123,11 +124,15 @@ class Surface:
         extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
         try:
             # What is no number among the coordinates is refused below.
-            with path.open("rb") as file, np.errstate(all="ignore"):
+            with open_plain(path) as file, np.errstate(all="ignore"):
                 mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
             vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         except MemoryError:
             raise
+        except OSError as error:
+            raise InputError(
+                f"surface file {str(path)!r} cannot be read: {error.strerror or error}"
+            ) from error
         except (
             ModuleNotFoundError
         ) as error:  # it would guess what the bytes that are no text could be
