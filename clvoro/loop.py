@@ -78,6 +78,8 @@ class Loop:
         converged, reason = False, "plan completed"
         try:
             stop = not self.rows and self.record(0.0)
+            if stop and self.checkpoint is not None:
+                self.checkpoint.offer(self, stop)
             done = work_of(self.plan, self.levels, self.mesh.engine.dim, asked)
             ahead = list(zip(self.plan, [*done[1:], 1.0], strict=False))
             for action, progress in ahead[self.position :]:

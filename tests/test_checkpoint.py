@@ -149,6 +149,15 @@ def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     assert_same(clvoro.Adapter(ctx).run(square, 0.25, resume=path, **options), whole)
 
 
+@pytest.mark.parametrize("kind", ["adaptive", "in 3D"])
+def test_stopped_before_the_first_step(ctx, tmp_path, kind):
+    box, size = (BOX_3D, SIZE_3D) if kind == "in 3D" else (BOX, SIZE)
+    path, options = tmp_path / "state", RUNS[kind]
+    clvoro.Adapter(ctx).run(box, size, callback=stop_after(0), checkpoint=path, **options)
+    resumed = clvoro.Adapter(ctx).run(box, size, resume=path, **options)
+    assert_same(resumed, clvoro.Adapter(ctx).run(box, size, **options))
+
+
 @pytest.mark.parametrize("before", ["diagram", "failed run"])
 @pytest.mark.parametrize("square", [clvoro.Box((0, 0), (1, 1)), clvoro.Box((0,) * 3, (1,) * 3)])
 def test_after_something_larger(ctx, tmp_path, square, before):
