@@ -1,6 +1,8 @@
 """Gradation limiting: the scheme against a plain solver, and against min f(y) + g |x - y|."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ from hypothesis import strategies as st
 
 import clvoro
 from clvoro import Box, sizing
+from clvoro._host_memory import host_memory
 from clvoro._program import Engine
-from clvoro.errors import InputError, InputTypeError, SizeFieldError
+from clvoro.errors import InputError, InputTypeError, MemoryLimitError, SizeFieldError
 from clvoro.gradation import Gradation
 
 
@@ -326,3 +329,31 @@ def test_resolution_is_chosen_and_capped(make_engine):
 def test_bad_input(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_nodes_beyond_memory_are_refused_before_there_are_any(make_engine, monkeypatch):
+    field = sizing.Graded(sizing.Expression("x < 0.5 ? 0.1 : 0.3"), slope=0.2, resolution=200)
+    box = Box((0, 0), (1, 0.5))
+    n = 200 * 101
+    engine = make_engine(2)
+    monkeypatch.setattr("clvoro.sizing.graded.host_memory", lambda: 48 * n - 1)
+    monkeypatch.setattr(sizing.Graded, "_at_nodes", None)  # is not come to
+    with pytest.raises(
+        MemoryLimitError, match=r"resolution is 200, .* 2.02e\+04 nodes .* the host has"
+    ):
+        field.raster(box, engine)
+    monkeypatch.undo()
+    monkeypatch.setattr("clvoro.sizing.graded.host_memory", lambda: 48 * n)
+    assert field.raster(box, engine).values.size == n
+
+
+def test_memory_of_the_host_is_that_of_the_process():
+    pytest.importorskip("resource")
+    whole = host_memory()
+    assert 1e8 < whole < 1e15
+    text = (
+        "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))\n"
+        "from clvoro._host_memory import host_memory; print(host_memory())"
+    )
+    found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert int(found.stdout) == min(3 << 30, whole)

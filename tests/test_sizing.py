@@ -1,5 +1,6 @@
 """Size fields: the device against NumPy, the grammar of expressions, what is refused."""
 
+import functools
 import math
 
 import numpy as np
@@ -656,3 +657,42 @@ def test_numbers_and_fields_pass_as_fields():
 
 def test_empty_points(double):
     assert _CIRCLE(np.zeros((0, 2))).shape == (0,)
+
+
+def test_constants_are_combined_on_the_host():
+    """One constant stands for thousands: they need no kernel of their own."""
+    values = np.random.default_rng(5).uniform(0.1, 9, 20_000)
+    x = np.full((3, 2), 0.2)
+    for make, of in ((sizing.minimum, np.min), (sizing.maximum, np.max)):
+        few = make(*values.tolist(), sizing.Expression("0.5*x"), 4.5)
+        assert few.parts == 3  # it, the formula and one number
+        assert (few(x) == of([of([*values, 4.5]), 0.1])).all()
+    ratio = sizing.as_field(2) / sizing.as_field(0.5) * sizing.as_field(3)
+    assert isinstance(ratio, sizing.Constant)
+    assert ratio.value == 12
+
+
+def test_numbers_beyond_a_size_are_left_to_what_follows():
+    huge = sizing.Constant(1e300)
+    assert (huge * huge / huge)(np.zeros((1, 2)))[0] == math.inf
+    assert isinstance(sizing.Constant(2) + sizing.Constant(3), sizing.Constant)
+
+
+def test_fields_of_too_many_parts_are_refused():
+    """Kernels of hundreds of formulas take minutes to build, and nested ones end Python's stack."""
+    formulas = [sizing.Expression(f"0.1 + {i}*x") for i in range(257)]
+    sizing.minimum(*formulas[:256])
+    with pytest.raises(InputError, match=r"257 parts, expected at most 256.*Raster"):
+        sizing.minimum(*formulas)
+    for grow in (lambda f: f + formulas[1], lambda f: 1.5 * f, lambda f: sizing.Graded(f, slope=1)):
+        with pytest.raises(InputError, match="parts"):
+            functools.reduce(lambda f, _, grow=grow: grow(f), range(20_000), formulas[0])
+    long = sizing.Expression("+".join(["x*y"] * 1000))
+    assert long.parts > 100
+    with pytest.raises(InputError, match="parts"):
+        sizing.maximum(long, long, long)
+    # The least of the least is one field.
+    least = formulas[0]
+    for f in formulas[1:200]:
+        least = sizing.minimum(least, f)
+    assert least.parts == 201

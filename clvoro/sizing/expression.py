@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _LONGEST = 4096  # characters
 _DEEPEST = 40  # brackets and ?: inside one another
+_OPERATIONS = 32  # that count as a part
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\w.])"
@@ -125,6 +126,7 @@ class Expression(Field):
         self._nodes = _Parser(text).parse()
         self._axes = 1 + max((n.value for n in self._nodes if n.kind == "axis"), default=-1)
         self.dim = 3 if self._axes == 3 else None
+        self.parts = 1 + len(self._nodes) // _OPERATIONS
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         values: list[Any] = []

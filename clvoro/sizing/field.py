@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .bind import Binder
 
 _MOST_GROWTH = 10  # more is meant as a percentage
+_MOST_PARTS = 256  # the time to build kernels grows faster than they do: 3 s for 200, 20 s for 400
 
 
 class Field:
@@ -35,10 +36,13 @@ class Field:
         2 or 3 if the field belongs to one dimension, None if it fits both.
     on_device : bool
         Whether the field has a device form.
+    parts : int
+        Number of fields that it is combined from, itself among them; long formulas count more than once.
     """
 
     dim: int | None = None
     on_device: bool = True
+    parts: int = 1
 
     def __call__(self, points: object) -> np.ndarray:
         """Return h at `points`.
@@ -131,7 +135,7 @@ class Field:
     def _combine(operation: str, *operands: object) -> Field:
         if not all(isinstance(f, (Field, Real)) or callable(f) for f in operands):
             return NotImplemented
-        return Combined(operation, *map(as_field, operands))
+        return _folded(operation, [as_field(f) for f in operands])
 
     # NumPy leaves operators between its arrays and a field to the field, which then refuses them.
     __array_ufunc__ = None
@@ -243,6 +247,7 @@ class Scaled(Field):
     def __init__(self, field: Field, factor: float):
         self.field, self.factor = field, positive("a factor of a size field", factor)
         self.dim, self.on_device = field.dim, field.on_device
+        self.parts = counted(field)
 
     def check_dim(self, dim: int) -> None:  # noqa: D102
         self.field.check_dim(dim)
@@ -290,6 +295,7 @@ class Combined(Field):
         self.operation, self.fields = operation, fields
         self.dim = dims.pop() if dims else None
         self.on_device = all(f.on_device for f in fields)
+        self.parts = counted(*fields)
 
     def check_dim(self, dim: int) -> None:  # noqa: D102
         for f in self.fields:
@@ -339,8 +345,45 @@ def maximum(*fields: object) -> Field:
 def _combined(operation: str, fields: tuple[object, ...]) -> Field:
     if not fields:
         raise InputError(f"{operation}imum got no size field, expected at least one")
-    made = [as_field(f) for f in fields]
+    made: list[Field] = []
+    for f in map(as_field, fields):
+        alike = isinstance(f, Combined) and f.operation == operation
+        made += f.fields if alike else [f]  # type: ignore[attr-defined]
+    constants = [f for f in made if isinstance(f, Constant)]
+    if len(constants) > 1:  # one does for all
+        others = [f for f in made if not isinstance(f, Constant)]
+        made = [*others, _folded(operation, constants)]
     return made[0] if len(made) == 1 else Combined(operation, *made)
+
+
+def _folded(operation: str, fields: Sequence[Field]) -> Field:
+    """Return `fields` combined; constants alone make a constant, where it is one that a size may have."""
+    if all(isinstance(f, Constant) for f in fields):
+        value = fields[0].value  # type: ignore[attr-defined]
+        with np.errstate(over="ignore", under="ignore"):
+            for f in fields[1:]:
+                value = float(_COMBINE[operation][0](value, f.value))  # type: ignore[attr-defined]
+        if 0 < value < math.inf:
+            return Constant(value)
+    return Combined(operation, *fields)
+
+
+def counted(*fields: Field) -> int:
+    """Return the number of parts of a field that stands on `fields`.
+
+    Raises
+    ------
+    InputError
+        If they are too many for compilers of kernels, and for Python to go through.
+    """
+    parts = sum(f.parts for f in fields)
+    if parts > _MOST_PARTS:
+        raise InputError(
+            f"a size field is combined from {parts} parts, expected at most {_MOST_PARTS}: kernels of more take "
+            "minutes to build; put many shapes into one Distance, many values into a Raster, or write a callable "
+            "of NumPy arrays"
+        )
+    return 1 + parts
 
 
 def as_field(size: object) -> Field:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._host_memory import host_memory
 from ..domain import Domain
-from ..errors import InputError, InputTypeError
+from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..polygon import Polygon
 from .covering import uncovered
-from .field import Field, as_field, slope_of
+from .field import Field, as_field, counted, slope_of
 from .raster import Raster
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 _MOST = 1 << 22  # nodes
 _MOST_GIVEN = 2**31 - 1  # nodes of a resolution that the caller gives
 _BATCH = 1 << 18  # nodes evaluated at once
+_NODE = 48  # bytes of a node on the host, at most, while values go to and from the device and into a raster
 _PROBES = {2: 129, 3: 33}  # nodes along the longest side of the grid that looks for the least size
 
 
@@ -60,6 +62,8 @@ class Graded(Field):
     ------
     InputError, InputTypeError
         If an argument is out of range or of the wrong kind.
+    MemoryLimitError
+        When it is computed, if host or device have no room for as many nodes as `resolution` makes.
     SizeFieldError
         When it is computed, if `field` is not positive and finite at a node.
 
@@ -82,6 +86,7 @@ class Graded(Field):
         resolution: int | Sequence[int] | None = None,
     ):
         self.field = as_field(field)
+        self.parts = counted(self.field)
         self.slope = slope_of("Graded", growth, slope)
         if box is not None and not isinstance(box, Domain):
             raise InputTypeError(
@@ -153,6 +158,7 @@ class Graded(Field):
         marks = marks[box.contains(marks)]
         at_marks = evaluate(marks) if len(marks) else np.zeros(0)
         counts = self._counts(box, evaluate, at_marks)
+        self._check_room(math.prod(counts.tolist()), engine)
         axes = _axes(box, counts)
         values = np.empty(np.prod(counts))
         for first in range(0, len(values), _BATCH):
@@ -233,6 +239,21 @@ class Graded(Field):
         while np.prod(_along(box, spacing), dtype=float) > _MOST:
             spacing *= 1.02
         return _along(box, spacing)
+
+    def _check_room(self, n: int, engine: Engine) -> None:
+        """Raise if host or device have no room for `n` nodes."""
+        device = engine.queue.device
+        name, own = device.name.strip(), n * engine.real.itemsize
+        for where, needed, has in (
+            ("the host", n * _NODE, host_memory()),
+            (name, own, device.global_mem_size),
+            (f"{name} in one piece", own, device.max_mem_alloc_size),
+        ):
+            if needed > has:
+                raise MemoryLimitError(
+                    f"Graded resolution is {self.resolution}, which makes {n:.3g} nodes and needs "
+                    f"{needed / 2**30:.3g} GiB; {where} has {has / 2**30:.3g} GiB. Give less, or leave it out"
+                )
 
     def _seed(
         self,
