@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
+from .check_faces import check_corners, check_measures
 from .check_polygon import check_cells, check_edges, check_outlines, hidden
 from .check_values import check_values
 from .faces import face_keys
@@ -33,17 +34,23 @@ def check_diagram(diagram: Diagram) -> Report:
 def check_result(result: Result) -> Report:
     """Check a result: its diagram, sizes, error (the paper's 3.1), quality (4.1) and history; see `Result.check`."""
     check = Check(result.diagram)
-    return _finish(check, lambda: check_values(check, result))
+    return _finish(
+        check, result.settings.get("dtype"), lambda geometry: check_values(check, result, geometry)
+    )
 
 
-def _finish(check: Check, more: Callable[[], None] | None = None) -> Report:
+def _finish(
+    check: Check, dtype: object = None, more: Callable[[Rebuilt], None] | None = None
+) -> Report:
     diagram, geometry = check.diagram, None
     try:
-        _check_structure(check)
-        geometry = Rebuilt(diagram)
-        _check_geometry(check, geometry)
-        if more is not None:
-            more()
+        # What is wrong may divide by 0, and is told as a finding.
+        with np.errstate(all="ignore"):
+            _check_structure(check)
+            geometry = Rebuilt(diagram, dtype)
+            _check_geometry(check, geometry)
+            if more is not None:
+                more(geometry)
     except MisfitError:
         pass
     names = tuple(dict.fromkeys(check.checked))
@@ -128,6 +135,7 @@ def _check_structure(check: Check) -> None:
         "graph symmetric", np.ones(len(lone)),
         lambda k: "cell {} lists cell {}, which does not list it".format(*pair(lone[k])), stop=True,
     )  # fmt: skip
+    check_corners(check)
     if isinstance(d.domain, Polygon):
         check_outlines(check)
 
@@ -196,6 +204,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
     )  # fmt: skip
     _check_faces(check, g, slack, doubts)
+    check_measures(check, g, slack)
     off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
     # A centroid is a quotient: where rounding is much of the cell, so it is of the centroid.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .check_history import check_history
 from .check_polygon import near_shared_corners
 from .findings import ROUNDINGS
 from .outlines import SIDE_TURN, Straightened, face_ends, straighten
 from .polygon import Polygon
-from .rebuilt import Rebuilt
 
 if TYPE_CHECKING:
     from .findings import Check
+    from .rebuilt import Rebuilt
     from .results import Diagram, Result
 
 
-def check_values(check: Check, result: Result) -> None:
+def check_values(check: Check, result: Result, g: Rebuilt) -> None:
     """Check the values of a result, whose diagram is right."""
     d = result.diagram
     n, dim = len(d), d.domain.dim
@@ -32,7 +33,6 @@ def check_values(check: Check, result: Result) -> None:
         lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
     )  # fmt: skip
     check.note("size", ~(h > 0), lambda i: f"size[{i}] is {h[i]}, expected > 0", stop=True)
-    g = Rebuilt(d)
     eps = float(np.finfo(g.real).eps)
     length = np.maximum(d.volumes, 0) ** (1 / dim)
     with np.errstate(all="ignore"):
@@ -47,16 +47,32 @@ def check_values(check: Check, result: Result) -> None:
         "error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
         lambda i: f"error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
     )  # fmt: skip
-    # The faces' measures round as positions do, where they were made anew from a file's corners.
+    # Where measures were made anew from a file's corners they round as positions do, as straightened boundaries do.
     rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
+    if not g.remade:
+        walls = np.bincount(g.owner, d.neighbours < 0, minlength=n) > 0
+        rounding *= walls & isinstance(d.domain, Polygon)
     check.note(
         "quality", np.maximum(np.abs(q - quality) - 64 * eps * (1 + quality) - 3 * rounding, 0),
         lambda i: f"quality[{i}] is {q[i]:.10g}, the cell gives {quality[i]:.10g}",
     )  # fmt: skip
-    steps = result.history["step"]
+    check_history(check, result, eps)
+    _check_factor(check, result)
+
+
+def _check_factor(check: Check, result: Result) -> None:
+    """Check the factor on the sizes: there is one only where a count of cells was asked for."""
+    factor, asked = result.size_factor, result.settings.get("n_cells")
+    known = "n_cells" in result.settings and asked is None
+    number = isinstance(factor, int | float) and np.isfinite(factor) and factor > 0
     check.note(
-        "history", np.diff(steps, prepend=-1) < 0,
-        lambda r: f"row {r} of the history is step {steps[r]}, after {steps[r - 1]}",
+        "size factor", [not number or (known and factor != 1)],
+        lambda _: f"size_factor is {factor!r:.40}, expected " + ("1: no count was asked for" if known else "> 0"),
+    )  # fmt: skip
+    told = result.settings.get("size_factor", factor)
+    check.note(
+        "size factor", [told != factor],
+        lambda _: f"size_factor is {factor!r:.40}, {told!r:.40} in the settings",
     )  # fmt: skip
 
 

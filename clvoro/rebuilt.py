@@ -53,6 +53,10 @@ class Rebuilt:
         Every corner of every cell: the cell and the vertex.
     unit : float
         The rounding of a position.
+    unit_of_cell : (n,) float
+        The rounding of a corner's place relative to its generator.
+    remade : bool
+        Whether the diagram's own measures of faces were made from its corners, too: they round as positions do.
     """
 
     directions: np.ndarray
@@ -61,9 +65,9 @@ class Rebuilt:
     """(m,) bool: faces between cells of a polygon that do not lie between their generators, as the boundary has cut one
     of the parts beside them off from its own generator."""
 
-    def __init__(self, d: Diagram) -> None:
+    def __init__(self, d: Diagram, dtype: object = None) -> None:
         dim, n = d.domain.dim, len(d)
-        self.real = _precision(d)
+        self.real = _precision(d, dtype)
         far = max(map(abs, (*d.domain.lower, *d.domain.upper)))
         size = float(np.linalg.norm(d.domain.extent))
         # What is on the host is in float64 again: the way from the origin rounds in that.
@@ -121,6 +125,9 @@ class Rebuilt:
         self.reach = np.zeros(n)
         np.maximum.at(self.reach, self.cells, self._distances)
         self._vertex_count = len(x)
+        self.unit_of_cell = float(np.finfo(self.real).eps) * self.reach + np.finfo(float).eps * far
+        told = getattr(d, "face_measures", None)
+        self.remade = told is not None and np.array_equal(told, self.measures)
 
     def _find_adopted(self, d: Diagram) -> None:
         self.adopted = np.zeros(len(self.owner), bool)
@@ -157,8 +164,8 @@ class Rebuilt:
                 result[row] = off.min() <= width
         return result
 
-    def doubts(self, slack: float) -> Doubts:
-        """Return what may be off by how much where a position may be off by `slack`.
+    def doubts(self, slack: float | np.ndarray) -> Doubts:
+        """Return what may be off by how much where a position may be off by `slack`, in all or each of the cells (n,).
 
         The bisector of two generators, d apart, is off by e = ``slack (1 + r / d)`` at the distance r: what two
         near-duplicates round by is their distance's share of r. A corner lies where its cell's bisectors meet, and
@@ -166,9 +173,11 @@ class Rebuilt:
         ``C = (sum n n^T / e^2)^-1``, but not beyond the cell. What follows from the corners is off by the sum of
         what each changes it by, sqrt(g^T C g) for the gradient g.
         """
-        return (self._doubts_2d if self.directions.shape[1] == 2 else self._doubts_3d)(slack)
+        doubts = self._doubts_2d if self.directions.shape[1] == 2 else self._doubts_3d
+        return doubts(np.broadcast_to(slack, self.reach.shape))
 
-    def _doubts_2d(self, slack: float) -> Doubts:
+    def _doubts_2d(self, per_cell: np.ndarray) -> Doubts:
+        slack = per_cell[self.cells]
         here = np.arange(len(self.corners))
         before = np.argsort(self._following)  # corner k lies between the faces before[k] and k
         one, two = (1 + self._distances / self.spacings[f] for f in (before, here))
@@ -177,19 +186,21 @@ class Rebuilt:
         with np.errstate(all="ignore"):
             off = slack * np.hypot(one, two) / sine
         off = np.where(off < self.reach[self.cells], off, self.reach[self.cells])
-        off[self._on_wall[before] & self._on_wall[here]] = slack  # a corner of the domain
+        of_domain = self._on_wall[before] & self._on_wall[here]
+        off[of_domain] = slack[of_domain]
         # A vertex is where several cells have a corner, of which it is one.
-        worst = np.full(self._vertex_count, slack)
-        np.maximum.at(worst, self.corners, off)
+        worst = np.zeros(self._vertex_count)
+        np.maximum.at(worst, self.corners, np.maximum(off, slack))
         off = worst[self.corners]
         ends = np.maximum(off, off[self._following])
         swept = np.bincount(self.owner, ends * self.measures, len(self.reach))
-        return Doubts(ends, ends, swept + slack**2)
+        return Doubts(ends, ends, swept + per_cell**2)
 
-    def _doubts_3d(self, slack: float) -> Doubts:
+    def _doubts_3d(self, per_cell: np.ndarray) -> Doubts:
         face, key = self.edges[0], self.cells.astype(np.int64) * self._vertex_count + self.corners
         _, first, group = np.unique(key, return_index=True, return_inverse=True)
-        k, cells, reach = len(first), self.cells[first], self.reach[self.cells[first]]
+        k, cells = len(first), self.cells[first]
+        slack, reach = per_cell[cells], self.reach[cells]
         e = 1 + self._distances[first][group] / self.spacings[face]
         normal = self.directions[face] / e[:, None]
         m = np.empty((k, 3, 3))
@@ -199,12 +210,12 @@ class Rebuilt:
         values, axes = np.linalg.eigh(m)
         # Below rounding an eigenvalue is 0: along this axis the corner may be anywhere in the cell.
         sure = values > 16 * np.finfo(float).eps * values[:, -1:]
-        off = slack / np.sqrt(np.where(sure, values, 1.0))
+        off = slack[:, None] / np.sqrt(np.where(sure, values, 1.0))
         off = np.where(sure & (off < reach[:, None]), off, np.maximum(reach, slack)[:, None])
         # A vertex has the position of the corner that is sharpest.
         best = np.full(self._vertex_count, np.inf)
         np.minimum.at(best, self.corners[first], off.max(axis=1))
-        placed = np.maximum(best, slack)[self.corners[first]]
+        placed = np.maximum(best[self.corners[first]], slack)
 
         def change(gradient: np.ndarray, which: np.ndarray) -> np.ndarray:
             along = np.einsum("kij,ki->kj", axes[which], gradient) * off[which]
@@ -218,7 +229,8 @@ class Rebuilt:
         cell = np.bincount(cells, change(cone, np.arange(k)), len(self.reach))
         widths = self.reach[self.owner]
         spread = faces * 2 * widths / np.maximum(self.measures, 1e-300)
-        return Doubts(faces + slack * widths, slack + spread, cell + slack * self.perimeters)
+        own = per_cell[self.owner]
+        return Doubts(faces + own * widths, own + spread, cell + per_cell * self.perimeters)
 
 
 def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -233,17 +245,30 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return across / distance[:, None], spacing
 
 
-def _precision(d: Diagram) -> np.dtype:
-    """Return the precision in which `d` was made: float32 shows, as the device's unit is a power of two."""
-    scale, dim = d.domain.frame[1], d.domain.dim
-    volumes = d.volumes / scale**dim
-    single = bool((volumes == volumes.astype(np.float32)).all())
+def _precision(d: Diagram, dtype: object) -> np.dtype:
+    """Return the precision in which `d` was made, which cannot be float32 if `dtype` is ``"float64"``.
+
+    float32 shows in generators and volumes, as the device's unit is a power of two.
+    """
+    origin, scale = d.domain.frame
+    volumes = d.volumes / scale**d.domain.dim
+    points = (d.points - origin) / scale
+    # The way from the origin and back rounds, and a generator on a wall is put there exactly.
+    noise = 4 * np.finfo(float).eps * np.maximum(np.abs(np.array(origin)) / scale, 1)
+    walls = (d.points == d.domain.lower) | (
+        d.points >= np.nextafter(d.domain.upper, d.domain.lower)
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(points - points.astype(np.float32))
+        single = bool((volumes == volumes.astype(np.float32)).all())
+    single &= bool(((off <= noise) | walls).all()) and dtype != "float64"
     return np.dtype(np.float32 if single else np.float64)
 
 
 def rebuild(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return what the corners of a diagram give of its other arrays: measures and centroids of faces, centroids."""
-    g = Rebuilt(diagram)
+    with np.errstate(all="ignore"):  # what is not finite is for the check to name
+        g = Rebuilt(diagram)
     return {
         "face_measures": g.measures,
         "face_centroids": g.middles + diagram.points[g.owner],

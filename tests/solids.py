@@ -90,18 +90,20 @@ def solid_result(diagram, size=None, seed=7741):
     length = np.cbrt(diagram.volumes)
     size = length * rng.uniform(0.9, 1.1, len(diagram)) if size is None else size(diagram.points)
     surfaces = np.add.reduceat(diagram.face_measures, diagram.neighbour_starts[:-1])
+    error = (length - size) / np.minimum(length, size)
+    quality = 36 * np.pi * diagram.volumes**2 / surfaces**3
     history = np.zeros(9, HISTORY_DTYPE)
-    history["step"] = np.arange(9)
-    history["mean_error"] = np.geomspace(0.5, 0.02, 9)
-    history["max_error"] = np.geomspace(3, 0.2, 9)
-    history["mean_quality"] = np.linspace(0.4, 0.68, 9)
-    history["min_quality"] = np.linspace(0.05, 0.4, 9)
+    history["step"], history["cells"] = np.arange(9), len(diagram)
+    history["mean_error"] = np.geomspace(0.5, np.abs(error).mean(), 9)
+    history["max_error"] = np.geomspace(3, np.abs(error).max(), 9)
+    history["mean_quality"] = np.linspace(0.1, quality.mean(), 9)
+    history["min_quality"] = np.linspace(0.05, quality.min(), 9)
     return Result(
         points=diagram.points,
         diagram=diagram,
         size=size,
-        error=(length - size) / np.minimum(length, size),
-        quality=36 * np.pi * diagram.volumes**2 / surfaces**3,
+        error=error,
+        quality=quality,
         history=history,
         converged=True,
         stop_reason="made up",

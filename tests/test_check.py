@@ -73,6 +73,122 @@ def test_right_diagrams_pass(ctx, dtype, n):
     assert n == 1 or report.precision == dtype
 
 
+@pytest.fixture(scope="module")
+def single(ctx):
+    """A mesh whose cells are small beside the domain, in float32."""
+    points = np.random.default_rng(5421).uniform(BOX.lower, BOX.upper, (3000, 2))
+    return clvoro.Adapter(ctx, "float32").run(BOX, 0.17, points=points, method="lloyd", max_steps=2)
+
+
+def names_of(report):
+    return {finding.name for finding in report.findings}
+
+
+def of_diagram(result, **changes):
+    return dataclasses.replace(result, diagram=spoilt(result, **changes))
+
+
+def test_float32_rounds_by_the_cells_not_the_domain(single):
+    assert single.check(), single.check()
+    widest = int(np.argmax(single.diagram.face_measures))
+    for factor in (1.003, 0.997):
+        changed = of_diagram(
+            single,
+            face_measures=lambda m, f=factor: m * np.where(np.arange(len(m)) == widest, f, 1),
+        )
+        assert "measures close" in names_of(changed.check())
+    quality = single.quality.copy()
+    quality[17] *= 1.0001
+    assert "quality" in names_of(dataclasses.replace(single, quality=quality).check())
+    bigger = of_diagram(single, volumes=lambda v: v * np.where(np.arange(len(v)) == 5, 1.001, 1))
+    assert "volumes" in names_of(bigger.check())
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_volumes_in_float32_do_not_make_a_float32_mesh(flat, known):
+    moved = flat.diagram.points + 1e-8 * np.random.default_rng(77).standard_normal((90, 2))
+
+    def rounded(volumes):
+        scale = BOX.frame[1] ** 2
+        return (volumes / scale).astype(np.float32) * scale
+
+    changed = of_diagram(flat, volumes=rounded, points=lambda _: moved)
+    settings = flat.settings if known else {}
+    report = dataclasses.replace(changed, points=moved, settings=settings).check()
+    assert report.precision == "float64"
+    assert {"volumes", "nearest generators"} <= names_of(report)
+
+
+@pytest.mark.parametrize("kind", ["flat", "solid"])
+def test_vertex_that_is_stored_twice_is_found(kind, request):
+    result = request.getfixturevalue(kind)
+    d, corners = result.diagram, "cell_vertices" if kind == "flat" else "face_vertices"
+    times = np.bincount(getattr(d, corners), minlength=len(d.vertices))
+    vertex = int(np.argmax(times))
+    if kind == "flat":
+        cells = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
+    else:
+        faces = np.repeat(np.arange(len(d.neighbours)), np.diff(d.face_vertex_starts))
+        cells = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))[faces]
+    one = cells == cells[getattr(d, corners) == vertex][0]
+    report = spoilt(
+        result,
+        vertices=lambda x: np.concatenate([x, x[[vertex]]]),
+        **{corners: lambda c: np.where(one & (c == vertex), len(d.vertices), c)},
+    ).check()
+    assert names_of(report) == {"vertices once"}
+
+
+HISTORIES = {
+    "nan": ("energy", 0, np.nan, "energy"),
+    "error": ("mean_error", -1, lambda x: 0.1 * x, "mean_error ends"),
+    "largest": ("max_error", -1, lambda x: 1.0001 * x, "max_error ends"),
+    "quality": ("mean_quality", -1, lambda x: 1.0001 * x, "mean_quality ends"),
+    "worst": ("min_quality", -1, lambda x: 0.9 * x, "min_quality ends"),
+    "cells": ("cells", -1, lambda x: x + 7, "cells"),
+    "none": ("cells", 0, 0, "cells in row 0"),
+    "step": ("step", 0, 1, "step 1, after 1"),
+    "time": ("seconds", 0, 1e9, "seconds in row 1"),
+    "level": ("level", -1, 2, "level in row 2"),
+    "coarse": ("level", slice(None), 2, "level 2"),
+    "progress": ("progress", 0, 1.5, "progress in row 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(HISTORIES))
+def test_history_fits_the_mesh(flat, case):
+    name, row, value, message = HISTORIES[case]
+    history = flat.history.copy()
+    history = np.concatenate([history, history[-1:]])  # as after a change of the count
+    assert dataclasses.replace(flat, history=history).check()
+    history[name][row] = value(history[name][row]) if callable(value) else value
+    report = dataclasses.replace(flat, history=history).check()
+    assert names_of(report) == {"history"}
+    assert message in str(report)
+
+
+def test_factor_of_the_sizes_needs_a_count(flat):
+    for changes in ({"size_factor": 3.0}, {"size_factor": -1.0}, {"size_factor": "much"},
+                    {"settings": {**flat.settings, "size_factor": 3}}):  # fmt: skip
+        assert names_of(dataclasses.replace(flat, **changes).check()) == {"size factor"}
+    counted = dataclasses.replace(flat, size_factor=3.0, settings={**flat.settings, "n_cells": 90})
+    assert counted.check()
+
+
+@pytest.mark.parametrize("suffix", ["npz", "vtu"])
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [({"volumes": put(4, -0.1)}, "volumes"), ({"points": put((4, 0), np.nan)}, "finite")],
+)
+def test_what_is_no_number_is_told_without_warnings(flat, suffix, change, name, tmp_path, capfd):
+    changed, path = of_diagram(flat, **change), str(tmp_path / f"m.{suffix}")
+    dataclasses.replace(changed, points=changed.diagram.points).save(path)
+    assert cli.main(["check", path]) == 1
+    told = capfd.readouterr()
+    assert name in told.out
+    assert not told.err
+
+
 def test_right_results_pass(flat, solid):
     for result in (flat, solid):
         report = result.check()

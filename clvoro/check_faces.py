@@ -1,0 +1,85 @@
+"""What holds of faces beside what `check.py` asks: both cells have the same corners, measures fit each other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .faces import face_keys, take_rows
+from .findings import ROUNDINGS
+from .outlines import face_ends
+from .polygon import Polygon
+from .walls import wall_planes
+
+if TYPE_CHECKING:
+    from .findings import Check
+    from .rebuilt import Rebuilt
+
+
+def check_corners(check: Check) -> None:
+    """Check that a face has the same corners from both sides: a vertex that is stored twice is found here.
+
+    In a polygon corners tell faces apart, and the graph is not symmetric otherwise. Across a seam each side has
+    vertices of its own.
+    """
+    d = check.diagram
+    if isinstance(d.domain, Polygon):
+        return
+    inner = np.flatnonzero((d.neighbours >= 0) & ~d.shifts.any(axis=1))
+    here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
+    if d.domain.dim == 2:
+        ends = face_ends(d)
+        wrong = (ends[here] != ends[there][:, ::-1]).any(axis=1)
+    else:
+        starts, corners = d.face_vertex_starts, d.face_vertices
+        a, b = (take_rows(starts, corners, rows) for rows in (here, there))
+        wrong = np.diff(a[0]) != np.diff(b[0])
+        same = ~wrong
+        row_a, row_b = (np.repeat(np.arange(len(here)), np.diff(x[0])) for x in (a, b))
+        one, two = a[1][same[row_a]], b[1][same[row_b]]
+        row = row_a[same[row_a]]
+        off = one[np.lexsort((one, row))] != two[np.lexsort((two, row))]
+        wrong[row[off]] = True
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
+    check.note(
+        "vertices once", wrong,
+        lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
+    )  # fmt: skip
+
+
+def check_measures(check: Check, g: Rebuilt, slack: float) -> None:
+    """Check that the faces' measures close each cell, and give its volume, with their places as generators have them.
+
+    A cell is cut out around its generator: its measures round by its own size, not the domain's, unless they were made
+    anew from a file's corners.
+    """
+    d = check.diagram
+    if g.remade:
+        return
+    dim, n = d.domain.dim, len(d)
+    own = ROUNDINGS * g.unit_of_cell
+    doubts = g.doubts(own)
+    # Normals of adopted faces are those of their corners, and those of polygons' edges meet corners to rounding.
+    loose = g.adopted | ((d.neighbours < 0) & isinstance(d.domain, Polygon))
+    width = np.bincount(g.owner, doubts.measures + np.where(loose, slack, 0.0), n)
+    gap = np.stack(
+        [np.bincount(g.owner, d.face_measures * g.directions[:, k], n) for k in range(dim)], axis=1
+    )
+    gap = np.linalg.norm(gap, axis=1)
+    check.note(
+        "measures close", np.maximum(gap - width, 0),
+        lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
+    )  # fmt: skip
+    height = g.spacings / 2
+    walls = np.flatnonzero(d.neighbours < 0)
+    normals, anchors = wall_planes(d.domain, -1 - d.neighbours[walls])
+    height[walls] = ((anchors - d.points[g.owner[walls]]) * normals).sum(axis=1)
+    height[g.adopted] = (g.middles * g.directions).sum(axis=1)[g.adopted]
+    volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
+    off = np.abs(d.volumes - volumes)
+    swept = np.bincount(g.owner, np.where(loose, slack, 0.0) * (g.measures + np.abs(height)), n)
+    check.note(
+        "volumes", np.maximum(off - doubts.volumes - swept, 0),
+        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
+    )  # fmt: skip

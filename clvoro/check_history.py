@@ -1,0 +1,69 @@
+"""The history of a run: is it one, and does its last row tell of the mesh beside it? See `check.py`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .findings import Check
+    from .results import Result
+
+LEAST_ONE = ("cells",)
+NOT_NEGATIVE = (
+    "step", "level", "mean_error", "max_error", "energy", "lloyd", "poisson", "iterations", "residual", "changed",
+    "ever_changed", "inserted", "deleted", "progress", "seconds",
+)  # fmt: skip
+LOOSE = 256 * float(np.finfo(np.float32).eps)
+"""Rounding of the history's means, in every precision: the device takes the quality's in float32."""
+
+
+def check_history(check: Check, result: Result, eps: float) -> None:
+    """Check numbers and order of the history, and its last row against the mesh, whose errors round by `eps`."""
+    rows = result.history
+    if not len(rows):  # as of a .vtu file
+        return
+    for name in rows.dtype.names or ():
+        values = rows[name]
+        least = 1 if name in LEAST_ONE else 0 if name in NOT_NEGATIVE else -np.inf
+        check.note(
+            "history", ~(np.isfinite(values) & (values >= least)),
+            lambda r, name=name, values=values: f"{name} in row {r} of the history is {values[r]}",
+        )  # fmt: skip
+    # One row more may follow the last step.
+    steps = rows["step"].astype(np.int64)
+    rises = np.diff(steps)
+    wrong = rises != 1
+    wrong[-1:] &= rises[-1:] != 0
+    check.note(
+        "history", wrong,
+        lambda r: f"row {r + 1} of the history is step {steps[r + 1]}, after {steps[r]}",
+    )  # fmt: skip
+    for name, sign in (("level", -1), ("progress", 1), ("seconds", 1)):
+        values = rows[name].astype(float)
+        check.note(
+            "history", np.diff(values) * sign < 0,
+            lambda r, name=name, values=values: f"{name} in row {r + 1} of the history is {values[r + 1]}, "
+            f"after {values[r]}",
+        )  # fmt: skip
+    check.note(
+        "history", [rows["cells"][-1] != len(result.points)],
+        lambda _: f"the history ends with {rows['cells'][-1]} cells, the mesh has {len(result.points)}",
+    )  # fmt: skip
+    check.note(
+        "history", [rows["level"][-1] != 0],
+        lambda _: f"the history ends on level {rows['level'][-1]}, expected 0",
+    )  # fmt: skip
+    if result.stop_reason == "interrupted":  # amid a step, perhaps, of which there is no row
+        return
+    error = np.abs(result.error)
+    for name, value in (
+        ("mean_error", error.mean()), ("max_error", error.max()),
+        ("mean_quality", result.quality.mean()), ("min_quality", result.quality.min()),
+    ):  # fmt: skip
+        last = rows[name][-1]
+        check.note(
+            "history", [not abs(last - value) <= LOOSE * abs(value) + 64 * eps],
+            lambda _, name=name, last=last, value=value: f"{name} ends with {last:.6g}, the mesh has {value:.6g}",
+        )  # fmt: skip
