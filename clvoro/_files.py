@@ -8,8 +8,8 @@ import stat
 from os import PathLike
 from typing import IO
 
-LONGEST_GEOMETRY = 1 << 29
-"""Bytes of a polygon's file: the coasts of the whole Earth in full detail take fewer."""
+LONGEST_GEOMETRY = 1 << 28
+"""Bytes of a polygon's file: the coasts of the whole Earth, at some hundred metres, take fewer."""
 _PIECE = 1 << 20
 # A pipe is opened without waiting for whoever writes into it; plain files take no notice.
 _NOWAIT = getattr(os, "O_NONBLOCK", 0)

@@ -7,6 +7,7 @@ import pickle
 import re
 import struct
 import time
+import tracemalloc
 import warnings
 import zipfile
 import zlib
@@ -20,6 +21,7 @@ from clvoro._files import read_text
 from clvoro.cases import load_case, toml
 from clvoro.cases.fields import load_array
 from clvoro.errors import InputError
+from clvoro.io.vtu import write_vtu
 from clvoro.io.vtu_read import load_vtu
 from clvoro.resume import Saved
 from clvoro.sizing import Expression
@@ -135,6 +137,7 @@ compressor="vtkZLibDataCompressor">
 </Piece></UnstructuredGrid>
 <AppendedData encoding="raw">
 _"""
+COMPRESSOR = ' compressor="vtkZLibDataCompressor"'
 TAIL = b"\n</AppendedData>\n</VTKFile>\n"
 LAUGHS = (
     '<!DOCTYPE lolz [<!ENTITY lol "lol">'
@@ -180,6 +183,76 @@ def test_vtu_bombs_and_lies_are_refused(tmp_path):
     write(1, 1 << 20, 0, [len(block)], block, points=10**18)
     with pytest.raises(InputError):
         load_vtu(path)
+
+
+def peak(work):
+    """Return the most bytes that Python and NumPy hold at once during `work`, which is refused."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError):
+            work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_many_arrays_in_the_same_bytes_are_refused(tmp_path, compress):
+    """Those that nobody uses are not read; those that are may neither come twice nor lie in each other."""
+    path, rows = tmp_path / "m.vtu", 1 << 16
+    raw = np.random.default_rng(5).random(rows).tobytes()
+    block = zlib.compress(raw, 1)
+    head = (1, len(raw) + 1, len(raw), len(block)) if compress else (len(raw),)
+    data = struct.pack(f"<{len(head)}Q", *head) + (block if compress else raw)
+
+    def write(names):
+        text = VTU % ("", 1) if compress else (VTU % ("", 1)).replace(COMPRESSOR, "")
+        arrays = "".join(
+            f'<DataArray type="Float64" Name="{name}" format="appended" offset="0"/>'
+            for name in names
+        )
+        text = text.replace("</Piece>", f"<Cells></Cells></Piece><FieldData>{arrays}</FieldData>")
+        path.write_bytes(
+            text.replace('offset="0"/></Points>', 'offset="8"/></Points>').encode() + data + TAIL
+        )
+
+    write([f"a{k}" for k in range(200)])
+    head = 1 << 22  # bytes that are read for it
+    assert peak(lambda: load_vtu(path)) < head + 4 * len(raw)
+    write(["bridges"] * 2)
+    with pytest.raises(InputError, match="two arrays called"):
+        load_vtu(path)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_arrays_that_lie_in_each_other_are_refused(result, tmp_path, compress):
+    write_vtu(result, tmp_path / "m.vtu", compress)
+    data = (tmp_path / "m.vtu").read_bytes()
+    load_vtu(tmp_path / "m.vtu")
+    for name in ("size", "error", "quality", "volume"):
+        data = re.sub(rb'(Name="%s".*?offset=)"\d+"' % name.encode(), rb'\1"0"', data)
+    (tmp_path / "m.vtu").write_bytes(data)
+    with pytest.raises(InputError, match=r"size has \d+ entries|lie in each other"):
+        load_vtu(tmp_path / "m.vtu")
+
+
+def test_results_that_expand_more_than_honest_ones_are_refused(tmp_path):
+    rows, rng = 1 << 20, np.random.default_rng(3)
+    with zipfile.ZipFile(tmp_path / "m.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("format.npy", member("clvoro-result"))
+        archive.writestr("version.npy", member(1))
+        archive.writestr("points.npy", member(np.zeros((rows, 2))))
+        archive.writestr("size.npy", member(rng.random(rows // 20)))
+    path = tmp_path / "m.npz"
+    assert peak(lambda: clvoro.load(path)) < 3 * path.stat().st_size
+    with pytest.raises(InputError, match="more than 16 times"):
+        clvoro.load(path)
+    # What the archive says of its members' packed sizes changes nothing.
+    data, said = path.read_bytes(), struct.pack("<L", 1 << 30)
+    at = data.rindex(b"PK\x01\x02")
+    (tmp_path / "m.npz").write_bytes(data[: at + 20] + said + data[at + 24 :])
+    with pytest.raises(InputError, match="more than 16 times"):
+        clvoro.load(path)
 
 
 INJECTIONS = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from os import PathLike, fspath, fstat
 from pathlib import Path
@@ -17,8 +17,13 @@ from .._files import open_plain
 from ..errors import InputError
 from .atomic import atomic_file
 
-EXPANSION, SMALL = 256, 1 << 24
-"""A file may hold this many times its own size, or this many bytes: meshes compress two- or threefold."""
+EXPANSION, LEAST = 16, 1 << 22
+"""A result's file may hold this many times its own size, or this many bytes: meshes compress two- or threefold, and
+lattices, which repeat themselves most, ninefold."""
+_FLATTEST, _SMALL = 256, 1 << 24  # as much for one array, of which most may be the same
+
+
+_PIECE = 1 << 22  # bytes read at once
 
 
 class FileError(Exception):
@@ -95,7 +100,7 @@ def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str,
 def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str, zipfile.ZipInfo]:
     """Return the members by name, after a look at what kind of file it is and how much it holds."""
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    check_expansion(archive)
+    check_expansion(archive, archive.infolist(), EXPANSION, LEAST)
     if "format" not in members or "version" not in members:
         raise FileError(f"it holds no {kind} (members: {', '.join(sorted(members)[:6]):.200})")
     found = read_member(archive, members["format"])
@@ -113,12 +118,15 @@ def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str,
     return members
 
 
-def check_expansion(archive: zipfile.ZipFile) -> None:
-    """Refuse a file that would fill the memory from next to nothing."""
-    held = sum(info.file_size for info in archive.infolist())
-    packed = sum(info.compress_size for info in archive.infolist())
-    if held > max(SMALL, EXPANSION * packed):
-        raise FileError(f"its {packed} bytes expand to {held}, more than {EXPANSION} times as many")
+def check_expansion(
+    archive: zipfile.ZipFile, members: Iterable[zipfile.ZipInfo], most: int, least: int
+) -> None:
+    """Refuse members that would fill the memory from next to nothing."""
+    held = sum(info.file_size for info in members)
+    # The sizes that the archive says its members are packed to are not relied on.
+    there = fstat(archive.fp.fileno()).st_size if archive.fp else 0
+    if held > max(least, most * there):
+        raise FileError(f"its {there} bytes expand to {held}, more than {most} times as many")
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
@@ -138,10 +146,11 @@ def read_array(path: Path, member: str = "points") -> np.ndarray:
     with explained(path, "a .npy file"), open_plain(path) as file:
         if file.read(4) == b"PK\x03\x04":
             with zipfile.ZipFile(file) as archive:
-                check_expansion(archive)
                 if f"{member}.npy" not in archive.namelist():
                     raise FileError(f"it holds no array called {member!r}")
-                return read_member(archive, archive.getinfo(f"{member}.npy"))
+                info = archive.getinfo(f"{member}.npy")
+                check_expansion(archive, [info], _FLATTEST, _SMALL)
+                return read_member(archive, info)
         file.seek(0)
         return _read(file, Path(path).name, fstat(file.fileno()).st_size)
 
@@ -163,9 +172,14 @@ def _read(stream: IO[bytes], name: str, size: int) -> np.ndarray:
     length = count * dtype.itemsize
     if min(shape, default=1) < 0 or length != size - stream.tell() or not dtype.itemsize:
         raise FileError(f"{name} has not the length that its shape {shape!s:.60} asks for")
-    data = stream.read()  # checks the checksum
-    array = np.frombuffer(data, dtype, count) if count else np.empty(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C").copy()
+    data = np.empty(length, np.uint8)  # once, not as bytes first
+    done = 0
+    while done < length and (more := stream.readinto(data[done : done + _PIECE])):
+        done += more
+    if done < length or stream.read(1):  # which also compares the checksum
+        raise FileError(f"{name} is cut off")
+    array = data.view(dtype).reshape(shape, order="F" if fortran else "C")
+    return np.asarray(array, order="C")
 
 
 def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:

@@ -10,7 +10,9 @@ import os
 import struct
 import sys
 import zlib
+from array import array
 from collections.abc import Iterator
+from itertools import pairwise
 from os import PathLike, fspath
 from typing import NoReturn
 from xml.parsers import expat
@@ -24,6 +26,7 @@ from ..polygon import Polygon
 from ..rebuilt import rebuild
 from ..results import HISTORY_DTYPE, Diagram, Result
 from ..walls import wall_count
+from .arrays import EXPANSION, LEAST
 from .vtu_more import check_repeated
 
 _LONGEST_HEAD = 1 << 22
@@ -31,8 +34,15 @@ _MARK = b'<AppendedData encoding="raw">\n_'
 _END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
 _BLOCK = 1 << 20
-EXPANSION = 256
-"""A file may not hold more than this many times its own size: meshes compress two- or threefold."""
+_USED = {
+    "Points.", "Cells.types", "Cells.connectivity", "Cells.offsets", "Cells.faces", "Cells.faceoffsets",
+    "CellData.size", "CellData.error", "CellData.quality", "CellData.volume", "CellData.generator",
+    "CellData.label", "CellData.sides", "CellData.faces_of_cell",
+    "FieldData.box_corners", "FieldData.box_periodic",
+    "FieldData.seam_faces", "FieldData.seam_neighbours", "FieldData.seam_shifts",
+    "FieldData.domain_vertices", "FieldData.domain_ring_starts", "FieldData.domain_piece_of_ring",
+    "FieldData.domain_edge_numbers", "FieldData.bridges", "FieldData.wall_faces", "FieldData.wall_edges",
+}  # fmt: skip
 
 
 class _FileError(Exception):
@@ -85,7 +95,8 @@ class _Reader:
 
     def __init__(self, head: bytes, start: int, size: int) -> None:
         self.start, self.size = start, size
-        self.left = EXPANSION * size
+        self.left = max(LEAST, EXPANSION * size)  # bytes of arrays
+        self.there = size  # bytes of the file, none of which two arrays share
         self.points = self.cells = -1
         self.compressed = False
         self.entries: dict[str, tuple[str, int, int]] = {}
@@ -123,19 +134,25 @@ class _Reader:
             width = int(given.get("NumberOfComponents", "1"))
             if width not in (1, 3):
                 raise _FileError(f"its array {name!r:.60} has {width} components")
-            self.entries[f"{group}.{name}"] = (_TYPES[given["type"]], width, int(given["offset"]))
+            key = f"{group}.{name}"
+            if key in self.entries:
+                raise _FileError(f"it has two arrays called {key!r:.60}")
+            self.entries[key] = (_TYPES[given["type"]], width, int(given["offset"]))
         self._within.append(tag)
 
     def read_all(self, file) -> dict[str, np.ndarray]:
-        """Return all arrays, by group and name."""
-        return {name: self._read(file, name, *entry) for name, entry in self.entries.items()}
+        """Return all arrays that a result is made of, by group and name."""
+        used = {name: entry for name, entry in self.entries.items() if name in _USED}
+        return {name: self._read(file, name, *entry) for name, entry in used.items()}
 
     def _read(self, file, name: str, kind: str, width: int, offset: int) -> np.ndarray:
         if not 0 <= offset <= self.size - self.start - 8:
             raise _FileError(f"{name} lies beyond the file's end")
         file.seek(self.start + offset)
         if self.compressed:
-            raw = b"".join(self._blocks(file, name))
+            raw = bytearray()
+            for block in self._blocks(file, name):
+                raw += block
         else:
             (length,) = struct.unpack("=Q", file.read(8))
             raw = self._take(file, name, length)
@@ -153,6 +170,9 @@ class _Reader:
         """Read `length` bytes, of which there are that many."""
         if length > self.size - file.tell():
             raise _FileError(f"{name} is cut off")
+        self.there -= length
+        if self.there < 0:
+            raise _FileError("its arrays lie in each other")
         return file.read(length)
 
     def _blocks(self, file, name: str) -> Iterator[bytes]:
@@ -321,20 +341,22 @@ def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nd
     """Take the streams of faces apart: starts of cells in faces, of faces in corners, corners."""
     stream = _indices(arrays["Cells.faces"], max(v, len(arrays["Cells.faces"])), "faces")
     ends = _starts(arrays["Cells.faceoffsets"], len(stream), "faceoffsets")
-    cells, faces, pieces = [0], [0], []
-    for begin, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
-        at = begin + 1
-        for _ in range(int(stream[begin])):
-            if at >= end or at + 1 + stream[at] > end:
-                raise _FileError("faces do not fit their cells")
-            pieces.append(stream[at + 1 : at + 1 + int(stream[at])])
-            faces.append(faces[-1] + len(pieces[-1]))
-            at += 1 + int(stream[at])
-        if at != end:
+    counts, cells = array("q"), array("q", [0])  # places of faces' numbers of corners
+    for begin, end in pairwise(ends.tolist()):
+        part = stream[begin:end].tolist()  # whose items are got at sooner
+        at = 1
+        for _ in range(part[0]):
+            if at >= len(part):
+                break
+            counts.append(begin + at)
+            at += 1 + part[at]
+        if at != len(part) or len(counts) - cells[-1] != part[0]:
             raise _FileError("faces do not fit their cells")
-        cells.append(len(faces) - 1)
-    corners = np.concatenate(pieces) if pieces else np.zeros(0, np.int64)
-    return np.array(cells), np.array(faces), _indices(corners, v, "corners of faces")
+        cells.append(len(counts))
+    headers = np.array(counts, np.int64)
+    faces = np.concatenate([[0], np.cumsum(stream[headers])])
+    corners = np.delete(stream, np.concatenate([ends[:-1], headers]))
+    return np.array(cells, np.int64), faces, _indices(corners, v, "corners of faces")
 
 
 def _neighbours(
