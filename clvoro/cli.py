@@ -113,11 +113,11 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = build_parser().parse_args(argv)
-    command = {"run": _run, "check": _check, "devices": _devices, "cases": _cases}[
-        arguments.command
-    ]
     try:
+        arguments = build_parser().parse_args(argv)
+        command = {"run": _run, "check": _check, "devices": _devices, "cases": _cases}[
+            arguments.command
+        ]
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return command(arguments)
