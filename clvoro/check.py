@@ -204,7 +204,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
     )  # fmt: skip
     _check_faces(check, g, slack, doubts)
-    check_measures(check, g, slack)
+    check_measures(check, g, doubts)
     off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
     # A centroid is a quotient: where rounding is much of the cell, so it is of the centroid.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)

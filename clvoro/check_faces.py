@@ -14,7 +14,7 @@ from .walls import wall_planes
 
 if TYPE_CHECKING:
     from .findings import Check
-    from .rebuilt import Rebuilt
+    from .rebuilt import Doubts, Rebuilt
 
 
 def check_corners(check: Check) -> None:
@@ -48,11 +48,11 @@ def check_corners(check: Check) -> None:
     )  # fmt: skip
 
 
-def check_measures(check: Check, g: Rebuilt, slack: float) -> None:
+def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     """Check that the faces' measures close each cell, and give its volume, with their places as generators have them.
 
-    A cell is cut out around its generator: its measures round by its own size, not the domain's, unless they were made
-    anew from a file's corners.
+    A cell is cut out around its generator: its measures round by its own size, not the domain's, as `positions` do,
+    unless they were made anew from a file's corners.
     """
     d = check.diagram
     if g.remade:
@@ -60,25 +60,34 @@ def check_measures(check: Check, g: Rebuilt, slack: float) -> None:
     dim, n = d.domain.dim, len(d)
     own = ROUNDINGS * g.unit_of_cell
     doubts = g.doubts(own)
-    # Normals of adopted faces are those of their corners, and those of polygons' edges meet corners to rounding.
-    loose = g.adopted | ((d.neighbours < 0) & isinstance(d.domain, Polygon))
-    width = np.bincount(g.owner, doubts.measures + np.where(loose, slack, 0.0), n)
+    normals, height = g.directions, g.spacings / 2
+    walls = np.flatnonzero(d.neighbours < 0)
+    planes, anchors = wall_planes(d.domain, -1 - d.neighbours[walls])
+    height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
+    loose = np.zeros(len(g.owner), bool)
+    if isinstance(d.domain, Polygon):
+        # Parts that were cut off from their generators have faces anywhere: these are where their corners are.
+        there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
+        adopted = np.linalg.norm(there - normals, axis=1) * g.measures > positions.measures
+        adopted |= np.abs((g.middles * normals).sum(axis=1) - height) > positions.middles
+        adopted &= (d.neighbours >= 0) & (g.measures > 0)
+        normals = np.where(adopted[:, None], there, normals)
+        height = np.where(adopted, (g.middles * there).sum(axis=1), height)
+        # Edges meet their corners to rounding.
+        loose = adopted | (d.neighbours < 0)
+    rounding = np.where(loose, 2 * positions.measures, 0.0)
+    width = np.bincount(g.owner, doubts.measures + rounding, n)
     gap = np.stack(
-        [np.bincount(g.owner, d.face_measures * g.directions[:, k], n) for k in range(dim)], axis=1
+        [np.bincount(g.owner, d.face_measures * normals[:, k], n) for k in range(dim)], axis=1
     )
     gap = np.linalg.norm(gap, axis=1)
     check.note(
         "measures close", np.maximum(gap - width, 0),
         lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
     )  # fmt: skip
-    height = g.spacings / 2
-    walls = np.flatnonzero(d.neighbours < 0)
-    normals, anchors = wall_planes(d.domain, -1 - d.neighbours[walls])
-    height[walls] = ((anchors - d.points[g.owner[walls]]) * normals).sum(axis=1)
-    height[g.adopted] = (g.middles * g.directions).sum(axis=1)[g.adopted]
     volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
     off = np.abs(d.volumes - volumes)
-    swept = np.bincount(g.owner, np.where(loose, slack, 0.0) * (g.measures + np.abs(height)), n)
+    swept = np.bincount(g.owner, rounding * (g.measures + np.abs(height)), n)
     check.note(
         "volumes", np.maximum(off - doubts.volumes - swept, 0),
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
