@@ -303,6 +303,59 @@ def test_cases_that_are_none_are_refused(tmp_path, name):
 PLAIN = b"[domain]\nlower=[0,0]\nupper=[1,1]\n[size]\nkind='constant'\nvalue=0.3\n"
 
 
+@pytest.mark.parametrize("part", ["a", "'a'", '"a"', '"a\\""', "a ", " a", "a\t"])
+@pytest.mark.parametrize("line", ["{}=1", "[{}]", "[[{}]]", "x={{{}=1}}"])
+def test_keys_of_very_many_parts_are_refused(tmp_path, part, line):
+    """The parser would make tables of all that stands before each part."""
+    path = tmp_path / "c.toml"
+    path.write_text("\n\n" + line.format(".".join([part] * 50_000)))
+    with pytest.raises(InputError, match=r"c\.toml: .* more than 16 parts \(at line 3"):
+        load_case(path)
+
+
+def test_the_search_for_long_keys_goes_over_the_text_once():
+    """To go back from each of so many characters to the first would take many minutes."""
+    for piece in (
+        "a",
+        "a.",
+        "a ",
+        '"',
+        "'",
+        "\"'",
+        ". ",
+        '"\\',
+        "a.'",
+        "\\",
+        '"""\\"',
+        "'''a",
+        '"a"',
+        "a#",
+    ):
+        text = piece * ((1 << 18) // len(piece))
+        began = time.process_time()
+        with pytest.raises(ValueError, match=r"\(at "):
+            toml.read(text)
+        assert time.process_time() - began < 5, piece
+
+
+def test_keys_of_many_parts_and_numbers_are_read():
+    assert toml.read(".".join("a" * 16) + "=1")
+    assert toml.read("a=[" + "1.5,0.25, " * 100 + "]")
+    dots = ".".join("a" * 99)
+    for text in (
+        f"b='{dots}'",
+        f'b="\\"{dots}"',
+        f"b=1 # '{dots}",
+        f'b="""{dots}\n"" {dots}\\""""',
+        f"b='''\n{dots}'''",
+    ):
+        assert toml.read(text)["b"]
+    with pytest.raises(ValueError, match="parts"):  # whatever stands before it
+        toml.read(f"b='\"'\nc=\"'\"\n#\"\nd='''\"'''\n{dots}=1")
+    with pytest.raises(ValueError, match="longer"):
+        toml.read("#" * (toml.LONGEST + 1))
+
+
 @pytest.mark.parametrize(
     "name",
     ["/tmp/x", "../x", "..", ".", "a/b", "a\\b", "a/", "C:x", "a\0b", "a\nb", "\x1b[31m", "\u00e4" * 101, ""],

@@ -15,13 +15,27 @@ except ModuleNotFoundError:  # Python 3.10
 
 __all__ = ["read", "write"]
 
-LONGEST = 1 << 22
-"""Bytes of a case file; polygons and arrays of any size have files of their own."""
+LONGEST = 1 << 21
+"""Bytes of a case file; larger polygons and arrays have files of their own."""
+_DEEPEST = 16  # parts of a key, for each of which and all before it tables are made
+# Comments and texts, which end somewhere even if no quote is there, are gone over at once: nothing is looked at twice.
+_PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]+|\\.)*"?|'[^'\n]*'?)"""
+_DOT = rf"[ \t]*\.[ \t]*{_PART}"
+_TOKENS = re.compile(
+    r"""#[^\n]*|\"{3}(?:[^"\\]+|\\[\s\S]|"(?!""))*(?:"{3})?|'{3}(?:[^']+|'(?!''))*(?:'{3})?"""
+    rf"|{_PART}(?:{_DOT}){{0,{_DEEPEST - 1}}}(?P<deep>{_DOT})?"
+)
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def read(text: str) -> dict:
-    """Parse TOML text; raises ``ValueError`` with line and column if it is not TOML."""
+    """Parse TOML text; raises ``ValueError`` if it is too long, with line and column if it is not TOML."""
+    if len(text) > LONGEST:
+        raise ValueError(f"it is longer than {LONGEST} characters")
+    for token in _TOKENS.finditer(text):
+        if token["deep"]:
+            line = text.count("\n", 0, token.start()) + 1
+            raise ValueError(f"{token[0]:.40}... has more than {_DEEPEST} parts (at line {line})")
     return tomllib.loads(text)
 
 
