@@ -155,6 +155,12 @@ def _flat(ring: object, name: str) -> object:
     """Leave out heights."""
     if not isinstance(ring, (list, tuple)):
         raise InputError(f"{name} has the ring {ring!r:.40}, expected a list of positions")
+    for k, p in enumerate(ring):
+        # NumPy would make numbers of these.
+        if isinstance(p, (list, tuple)) and any(type(c) in (bool, str) for c in p[:2]):
+            raise InputError(
+                f"{name} has the position {p!r:.60} at {k} of a ring, expected numbers"
+            )
     return [p[:2] if isinstance(p, (list, tuple)) else p for p in ring]
 
 

@@ -350,6 +350,14 @@ def test_keys_of_many_parts_and_numbers_are_read():
         f"b='''\n{dots}'''",
     ):
         assert toml.read(text)["b"]
+    for ends in (
+        '"""c""""',
+        '"""c"""""',
+        "'''c''''",
+        "'''c'''''",
+    ):  # with quotes before the last ones
+        with pytest.raises(ValueError, match="parts"):
+            toml.read(f"x=[{{b={ends}, {dots}=1}}]")
     with pytest.raises(ValueError, match="parts"):  # whatever stands before it
         toml.read(f"b='\"'\nc=\"'\"\n#\"\nd='''\"'''\n{dots}=1")
     with pytest.raises(ValueError, match="longer"):
@@ -401,6 +409,13 @@ def test_well_known_text_that_is_none_is_refused(text, message):
         with pytest.raises(InputError, match=message) as refused:
             clvoro.Polygon.from_wkt(text)
     assert len(str(refused.value)) < 500
+
+
+@pytest.mark.parametrize("bad", [True, False, "1"])
+def test_geojson_with_positions_that_are_no_numbers_is_refused(bad):
+    ring = [[0, 0], [1, 0], [1, bad], [0, 0]]
+    with pytest.raises(InputError, match="at 2 of a ring, expected numbers"):
+        clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [ring]})
 
 
 def test_well_known_text_may_have_many_parentheses_beside_each_other():

@@ -22,7 +22,7 @@ _DEEPEST = 16  # parts of a key, for each of which and all before it tables are 
 _PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]+|\\.)*"?|'[^'\n]*'?)"""
 _DOT = rf"[ \t]*\.[ \t]*{_PART}"
 _TOKENS = re.compile(
-    r"""#[^\n]*|\"{3}(?:[^"\\]+|\\[\s\S]|"(?!""))*(?:"{3})?|'{3}(?:[^']+|'(?!''))*(?:'{3})?"""
+    r"""#[^\n]*|\"{3}(?:[^"\\]+|\\[\s\S]|"(?!""))*(?:"{3,5})?|'{3}(?:[^']+|'(?!''))*(?:'{3,5})?"""
     rf"|{_PART}(?:{_DOT}){{0,{_DEEPEST - 1}}}(?P<deep>{_DOT})?"
 )
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
