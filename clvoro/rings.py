@@ -22,6 +22,7 @@ SHORTEST_EDGE = 1e-12
 """Least length of an edge, of the bounding box's longest edge."""
 _RESOLUTION = 2.0**-40  # least extent, of the largest coordinate: what is left of float64's digits
 _SPLIT = 2.0**27 + 1
+_NAMED = 4  # rings at one place
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,22 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
     if not len(pieces):
         raise InputError("Polygon got no rings, expected an outer ring of at least 3 vertices")
     several = len(pieces) > 1
-    rings = []
+    rings: list[list[Ring]] = []
+    known: dict[tuple[bool, bytes], str] = {}
     for p, piece in enumerate(pieces):
         if not len(piece):
             raise InputError(f"Polygon got no rings for piece {p}, expected an outer ring")
         of = f" of piece {p}" if several else ""
         names = [f"outer ring{of}", *(f"hole {h}{of}" for h in range(len(piece) - 1))]
-        rings.append([_cleaned(ring, name) for ring, name in zip(piece, names, strict=True)])
+        rings.append([])
+        for k, (ring, name) in enumerate(zip(piece, names, strict=True)):
+            rings[-1].append(_cleaned(ring, name))
+            # Soon, as all pairs of such rings cross everywhere.
+            other = known.setdefault((k > 0, _shape_key(rings[-1][-1].vertices)), name)
+            if other != name:
+                raise InputError(
+                    f"Polygon's {name} is the {other} once more; leave one of them out"
+                )
     flat = [ring for piece in rings for ring in piece]
     for ring in flat:
         _check_area(ring)
@@ -127,6 +137,14 @@ def _cleaned(given: object, name: str) -> Ring:
             f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
         )
     return Ring(vertices, np.flatnonzero(long), len(array), name)
+
+
+def _shape_key(vertices: np.ndarray) -> bytes:
+    """Return what is the same for a ring from whichever vertex and in whichever direction it begins."""
+    first = np.lexsort(vertices.T)[0]
+    forth = np.roll(vertices, -first, axis=0)
+    back = np.roll(forth[::-1], 1, axis=0)
+    return min(forth.tobytes(), back.tobytes())
 
 
 def _other_maker(given: object) -> str:
@@ -223,11 +241,13 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
         distance = distance_to_edges(place, ring.vertices)
         away.append((float(distance.min()), int(ring.numbers[np.argmin(distance)])))
     close = min(d for d, _ in away) + 1e-9 * float(np.ptp(rings[0].vertices, axis=0).max())
-    where = " and ".join(  # by the numbers in their rings
+    there = [  # by the numbers in their rings
         f"edge {e} of the {ring.name}"
         for ring, (d, e) in zip(rings, away, strict=True)
         if d <= close
-    )
+    ]
+    more = len(there) - _NAMED
+    where = " and ".join([*there[:_NAMED], *([f"those of {more} more rings"] if more > 0 else [])])
     remedy = "correct it (shapely.make_valid shows what can be made of it)"
     if shape.geom_type == "MultiPolygon":  # each piece of which is valid
         remedy = _UNITE

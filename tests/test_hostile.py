@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro import rings
 from clvoro._files import read_text
 from clvoro.cases import load_case, toml
 from clvoro.cases.fields import load_array
@@ -416,6 +417,31 @@ def test_geojson_with_positions_that_are_no_numbers_is_refused(bad):
     ring = [[0, 0], [1, 0], [1, bad], [0, 0]]
     with pytest.raises(InputError, match="at 2 of a ring, expected numbers"):
         clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [ring]})
+
+
+@pytest.mark.parametrize(
+    "other",
+    [[(1, 1), (2, 1), (2, 2)], [(2, 1), (2, 2), (1, 1), (2, 1)], [(2, 2), (2, 1), (1, 1)], [(2, 1), (1, 1), (2, 2)]],
+)  # fmt: skip
+def test_equal_rings_are_refused_before_all_are_looked_at(monkeypatch, other):
+    square, hole = [(0, 0), (9, 0), (9, 9), (0, 9)], [(1, 1), (2, 1), (2, 2)]
+    looked = []
+    monkeypatch.setattr(
+        rings, "_cleaned", lambda *a, clean=rings._cleaned: looked.append(a) or clean(*a)
+    )
+    with pytest.raises(InputError, match="Polygon's hole 1 is the hole 0 once more; leave"):
+        clvoro.Polygon(square, [hole, *[other] * 10_000])
+    assert len(looked) == 3
+    with pytest.raises(InputError, match="outer ring of piece 1 is the outer ring of piece 0 once"):
+        clvoro.Polygon.from_pieces([[hole], [other]])
+
+
+def test_errors_name_few_of_many_rings_at_one_place():
+    square = [(0, 0), (9, 0), (9, 9), (0, 9)]
+    holes = [[(1, 1), (2, 1), (2, 2 + 0.1 * k)] for k in range(50)]
+    with pytest.raises(InputError, match=r"of the hole 0 and .* more rings; ") as refused:
+        clvoro.Polygon(square, holes)
+    assert len(str(refused.value)) < 500
 
 
 def test_well_known_text_may_have_many_parentheses_beside_each_other():
