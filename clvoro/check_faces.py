@@ -69,10 +69,8 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         # Parts that were cut off from their generators have faces anywhere: these are where their corners are.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
         adopted = np.linalg.norm(there - normals, axis=1) * g.measures > positions.measures
-        adopted |= np.abs((g.middles * normals).sum(axis=1) - height) > positions.middles
         adopted &= (d.neighbours >= 0) & (g.measures > 0)
         normals = np.where(adopted[:, None], there, normals)
-        height = np.where(adopted, (g.middles * there).sum(axis=1), height)
         # Edges meet their corners to rounding.
         loose = adopted | (d.neighbours < 0)
     rounding = np.where(loose, 2 * positions.measures, 0.0)
@@ -85,10 +83,11 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         "measures close", np.maximum(gap - width, 0),
         lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
     )  # fmt: skip
+    if isinstance(d.domain, Polygon):  # how far off a part's faces are only corners tell
+        return
     volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
     off = np.abs(d.volumes - volumes)
-    swept = np.bincount(g.owner, rounding * (g.measures + np.abs(height)), n)
     check.note(
-        "volumes", np.maximum(off - doubts.volumes - swept, 0),
+        "volumes", np.maximum(off - doubts.volumes, 0),
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
     )  # fmt: skip

@@ -253,15 +253,13 @@ def _precision(d: Diagram, dtype: object) -> np.dtype:
     origin, scale = d.domain.frame
     volumes = d.volumes / scale**d.domain.dim
     points = (d.points - origin) / scale
-    # The way from the origin and back rounds, and a generator on a wall is put there exactly.
+    # The way from the origin and back rounds. Some generators are put on a wall exactly, or back into a polygon: where
+    # a quarter are in float32, all were.
     noise = 4 * np.finfo(float).eps * np.maximum(np.abs(np.array(origin)) / scale, 1)
-    walls = (d.points == d.domain.lower) | (
-        d.points >= np.nextafter(d.domain.upper, d.domain.lower)
-    )
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(points - points.astype(np.float32))
         single = bool((volumes == volumes.astype(np.float32)).all())
-    single &= bool(((off <= noise) | walls).all()) and dtype != "float64"
+    single &= bool((off <= noise).mean() >= 0.25) and dtype != "float64"
     return np.dtype(np.float32 if single else np.float64)
 
 
