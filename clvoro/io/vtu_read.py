@@ -180,11 +180,12 @@ class _Reader:
         if not 0 < block <= _BLOCK or partial >= block:
             raise _FileError(f"{name} is in blocks of {block} bytes")
         sizes = struct.unpack(f"={count}Q", self._take(file, name, 8 * min(count, self.size)))
+        # Before any is expanded.
+        self.left -= (count - 1) * block + (partial or block) if count else 0
+        if self.left < 0:
+            raise _FileError(f"it expands to more than {EXPANSION} times its size")
         for k, size in enumerate(sizes):
             expected = partial if k == count - 1 and partial else block
-            self.left -= expected
-            if self.left < 0:
-                raise _FileError(f"it expands to more than {EXPANSION} times its size")
             part = zlib.decompressobj()
             data = part.decompress(self._take(file, name, size), expected)
             if len(data) != expected or part.decompress(part.unconsumed_tail, 1):
