@@ -1,8 +1,8 @@
 """Small work for every kernel, to be run on the simulator Oclgrind: `python -m tests.oclgrind_work NAME [OPTION ...]`.
 
-Prints one JSON object: which kernels have run ("file.kernel"), and how often. `tests/test_oclgrind.py` starts it and
-reads the simulator's log. Options: `float32`; `groups`, the work-groups of a GPU (of 16 here, with
-local memory and barriers) in the place of a CPU's groups of one.
+Prints one JSON object: for each kind of domain which kernels have run in it ("file.kernel"), and how often.
+`tests/test_oclgrind.py` starts it and reads the simulator's log. Options: `float32`; `groups`, the work-groups of a
+GPU (of 16 here, with local memory and barriers) in the place of a CPU's groups of one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import collections
 import json
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
 from unittest import mock
 
 import numpy as np
@@ -19,7 +18,7 @@ import pyopencl as cl
 from scipy.spatial import ConvexHull
 
 import clvoro
-from clvoro import _program, repair
+from clvoro import _program
 from clvoro._primitives import Scan
 from clvoro.population import Population, PopulationControl
 from clvoro.sizing import (
@@ -37,6 +36,7 @@ from clvoro.sizing import (
 from clvoro.stages import Stages
 from clvoro.tessellator import Tessellator
 from tests.gpu_like import use_groups
+from tests.oclgrind_runs import RUNS, large
 from tests.patch import BOX as PATCH
 from tests.patch import hexagons, tessellate
 
@@ -93,10 +93,15 @@ def lattice(side: int, dim: int) -> np.ndarray:
     return np.stack(np.meshgrid(*[line] * dim), axis=-1).reshape(-1, dim)
 
 
-def solid(adapter: clvoro.Adapter) -> None:
-    """Three dimensions: the same kinds of sets, and a lattice off by so little that loops must be mended."""
+def almost_cubes(adapter: clvoro.Adapter) -> np.ndarray:
+    """Return a lattice in space that is off by so little that loops must be mended."""
     noise = np.random.default_rng(0).standard_normal((8, 3))
-    near = lattice(2, 3) + (1e-14 if adapter.dtype == np.float64 else 3e-6) * noise
+    return lattice(2, 3) + (1e-14 if adapter.dtype == np.float64 else 3e-6) * noise
+
+
+def solid(adapter: clvoro.Adapter) -> None:
+    """Three dimensions: the same kinds of sets, and almost a lattice."""
+    near = almost_cubes(adapter)
     cluster = np.concatenate([points(6, 3), 0.3 + 1e-2 * points(12, 3)])
     ball = points(40, 3) - 0.5
     ball *= 0.4 / np.linalg.norm(ball, axis=1)[:, None]
@@ -118,22 +123,6 @@ def method(
     return work
 
 
-def as_for_many(
-    work: Callable[[clvoro.Adapter], None],
-) -> Callable[[clvoro.Adapter], None]:
-    """Have done what is done for large meshes: iterations take their launches, repaired cells are found in lanes."""
-
-    def large(adapter: clvoro.Adapter) -> None:
-        with ExitStack() as patches:
-            for name, module in list(sys.modules.items()):
-                if name.startswith("clvoro.") and hasattr(module, "most_alone"):
-                    patches.enter_context(mock.patch.object(module, "most_alone", return_value=0))
-            patches.enter_context(mock.patch.object(repair, "FEW", 8))
-            work(adapter)
-
-    return large
-
-
 def repaired(adapter: clvoro.Adapter) -> None:
     """Generators that move a little: a fifth of the cells change."""
     square, n = clvoro.Box((0, 0), (1, 1)), 120
@@ -153,26 +142,29 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
     """Close rows that have lost faces, which roundings hardly ever bring about."""
     from clvoro.torus import Torus
 
-    box, n = clvoro.Box((0, 0), (1, 1), periodic=True), 30
-    stages = adapter._stages_for(box)
-    engine = stages.engine
-    torus = Torus(stages, box)
-    t = torus.tessellate(engine.upload(box.place(points(n), adapter.dtype)), n, whole=True)
-    m = int(t.starts.get()[-1])
-    kept = np.ones(m, np.uint8)
-    kept[::7] = 0
-    starts = np.concatenate(
-        [[0], np.cumsum(np.add.reduceat(kept.astype(int), t.starts.get()[:-1]))]
-    )
-    left = int(starts[-1])
-    ints = [engine.empty(left, np.int32) for _ in range(3)]
-    engine.run_each(
-        stages.seam._kernels.close_rows, n, t.starts, engine.upload(kept, np.uint8),
-        engine.upload(starts, np.int32), t.neighbours, torus.latest.folded.codes, t.face_measures,
-        t.face_centroids, ints[0], ints[1], engine.empty(left, engine.face),
-        engine.empty((left, 2), engine.face), ints[2],
-    )  # fmt: skip
-    assert (ints[2].get() == np.flatnonzero(kept)).all()
+    for dim in (2, 3):
+        which, n = (True, *(dim == 2,) * (dim - 1)), 30 if dim == 2 else 12
+        box = clvoro.Box((0,) * dim, (1,) * dim, periodic=which)
+        stages = adapter._stages_for(box)
+        engine = stages.engine
+        torus = Torus(stages, box)
+        x = engine.upload(box.place(points(n, dim), adapter.dtype))
+        t = torus.tessellate(x, n, nearest=False, whole=True)
+        m = int(t.starts.get()[-1])
+        kept = np.ones(m, np.uint8)
+        kept[::7] = 0
+        starts = np.concatenate(
+            [[0], np.cumsum(np.add.reduceat(kept.astype(int), t.starts.get()[:-1]))]
+        )
+        left = int(starts[-1])
+        ints = [engine.empty(left, np.int32) for _ in range(3)]
+        engine.run_each(
+            stages.seam._kernels.close_rows, n, t.starts, engine.upload(kept, np.uint8),
+            engine.upload(starts, np.int32), t.neighbours, torus.latest.folded.codes, t.face_measures,
+            t.face_centroids, ints[0], ints[1], engine.empty(left, engine.face),
+            engine.empty((left, dim), engine.face), ints[2],
+        )  # fmt: skip
+        assert (ints[2].get() == np.flatnonzero(kept)).all()
 
 
 def gradation(adapter: clvoro.Adapter) -> None:
@@ -229,7 +221,9 @@ def periodic(adapter: clvoro.Adapter) -> None:
     for x, which in (
         (points(60), (True, True)),
         (points(60), (True, False)),
+        (lattice(4, 2), (True, True)),
         (near, (True, False, False)),
+        (almost_cubes(adapter), (True, False, False)),
     ):
         dim = len(which)
         diagram = adapter.diagram(clvoro.Box((0,) * dim, (1,) * dim, periodic=which), x)
@@ -336,14 +330,15 @@ def nuclei(adapter: clvoro.Adapter) -> None:
 
 def scan(adapter: clvoro.Adapter) -> None:
     """Prefix sums of an array of no round length that is too long for one work-item."""
-    engine, n = stages_of(adapter).engine, 8219
-    values, sums = engine.upload(np.arange(n) % 7, np.int32), engine.empty(n - 2, np.int32)
-    Scan(engine).exclusive(values, sums, n - 3, first=3)
-    assert (np.diff(sums.get()) == np.arange(3, n) % 7).all()
+    for dim in (2, 3):
+        engine, n = stages_of(adapter, dim).engine, 8219
+        values, sums = engine.upload(np.arange(n) % 7, np.int32), engine.empty(n - 2, np.int32)
+        Scan(engine).exclusive(values, sums, n - 3, first=3)
+        assert (np.diff(sums.get()) == np.arange(3, n) % 7).all()
 
 
-def stages_of(adapter: clvoro.Adapter) -> Stages:
-    return Stages(_program.Engine(adapter.ctx, adapter.queue, 2, np.dtype(adapter.dtype)))
+def stages_of(adapter: clvoro.Adapter, dim: int = 2) -> Stages:
+    return Stages(_program.Engine(adapter.ctx, adapter.queue, dim, np.dtype(adapter.dtype)))
 
 
 def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
@@ -392,7 +387,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "hulls": hulls,
     "solid": solid,
     "fields": fields,
-    "multigrid": as_for_many(multigrid),
+    "multigrid": large(multigrid),
     "scan": scan,
     "nuclei": nuclei,
     "transfer": transfer,
@@ -401,15 +396,15 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,
-    "repaired": as_for_many(repaired),
-    "coupled": as_for_many(method("coupled", max_steps=2)),
+    "repaired": large(repaired),
+    "coupled": large(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
     "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
     "best": method("adaptive", levels=0, n_cells=150, effort="best", max_steps=20),
-    "exact": as_for_many(method("exact", levels=0, effort="fast", max_steps=75)),
-    "solid-run": method("exact", CUBE, SOLID, effort="fast", max_steps=14),
+    "exact": large(method("exact", levels=0, effort="fast", max_steps=75)),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
+    **RUNS,
     **{
         f"broken-{k}": broken(k)
         for k in ("bounds", "race", "same", "local_race", "barrier_", "private")
@@ -427,19 +422,47 @@ def buffers_of_their_own() -> Callable[[], None]:
     return lambda: setattr(_program.Engine, "scratch", shared)
 
 
+def domain_of(engine: _program.Engine) -> str:
+    """Return the kind of domain that an engine is for: "plane", "torus", "polygon", "space" or "periodic space"."""
+    names = dict(engine.domain_defines)
+    if engine.dim == 3:
+        return "periodic space" if "PERIODIC" in names else "space"
+    return "torus" if "PERIODIC" in names else "polygon" if "POLYGON" in names else "plane"
+
+
+def name_domains() -> None:
+    """Have kernels know the kind of `domain` that they work for; those of no engine are "none"."""
+    made = _program.Engine.__post_init__
+
+    def told(self: _program.Engine) -> None:
+        made(self)
+        take, domain = self.pool.take, domain_of(self)
+
+        def taken(program: cl.Program, name: str) -> cl.Kernel:
+            kernel = take(program, name)
+            kernel.domain = domain
+            return kernel
+
+        self.pool.take = taken
+
+    _program.Engine.__post_init__ = told
+
+
 def main(name: str, *options: str) -> None:
     context = clvoro.create_context("oclgrind")
-    counts: collections.Counter[str] = collections.Counter()
+    counts = collections.defaultdict(collections.Counter)
     original = cl.enqueue_nd_range_kernel
 
     def counted(queue, kernel, *rest, **more):
         # Kernels of several files share names; PyOpenCL's own know no stage.
-        counts[f"{getattr(kernel, 'stage', 'pyopencl')}.{kernel.function_name}"] += 1
+        full = f"{getattr(kernel, 'stage', 'pyopencl')}.{kernel.function_name}"
+        counts[getattr(kernel, "domain", "none")][full] += 1
         return original(queue, kernel, *rest, **more)
 
     cl.enqueue_nd_range_kernel = counted
     if "groups" in options:
         use_groups(16, 3)
+    name_domains()
     buffers_of_their_own()
     adapter = clvoro.Adapter(context, "float32" if "float32" in options else "float64")
     WORK[name](adapter)
