@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 
 import clvoro
+from clvoro import cli
 from clvoro.cases import Case, toml
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
@@ -21,6 +22,7 @@ from clvoro.jobs import Job
 from clvoro.layers import count_rows, free_domain, place_layers
 from clvoro.resume import Saved
 from tests import fuzz_files as files
+from tests.fuzz_cases import some_case
 from tests.fuzz_inputs import (
     placed,
     placed_in_polygon,
@@ -29,13 +31,17 @@ from tests.fuzz_inputs import (
     some_periodic_box,
     some_polygon,
 )
-from tests.fuzz_sizes import fine_size, some_size
+from tests.fuzz_sizes import fail, fine_size, some_size
 from tests.reference_polygon import faults
 
 WILD = 0.25
 """Share of inputs that need not end in a mesh, of kinds where most should."""
 MOST_ROWS = 5000
 """Generators of layers, of inputs that are tried."""
+CALLBACKS: list[Any] = [
+    lambda row: fail(), lambda row: "yes", lambda row: np.ones(2), lambda row: np.bool_(row["step"] > 2),
+    lambda: None, 3, lambda row: 0.0,
+]  # fmt: skip
 _adapters: dict[str, clvoro.Adapter] = {}
 _files: dict[str, bytes] = {}
 
@@ -153,7 +159,7 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
         "n_cells": lambda: int(most * rng.uniform(1, 1.5)) + (1 if periods.size else 12),
         "k": lambda: float(rng.choice([0.1, 1.0, 2.0])),
         "alpha": lambda: float(rng.choice([0.3, 1.0, 3.0])),
-        "tol": lambda: float(rng.choice([0.0, 0.5])),
+        "tol": lambda: float(rng.choice([0.0, 0.5, 0.9])),
         "levels": lambda: 0 if periods.size else int(rng.integers(0, 2)),
         "error_target": lambda: float(rng.choice([1e-4, 0.01, 0.1])),
         "points": lambda: some_generators(rng, domain, real, wild),
@@ -167,6 +173,11 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
             "tol": lambda: rng.choice([1e9, -1.0]),
             "levels": lambda: rng.choice([np.int64(2), 50, -1]),
             "error_target": lambda: rng.choice([1e-9, 10.0, 0.0]),
+            "effort": lambda: ["slow", None, 3][rng.integers(3)],
+            "start": lambda: ["random", None, 0][rng.integers(3)],
+            "seed": lambda: [-1, 1.5, 2**70, "1", None][rng.integers(5)],
+            "max_steps": lambda: [-1, 2.5, "3"][rng.integers(3)],
+            "callback": lambda: CALLBACKS[rng.integers(len(CALLBACKS))],
         }
     options |= {name: make() for name, make in optional.items() if rng.random() < 0.12}
     if "points" in options and not wild:
@@ -198,7 +209,10 @@ def few_layers(rng: np.random.Generator, domain: Any, wild: bool) -> list[clvoro
 
 def try_layers(rng: np.random.Generator) -> str:
     wild = rng.random() < WILD
-    domain = some_polygon(rng) if rng.random() < 0.6 else some_box(rng, 2, wild)
+    kind = rng.random()
+    domain = some_polygon(rng) if kind < 0.6 else some_box(rng, 2, wild)
+    if kind > 0.9:
+        domain = some_periodic_box(rng, 2, wild)
     layers, real = few_layers(rng, domain, wild), some_real(rng)
     if MOST_ROWS < count_rows(domain, layers) < 1e9:  # a benchmark, not a test
         return "left out"
@@ -309,7 +323,8 @@ def try_moved(rng: np.random.Generator) -> str:
 def try_case(rng: np.random.Generator) -> str:
     """A case file with what it may hold, from the text to the files written."""
     with tempfile.TemporaryDirectory() as folder:
-        text = toml.write(some_case(rng, Path(folder)))
+        wild = rng.random() < WILD
+        text = toml.write(some_case(rng, Path(folder), some_real(rng), wild))
         case = Case.from_toml(text, "fuzz.toml", Path(folder))
         out = Path(folder) / "out"
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -321,68 +336,6 @@ def try_case(rng: np.random.Generator) -> str:
         if (again.domain, again.layers) != (case.domain, case.layers):
             raise Wrong("the case that was written is another")
     return "mesh"
-
-
-def some_case(rng: np.random.Generator, folder: Path) -> dict[str, Any]:
-    wild = rng.random() < WILD
-    fields: list[dict[str, Any]] = [
-        {"kind": "constant", "value": 0.2},
-        {"kind": "expression", "expression": "0.1 + 0.05*x"},
-        {"kind": "distance", "shapes": [{"kind": "circle", "centre": [0.5, 0.5], "radius": 0.2}],
-         "h_min": 0.1, "growth": 1.3, "h_max": 0.3},
-        {"kind": "distance", "shapes": [{"kind": "boundary"}], "h_min": 0.1, "slope": 0.5},
-        {"kind": "raster", "file": "a.npy", "lower": [0, 0], "upper": [2, 1]},
-        {"kind": "raster", "file": "a.npy"},
-    ]  # fmt: skip
-    np.save(folder / "a.npy", 0.1 + 0.1 * rng.random((4, 5)))
-    size = dict(fields[rng.integers(len(fields))])
-    kind = rng.integers(0, 4)
-    if kind == 0:
-        size = {"kind": "graded", "field": size, "growth": 1.3}
-    elif kind == 1:
-        other = dict(fields[rng.integers(len(fields))])
-        size = {"kind": str(rng.choice(["min", "max"])), "fields": [size, other]}
-    domains: list[dict[str, Any]] = [
-        {"lower": [0, 0], "upper": [2, 1]},
-        {"lower": [0, 0], "upper": [2, 2], "periodic": bool(rng.integers(2))},
-        {"outer": [[0, 0], [2, 0], [2, 1], [0, 1.5]], "holes": [{"kind": "circle", "centre": [1, 0.6], "radius": 0.2}]},
-        {"polygon": "g.geojson"},
-    ]  # fmt: skip
-    (folder / "g.geojson").write_bytes(files.GEOJSON)
-    domain = domains[rng.integers(len(domains))]
-    run = {"method": str(rng.choice(["adaptive", "exact", "coupled"])), "effort": "fast", "max_steps": 5,
-           "seed": int(rng.integers(99)), "dtype": some_real(rng)}  # fmt: skip
-    case: dict[str, Any] = {"name": "fuzz", "domain": domain, "size": size, "run": run}
-    if rng.random() < 0.2 and "periodic" not in domain:
-        case["layers"] = [{"height": 0.02, "count": int(rng.integers(1, 4))}]
-    if rng.random() < 0.1:
-        case["sequence"] = {"frames": 2}
-    if wild:
-        table: Any = [case, domain, size, run][rng.integers(4)]
-        key = str(rng.choice(list(table)))
-        strange = [
-            None,
-            -1,
-            0,
-            "",
-            "nonsense",
-            [],
-            {},
-            True,
-            [1],
-            1e300,
-            [[1, 2]],
-            float("nan"),
-            "../a.npy",
-        ]
-        value = strange[rng.integers(len(strange))]
-        if value is None:
-            del table[key]
-        elif rng.random() < 0.3:
-            table[key + "s"] = table.pop(key)
-        else:
-            table[key] = value
-    return case
 
 
 # Files.
@@ -404,6 +357,131 @@ def try_file(rng: np.random.Generator) -> str:
     return f"{path.suffix or 'checkpoint'} read"
 
 
+# One adapter for all, and the command.
+
+
+def try_turns(rng: np.random.Generator) -> str:
+    """What else an adapter does, of whatever size, changes nothing of a run that is carried on in it."""
+    domain, real = some_domain(rng), some_real(rng)
+    arguments = (domain, some_size(rng, domain, wild=False))
+    options = some_options(rng, domain, real, wild=False) | {"effort": "fast"}
+    whole = clvoro.Adapter(adapter(real).ctx, real).run(*arguments, **options)
+    kept = clvoro.Adapter(adapter(real).ctx, real)
+    with tempfile.TemporaryDirectory() as folder:
+        state = Path(folder) / "state"
+        between(rng, kept, real)
+        kept.run(*arguments, checkpoint=state, checkpoint_every=0, **options)
+        if not state.exists():
+            return "mesh"
+        between(rng, kept, real)
+        try:
+            resumed = kept.run(*arguments, resume=state, **options)
+        except InputError as error:
+            raise Wrong(f"not resumed in the adapter that has done more: {error}") from error
+        for name in ("points", "error", "size"):
+            if not np.array_equal(getattr(resumed, name), getattr(whole, name)):
+                raise Wrong(f"in an adapter that has done more a resumed run has other {name}")
+        changed: dict[str, Any] = {
+            "seed": options["seed"] + 1, "k": 0.7, "points": whole.points[:3], "n_cells": 7, "method": "lloyd",
+            "tol": 0.3, "max_steps": 1, "effort": "default",
+        }  # fmt: skip
+        name = str(rng.choice(list(changed)))
+        with contextlib.suppress(InputError):  # the state is of another run
+            other = kept.run(*arguments, **{**options, name: changed[name]}, resume=state)
+            demand(other, real)
+    return "mesh"
+
+
+def between(rng: np.random.Generator, kept: clvoro.Adapter, real: str) -> None:
+    """Other work of very different sizes in the adapter `kept`."""
+    for _ in range(rng.integers(1, 4)):
+        domain, kind = some_domain(rng), rng.integers(3)
+        if kind == 0:
+            size = fine_size(rng, domain) * 10 ** rng.uniform(-1, 0)
+            if not kept.memory_needed(domain, float(size)) > 0:
+                raise Wrong("a run that needs no memory")
+        elif kind == 1:
+            n = int(10 ** rng.uniform(0, 4 if domain.dim == 2 else 3))
+            x = domain.lower + rng.random((n, domain.dim)) * domain.extent
+            inside = x[domain.contains(x)]
+            if len(inside):
+                demand(kept.diagram(domain, inside), real)
+        else:
+            demand(kept.run(domain, fine_size(rng, domain), effort="fast", max_steps=2), real)
+
+
+def try_command(rng: np.random.Generator) -> str:
+    """The command with a case and options: it ends with a code that it knows, and what it writes passes `check`."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, real = Path(name), some_real(rng)
+        wild = rng.random() < WILD
+        case = some_case(rng, folder, real, wild and bool(rng.integers(2)))
+        (folder / "c.toml").write_text(toml.write(case))
+        run = ["run", str(folder / "c.toml"), "--out", str(folder / "out")]
+        options = [
+            ["--profile"], ["--quiet"], ["--json"], ["--steps", "3"], ["--tol", "0.6"], ["--seed", "8"],
+            ["--dtype", "float32"], ["--levels", "two" if wild else str(rng.choice(["auto", "0", "1"]))],
+            ["--cells", "90"],
+            ["--method", "magic" if wild else str(rng.choice(["exact", "lloyd"]))], ["--k", "0.4"],
+            ["--checkpoint-every", "-1" if wild else "0"],
+        ]  # fmt: skip
+        if not wild and (
+            case.get("layers") or "methods" in case.get("run", {})
+        ):  # of many rows, and without a state
+            options = [o for o in options if o[0] not in ("--cells", "--checkpoint-every")]
+        run += [word for option in options if rng.random() < 0.15 for word in option]
+        run += [
+            ["--no-report"],
+            ["--no-report"],
+            ["--no-report"],
+            ["--format", "svg", "--format", "png"],
+        ][rng.integers(4)]
+        state = folder / "state"
+        resumable = rng.random() < 0.4 and "methods" not in case.get("run", {})
+        code = command(*run, *(["--checkpoint", str(state)] if resumable else []))
+        if code:
+            return "error"
+        mesh = folder / "out" / str(rng.choice(["mesh.npz", "mesh.vtu"]))
+        if not mesh.exists() or command("check", str(mesh)):
+            raise Wrong(f"{' '.join(run[3:])}: no right {mesh.name}")
+        if state.exists() and command(*run, "--resume", str(state)):
+            raise Wrong(f"{' '.join(run[3:])}: not resumed from its own state")
+        made = clvoro.load(folder / "out" / "mesh.npz")
+        use(rng, made, folder)
+    return "mesh"
+
+
+def command(*words: str) -> int:
+    """Return the exit code of the command."""
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(shown):
+        try:
+            code = cli.main(words)
+        except SystemExit as end:  # of words that nobody knows
+            code = int(end.code or 0)
+    if code not in (cli.OK, cli.FAILED, cli.BAD_INPUT):
+        raise Wrong(f"{' '.join(words)} ends with {code}: {shown.getvalue()[-300:]}")
+    return code
+
+
+def use(rng: np.random.Generator, result: clvoro.Result, folder: Path) -> None:
+    """What can be done with a mesh besides reading it."""
+    diagram, patches = result.diagram, None
+    if isinstance(diagram.domain, clvoro.Polygon) and rng.random() < 0.5:
+        patches = {"inlet": [0], "wall": [1, 2]}
+    with contextlib.suppress(InputError):  # which has no room for cells around holes
+        result.save(folder / "case" / "a.foam", patches=patches)
+    if diagram.domain.dim == 2 and not any(diagram.domain.periodic):
+        corners = diagram.triangles()
+        if corners.shape[1] != 3 or corners.max(initial=0) >= len(result.points):
+            raise Wrong(f"triangles {corners.shape} of {len(result.points)} generators")
+    if rng.random() < 0.2:
+        import matplotlib.pyplot as plt
+
+        result.plot(str(rng.choice(["error", "size", "quality"])))
+        plt.close("all")
+
+
 WORK = {
     "diagram": (partial(try_diagram, in_plane), 0.3),
     "solid": (partial(try_diagram, in_space), 0.12),
@@ -417,6 +495,8 @@ WORK = {
     "resumed": (try_resumed, 0.06),
     "moved": (try_moved, 0.05),
     "case": (try_case, 0.06),
+    "turns": (try_turns, 0.08),
+    "command": (try_command, 0.06),
     "file": (try_file, 0.1),
 }
 """What is tried by kind of input, and how often."""
