@@ -66,9 +66,12 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
     loose = np.zeros(len(g.owner), bool)
     if isinstance(d.domain, Polygon):
-        # Parts that were cut off from their generators have faces anywhere: these are where their corners are.
+        # Parts that were cut off from their generators have faces anywhere: these are where their corners are. Such a
+        # part lies at the boundary, and so does the cell that has it now.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
-        adopted = np.linalg.norm(there - normals, axis=1) * g.measures > positions.measures
+        at_wall = np.bincount(g.owner[walls], minlength=n)[g.owner] > 0
+        off = np.linalg.norm(there - normals, axis=1) * g.measures
+        adopted = off > np.where(at_wall, doubts.measures, positions.measures)
         adopted &= (d.neighbours >= 0) & (g.measures > 0)
         normals = np.where(adopted[:, None], there, normals)
         # Edges meet their corners to rounding.

@@ -111,7 +111,8 @@ def hidden(
 
     A corner belongs to the cell of the generator nearest to it if the way between them is all in the domain. Otherwise
     the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
-    the domain touch in a point, either side sees both; a generator in that point belongs to one side alone.
+    the domain touch in a point, either side sees both; a generator in that point belongs to one side alone. Likewise
+    what is seen from a corner that the boundary goes around may be hidden just beside it.
     """
     at = d.vertices[corners[places]]
     distances = tree.query(at - np.array(domain.lower))[0]
@@ -123,7 +124,9 @@ def hidden(
     part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
     lines = shapely.linestrings(np.stack([at[place] + part[:, None] * way, goal], axis=1))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
-    away |= near_shared_corners(domain, at, slack)
+    away |= near_shared_corners(domain, at, slack) | near_places(
+        at, _salient_corners(domain), slack
+    )
     # Nor is anything seen through a point, or from one.
     away[place[near_shared_corners(domain, lines, slack)]] = True
     return places[away]
@@ -132,9 +135,22 @@ def hidden(
 def near_shared_corners(domain: Polygon, places: np.ndarray, slack: float) -> np.ndarray:
     """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of a corner that several rings have."""
     once, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    return near_places(places, once[times > 1], slack)
+
+
+def near_places(places: np.ndarray, others: np.ndarray, slack: float) -> np.ndarray:
+    """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of one of `others` (m, 2)."""
     near = np.zeros(len(places), bool)
-    if (times > 1).any():
-        tree = shapely.STRtree(np.asarray(shapely.points(once[times > 1])))
+    if len(places) and len(others):
+        tree = shapely.STRtree(np.asarray(shapely.points(others)))
         shapes = shapely.points(places) if places.ndim == 2 else places
         near[tree.query(shapes, predicate="dwithin", distance=slack)[0]] = True
     return near
+
+
+def _salient_corners(domain: Polygon) -> np.ndarray:
+    """Return the corners (m, 2) where the domain takes more than half of the surroundings."""
+    after = domain.next_vertex
+    edges = domain.vertices[after] - domain.vertices
+    turn = edges[:, 0] * edges[after, 1] - edges[:, 1] * edges[after, 0]
+    return domain.vertices[after[turn < 0]]
