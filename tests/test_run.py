@@ -498,10 +498,12 @@ def test_published_ordering(adapter):
 def test_figures_of_adaptive_runs(
     adapter, adapter32, dtype, options, mean, largest, quality, least
 ):
+    """The median of five starts: the largest error of one start hangs on a cell or two, and so on rounding."""
     run = (adapter if dtype == "float64" else adapter32).run
-    result = run(BOX, F1, seed=9, **options)
-    check(result, F1, real=dtype)
-    e_mean, e_max, q_mean, q_min = figures(result)
+    results = [run(BOX, F1, seed=seed, **options) for seed in range(1, 6)]
+    for result in results:
+        check(result, F1, real=dtype)
+    e_mean, e_max, q_mean, q_min = np.median([figures(r) for r in results], axis=0)
     assert e_mean <= mean
     assert e_max <= largest
     assert q_mean >= quality
