@@ -91,13 +91,14 @@ def main() -> int:
     print(f"first seed {first}", flush=True)
     ends, errors = ({kind: collections.Counter() for kind in WORK} for _ in range(2))
     until, seed, failures = time.monotonic() + 60 * arguments.minutes, first, 0
-    only = f" --only {arguments.only}" if arguments.only else ""
     arguments.out.mkdir(exist_ok=True, parents=True)
     now = arguments.out / "now.txt"
     while time.monotonic() < until:
         faulthandler.dump_traceback_later(SLOWEST, exit=True)
-        now.write_text(f"python -m tests.fuzz --repeat {seed}{only}\n")  # should it crash or hang
         kind = arguments.only or kind_of(seed)
+        now.write_text(
+            f"python -m tests.fuzz --repeat {seed} --only {kind}\n"
+        )  # should it crash or hang
         try:
             end, error = attempt(kind, seed)
             ends[kind][end] += 1
@@ -109,9 +110,11 @@ def main() -> int:
                 break
             failures += 1
             ends[kind]["failed"] += 1
-            text = f"python -m tests.fuzz --repeat {seed}{only}\n\n{traceback.format_exc()}"
+            text = f"python -m tests.fuzz --repeat {seed} --only {kind}\n\n{traceback.format_exc()}"
             (arguments.out / f"{seed}.txt").write_text(text)
-            print(f"seed {seed} ({kind}): {type(error).__name__}: {error!s:.600}", flush=True)
+            print(
+                f"--repeat {seed} --only {kind}: {type(error).__name__}: {error!s:.600}", flush=True
+            )
         seed += 1
     faulthandler.cancel_dump_traceback_later()
     now.unlink(missing_ok=True)

@@ -23,3 +23,9 @@ def test_the_table_counts_what_there_was():
     assert row.split() == ["run", "5", "3", "1", "1", "60%"]
     assert head.split()[:5] == ["kind", "inputs", "mesh", "error", "failed"]
     assert error == "run: 1 x InputError: k is # expected"
+
+
+@pytest.mark.parametrize("seed", [5, 300])
+def test_parts_that_were_cut_off_pass_the_check(seed):
+    """Around corners of holes, and in a cell with two faces towards one neighbour: both were refused once."""
+    assert fuzz.attempt("layers", seed)[0] == "mesh"
