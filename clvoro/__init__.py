@@ -19,26 +19,15 @@ warnings are in `clvoro.errors`, pictures in `clvoro.report`, times of kernels i
 ``clvoro``; begin with ``clvoro --help``.
 """
 
-try:
-    from . import profile, sizing
-    from .adapter import Adapter
-    from .device import create_context, list_devices
-    from .domain import Box
-    from .errors import ClvoroError
-    from .io import load
-    from .layers import Layers
-    from .polygon import Polygon
-    from .results import Diagram, Displacements, Result
-except KeyboardInterrupt:
-    # The command is still loading, which takes a second: it ends as it does later, without a traceback.
-    import sys
-    from pathlib import Path
-
-    module = sys.argv[0] == "-m" and "clvoro" in sys.orig_argv  # python -m clvoro
-    if not module and Path(sys.argv[0]).stem != "clvoro":
-        raise
-    print("clvoro: interrupted", file=sys.stderr)
-    raise SystemExit(130) from None
+from . import profile, sizing
+from .adapter import Adapter
+from .device import create_context, list_devices
+from .domain import Box
+from .errors import ClvoroError
+from .io import load
+from .layers import Layers
+from .polygon import Polygon
+from .results import Diagram, Displacements, Result
 
 __version__ = "0.1.0"
 

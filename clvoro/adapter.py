@@ -1,4 +1,4 @@
-"""The entry: checks what the user gives, and runs the loop."""
+"""The entry: checks what the user gives, and has the stages for it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
-from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -14,23 +13,16 @@ import pyopencl as cl
 from . import device
 from ._arrays import Naming, check_callable, check_number, check_points
 from ._program import Engine
-from .checkpoint import Checkpointer
 from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
 from .layers import Layers
-from .loop import Loop
-from .made_by import describe
 from .memory import check_memory, memory_needed
-from .preparation import Options, Preparation, check_options
+from .preparation import Preparation, check_options
 from .results import Diagram, Result
-from .resume import Saved
+from .run import Files, carry_out
 from .stages import Stages
 from .tessellator import Tessellator
-from .torus import FewCellsError
-
-MOST_LEVELS = 99
-"""Coarser levels: no mesh has as many."""
 
 
 class Adapter:
@@ -324,9 +316,15 @@ class Adapter:
                 "run(domain, size)"
             )
         every = check_number("checkpoint_every", checkpoint_every, least=0)
-        files = checkpoint, every, resume
         with self._alone():
-            return self._run(domain, size, points, options, self._shown(callback), *files)
+            for kept in self._stages.values():
+                kept.release()  # a diagram's buffers, or a failed run's, are not part of what this one takes
+            stages = self._stages_for(domain)
+            host = None if points is None else check_points(points, domain)
+            return carry_out(
+                stages, domain, size, host, options, Files(checkpoint, every, resume),
+                self._shown(callback), self.told,
+            )  # fmt: skip
 
     def memory_needed(
         self,
@@ -368,90 +366,6 @@ class Adapter:
             max_steps=None, n_cells=n_cells, error_target=None, layers=layers,
         )  # fmt: skip
         with self._alone():
-            return self._memory_needed(domain, size, points, options)
-
-    def _memory_needed(
-        self, domain: Domain, size: object, points: np.ndarray | None, options: Options
-    ) -> float:
-        stages = self._stages_for(domain)
-        host = None if points is None else check_points(points, domain)
-        return Preparation(stages, domain, size, host, options, MOST_LEVELS).memory
-
-    def _run(
-        self,
-        domain: Domain,
-        size: object,
-        points: np.ndarray | None,
-        options: Options,
-        callback: Callable[[np.void], object] | None,
-        checkpoint: str | PathLike[str] | None,
-        every: float,
-        resume: str | PathLike[str] | None,
-    ) -> Result:
-        """Prepare a run and carry it out, with fewer coarse levels where a periodic box has too few cells around it."""
-        for kept in self._stages.values():
-            kept.release()  # a diagram's buffers, or a failed run's, are not part of what this one takes
-        stages = self._stages_for(domain)
-        host = None if points is None else check_points(points, domain)
-        saved = None if resume is None else Saved(resume)
-        made_by = {}
-        if saved is not None or checkpoint is not None:
-            made_by = describe(domain, vars(options), self.dtype, host)
-        if saved is not None:
-            saved.fit(made_by)
-        most, told = MOST_LEVELS if saved is None else saved.levels, self.told
-        while True:
-            prepared = Preparation(stages, domain, size, host, options, most)
-            if told is not None:
-                told(prepared.memory)
-                told = None
-            try:
-                loop = self._begin(prepared, made_by, saved, checkpoint, every, callback)
-                return loop.run(
-                    options.n_cells if options.planned else None,
-                    float(prepared.target),
-                    self._settings(prepared),
-                )
-            except FewCellsError:
-                if options.levels != "auto" or prepared.levels == 0:
-                    raise
-                most = prepared.levels - 1
-
-    @staticmethod
-    def _begin(
-        prepared: Preparation,
-        made_by: dict,
-        saved: Saved | None,
-        checkpoint: str | PathLike[str] | None,
-        every: float,
-        callback: Callable[[np.void], object] | None,
-    ) -> Loop:
-        """Return the loop at its beginning, or where it was when it was saved."""
-        options, mesh = prepared.options, None
-        if saved is None or prepared.may_be_near:
-            mesh = prepared.mesh()
-        plan = prepared.plan(mesh)
-        writer = None if checkpoint is None else Checkpointer(checkpoint, every, made_by, plan)
-        if saved is not None:
-            mesh = None  # and with it the room that the one from there takes
-            mesh = saved.restore(
-                prepared.stages, prepared.domain, prepared.sizing, plan, prepared.free, len(prepared.rows)
-            )  # fmt: skip
-        assert mesh is not None
-        tol = None if options.planned else options.tol
-        loop = Loop(mesh, plan, prepared.levels, options.max_steps, tol, callback)
-        loop.checkpoint = writer
-        if saved is not None:
-            saved.set(loop)
-        return loop
-
-    def _settings(self, prepared: Preparation) -> dict[str, Any]:
-        """Return what the result says of how it was made."""
-        options = prepared.options
-        return {
-            **vars(options),
-            "start": options.start if prepared.points is None else "points",
-            "levels": prepared.levels,
-            "dtype": self.dtype.name,
-            "layers": [repr(layer) for layer in options.layers],
-        }
+            stages = self._stages_for(domain)
+            host = None if points is None else check_points(points, domain)
+            return Preparation(stages, domain, size, host, options).memory

@@ -124,9 +124,7 @@ def hidden(
     part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
     lines = shapely.linestrings(np.stack([at[place] + part[:, None] * way, goal], axis=1))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
-    away |= near_shared_corners(domain, at, slack) | near_places(
-        at, _salient_corners(domain), slack
-    )
+    away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
     # Nor is anything seen through a point, or from one.
     away[place[near_shared_corners(domain, lines, slack)]] = True
     return places[away]
@@ -148,7 +146,7 @@ def near_places(places: np.ndarray, others: np.ndarray, slack: float) -> np.ndar
     return near
 
 
-def _salient_corners(domain: Polygon) -> np.ndarray:
+def _reflex_corners(domain: Polygon) -> np.ndarray:
     """Return the corners (m, 2) where the domain takes more than half of the surroundings."""
     after = domain.next_vertex
     edges = domain.vertices[after] - domain.vertices

@@ -146,10 +146,9 @@ class Job:
                 return self.interrupted
 
             def told(needed: float) -> None:
-                there = adapter.ctx.devices[0].global_mem_size
-                text = f"{title}: takes {in_bytes(needed)} of the device's {in_bytes(there)}"
                 if shown is not None and (shown.live or needed >= _MUCH):
-                    shown.tell(text)
+                    there = in_bytes(adapter.ctx.devices[0].global_mem_size)
+                    shown.tell(f"{title}: takes {in_bytes(needed)} of the device's {there}")
 
             adapter.told = told
             try:

@@ -118,7 +118,7 @@ class Preparation:
     points : (n, d) array, optional
         The caller's generators, checked.
     options : Options
-    most_levels : int
+    most_levels : int, optional
         Most coarser levels, where their number is left to this.
 
     Attributes
@@ -149,7 +149,7 @@ class Preparation:
         size: object,
         points: np.ndarray | None,
         options: Options,
-        most_levels: int,
+        most_levels: int | None = None,
     ) -> None:
         self.stages, self.domain, self.points, self.options = stages, domain, points, options
         n_cells, d = options.n_cells, domain.dim
@@ -202,7 +202,7 @@ class Preparation:
         self.levels = 0
         if options.planned:
             self.levels = self._count_levels()
-            if options.levels == "auto":
+            if options.levels == "auto" and most_levels is not None:
                 self.levels = min(self.levels, most_levels)
         surplus, shore = 0.0, None
         if options.planned and self._tree is not None:

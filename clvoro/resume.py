@@ -203,20 +203,11 @@ class Saved:
         if "multipliers" in a:
             arrays["multipliers"] = engine.upload(a["multipliers"], np.float32)
         mesh = Mesh.saved(stages, domain, sizing, arrays, self.coarsening, free, fixed)
-        # Into the arrays of the stage that makes the next one: those of a run take much of the device's memory.
-        if isinstance(domain, Polygon):
-            # Trimmed from another diagram, which is not kept: made anew, it has the same bits.
-            mesh.tessellation = mesh.tessellator.tessellate(points, n)
-            stages.bins.clear()
-        elif a["diagram.face_measures"].dtype != engine.face:
-            raise InputError(
-                f"cannot resume from {self.name}: it is damaged (faces are {a['diagram.face_measures'].dtype})"
-            )
-        else:
-            folded = engine.dim == 2 and any(domain.periodic)
-            cells = stages.folded if folded else stages.cells
-            t = {name: a[f"diagram.{name}"] for name in DIAGRAM}
-            mesh.tessellation = cells.restore(points, t, state["spare"])
+        faces = a["diagram.face_measures"].dtype
+        if not isinstance(domain, Polygon) and faces != engine.face:
+            raise InputError(f"cannot resume from {self.name}: it is damaged (faces are {faces})")
+        diagram = {name: a[f"diagram.{name}"] for name in DIAGRAM}
+        mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"])
         mesh.next_label = state["next_label"]
         torus = mesh.tessellator.torus
         if torus is not None:

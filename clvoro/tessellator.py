@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pyopencl.array as cla
@@ -71,6 +71,22 @@ class Tessellator:
         if self._polygon is None and not isinstance(self.stages.cells, Polyhedra):
             t = self.stages.cells.measure_faces(self.domain, t)
         return t, None
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
+    ) -> Tessellation:
+        """Return the diagram of `points` (n, d) that was `saved`, with room for so many more faces.
+
+        It lies in the arrays of the stage that makes the next one: those of a run take much of the device's memory.
+        """
+        stages = self.stages
+        if self._polygon is not None:
+            # Trimmed from another diagram, which is not kept: made anew, it has the same bits.
+            t = self.tessellate(points, len(points))
+            stages.bins.clear()
+            return t
+        cells = stages.folded if self.torus is not None and stages.engine.dim == 2 else stages.cells
+        return cells.restore(points, saved, spare)
 
     def tessellate(
         self,

@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,25 +189,6 @@ def test_second_interrupt_quits_at_once(here, monkeypatch, capsys):
     assert call("run", "small.toml") == cli.INTERRUPTED
     assert not list((here / "out" / "small").iterdir())
     assert "nothing more has been written" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("started", ["module", "script", "library"])
-def test_interrupt_while_the_command_loads_is_quiet(tmp_path, started):
-    """Loading takes a second; who imports clvoro in a program of their own gets the exception."""
-    (tmp_path / "pyopencl").mkdir()
-    (tmp_path / "pyopencl" / "__init__.py").write_text("raise KeyboardInterrupt")
-    (tmp_path / "clvoro-script").mkdir()
-    script = tmp_path / "clvoro-script" / ("clvoro" if started == "script" else "mine.py")
-    script.write_text("from clvoro.cli import main")
-    path = os.pathsep.join([str(tmp_path), str(Path(clvoro.__file__).parents[1])])
-    found = subprocess.run(
-        [sys.executable, *(["-m", "clvoro"] if started == "module" else [str(script)]), "cases"],
-        env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if started == "library":
-        assert "KeyboardInterrupt" in found.stderr
-    else:
-        assert (found.returncode, found.stderr) == (cli.INTERRUPTED, "clvoro: interrupted\n")
 
 
 def pressing_run(number):

@@ -21,8 +21,6 @@ EXPANSION, LEAST = 16, 1 << 22
 """A result's file may hold this many times its own size, or this many bytes: meshes compress two- or threefold, and
 lattices, which repeat themselves most, ninefold."""
 _FLATTEST, _SMALL = 256, 1 << 24  # as much for one array, of which most may be the same
-
-
 _PIECE = 1 << 22  # bytes read at once
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -77,9 +76,29 @@ class Binder:
         return np.clip(packed, -largest, largest).astype(self.real)
 
 
+class Bound(NamedTuple):
+    """A size field as OpenCL.
+
+    Attributes
+    ----------
+    prelude : str
+        OpenCL text that defines ``REAL size_at(const REAL *x, __global const REAL *data)``, h' = h
+        / scale at x' = (x - origin) / scale. Give it to `Engine.kernels(stage, prelude=...)`; it
+        needs DIM and REAL only.
+    data : (m,) real
+        What to pass as `data`.
+    taken : int
+        Bytes that the device has had taken to compute it.
+    """
+
+    prelude: str
+    data: np.ndarray
+    taken: int
+
+
 def bind(
     field: Field, domain: Domain, real: DTypeLike = np.float64, engine: Engine | None = None
-) -> tuple[str, np.ndarray]:
+) -> Bound:
     """Return `field` as OpenCL for the normalised coordinates of `domain`.
 
     Geometry is converted to those coordinates in float64, so that float32 is as accurate far from
@@ -95,35 +114,11 @@ def bind(
         Where a field that has to be computed first (`Graded`) is computed; by default a new one on
         the default device.
 
-    Returns
-    -------
-    prelude : str
-        OpenCL text that defines ``REAL size_at(const REAL *x, __global const REAL *data)``, h' = h
-        / scale at x' = (x - origin) / scale. Give it to `Engine.kernels(stage, prelude=...)`; it
-        needs DIM and REAL only.
-    data : (m,) real
-        What to pass as `data`.
-
     Raises
     ------
     InputError
         If the field is of another dimension than the domain, or has no device form.
     """
-    bound = bound_to(field, domain, real, engine)
-    return bound.prelude, bound.numbers
-
-
-@dataclass(frozen=True)
-class Bound:
-    """What `bind` returns, and the bytes that the device has had `taken` for it."""
-
-    prelude: str
-    numbers: np.ndarray
-    taken: int
-
-
-def bound_to(field: Field, domain: Domain, real: DTypeLike, engine: Engine | None) -> Bound:
-    """Bind `field` to `domain`: see `bind`."""
     field.check_dim(domain.dim)
     binder = Binder(domain, np.dtype(real), engine)
     result = field._emit(binder)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import SizeFieldError
-from .bind import bound_to
+from .bind import bind
 from .field import Constant, Field, as_field
 
 if TYPE_CHECKING:
@@ -73,9 +73,8 @@ class Sizing:
         self._parts: list[Sizing] = []
         self._taken = 0
         if self.field.on_device:
-            bound = bound_to(self.field, domain, engine.real, engine)
-            self.prelude, self._taken = bound.prelude, bound.taken
-            self.data = engine.upload(bound.numbers)
+            self.prelude, numbers, self._taken = bind(self.field, domain, engine.real, engine)
+            self.data = engine.upload(numbers)
             self._bad = engine.upload([_NONE_BAD], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
