@@ -221,6 +221,23 @@ inline Stride stride_of(int k, int n, int centre, global const REAL *partial, gl
     return s;
 }
 
+/* One group: what the host may look at once iteration k - 1 has been enqueued, and whether k has anything left to do. The
+   row is written again by `direction`, if it comes to that. */
+kernel void look(int k, global const REAL *partial, global const REAL *state, global REAL *record, const int groups)
+{
+    local REAL scratch[GROUP_SIZE];
+    global REAL *now = record + 4 * k;
+    REAL norm = 0;
+    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
+        norm += partial[NORM_R(k) * groups + g];
+    norm = group_sum(norm, scratch);
+    if (get_local_id(0) == 0) {
+        now[RECORD_NORM] = norm;
+        now[RECORD_RUNNING] = !(norm <= state[0]);
+        now[RECORD_CURVATURE] = 1;
+    }
+}
+
 /* x += alpha p, r -= alpha q. */
 kernel void update(int k, int n, int centre, global const STORE *p, global const STORE *q, global REAL *x,
                    global STORE *r, global REAL *partial, global REAL *state, global REAL *record)

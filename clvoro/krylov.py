@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
 from ._launch import Launch, most_alone
@@ -160,7 +161,7 @@ class ConjugateGradient:
         n = len(rhs)
         if max_iterations > self._record_capacity:
             self._record_capacity = max_iterations
-            self._record = self.engine.zeros(4 * max_iterations)
+            self._record = self.engine.zeros(4 * (max_iterations + 1))
             self._alone = self.engine.zeros(_STATE + 4 * (max_iterations + 1))
         diagonal = isinstance(precondition, cla.Array)
         if rows is not None and diagonal and n <= self._most_alone:
@@ -170,6 +171,7 @@ class ConjugateGradient:
         kernels, launch = self._kernels_in(store), self.engine.run_blocks
         r, u, p, q = (self.engine.scratch(n, store) for _ in range(4))
         size, zero, mean = np.int32(n), np.int32(0), np.int32(centre)
+        groups, group = np.int32(self.engine.groups), self.engine.group_size
         # The recurrence stops a little lower, so that the true residual is within the tolerance.
         limit = self.engine.real.type(0.95 * tolerance)
         tail = (self.partial, self._state, self._record)
@@ -192,6 +194,14 @@ class ConjugateGradient:
         else:
             update = Launch(self.engine, kernels.update, zero, size, mean, p, q, x, r, *tail)
 
+        def alone(kernel: cl.Kernel, *args: object) -> None:
+            """Enqueue a kernel of one work-group."""
+            self.engine.run(kernel, group, *args, group=group)
+
+        def look(k: int) -> None:
+            """Have row k of the record tell whether there is an iteration k."""
+            alone(kernels.look, np.int32(k), *tail, groups)
+
         def measure(zero: bool = False) -> float:
             """Set r to the true residual and return its relative norm; negative: b is zero."""
             if not zero:
@@ -201,10 +211,7 @@ class ConjugateGradient:
             launch(
                 kernels.begin, size, anew, mean, rhs, q, x, r, p, self.partial, self._state
             )  # fmt: skip
-            self.engine.run(
-                kernels.sum_norms, self.engine.group_size, self.partial, self._state,
-                np.int32(self.engine.groups), group=self.engine.group_size,
-            )  # fmt: skip
+            alone(kernels.sum_norms, self.partial, self._state, groups)
             return self._relate(*self._state.get()[2:])
 
         def iterate(k: int) -> None:
@@ -233,7 +240,7 @@ class ConjugateGradient:
             if diagonal:
                 launch(kernels.jacobi, size, precondition, r, u, self.partial)
             most = max_iterations - iterations
-            iterations += self._cycle(iterate, most, tolerance, residual, lookahead, history)
+            iterations += self._cycle(iterate, look, most, tolerance, residual, lookahead, history)
             if not verify and self._left <= tolerance:
                 residual, reason = self._left, "converged"
                 break
@@ -310,6 +317,7 @@ class ConjugateGradient:
     def _cycle(
         self,
         iterate: Callable[[int], None],
+        look: Callable[[int], None],
         most: int,
         tolerance: float,
         residual: float,
@@ -322,10 +330,12 @@ class ConjugateGradient:
             end = min(done + ahead, most)
             for k in range(done, end):
                 iterate(k)
-            stop = self._follow(self._record[4 * done : 4 * end].get(), done, tolerance, history)
+            look(end)
+            rows = self._record[4 * done : 4 * (end + 1)].get()
+            stop = self._follow(rows, done, tolerance, history)
             if stop is not None:
                 return stop
-            residual = history[-1]
+            residual = history.pop()  # the next iteration leaves it again
             done = end
             rate = math.log(first / residual) / done if residual < first else 0.0
             left = math.log(residual / tolerance) / rate if rate > 0 else lookahead

@@ -321,6 +321,27 @@ def test_result_does_not_depend_on_when_the_host_looks(make):
     assert all(np.array_equal(x, results[0][1]) for _, x in results)
 
 
+def test_no_preconditioning_in_vain(make):
+    """Where the host looks after each iteration, the preconditioner is applied as often as there are iterations."""
+    engine = make()
+    _, laplacian = assembled(engine, graphs.random_graph(800, seed=57))
+    poisson, applied = Poisson(engine), 0
+    inverse = poisson.inverse_diagonal(laplacian).copy()
+
+    def precondition(r, u, spare):
+        nonlocal applied
+        applied += 1
+        u[:] = r * inverse
+
+    b = engine.upload(np.random.default_rng(58).standard_normal(800))
+    solution = ConjugateGradient(engine).solve(
+        lambda p, q: poisson.apply(laplacian, p, q), b, engine.zeros(800), tolerance=1e-2,
+        max_iterations=500, precondition=precondition, centre=True, lookahead=1, verify=False,
+    )  # fmt: skip
+    assert solution.converged
+    assert applied == solution.iterations > 10
+
+
 @pytest.mark.parametrize(
     ("n", "group_size"),
     [
