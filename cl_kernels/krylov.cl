@@ -221,8 +221,8 @@ inline Stride stride_of(int k, int n, int centre, global const REAL *partial, gl
     return s;
 }
 
-/* One group: what the host may look at once iteration k - 1 has been enqueued, and whether k has anything left to do. The
-   row is written again by `direction`, if it comes to that. */
+/* One group: what the host may look at once iteration k - 1 has been enqueued, and whether k has anything left to do.
+   The row is written again by `direction`, if it comes to that. */
 kernel void look(int k, global const REAL *partial, global const REAL *state, global REAL *record, const int groups)
 {
     local REAL scratch[GROUP_SIZE];
