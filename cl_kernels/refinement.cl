@@ -3,7 +3,8 @@
 
 /* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular
    lattice over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbour, so that
-   cells along it would be left alone: each gets one new generator between its generator and the wall. */
+   cells along it would be left alone: each gets one new generator between its generator and the wall, or beyond its
+   generator if that all but stands on the wall, where between them is no room. */
 
 /* A pair is counted once, by its lower index. */
 inline bool has_middle(int i, int j, REAL measure, REAL volume)
@@ -72,7 +73,7 @@ kernel void place_children(const int size, global const int *starts, global cons
 #ifdef POLYGON
             const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]), t = BOUNDARY_TANGENT(j);
             const REAL gap = m.s0 * t.s1 - m.s1 * t.s0;
-            const REAL way = gap > 0 ? fmin(gap / 2, h[i] / 4) : h[i] / 4;
+            const REAL way = gap > h[i] / 8 ? fmin(gap / 2, h[i] / 4) : h[i] / 4;
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {x[0] + m.s0 - way * t.s1, x[1] + m.s1 + way * t.s0};
             keep_inside(x, y, DOMAIN);
@@ -83,9 +84,10 @@ kernel void place_children(const int size, global const int *starts, global cons
             const REAL level = wall % 2 ? upper[axis] : lower[axis];
             for (int a = 0; a < DIM; ++a)
                 child[a] = points[DIM * i + a];
-            /* Half a cell from the wall; not on its own parent where that stands on the wall. */
-            const REAL gap = points[DIM * i + axis] - level;
-            const REAL way = gap != 0 ? fmin(fabs(gap) / 2, h[i] / 4) : h[i] / 2;
+            /* In a box that is thinner than the cell, too: short of what comes from its other wall. */
+            const REAL gap = fabs(points[DIM * i + axis] - level);
+            const REAL room = fmin(h[i], (upper[axis] - lower[axis]) / 2);
+            const REAL way = gap > room / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
             child[axis] = level + (wall % 2 ? -way : way);
 #endif
         } else if (has_middle(i, j, face_measures[k], volumes[i])) {

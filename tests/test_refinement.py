@@ -4,6 +4,7 @@ import numpy as np
 import patch
 import pytest
 import shapely
+from scipy.spatial import cKDTree
 from shores import POLYGONS, lattice, scattered
 
 from clvoro.refinement import SHORT_FACE, Refinement
@@ -25,8 +26,8 @@ def expected_children(host, h):
         if j < 0:
             axis, upper = divmod(-1 - j, 2)
             wall = (BOX.lower, BOX.upper)[upper][axis]
-            gap = abs(host.points[i, axis] - wall)
-            way = h[i] / 2 if gap == 0 else min(gap / 2, h[i] / 4)
+            gap, room = abs(host.points[i, axis] - wall), min(h[i], BOX.extent[axis] / 2)
+            way = min(gap / 2, h[i] / 4) if gap > room / 8 else room / 2
             child = host.points[i].copy()
             child[axis] = wall - way if upper else wall + way
             children.append(child)
@@ -44,7 +45,7 @@ def as_sorted(points):
 def test_children(ctx, real, n):
     engine = patch.make_engine(ctx, real)
     points = patch.random_points(n, n + 41).astype(real)
-    points[0] = (0, 0.3)  # on a wall
+    points[:2] = [(0, 0.3), (0.6, 1e-6)][:n]  # on a wall, and nearly on one
     h = np.random.default_rng(n).uniform(0.5, 1, n).astype(real) * np.sqrt(0.75 / n / 4)
     host, finer = refine(engine, points, h)
     assert np.array_equal(finer[:n], points), "the parents come first, in their order"
@@ -86,7 +87,7 @@ def children_in(shape, tangents, host, h, labels, fixed):
         elif longest:
             inwards = np.array([-tangents[-1 - j, 1], tangents[-1 - j, 0]])
             gap = -m @ inwards
-            way = min(gap / 2, h[i] / 4) if gap > 0 else h[i] / 4
+            way = min(gap / 2, h[i] / 4) if gap > h[i] / 8 else h[i] / 4
             children.append(kept(x, x + m + way * inwards))
     return np.array(children)
 
@@ -157,6 +158,24 @@ def test_squares_get_no_point_twice(ctx):
     _, finer = refine(patch.make_engine(ctx), points, np.full(48, 1 / 16))
     assert len(finer) == 48 + 7 * 6 + 8 * 5 + 2 * (8 + 6)
     assert len(np.unique(finer, axis=0)) == len(finer)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("share", [0, 1e-4, 0.99, 1.01])
+def test_no_child_is_close_to_a_generator_at_a_wall(ctx, real, share):
+    """Between a generator and the wall that it all but stands on there is no room, in thin boxes neither."""
+    h = 0.08
+    for thin in (0.75, 0.0625):
+        room = min(h, thin / 2)
+        gap = share * room / 8  # about where there is enough
+        box = patch.Box((0, 0), (1, thin))
+        engine = patch.make_engine(ctx, real, box=box)
+        points = np.array([(0.3, gap), (0.7, thin - gap)], real)
+        t = patch.tessellate(engine, points, box)
+        finer = Refinement(engine).refine(box, t, engine.upload(np.full(2, h))).get()
+        assert box.contains(finer).all()
+        apart, _ = cKDTree(finer).query(finer, k=2)
+        assert apart[:, 1].min() > 0.06 * room  # half of the gap where there is enough: a sixteenth
 
 
 def test_repeats_bit_by_bit(ctx):
