@@ -417,6 +417,8 @@ def try_command(rng: np.random.Generator) -> str:
         wild = rng.random() < WILD
         case = some_case(rng, folder, real, wild and bool(rng.integers(2)))
         (folder / "c.toml").write_text(toml.write(case))
+        settings = case.get("run")
+        several = isinstance(settings, dict) and "methods" in settings
         run = ["run", str(folder / "c.toml"), "--out", str(folder / "out")]
         options = [
             ["--profile"], ["--quiet"], ["--json"], ["--steps", "3"], ["--tol", "0.6"], ["--seed", "8"],
@@ -425,9 +427,7 @@ def try_command(rng: np.random.Generator) -> str:
             ["--method", "magic" if wild else str(rng.choice(["exact", "lloyd"]))], ["--k", "0.4"],
             ["--checkpoint-every", "-1" if wild else "0"],
         ]  # fmt: skip
-        if not wild and (
-            case.get("layers") or "methods" in case.get("run", {})
-        ):  # of many rows, and without a state
+        if not wild and (case.get("layers") or several):  # of many rows, and without a state
             options = [o for o in options if o[0] not in ("--cells", "--checkpoint-every")]
         run += [word for option in options if rng.random() < 0.15 for word in option]
         run += [
@@ -437,7 +437,7 @@ def try_command(rng: np.random.Generator) -> str:
             ["--format", "svg", "--format", "png"],
         ][rng.integers(4)]
         state = folder / "state"
-        resumable = rng.random() < 0.4 and "methods" not in case.get("run", {})
+        resumable = rng.random() < 0.4 and not several
         code = command(*run, *(["--checkpoint", str(state)] if resumable else []))
         if code:
             return "error"
