@@ -11,7 +11,6 @@
 
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
 #define ON_BOUNDARY (4 * REAL_EPS)
-#define ONE_POINT (64 * REAL_EPS)
 
 /* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
 
@@ -312,15 +311,16 @@ kernel void copy_whole(const int size, global const int *starts, global const in
    have changed cells, in order; place_cells[place] is the touched cell that they lie in.
 
    outlines[i] = (quality, neighbours that a hexagonal lattice would have here) */
-kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *points, global const int *touched,
-                          global const int *slots, global const int *roots, global const int *orphans,
-                          const int orphan_count, global const int *place_cells, global const int *new_starts,
-                          global int *new_neighbours, global REAL *new_measures, global REAL2 *new_centroids,
-                          global int *face_segments, global REAL *volumes, global REAL *offsets,
-                          global REAL *covariances, global REAL2 *outlines, global const REAL2 *tangents)
+kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const REAL2 *points,
+                          global const int *touched, global const int *slots, global const int *roots,
+                          global const int *orphans, const int orphan_count, global const int *place_cells,
+                          global const int *new_starts, global int *new_neighbours, global REAL *new_measures,
+                          global REAL2 *new_centroids, global int *face_segments, global REAL *volumes,
+                          global REAL *offsets, global REAL *covariances, global REAL2 *outlines)
 {
     WORK_ITEM(u);
     const segments_t s = SEGMENTS;
+    const shore_t shore = SHORE;
     const int i = touched[u];
     moments_t m = {0, 0, 0, 0, 0, 0};
     outline_t o = no_outline();
@@ -334,28 +334,18 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
         const int v = turn < 0 ? u : place_cells[place];
         const int home = touched[v];
         const REAL2 shift = points[home] - points[i];
-        int piece = place;
         for (int k = s.starts[v]; k < s.starts[v + 1]; ++k) {
             if (turn < 0 ? roots[s.places[k]] != i : s.places[k] != place)
                 continue;
-            if (s.places[k] != piece)
-                end_piece(&o);
-            piece = s.places[k];
             const REAL2 p = s.p[k] + shift, q = s.q[k] + shift, e = q - p;
             add_triangle(&m, p, q);
             int other;
-            if (!is_face(&s, k, home, i, slots, roots, &other)) {
-                /* Pieces that meet in a point, give or take a rounding, do not go on in each other. */
-                if (other == i && dot(e, e) > ONE_POINT * ONE_POINT)
-                    join_runs(&o);
+            if (!is_face(&s, k, home, i, slots, roots, &other))
                 continue;
-            }
             if (other >= 0)
                 add_face(&o, p, q);
-            else if (s.to[k] != ISLAND)
-                add_chord(&o, p, q, BOUNDARY_TANGENT(other));
-            else
-                add_straight(&o, p, q);
+            else if (begins_run(&shore, s.from[k], i))
+                add_run(&o, &shore, s.from[k], i, points[i]);
             perimeter += sqrt(dot(e, e));
             new_neighbours[at] = other;
             new_measures[at] = sqrt(dot(e, e));
@@ -363,7 +353,6 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
             face_segments[at] = k;
             ++at;
         }
-        end_piece(&o);
     }
     write_moments(&m, i, volumes, offsets, covariances);
     /* Two sides, of which one is bent, are no polygon. */
@@ -372,10 +361,17 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, global const REAL2 *poin
     outlines[i] = (REAL2)(fmax(quality, R(0)), 6 - o.missing);
 }
 
-/* Per touched cell: the places of its loops are its own. */
-kernel void name_places(const int size, global const int *list_starts, global int *place_cells)
+/* Per touched cell: the places of its loops are its own, its chords those of the pieces that they bound. */
+kernel void name_owners(const int size, SEGMENT_ARGS, global const int *list_starts, global const int *listed,
+                        global const int *roots, global int *place_cells, global int *chord_owners)
 {
     WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
     for (int place = list_starts[u] + u; place < list_starts[u + 1] + u + 1; ++place)
         place_cells[place] = u;
+    for (int k = list_starts[u]; k < list_starts[u + 1]; ++k)
+        chord_owners[listed[k]] = -1;
+    for (int k = s.starts[u]; k < s.starts[u + 1]; ++k)
+        if (s.labels[k] < 0 && !is_empty(&s, k))
+            chord_owners[s.from[k]] = roots[s.places[k]];
 }

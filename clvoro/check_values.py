@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .check_history import check_history
-from .check_polygon import near_shared_corners
 from .findings import ROUNDINGS
-from .outlines import SIDE_TURN, Straightened, face_ends, straighten
+from .outlines import straighten
 from .polygon import Polygon
 
 if TYPE_CHECKING:
     from .findings import Check
     from .rebuilt import Rebuilt
-    from .results import Diagram, Result
+    from .results import Result
 
 
 def check_values(check: Check, result: Result, g: Rebuilt) -> None:
@@ -40,7 +37,7 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         counts = np.diff(d.neighbour_starts)
         perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
         if dim == 2:
-            quality = _quality_2d(d, q, eps, g.unit)
+            quality = straighten(d, g.real).quality()
         else:
             quality = 36 * np.pi * d.volumes**2 / perimeter**3
     check.note(
@@ -74,40 +71,3 @@ def _check_factor(check: Check, result: Result) -> None:
         "size factor", [told != factor],
         lambda _: f"size_factor is {factor!r:.40}, {told!r:.40} in the settings",
     )  # fmt: skip
-
-
-def _quality_2d(d: Diagram, q: np.ndarray, eps: float, unit: float) -> np.ndarray:
-    """Return the quality (4.1) of each cell (n,).
-
-    Where rounding decides which sides the boundary has, those are taken that suit the quality `q` best.
-    """
-    quality = np.full(len(q), np.inf)
-    for polygons in _straightened(d, eps, unit):
-        # A face no longer than a rounding is a side or none, as where pieces touch.
-        owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
-        points = np.bincount(owner, d.face_measures <= ROUNDINGS * unit, len(d)).astype(int)
-        for more in range(-int(points.max(initial=0)), 1):
-            sides = polygons.sides + np.maximum(more, -points)
-            found = dataclasses.replace(polygons, sides=sides).quality()
-            quality = np.where(np.abs(found - q) < np.abs(quality - q), found, quality)
-    return quality
-
-
-def _straightened(d: Diagram, eps: float, unit: float) -> Iterator[Straightened]:
-    """Go through the polygons that the cells may be, as rounding will have it."""
-    if not isinstance(d.domain, Polygon):
-        yield straighten(d)
-        return
-    # In a corner of several rings parts of a cell may come together, with which a side ends.
-    on_wall = d.neighbours < 0
-    corners = on_wall & near_shared_corners(
-        d.domain, d.vertices[face_ends(d)[:, 1]], ROUNDINGS * unit
-    )
-    # And a cell that is a whole piece of the domain has no corner in which to begin.
-    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbour_starts))
-    alone = np.bincount(owner, ~on_wall, len(d)) == 0
-    begins = int(np.diff(d.neighbour_starts)[alone].max(initial=1))
-    for turn in (SIDE_TURN * (1 + k * eps) for k in (64, -64)):
-        for ends_at in (None, corners) if corners.any() else (None,):
-            for begins_at in range(begins):
-                yield straighten(d, turn, ends_at, begins_at)

@@ -36,6 +36,8 @@ class Chords:
         The chords of each, in order.
     tangents : (edges, 2) real
         Unit vectors along the edges.
+    turns : tuple of arrays
+        The edge before each and how far the boundary turns there; see common/sides.h.
     """
 
     count: int
@@ -46,6 +48,7 @@ class Chords:
     list_starts: cla.Array
     listed: cla.Array
     tangents: cla.Array
+    turns: tuple[cla.Array, ...]
 
 
 def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
@@ -93,6 +96,10 @@ class Boundary:
         self.shells = engine.upload(shells(domain), np.int32)
         along = domain.vertices[domain.next_vertex] - domain.vertices
         self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
+        before = np.empty_like(domain.next_vertex)
+        before[domain.next_vertex] = np.arange(self.edges)
+        before[domain.sharpest] = -1 - before[domain.sharpest]
+        self.turns = engine.upload(before, np.int32), engine.upload(domain.turns)
         self.owners = engine.zeros(self.edges, np.int32)
         self._known = 0  # cells that owners are among
         self._flags = engine.empty(1, np.int32)
@@ -167,4 +174,6 @@ class Boundary:
         self._scan.exclusive(starts, starts, touched_count)
         engine.run_each(k.place_chords, count, cells, slots, ranks, starts, listed)
         engine.run_each(k.sort_chords, touched_count, starts, listed)
-        return Chords(count, touched_count, arrays, slots, touched, starts, listed, self.tangents)
+        return Chords(
+            count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns
+        )

@@ -10,10 +10,16 @@ import numpy as np
 from .polygon import Polygon
 
 if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
+
     from .results import Diagram
 
-SIDE_TURN = np.pi / 6
-"""A side of a cell on the boundary turns by no more than this."""
+SIDE_TURN = np.pi / 6 * (1 + 2.0**-10)
+"""A side of a cell on the boundary turns by no more than this: 30 degrees, and a little so that it is never met.
+
+Sums of turns round, by some roundings each; yet an arc of 2 x 15 degrees shall be one side in any precision. Regular
+rings turn by a fraction of 360 degrees with a denominator that is no more than their number of edges.
+"""
 
 
 def face_ends(diagram: Diagram) -> np.ndarray:
@@ -69,27 +75,20 @@ class Straightened:
         return 4 * np.maximum(self.areas, 0) * n * np.tan(np.pi / n) / self.perimeters**2
 
 
-def straighten(
-    diagram: Diagram,
-    turn: float = SIDE_TURN,
-    ends_at: np.ndarray | None = None,
-    begins_at: int = 0,
-) -> Straightened:
+def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     """Return sides, areas and perimeters of cells in 2D, the boundary between two of their corners made straight.
 
-    Each face between cells is a side. So is each stretch of the boundary along which the cell's outline turns by no
-    more than `turn` (radians) in sum, as a straight line from its first end to its last; where it turns farther a new
-    side begins, and where parts of the cell come together amid an edge. Holes within a cell are no sides of it. Cells
+    Each face between cells is a side. So is each stretch of the boundary along which it turns by no more than 30
+    degrees (`SIDE_TURN`) in sum, as a straight line from its first end to its last; where it turns farther a new side
+    begins. Stretches go along the rings of the domain, from where the cell's part of a ring begins to where it ends; in
+    a ring that is all one cell's the first begins in its sharpest corner. Holes within a cell are no sides of it. Cells
     with less than three sides are left as they are. In a box the sides are the faces.
 
     Parameters
     ----------
     diagram : Diagram
-    turn : float
-    ends_at : (m,) bool, optional
-        Faces with which a side ends in any case.
-    begins_at : int
-        With which face a loop that is boundary all around begins.
+    real : dtype
+        Precision in which turns are added up, as the device does.
     """
     starts = diagram.neighbour_starts
     counts, n = np.diff(starts), len(diagram)
@@ -97,20 +96,13 @@ def straighten(
     perimeters = np.bincount(owner, measures, minlength=n)
     if not isinstance(diagram.domain, Polygon):
         return Straightened(counts, diagram.volumes, perimeters)
-    of = _sides_of(diagram, turn, ends_at, begins_at)
-    rows = np.flatnonzero(of >= 0)
-    last = int(of.max(initial=-1)) + 1
-    cells = np.zeros(last, int)
-    cells[of[rows]] = owner[rows]
+    of, first, final = _stretches(diagram, diagram.domain, owner, np.dtype(real))
+    rows, cells, last = np.flatnonzero(of >= 0), owner[first], len(first)
     # From the generator, with what is known of it: of sides of one face nothing is left.
     ends = face_ends(diagram)
     p, q = (diagram.vertices[v] - diagram.points[owner] for v in ends.T)
     length, area = (np.bincount(of[rows], x[rows], last) for x in (measures, _cross(p, q) / 2))
-    begin, end = np.zeros((last, 2)), np.zeros((last, 2))
-    following = next_faces(diagram)
-    preceding = np.argsort(following)
-    first, final = (rows[of[rows] != of[other[rows]]] for other in (preceding, following))
-    begin[of[first]], end[of[final]] = p[first], q[final]
+    begin, end = p[first], q[final]
     several = np.bincount(of[rows], minlength=last) > 1
     longer = np.where(several, length - np.hypot(*(end - begin).T), 0.0)
     beyond = np.where(several, area - _cross(begin, end) / 2, 0.0)
@@ -128,60 +120,79 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def _sides_of(
-    diagram: Diagram, turn: float, ends_at: np.ndarray | None, begins_at: int
-) -> np.ndarray:
-    """Return which side each face on the boundary is a part of, (m,); -1 for others."""
-    inner, following = diagram.neighbours >= 0, next_faces(diagram)
-    preceding = np.empty_like(following)
-    preceding[following] = np.arange(len(following))
-    # By the edges: the direction of a short part of one rounds.
-    domain = diagram.domain
-    along = domain.vertices[domain.next_vertex] - domain.vertices
-    angle = np.where(
-        inner, 0.0, np.arctan2(*along.T[::-1])[np.where(inner, 0, -1 - diagram.neighbours)]
-    )
-    turns = np.remainder(angle[following] - angle + np.pi, 2 * np.pi) - np.pi
-    ends = diagram.neighbours[following] == diagram.neighbours
-    if ends_at is not None:
-        ends |= ends_at
-    onward, by, boundary = following.tolist(), turns.tolist(), (~inner).tolist()
-    breaks = ends.tolist()
-    firsts = np.flatnonzero(~inner & inner[preceding]).tolist()
-    for face in _whole_rings(diagram, inner, following):
-        first = face
-        for _ in range(begins_at):
-            first = onward[first]
-        firsts.append(first)
-    side = [-1] * len(inner)
-    count = 0
-    for first in firsts:
-        face, turned, begun = first, 0.0, count
-        side[face] = count
-        while boundary[onward[face]] and onward[face] != first:
-            turned += by[face]
-            if breaks[face] or abs(turned) > turn:
-                turned, count = 0.0, count + 1
-            face = onward[face]
-            side[face] = count
-        if onward[face] == first and count > begun and abs(turned + by[face]) <= turn:
-            # All around, and back on the side where it began.
-            while side[face] == count:
-                side[face] = begun
-                face = int(preceding[face])
-            count -= 1
-        count += 1
-    return np.array(side, dtype=int)
+def _stretches(
+    diagram: Diagram, domain: Polygon, owner: np.ndarray, real: np.dtype
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which stretch each face is a part of, (m,), -1 for none; and the first and last face of each, (s,)."""
+    following = _along_rings(diagram, domain)
+    edges = -1 - diagram.neighbours
+    begins = _beginnings(domain, following, edges, owner)
+    onward, of_face, cells = following.tolist(), edges.tolist(), owner.tolist()
+    next_edge, turns = domain.next_vertex.tolist(), list(domain.turns.astype(real))
+    stretch = np.full(len(edges), -1)
+    first: list[int] = []
+    final: list[int] = []
+    for begin in begins:
+        face, turned = begin, real.type(0)
+        first.append(face)
+        while True:
+            stretch[face] = len(first) - 1
+            next_, edge = onward[face], of_face[face]
+            if next_ < 0 or next_ == begin or cells[next_] != cells[begin] or stretch[next_] >= 0:
+                break
+            while edge != of_face[next_]:
+                edge = next_edge[edge]
+                turned += turns[edge]
+            if abs(turned) > real.type(SIDE_TURN):
+                final.append(face)
+                first.append(next_)
+                turned = real.type(0)
+            face = next_
+        final.append(face)
+    return stretch, np.array(first, int), np.array(final, int)
 
 
-def _whole_rings(diagram: Diagram, inner: np.ndarray, following: np.ndarray) -> list[int]:
-    """Return a face of each loop that is on the boundary all around and has its cell inside."""
-    x, ends = diagram.vertices, face_ends(diagram)
-    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbour_starts))
-    # A loop's first face is one that no earlier one leads to.
-    begins = np.flatnonzero(following <= np.arange(len(following)))
-    loop = np.searchsorted(begins, np.arange(len(following)))
-    open_ = np.bincount(loop, inner, len(begins)) > 0
-    a, b = x[ends[:, 0]] - diagram.points[owner], x[ends[:, 1]] - diagram.points[owner]
-    area = np.bincount(loop, a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], len(begins))
-    return following[begins[~open_ & (area > 0)]].tolist()
+def _along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
+    """Return for each face on the boundary the next one on its ring, (m,); -1 for others, and where there is none."""
+    rows = np.flatnonzero(diagram.neighbours < 0)
+    edge = -1 - diagram.neighbours[rows]
+    begin, end = face_ends(diagram)[rows].T.astype(np.int64)
+    # Edges may be too short for a face.
+    used = np.unique(edge)
+    ring = np.searchsorted(domain.ring_starts, used, side="right")
+    starts = np.flatnonzero(np.diff(ring, prepend=-1))
+    after = np.roll(used, -1)
+    after[np.append(starts[1:], len(used)) - 1] = used[starts]
+    onward = np.zeros(len(domain.vertices), np.int64)
+    onward[used] = after
+    keys = edge * len(diagram.vertices) + begin
+    order = np.argsort(keys, kind="stable")
+    following = np.full(len(diagram.neighbours), -1)
+    for on in (onward[edge], edge):
+        wanted = on * len(diagram.vertices) + end
+        places = order[np.minimum(np.searchsorted(keys[order], wanted), len(rows) - 1)]
+        found = keys[places] == wanted
+        following[rows[found]] = rows[places[found]]
+    return following
+
+
+def _beginnings(
+    domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray
+) -> list[int]:
+    """Return the faces on the boundary with which a cell's part of a ring begins; none where that is a whole hole."""
+    rows = np.flatnonzero(edges >= 0)
+    goes_on = rows[following[rows] >= 0]
+    before = np.full(len(edges), -1)
+    before[following[goes_on]] = goes_on
+    begins = rows[(before[rows] < 0) | (owner[before[rows]] != owner[rows])]
+    ring = np.searchsorted(domain.ring_starts, edges, side="right") - 1
+    divided = np.zeros(len(domain.sharpest), bool)
+    divided[ring[begins]] = True
+    is_outer = np.diff(domain.piece_of_ring, prepend=-1) > 0
+    # Of those that are all one cell's the first faces of edges, the nearest behind the sharpest corner.
+    firsts = rows[(edges[before[rows]] != edges[rows]) & (is_outer & ~divided)[ring[rows]]]
+    size = np.diff(domain.ring_starts)[ring[firsts]]
+    away = (edges[firsts] - domain.sharpest[ring[firsts]]) % size
+    order = np.lexsort((away, ring[firsts]))
+    nearest = np.diff(ring[firsts[order]], prepend=-1) > 0
+    return [*begins.tolist(), *firsts[order][nearest].tolist()]

@@ -34,6 +34,27 @@ class Region(Domain):
         return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
 
     @cached_property
+    def turns(self) -> np.ndarray:
+        """How far the boundary turns to the left in each vertex, -pi to pi, (k,)."""
+        ahead = self.vertices[self.next_vertex] - self.vertices
+        ahead /= np.hypot(*ahead.T)[:, None]
+        after = ahead[self.next_vertex]
+        found = np.empty(len(ahead))
+        found[self.next_vertex] = np.arctan2(
+            ahead[:, 0] * after[:, 1] - ahead[:, 1] * after[:, 0], (ahead * after).sum(axis=1)
+        )
+        return found
+
+    @cached_property
+    def sharpest(self) -> np.ndarray:
+        """The vertex of each ring in which it turns farthest, the first but for roundings, (r,) int."""
+        found = []
+        for a, b in pairwise(self.ring_starts.tolist()):
+            by = np.abs(self.turns[a:b])
+            found.append(a + int(np.argmax(by >= (1 - 1e-9) * by.max())))
+        return np.array(found)
+
+    @cached_property
     def pieces(self) -> list[Any]:
         """Each piece as a shapely Polygon."""
         found = []

@@ -172,11 +172,16 @@ class Trim:
             centroids, convex.volumes, outlines,
         )  # fmt: skip
         place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
-        engine.run_each(k.name_places, u, chords.list_starts, place_cells)
+        chord_owners = room("chord_owners", size=chords.count, dtype=np.int32)
         engine.run_each(
-            k.write_trimmed, u, *segments, convex.points, *owners, orphans, np.int32(orphan_count),
-            place_cells, starts, neighbours, measures, centroids, face_segments, convex.volumes,
-            convex.offsets, convex.covariances, outlines, chords.tangents,
+            k.name_owners, u, *segments, chords.list_starts, chords.listed, roots, place_cells,
+            chord_owners,
+        )  # fmt: skip
+        engine.run_each(
+            k.write_trimmed, u, *segments, *chords.arrays, chord_owners, *chords.turns,
+            convex.points, *owners, orphans, np.int32(orphan_count), place_cells, starts, neighbours,
+            measures, centroids, face_segments, convex.volumes, convex.offsets, convex.covariances,
+            outlines,
         )  # fmt: skip
         return Tessellation(
             n=n,

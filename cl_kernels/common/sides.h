@@ -1,37 +1,46 @@
+#include "common/boundary.h"
 #include "common/outline.h"
 
 /* The outline of a cell, side by side: a face between cells is one, and so is each stretch of the boundary along which
    it turns by no more than 30 degrees. A stretch counts as if it were straight, from its first end to its last, with
-   the area that the cell then has: as a polygon of so many sides. How many neighbours a hexagonal lattice would have at
-   the boundary: 6 - sum of 2 + turning / 60 degrees over its runs. */
+   the area that the cell then has: as a polygon of so many sides.
+
+   A run is what one cell has of a ring without a break, in however many pieces it came to the cell: chord by chord, as
+   the ring goes on. Its first stretch begins where it begins; of a ring that is all one cell's, in its sharpest corner.
+   A hole that is all within a cell is no side of it. How many neighbours a hexagonal lattice would have at the
+   boundary: 6 - sum of 2 + turning / 60 degrees over the runs. */
 typedef struct {
-    REAL2 ahead;                         /* along the chord before, 0 at the start of a run */
-    REAL2 begin, end;                    /* of the stretch at hand */
-    REAL2 first, first_end, first_ahead; /* of a piece's first stretch: where it begins and ends, its direction */
-    REAL turned, sides, missing;
+    REAL sides, missing;
     REAL perimeter, area; /* twice the area */
-    bool begun, open;     /* is the first stretch at an end; is there anything else than boundary? */
 } outline_t;
 
-#define SIDE_TURN R(0.5235987755982988)
+/* 30 degrees and a little more, which no part of a regular ring turns by: an arc of 2 x 15 degrees is one side, however
+   its sum rounds. The host adds up the same numbers in the same order (outlines.py). */
+#define SIDE_TURN R(0.524110102527594)
+
+/* The boundary as the cells of a trimmed diagram have it.
+
+   owners[chord]  the generator whose cell it bounds, -1 for those without length, which are passed over
+   before[e]      the edge before edge e in its ring; -1 - that where e begins in the ring's sharpest corner
+   turns[e]       how far the boundary turns to the left where edge e begins */
+typedef struct {
+    chords_t c;
+    global const int *owners, *before;
+    global const REAL *turns;
+} shore_t;
+
+#define SHORE_ARGS CHORD_ARGS, global const int *chord_owners, global const int *edges_before, global const REAL *turns
+#define SHORE                                                                                                          \
+    {                                                                                                                  \
+        CHORDS, chord_owners, edges_before, turns                                                                      \
+    }
 
 inline outline_t no_outline(void)
 {
-    outline_t o = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, false, false};
+    outline_t o = {0, 0, 0, 0};
     return o;
 }
 
-inline REAL turn_from_to(REAL2 a, REAL2 b)
-{
-    return atan2(a.s0 * b.s1 - a.s1 * b.s0, dot(a, b));
-}
-
-inline bool goes_along(const outline_t *o)
-{
-    return o->ahead.s0 != 0 || o->ahead.s1 != 0;
-}
-
-/* A piece of the outline that is straight, or of an island's, which is no side. */
 inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
 {
     const REAL2 e = q - p;
@@ -39,69 +48,75 @@ inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
     o->area += difference_of_products(p.s0, q.s1, p.s1, q.s0);
 }
 
-/* The stretch at hand, if there is one, ends. */
-inline void end_stretch(outline_t *o)
-{
-    if (!goes_along(o))
-        return;
-    add_straight(o, o->begin, o->end);
-    if (!o->begun)
-        o->first_end = o->end;
-    o->begun = true;
-}
-
 /* A face between cells. */
 inline void add_face(outline_t *o, REAL2 p, REAL2 q)
 {
-    end_stretch(o);
-    o->open = true;
-    o->ahead = 0;
     o->sides += 1;
     add_straight(o, p, q);
 }
 
-/* A chord of the boundary with the direction `ahead`. */
-inline void add_chord(outline_t *o, REAL2 p, REAL2 q, REAL2 ahead)
+/* The next chord that has a length; the boundary turns on the way there. */
+inline int chord_past(const shore_t *s, int chord, REAL *turned)
 {
-    const bool goes_on = goes_along(o);
-    const REAL turn = goes_on ? turn_from_to(o->ahead, ahead) : 0;
-    o->turned = goes_on ? o->turned + turn : 0;
-    if (!goes_on || fabs(o->turned) > SIDE_TURN) {
-        end_stretch(o);
-        if (!goes_on && !o->begun && !o->open) {
-            o->first = p;
-            o->first_ahead = ahead;
+    do {
+        chord = chord_after(&s->c, chord);
+        if (begins_inside(&s->c, chord))
+            *turned += s->turns[s->c.edges[chord]];
+    } while (s->owners[chord] < 0);
+    return chord;
+}
+
+/* Are all chords of the ring generator i's? */
+inline bool is_ring(const shore_t *s, int chord, int i)
+{
+    REAL turned = 0;
+    int other = chord;
+    do
+        other = chord_past(s, other, &turned);
+    while (other != chord && s->owners[other] == i);
+    return other == chord;
+}
+
+/* Does a run of generator i begin with the chord? */
+inline bool begins_run(const shore_t *s, int chord, int i)
+{
+    bool sharpest = false;
+    int other = chord;
+    do {
+        if (begins_inside(&s->c, other)) {
+            const int edge = s->before[s->c.edges[other]];
+            sharpest |= edge < 0;
+            other = s->c.firsts[(edge < 0 ? -1 - edge : edge) + 1];
         }
-        o->sides += 1;
-        o->turned = 0;
-        o->begin = p;
-    }
-    o->end = q;
-    o->missing += (goes_on ? 0 : 2) + turn / R(1.0471975511965976);
-    o->ahead = ahead;
+        --other;
+    } while (s->owners[other] < 0);
+    return s->owners[other] != i || (sharpest && is_ring(s, chord, i));
 }
 
-/* A segment between two pieces of the cell: a run that ends there goes on in the other piece, straight on. Its stretch
-   does not: both parts, not known to each other, may turn. */
-inline void join_runs(outline_t *o)
+/* The run of generator i, at x, that begins with `first`. */
+inline void add_run(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
 {
-    end_stretch(o);
-    o->open = true;
-    o->missing -= 2 * goes_along(o);
-    o->ahead = 0;
-}
-
-/* A piece is complete. If it is boundary all around it may be back on the stretch with which it began. */
-inline void end_piece(outline_t *o)
-{
-    const REAL2 p = o->begin, q = o->first, r = o->first_end;
-    const bool around = !o->open && o->begun;
-    end_stretch(o);
-    if (around && fabs(o->turned + turn_from_to(o->ahead, o->first_ahead)) <= SIDE_TURN) {
-        o->sides -= 1;
-        o->perimeter += sqrt(dot(r - p, r - p)) - sqrt(dot(q - p, q - p)) - sqrt(dot(r - q, r - q));
-        o->area -= difference_of_products(q.s0 - p.s0, r.s1 - p.s1, q.s1 - p.s1, r.s0 - p.s0);
+    const bool is_hole = s->c.shells[s->c.edges[first]] >= 0 && is_ring(s, first, i);
+    REAL2 begin = chord_begin(&s->c, first) - x;
+    REAL turned = 0;
+    bool goes_on = true;
+    o->sides += !is_hole;
+    o->missing += is_hole ? 0 : 2;
+    for (int chord = first; goes_on;) {
+        REAL sum = turned;
+        const int next = chord_past(s, chord, &sum);
+        const REAL2 end = chord_end(&s->c, chord) - x;
+        const bool turns = fabs(sum) > SIDE_TURN;
+        goes_on = next != first && s->owners[next] == i;
+        if (!goes_on || turns || is_hole) {
+            add_straight(o, begin, end);
+            begin = end;
+        }
+        if (goes_on && !is_hole) {
+            o->sides += turns;
+            o->missing += (sum - turned) / R(1.0471975511965976);
+        }
+        turned = turns ? 0 : sum;
+        chord = next;
     }
-    o->ahead = 0;
-    o->begun = o->open = false;
 }
