@@ -75,9 +75,7 @@ kernel void average_strain(const int size, global const int *starts, global cons
         sum += other * other.s3;
         weight += other.s3;
     }
-    sum = weight > 0 ? sum / weight : (float4)(1, 0, 1, 0);
-    sum.s3 = weight;
-    mean[i] = sum;
+    mean[i] = (float4)(weight > 0 ? sum.s012 / weight : (float3)(1, 0, 1), weight);
 }
 
 /* Per cell i of negative charge: the pull s = b.S.b - t.S.t on its pair with the neighbour of positive charge where |s|
@@ -312,7 +310,7 @@ kernel void score_flaws(const int size, global const int *starts, global const i
     bool site = odd || own > flaw;
     for (int k = starts[i]; k < starts[i + 1] && site; ++k)
         site = neighbours[k] >= 0;
-    keys[i] = site ? site_key(odd ? 1 + own : own, i) : 0;
+    keys[i] = site ? site_key(odd + own, i) : 0;
 }
 
 /* Per chosen site: split a cell of at least `split_from` sides, delete any other. */

@@ -100,10 +100,10 @@ kernel void next_margins(const int size, global const float *needed, const int4 
     const int a = k / (2 * per_seam), seam = k / per_seam, along = k % per_seam;
     const int first = DIM == 2 ? along : along / BLOCKS, second = DIM == 2 ? 0 : along % BLOCKS;
     const int b = FIRST_ALONG(a), c = DIM == 2 ? b : SECOND_ALONG(a), earlier[4] = {was.s0, was.s1, was.s2, was.s3};
-    const int count_b = count_along(&blocks, b), count_c = DIM == 2 ? 1 : count_along(&blocks, c);
+    const int count_b = count_along(&blocks, b), count_c = count_along(&blocks, c);
     const REAL period = PERIOD_ALONG(a);
     wishes[k] = 0;
-    if ((first >= count_b) | (second >= count_c)) {
+    if ((first >= count_b) | (second >= count_c) | !(period > 0)) {
         margins[k] = 0;
         return;
     }
@@ -125,10 +125,8 @@ kernel void next_margins(const int size, global const float *needed, const int4 
     if (margin > 0.99f * (float)period)
         margin = WHOLE_PERIOD; /* at least as deep as any image, whatever rounds */
     margins[k] = margin;
-    if (period > 0) {
-        atomic_max(extremes + a, as_int(margin));
-        atomic_max(extremes + EXTREMES_LEAST + seam, as_int(WHOLE_PERIOD) - as_int(margin));
-    }
+    atomic_max(extremes + a, as_int(margin));
+    atomic_max(extremes + EXTREMES_LEAST + seam, as_int(WHOLE_PERIOD) - as_int(margin));
 }
 
 /* Per generator i: how many images it has. */

@@ -157,7 +157,7 @@ class PopulationControl:
         rows, next_label, fixed
             As for `reorganise`.
         flaw : float
-            1 - Q from which on a cell is mended.
+            1 - Q above which a cell is mended.
         split : bool
             Split cells of six sides; else they are deleted. Those of more are split, those of fewer deleted.
         share : float
