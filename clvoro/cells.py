@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -16,14 +15,14 @@ from ._program import Engine
 from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
-from .errors import ClvoroError, InputError, MemoryLimitError
+from .errors import ClvoroError, MemoryLimitError
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 from .tessellation import (
-    COINCIDE,
     DOUBT,
     EXACT_SHARE,
     FULL,
     ROUGH_SHARE,
+    CloseError,
     Tessellation,
     restored,
 )
@@ -147,7 +146,7 @@ class Cells:
         Raises
         ------
         InputError
-            If two generators coincide or are too close for the precision; names the first.
+            If two generators coincide or are too close for the precision (`CloseError`).
         MemoryLimitError
             If the rows of faces are too many for 32-bit indices.
         ClvoroError
@@ -165,11 +164,11 @@ class Cells:
                 flags, generator, m = self._clip(rows, box, points, total, n, binned, exact)
                 if not flags & CROWDED:
                     if flags & ~DOUBT:
-                        self._refuse(flags, generator)
+                        raise CloseError(points, total, generator)
                     old = rows.places, rows.places
                     t, flags, generator = self._measure(rows, box, points, n, *old, m, flags, exact)
                     if t is None:
-                        self._refuse(flags, generator)
+                        raise CloseError(points, total, generator)
                     return t
                 # All anew: as many as have been asked for by now, and more by those that were not yet.
                 spare = 2 * (int(rows.flags.get()[4]) - n)
@@ -365,10 +364,3 @@ class Cells:
             )
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
         self._enlarged_for = n
-
-    def _refuse(self, flags: int, generator: int) -> NoReturn:
-        what = "coincides with another" if flags & COINCIDE else "is too close to others"
-        raise InputError(
-            f"generator {generator} {what} in {self.engine.real}; expected distinct generators: "
-            "remove duplicates (numpy.unique(points, axis=0)) or use dtype='float64'"
-        )

@@ -16,15 +16,15 @@ from ._program import Engine
 from ._workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .domain import ClipBox
-from .errors import ClvoroError, InputError, MemoryLimitError
+from .errors import ClvoroError, MemoryLimitError
 from .margins import seam_defines
 from .tessellation import (
-    COINCIDE,
     DOUBT,
     EXACT_SHARE,
     FULL,
     NARROW,
     ROUGH_SHARE,
+    CloseError,
     Tessellation,
     restored,
 )
@@ -149,7 +149,7 @@ class Polyhedra:
         Raises
         ------
         InputError
-            If two generators coincide or are too close for the precision; names the first.
+            If two generators coincide or are too close for the precision (`CloseError`).
         MemoryLimitError
             If the faces are too many for 32-bit indices.
         ClvoroError
@@ -201,7 +201,7 @@ class Polyhedra:
             )  # fmt: skip
             flags, generator, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | DOUBT | NARROW):
-                self._refuse(flags, generator)
+                raise CloseError(points, n, generator)
             if m > self._room:
                 # All anew: what did not fit was not kept. With the radii from before, as the last bits depend on them,
                 # and should not on how much room there was.
@@ -232,7 +232,7 @@ class Polyhedra:
         )  # fmt: skip
         flags, generator, _ = (int(v) for v in self._report.get())
         if flags & ~(DOUBT | NARROW):
-            self._refuse(flags, generator)
+            raise CloseError(points, n, generator)
         self._scan.exclusive(starts, starts, rows)
         faces, cells["starts"] = self._faces(m), self._of_cells["starts"][: rows + 1]
         engine.run_each(
@@ -257,10 +257,3 @@ class Polyhedra:
         self._scan.exclusive(starts, starts, cubes)
         engine.run_each(k.order_places, cubes, *bins, starts, order, group=1)
         return order
-
-    def _refuse(self, flags: int, generator: int) -> None:
-        what = "coincides with another" if flags & COINCIDE else "is too close to others"
-        raise InputError(
-            f"generator {generator} {what} in {self.engine.real}; expected distinct generators: "
-            "remove duplicates (numpy.unique(points, axis=0)) or use dtype='float64'"
-        )

@@ -5,19 +5,70 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pyopencl.array as cla
+
+from .errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-
+    from .domain import Domain
     from .trim import Trimmed
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
-# FULL and COINCIDE are bits of common/face_rows.h, whose other one means cells that collapsed.
-FULL, COINCIDE, DOUBT, NARROW = 1, 2, 8, 16
+# Bits of common/face_rows.h; its others mean generators that coincide, and cells that collapsed.
+FULL, DOUBT, NARROW = 1, 8, 16
+NEAR = 16
+"""Generators around a cell that is none, of which two are too close: its neighbours and some."""
+
+
+class CloseError(InputError):
+    """Generators cannot be told apart; stages know them by their order alone, and by places of the device.
+
+    Parameters
+    ----------
+    points : (n or more, d) real, on the device
+        In its coordinates.
+    n, generator : int
+        How many there are, and one whose cell has shown it: those that are too close may be beside it.
+
+    Attributes
+    ----------
+    place : (d,) float
+        Of one of the two closest generators there.
+    gap : float
+        From that to the other.
+    """
+
+    def __init__(self, points: cla.Array, n: int, generator: int) -> None:
+        x = points.get()[:n].astype(np.float64)
+        near = x[np.argsort(((x - x[generator]) ** 2).sum(axis=1), kind="stable")[:NEAR]]
+        apart = np.sqrt(((near[:, None] - near) ** 2).sum(axis=2))
+        np.fill_diagonal(apart, np.inf)
+        first = apart.min(axis=1).argmin()
+        self.place, self.gap, self.real = near[first], float(apart[first].min()), points.dtype
+        super().__init__(self._text(self.place, self.gap))
+
+    def _text(self, place: np.ndarray, gap: float) -> str:
+        what = "coincide" if gap == 0 else "are too close to each other"
+        other = "" if self.real == np.float64 else ", or use dtype='float64'"
+        return (
+            f"generators at {place}, {gap:.3g} apart, {what} in {self.real}, expected some roundings between them; "
+            f"remove one or move it{other}"
+        )
+
+    def within(self, domain: Domain) -> InputError:
+        """Return what to tell the caller, in his units."""
+        return InputError(self._text(whereabouts(domain, self.place), self.gap * domain.frame[1]))
+
+
+def whereabouts(domain: Domain, place: np.ndarray) -> np.ndarray:
+    """Return the position in `domain` of a place (d,) in the device's coordinates, which may be that of an image."""
+    origin, scale = domain.frame
+    x, lower = origin + scale * place, np.array(domain.lower)
+    return np.where(domain.periodic, lower + (x - lower) % domain.extent, x)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 import numpy as np
 import pyopencl.array as cla
@@ -13,7 +14,7 @@ from .polygon import Polygon
 from .polygonal import PolygonTessellator
 from .polyhedra import Polyhedra
 from .stages import Stages, tessellate_box
-from .tessellation import Tessellation
+from .tessellation import CloseError, Tessellation
 from .torus import Torus, Unfolded
 
 
@@ -59,7 +60,8 @@ class Tessellator:
     def make_whole(self, points: cla.Array, n: int) -> Tessellation:
         """Tessellate a periodic box anew, so that it is."""
         assert self.torus is not None
-        return self.torus.tessellate(points, n, whole=True)
+        with self._in_units():
+            return self.torus.tessellate(points, n, whole=True)
 
     def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
         """Return `t`, the latest diagram, which `is_whole`, with what is known of faces in full precision.
@@ -112,8 +114,17 @@ class Tessellator:
         InputError
             If generators are too close to each other to be told apart.
         """
-        if self.torus is not None:
-            return self.torus.tessellate(points, n, previous, exact, not exact, whole=exact)
-        if self._polygon is not None:
-            return self._polygon.tessellate(points, n, previous, exact, binned)
-        return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned)
+        with self._in_units():
+            if self.torus is not None:
+                return self.torus.tessellate(points, n, previous, exact, not exact, whole=exact)
+            if self._polygon is not None:
+                return self._polygon.tessellate(points, n, previous, exact, binned)
+            return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned)
+
+    @contextmanager
+    def _in_units(self) -> Iterator[None]:
+        """Tell of generators that are too close where they are in the domain."""
+        try:
+            yield
+        except CloseError as error:
+            raise error.within(self.domain) from None

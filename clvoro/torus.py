@@ -14,7 +14,7 @@ from .errors import InputError
 from .margins import Margins
 from .polyhedra import Polyhedra
 from .seam import COLLAPSED, FAR, ExtendedBox, Folded, Images
-from .tessellation import EXACT_SHARE, ROUGH_SHARE, Tessellation
+from .tessellation import EXACT_SHARE, ROUGH_SHARE, CloseError, Tessellation, whereabouts
 
 if TYPE_CHECKING:
     from .stages import Stages
@@ -126,15 +126,13 @@ class Torus:
             # Room for what is made anew.
             del images, binned, args, t, folded
         if flags & COLLAPSED:
-            raise InputError(
-                f"generator {generator} is too close to others in {stages.engine.real}; expected distinct generators: "
-                "remove duplicates (numpy.unique(points, axis=0)) or use dtype='float64'"
-            )
+            raise CloseError(points, n, generator)
         if flags & FAR:
+            place = whereabouts(self.domain, points[generator].get())
             raise FewCellsError(
-                f"generator {generator} of {n} has a neighbour half a period away or farther, expected at least four "
-                f"or five cells across each period of {self.domain}; use a smaller size, more cells (n_cells) or "
-                "fewer levels"
+                f"the generator at {place}, one of {n}, has a neighbour half a period away or farther, expected at "
+                f"least four or five cells across each period of {self.domain}; use a smaller size, more cells "
+                "(n_cells) or fewer levels"
             )
         self.latest = Unfolded(images, t, folded) if whole else None
         return folded.tessellation
