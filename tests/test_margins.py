@@ -188,35 +188,42 @@ def test_blocks_are_twice_as_many_as_cells():
     assert (block_counts(np.array([1.0, 1.0, 0.0]), 100)[:2] == BLOCKS[3]).all()
 
 
-@pytest.mark.parametrize(("before", "after"), [(600, 5000), (5000, 600), (5000, 40_000)])
-def test_margins_of_other_blocks(adapter, before, after):
-    """Where blocks are others than before, margins are those of all that lie within their own depth."""
-    box, rng = BOXES[3], np.random.default_rng(2208)
+@pytest.mark.parametrize(
+    ("dim", "before", "after"),
+    [(2, 600, 900), (3, 600, 5000), (3, 5000, 600), (3, 5000, 40_000), (3, 40_000, 5000)],
+)
+def test_margins_of_other_blocks(adapter, dim, before, after):
+    """Where blocks or cells are others than before, margins are those of all that lie within their own depth."""
+    box, rng = BOXES[dim], np.random.default_rng(2208)
     stages = adapter._stages_for(box)
     margins, periods = Margins(stages.engine), box.periods(adapter.dtype)
-    was, counts = (block_counts(periods, n)[:3] for n in (before, after))
-    assert (was != counts).any()
-    old = np.zeros((3, 2, BLOCKS[3], BLOCKS[3]), np.float32)
-    for axis in range(3):
-        along = [was[a] for a in range(3) if a != axis]
-        old[axis, :, : along[0], : along[1]] = 0.02 * (1 + rng.random((2, *along)))
+    was, counts = (block_counts(periods, n)[:dim] for n in (before, after))
+    assert dim == 2 or (was != counts).any()
+    old = np.zeros((dim, 2, *(BLOCKS[dim],) * (dim - 1)), np.float32)
+    for axis in range(dim):
+        along = tuple(slice(was[a]) for a in range(dim) if a != axis)
+        shape = [2, *(k.stop for k in along)]
+        old[(axis, slice(None), *along)] = 0.02 * (1 + rng.random(shape))
     margins.needed.set(old.ravel())
     margins.cells = before
-    factor = (before / after) ** (1 / 3)
-    points = np.array(box.lower) + box.extent * rng.random((after, 3))
+    factor = (before / after) ** (1 / dim)
+    points = np.array(box.lower) + box.extent * rng.random((after, dim))
     x = stages.engine.upload(box.place(points, adapter.dtype))
     stages.seam.extend(box, x, after, margins, factor, False)
-    found = blocks_of(margins.widths, 3, counts)
-    for axis, end in itertools.product(range(3), (0, 1)):
-        b, c = (a for a in range(3) if a != axis)
-        gaps = []
-        for a in (b, c):
+    found = blocks_of(margins.widths, dim, counts)
+    for axis, end in itertools.product(range(dim), (0, 1)):
+        across = [a for a in range(dim) if a != axis]
+        depths = factor * old[(axis, end, *(slice(was[a]) for a in across))]
+        # Of each new block from each old one: how far they are apart along either axis, squared and added.
+        apart2 = np.zeros(())
+        for a in across:
             one, other = (periods[a] / k[a] for k in (counts, was))
             middles = one * (np.arange(counts[a]) + 0.5), other * (np.arange(was[a]) + 0.5)
-            apart = np.abs(middles[0][:, None] - middles[1]) - abs(one - other) / 2
-            gaps.append(np.maximum(apart, 0))
-        depths = factor * old[axis, end, : was[b], : was[c]]
-        apart2 = gaps[0][:, None, :, None] ** 2 + gaps[1][None, :, None, :] ** 2
-        expected = np.where(apart2 < depths**2, depths, 0).max(axis=(2, 3))
+            gaps = np.abs(middles[0][:, None] - middles[1]) - abs(one - other) / 2
+            apart2 = np.add.outer(apart2, np.maximum(gaps, 0) ** 2)
+        if dim == 3:
+            apart2 = apart2.transpose(0, 2, 1, 3)
+        nearby = np.where(apart2 < depths**2, depths, 0)
+        expected = nearby.reshape(*found[axis, end].shape, -1).max(axis=-1)
         # Rounding may decide whether a block is as near as its margin is deep: random depths are not that near.
         assert np.abs(found[axis, end] - expected).max() < 1e-6

@@ -190,11 +190,19 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
     run = Engine.run_each
 
     def watched(self, kernel, size, *args, **kwargs):
+        name = kernel.function_name
+        if name == "wrap_marked":
+            args[3].fill(-7)
+            args[4].fill(-7)
         event = run(self, kernel, size, *args, **kwargs)
-        if kernel.function_name == "wrap_marked":
-            count, listed, slots, counts = args[0], args[1], args[3], args[4]
-            found.append((listed.get()[:count], counts.get()[:count], slots.get()))
-        elif kernel.function_name == "clip_marked":
+        if name == "wrap_marked":
+            count, listed, slots, counts = args[0], args[1].get(), args[3].get(), args[4].get()
+            found.append((listed[:count], counts[:count], slots))
+            # Lanes beyond the last cell leave everything alone.
+            assert count % 8
+            assert (counts[count:] == -7).all()
+            assert (slots[SLOT * count :] == -7).all()
+        elif name == "clip_marked":
             rounds.append(size)
         return event
 
@@ -427,7 +435,15 @@ def test_onto_a_lattice(engine, name, monkeypatch):
     rng = np.random.default_rng(40975)
     eps, there = float(np.finfo(engine.real).eps), POINTS[name].astype(engine.real)
     points = there + (0.02 * spacing(there) * (rng.random(there.shape) - 0.5)).astype(engine.real)
-    carried, times = Carried(engine, points), 0
+    carried, times, run, certain = Carried(engine, points), 0, Engine.run_each, []
+
+    def watched(self, kernel, size, *args, **kwargs):
+        event = run(self, kernel, size, *args, **kwargs)
+        if kernel.function_name == "wrap_marked":
+            certain.append((args[4].get()[: args[0]] > 0).mean())
+        return event
+
+    monkeypatch.setattr(Engine, "run_each", watched)
     for noise in (0, 1, 4, 0):
         points = (there + noise * eps * (rng.random(there.shape) - 0.5)).astype(engine.real)
         t, was = carried.move(points)
@@ -439,7 +455,11 @@ def test_onto_a_lattice(engine, name, monkeypatch):
             known = set(zip(b.owners.tolist(), b.neighbours.tolist(), strict=True))
             faces = zip(a.owners.tolist(), a.neighbours.tolist(), a.face_measures, strict=True)
             assert all(length < 256 * eps for i, j, length in faces if (i, j) not in known)
+        if was:
+            assert not ((carried.repair._fits.get() == 1) & ~fitting(t)).any()
     assert times == 4
+    if name == "lattice" and certain:
+        assert max(certain) == 0
 
 
 def test_far_jump(engine):

@@ -26,6 +26,11 @@ def adapter(ctx, request):
     return clvoro.Adapter(ctx, request.param)
 
 
+def bits(x):
+    """Return a float's bits, as a number."""
+    return int(np.float32(x).view(np.int32))
+
+
 class Given:
     """Generators of a box, some on walls and seams, with their images within random margins; or as deep as these."""
 
@@ -77,6 +82,12 @@ class Given:
                 return False
         return True
 
+    def wide_of(self, axis, end):
+        """Return the margins of the blocks of a seam."""
+        along = [self.counts[a] for a in range(self.dim) if a != axis]
+        whole = self.wide[axis, end].reshape((BLOCKS[self.dim],) * len(along))
+        return whole[tuple(slice(k) for k in along)]
+
     def expected(self):
         """Return owners, codes and places of all images, in the order of owners and codes."""
         found = []
@@ -102,6 +113,19 @@ def test_images_are_those_within_the_margins(adapter, name):
     ]
     points = images.points.get()[: images.count]
     assert np.array_equal(points, np.concatenate([given.points, [p for *_, p in expected]]))
+    # Extremes are those of the blocks that there are.
+    extremes = given.margins.extremes.get()
+    used = [given.wide_of(a, end) for a in range(given.dim) for end in (0, 1)]
+    walls = np.repeat(given.periods == 0, 2)
+    widest = [0 if wall else wide.max() for wall, wide in zip(walls, used, strict=True)]
+    assert np.array_equal(
+        extremes[: given.dim].view(np.float32), np.maximum(widest[::2], widest[1::2])
+    )
+    least = [
+        0 if wall else bits(WHOLE) - bits(wide.min())
+        for wall, wide in zip(walls, used, strict=True)
+    ]
+    assert np.array_equal(extremes[4 : 4 + 2 * given.dim], least)
     firsts = np.searchsorted([i for i, *_ in expected], np.arange(61))
     assert np.array_equal(images.firsts.get(), firsts)
 

@@ -97,7 +97,8 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
     long written[LANES], sizes[LANES];
     vstore8(lanes & ~doubt, 0, written);
     vstore8(hull.sizes, 0, sizes);
-    for (int lane = 0; lane < LANES && first + lane < size; ++lane) {
+    const int end = min(size - first, LANES);
+    for (int lane = 0; lane < end; ++lane) {
         const int w = first + lane, count = written[lane] ? (int)sizes[lane] : 0;
         int labels[HULL_CAPACITY];
         for (int k = 0; k < count; ++k)

@@ -83,8 +83,9 @@ inline int check_eight(int first, int size, global const int *starts, global con
     vstore8(bad, 0, bits);
     vstore8(turns, 0, turned);
     vstore8(least2 < sqrt(DBL_EPSILON) * reach2, 0, close);
+    const int given = min(size - first, LANES);
     int found = 0;
-    for (int lane = 0; lane < LANES && first + lane < size; ++lane) {
+    for (int lane = 0; lane < given; ++lane) {
         const int i = first + lane, n = counts[lane];
         global const int *row = neighbours + starts[i];
         const bool fit = n > 0 && !walled[lane] && (fits[i] || fits_exactly(i, row, n, starts, neighbours));
