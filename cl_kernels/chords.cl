@@ -7,15 +7,28 @@
 
 #define FLAG_OUTSIDE 2 /* the cell of a generator outside the domain, an auxiliary one, reaches into it */
 
+#define MOST_STEPS 64 /* among generators that are as near as each other, but for rounding */
+
 inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 {
     const REAL2 d = (REAL2)(points[2 * i], points[2 * i + 1]) - y;
     return dot(d, d);
 }
 
+/* By how much y is on j's side of the bisector of i and j, times their distance; for i and j the same but for the sign.
+   Where they are so near each other that their distances from y differ by less than these round, it is right. */
+inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
+{
+    const int o = min(i, j), q = max(i, j);
+    const REAL2 x = (REAL2)(points[2 * o], points[2 * o + 1]);
+    const REAL2 d = (REAL2)(points[2 * q], points[2 * q + 1]) - x;
+    const REAL s = dot(y - x - d / 2, d);
+    return i == o ? s : -s;
+}
+
 /* Per vertex: the generator in whose cell it lies, the nearest one, from neighbour to neighbour: as long as one is
-   nearer. `inner` are the vertices a few roundings further inside, so that what lies on faces counts to the cells
-   within. */
+   nearer; then, among those as near but for rounding, by the bisectors. `inner` are the vertices a few roundings
+   further inside, so that what lies on faces counts to the cells within. */
 kernel void find_owners(const int size, global const REAL2 *inner, global const int *starts,
                         global const int *neighbours, global const REAL *points, global int *owners)
 {
@@ -34,6 +47,21 @@ kernel void find_owners(const int size, global const REAL2 *inner, global const 
             }
         }
     } while (next != cell);
+    /* Rounding may lead around in a circle. */
+    for (int steps = 0; steps < MOST_STEPS; ++steps) {
+        REAL most = 0;
+        for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
+            const int j = neighbours[k];
+            const REAL s = j >= 0 ? beyond_bisector(y, cell, j, points) : 0;
+            if (s > most) {
+                most = s;
+                next = j;
+            }
+        }
+        if (next == cell)
+            break;
+        cell = next;
+    }
     owners[v] = cell;
 }
 

@@ -113,6 +113,8 @@ def hidden(
     the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
     the domain touch in a point, either side sees both; a generator in that point belongs to one side alone. Likewise
     what is seen from a corner that the boundary goes around may be hidden just beside it.
+
+    Corner k of `corners` is where face k begins.
     """
     at = d.vertices[corners[places]]
     distances = tree.query(at - np.array(domain.lower))[0]
@@ -124,6 +126,14 @@ def hidden(
     part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
     lines = shapely.linestrings(np.stack([at[place] + part[:, None] * way, goal], axis=1))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
+    # Which leads over slits that are no wider: from their sides nothing behind them is seen.
+    before = np.argsort(next_faces(d))
+    for faces in (places, before[places]):
+        edge = np.maximum(-1 - d.neighbours[faces], 0)
+        along = domain.vertices[domain.next_vertex[edge]] - domain.vertices[edge]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
+        away[place[(right > slack) & (d.neighbours[faces] < 0)[place]]] = True
     away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
     # Nor is anything seen through a point, or from one.
     away[place[near_shared_corners(domain, lines, slack)]] = True

@@ -135,8 +135,13 @@ class Rebuilt:
             return
         inner = d.neighbours >= 0
         across = np.where(inner, self.spacings, 0.0)
-        off = np.abs((self.middles * self.directions).sum(axis=1) - across / 2)
-        far = np.linalg.norm(self.middles, axis=1)
+        # By both ends: the middle of an adopted face may lie on the bisector, too.
+        half = np.stack([-self.areas[:, 1], self.areas[:, 0]], axis=1) / 2
+        ends = [self.middles - half, self.middles + half]
+        off = np.max(
+            [np.abs((end * self.directions).sum(axis=1) - across / 2) for end in ends], axis=0
+        )
+        far = np.max([np.linalg.norm(end, axis=1) for end in ends], axis=0)
         # Nearer than that, shares would overflow.
         least = np.maximum(1e-200 * far, np.finfo(float).tiny)
         noise = ADOPTED * self.unit * (1 + far / np.maximum(across, least))
@@ -248,18 +253,20 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _precision(d: Diagram, dtype: object) -> np.dtype:
     """Return the precision in which `d` was made, which cannot be float32 if `dtype` is ``"float64"``.
 
-    float32 shows in generators and volumes, as the device's unit is a power of two.
+    float32 shows in volumes and in generators or lengths, as the device's unit is a power of two.
     """
     origin, scale = d.domain.frame
     volumes = d.volumes / scale**d.domain.dim
     points = (d.points - origin) / scale
-    # The way from the origin and back rounds. Some generators are put on a wall exactly, or back into a polygon: where
-    # a quarter are in float32, all were.
+    lengths = getattr(d, "face_measures", points) / scale ** (d.domain.dim - 1)
+    # The way from the origin and back rounds. Some generators are put on a wall exactly, or back into a polygon, where
+    # all may be: where a quarter are in float32, all were.
     noise = 4 * np.finfo(float).eps * np.maximum(np.abs(np.array(origin)) / scale, 1)
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(points - points.astype(np.float32))
         single = bool((volumes == volumes.astype(np.float32)).all())
-    single &= bool((off <= noise).mean() >= 0.25) and dtype != "float64"
+        told = bool((lengths == lengths.astype(np.float32)).all())
+    single &= (told or bool((off <= noise).mean() >= 0.25)) and dtype != "float64"
     return np.dtype(np.float32 if single else np.float64)
 
 

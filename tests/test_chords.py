@@ -3,10 +3,12 @@
 import numpy as np
 import patch
 import pytest
-from shores import POLYGONS, scattered
+from shores import POLYGONS, UNIT, scattered
 
+import clvoro
 from clvoro.chords import UNTOUCHED, Boundary
 from clvoro.stages import Stages, tessellate_box
+from clvoro.tessellation import CloseError
 
 N = 90
 
@@ -90,3 +92,31 @@ def test_cells_of_generators_outside_are_named(ctx):
     expected = sorted(cell - N for cell in met if cell >= N)
     assert 5 < len(expected) < len(away) - 5
     assert boundary.cut(t, N).tolist() == expected
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_vertices_go_to_the_nearer_of_generators_some_roundings_apart(ctx, real):
+    """Whose distances from there are the same number, but whose bisector passes by far away."""
+    domain = clvoro.Polygon(UNIT)
+    engine = patch.make_engine(ctx, real, box=domain)
+    vertices = domain.place(domain.vertices, engine.real).astype(float)
+    boundary, stages = Boundary(engine, domain), Stages(engine)
+    rng, made = np.random.default_rng(5703), 0
+    for _ in range(40):
+        x = rng.uniform(0.1, 0.9, 2).astype(engine.real)
+        points = np.stack([x, x + rng.integers(1, 4, 2) * (1, -1) * np.spacing(x)])
+        on_device, n = engine.upload(points.astype(engine.real)), len(points)
+        try:
+            t = tessellate_box(stages, domain, on_device, n, None, False)
+        except CloseError:
+            continue
+        made += 1
+        boundary.owners.set(rng.integers(0, n, len(vertices)).astype(np.int32))
+        boundary._known = n
+        owners = boundary.cut(t, n).arrays[2].get()
+        points = points.astype(float)
+        for v, owner in zip(vertices, owners.tolist(), strict=True):
+            # Differences of generators are exact; the longest rounding is that of v - x.
+            beyond = [(v - (points[owner] + p) / 2) @ (p - points[owner]) for p in points]
+            assert max(beyond) <= 4 * np.finfo(real).eps * np.abs(points - points[owner]).max()
+    assert made > 10

@@ -1,0 +1,83 @@
+"""Right diagrams of hard polygons pass the check: what was refused once, and what must be refused still."""
+
+import numpy as np
+import pytest
+from shores import UNIT, scattered, slit
+
+import clvoro
+from clvoro.errors import InputError
+from clvoro.rebuilt import Rebuilt
+from clvoro.results import Diagram
+
+REALS = ("float64", "float32")
+
+
+@pytest.fixture(scope="module")
+def adapters(ctx):
+    return {real: clvoro.Adapter(ctx, real) for real in REALS}
+
+
+@pytest.mark.parametrize("real", REALS)
+def test_faces_of_pieces_that_went_to_other_cells(adapters, real):
+    """Two pieces in a prong come from beside it: their common face is upright, its middle on another bisector."""
+    gaps = [
+        (0.57, 1),
+        (0.57, 0.1),
+        (0.55, 0.1),
+        (0.55, 1),
+        (0.45, 1),
+        (0.45, 0.1),
+        (0.43, 0.1),
+        (0.43, 1),
+    ]
+    domain = clvoro.Polygon([(0, 0), (1, 0), (1, 1), *gaps, (0, 1)])
+    for side in (1, -1):
+        above, below = (0.5 - 0.04 * side, 0.7), (0.5 + 0.04 * side, 0.4)
+        diagram = adapters[real].diagram(domain, [above, below, (0.43, 0.55), (0.57, 0.55)])
+        report = diagram.check()
+        assert report, report
+        begin, end = diagram.vertices[diagram.face_vertices.reshape(-1, 2)].transpose(1, 0, 2)
+        upright = (
+            np.isclose(begin, end)[:, 0]
+            & (diagram.neighbours >= 0)
+            & (diagram.face_measures > 0.01)
+        )
+        middles = np.isclose((begin + end) / 2, (0.5, 0.55)).all(axis=1)
+        assert (upright & middles).sum() == 2
+        assert Rebuilt(diagram).adopted[upright & middles].all()
+
+
+def test_slits_that_are_no_wider_than_some_roundings_hide_what_is_behind_them(adapters):
+    """A corner on one side of a slit, and a generator on its other side that is nearer than the cell's own."""
+    checked = 0
+    for width in (2.5e-7, 1e-6):
+        for seed in range(12):
+            domain = clvoro.Polygon(slit(width))
+            try:
+                diagram = adapters["float32"].diagram(domain, scattered(domain, 20, seed))
+            except InputError:  # the sides are in the same place
+                continue
+            report = diagram.check()
+            assert report, report
+            checked += 1
+    assert checked > 15
+    # And what is not hidden is found: two generators beside the slit, exchanged.
+    domain = clvoro.Polygon(slit(1e-6))
+    points = np.array([(0.3, 0.8), (0.7, 0.6), (0.8, 0.9)])
+    diagram = adapters["float32"].diagram(domain, points)
+    arrays = {name: getattr(diagram, name) for name in diagram._arrays}
+    arrays["points"] = arrays["points"][[0, 2, 1]]
+    report = Diagram(domain, arrays).check()
+    assert any("nearest generators" in str(finding) for finding in report.findings)
+
+
+def test_one_generator_on_the_boundary_has_its_precision(adapters):
+    """It is put back into the polygon in float64: lengths show what it was made in."""
+    for angle in (0.1, 0.2, 0.3):
+        turned = UNIT @ np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
+        domain = clvoro.Polygon(turned)
+        for middle in (turned + np.roll(turned, -1, axis=0)) / 2:
+            for real, adapter in adapters.items():
+                report = adapter.diagram(domain, middle[None]).check()
+                assert report, report
+                assert real in str(report)
