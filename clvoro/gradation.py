@@ -65,11 +65,14 @@ class Gradation:
             begin = self._least_awake(awake.get(), lowest.get(), tiles)
             if begin is None:
                 return passes
+            # What is beyond the precision's range is infinite, and bounds nothing.
+            with np.errstate(over="ignore"):
+                growth = engine.real.type(slope)
+                front = [engine.real.type(begin + (1 + k // 2) * rise) for k in range(_PASSES)]
             for k in range(_PASSES):
                 engine.run_each(
-                    kernels.sweep_tiles, n, *nodes, *steps, np.int32(k % 2),
-                    engine.real.type(slope), engine.real.type(begin + (1 + k // 2) * rise), awake,
-                    wake, lowest, values,
+                    kernels.sweep_tiles, n, *nodes, *steps, np.int32(k % 2), growth, front[k],
+                    awake, wake, lowest, values,
                 )  # fmt: skip
                 awake.fill(np.int32(0))
                 awake, wake = wake, awake

@@ -18,6 +18,8 @@ SAMPLING_GAIN = 0.36
 """Error in counting by sizes at generators over that on the next coarser level: measured on a kinked field."""
 WINDOW = 10
 """Steps over which error and quality are watched for progress."""
+COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
+"""Why runs end that have converged."""
 
 
 class Loop:
@@ -75,7 +77,6 @@ class Loop:
         factor on the size field follows; with None the size field decides.
         """
         self.n_cells, self.asked = n_cells, asked
-        converged, reason = False, "plan completed"
         try:
             stop = not self.rows and self.record(0.0)
             if stop and self.checkpoint is not None:
@@ -83,8 +84,9 @@ class Loop:
             done = work_of(self.plan, self.levels, self.mesh.engine.dim, asked)
             ahead = list(zip(self.plan, [*done[1:], 1.0], strict=False))
             for action, progress in ahead[self.position :]:
-                if stop or (self.max_steps is not None and self.steps >= self.max_steps):
-                    reason = "stopped by the callback" if stop else "max_steps reached"
+                # Also where a run that goes on had been stopped just when it would have ended.
+                reason = self.why_ended(stop)
+                if reason:
                     break
                 if isinstance(action, Step):
                     self.step(action)
@@ -99,19 +101,11 @@ class Loop:
                     self.refine()
                 elif isinstance(action, Rest):
                     self.mesh.velocity.fill(0)
-                if not stop and self.stalled():
-                    converged, reason = True, "error and quality no longer improve"
-                    break
                 self.position += 1
                 if self.checkpoint is not None:
                     self.checkpoint.offer(self, stop)
             else:
-                if stop:
-                    reason = "stopped by the callback"
-                elif self.tol is None:
-                    converged = True
-                else:
-                    reason = "max_steps reached"
+                reason = self.why_ended(stop, over=True)
         except KeyboardInterrupt:
             reason = "interrupted"
             self.mesh.update()
@@ -122,7 +116,7 @@ class Loop:
         if self.inserted or self.deleted or not self.rows:
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
-        return self.result(converged, reason, settings)
+        return self.result(reason in (COMPLETED, STALLED), reason, settings)
 
     @property
     def held(self) -> int | None:
@@ -218,7 +212,7 @@ class Loop:
     def record(self, progress: float) -> bool:
         """Append a row to the history; True if the callback wants to stop."""
         self.add_row(progress)
-        return bool(self.callback is not None and self.callback(self.rows[-1][0]))
+        return bool(self.callback is not None and self.callback(self.rows[-1][0].copy()))
 
     def add_row(self, progress: float) -> None:
         """Append a row to the history."""
@@ -238,6 +232,17 @@ class Loop:
             row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
         row["seconds"] = time.perf_counter() - self.began
         self.rows.append(row)
+
+    def why_ended(self, stop: bool, over: bool = False) -> str:
+        """Return why nothing more is done; "" if there is something: `over` says that the plan has no more."""
+        if stop:
+            return "stopped by the callback"
+        if self.stalled():
+            return STALLED
+        if over and self.tol is None:
+            return COMPLETED
+        used_up = self.max_steps is not None and self.steps >= self.max_steps
+        return "max_steps reached" if over or used_up else ""
 
     def stalled(self) -> bool:
         """Tell whether neither mean error nor mean quality has improved by `tol` over the last steps."""

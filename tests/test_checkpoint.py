@@ -15,6 +15,7 @@ import pytest
 import clvoro
 from clvoro import checkpoint, cli, poisson
 from clvoro.errors import InputError
+from clvoro.loop import STALLED
 from clvoro.made_by import identity
 from clvoro.resume import Saved
 
@@ -156,6 +157,17 @@ def test_stopped_before_the_first_step(ctx, tmp_path, kind):
     clvoro.Adapter(ctx).run(box, size, callback=stop_after(0), checkpoint=path, **options)
     resumed = clvoro.Adapter(ctx).run(box, size, resume=path, **options)
     assert_same(resumed, clvoro.Adapter(ctx).run(box, size, **options))
+
+
+def test_stopped_just_where_the_run_would_have_ended(ctx, tmp_path):
+    """By the callback, in the row that ends a run whose error no longer improves: it ends there, resumed, too."""
+    path, options = tmp_path / "state", {"method": "coupled", "tol": 0.5}
+    whole = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
+    assert whole.stop_reason == STALLED
+    rows = len(whole.history) - 1
+    assert rows < 100
+    clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(rows), checkpoint=path, **options)
+    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **options), whole)
 
 
 @pytest.mark.parametrize("before", ["diagram", "failed run"])

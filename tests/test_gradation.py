@@ -151,6 +151,17 @@ def test_graded_values_stay_as_they_are(make_engine):
         assert np.array_equal(limit(engine, values, (1 / (n - 1),) * dim, 0.2), values)
 
 
+@pytest.mark.filterwarnings("error")
+def test_any_growth_leaves_all(make_engine):
+    """Also such as single precision has no number for."""
+    engine, values = make_engine(2), np.random.default_rng(3).uniform(1e-3, 1, 33 * 20)
+    values = values.astype(engine.real)
+    for slope in (1e30, 1e300):
+        u = engine.upload(values)
+        Gradation(engine).sweep_tiles(u, (33, 20), (0.1, 0.05), slope)
+        assert np.array_equal(u.get(), values)
+
+
 def test_no_growth_at_all_leaves_the_least(make_engine):
     engine = make_engine(2)
     values = np.random.default_rng(5).uniform(1, 2, (40, 40))
