@@ -79,10 +79,11 @@ def some_field(rng: np.random.Generator, domain: dict[str, Any], depth: int = 0)
 
 
 def some_run(rng: np.random.Generator, d: int, real: str) -> dict[str, Any]:
-    """Settings of a short run."""
+    """Settings of a run, short or to its end."""
     methods = ["adaptive", "exact", "coupled", "lloyd"]
-    run: dict[str, Any] = {"effort": "fast", "max_steps": int(rng.integers(0, 6)), "seed": int(rng.integers(99)),
-                           "dtype": real}  # fmt: skip
+    run: dict[str, Any] = {"effort": "fast", "seed": int(rng.integers(99)), "dtype": real}
+    if rng.random() < 0.4:
+        run["max_steps"] = int(rng.integers(0, 6))
     if rng.random() < 0.2:
         run["methods"] = ["lloyd", "coupled"]
     else:

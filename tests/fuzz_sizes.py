@@ -42,9 +42,13 @@ def some_size(rng: np.random.Generator, domain: Domain, wild: bool):
 
 
 def fine_size(rng: np.random.Generator, domain: Domain) -> float:
-    """A size of up to three hundred cells, and of six across a period at least."""
+    """A size of up to some hundred cells, most of them with levels below; of six across a period at least.
+
+    Boundaries of polygons bring cells of their own.
+    """
     d = domain.dim
-    h = (domain.measure / 10 ** rng.uniform(0.5, 2.5 if d == 2 else 2.0)) ** (1 / d)
+    most = 2.5 if isinstance(domain, clvoro.Polygon) else 3.1 if d == 2 else 2.7
+    h = (domain.measure / 10 ** rng.uniform(most - 2, most)) ** (1 / d)
     periods = domain.extent[list(domain.periodic)]
     return float(min(h, periods.min(initial=np.inf) / rng.uniform(6.5, 9)))
 
