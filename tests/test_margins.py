@@ -172,10 +172,38 @@ def is_enough(stages, seam: Seam, box, x, n, margins):
     """Whether a diagram within these margins is said to be right."""
     images = seam.extend(box, x, n, margins, 1.0, False)
     binned = stages.bins.build(images.box, images.points, images.count)
-    t = stages.cells.tessellate(
-        images.box, images.points, images.count, binned, None, False, n, images.seams
-    )
+    args = images.box, images.points, images.count, binned
+    if box.dim == 3:
+        t = stages.cells.tessellate(*args, None, False, n, images.seams)
+    else:
+        t = stages.cells.tessellate(*args, False, n)
     return seam.fold(images, binned, t, x, 0.5, True)[1]
+
+
+@pytest.mark.parametrize(("dim", "count"), [(2, 60), (3, 100)])
+def test_numbers_of_generators_do_not_matter(adapter, dim, count):
+    """To margins: whichever of those beside seams is number 0, the one that is most easily forgotten."""
+    box, rng = BOXES[dim], np.random.default_rng(2209)
+    points, real = np.array(box.lower) + box.extent * rng.random((count, dim)), adapter.dtype
+    n, stages = count, adapter._stages_for(box)
+    periods = box.periods(real)
+    counts, noise = block_counts(periods, n)[:dim], NOISE[real.name]
+    place = box.place(points, real).astype(float)
+    whole = np.zeros((dim, 2, *(BLOCKS[dim],) * (dim - 1)), np.float32)
+    for seam, need in needs(place, periods, periods, counts, 0, 0, 2 * noise).items():
+        whole[(*seam, *map(slice, need.shape))] = 1.0001 * need + noise / 10
+    found, beside = [], np.minimum(place, periods - place).min(axis=1).argsort()
+    for first in (n - 1, *beside[:24]):
+        margins, order = Margins(stages.engine), np.arange(n)
+        order[[0, first]] = first, 0
+        margins.needed.set(whole.ravel())
+        margins.cells = n
+        x = stages.engine.upload(box.place(points[order], real))
+        assert is_enough(stages, stages.seam, box, x, n, margins)
+        found.append(margins.needed.get())
+    assert (found[0] > whole.ravel()).mean() > 0.3 * (found[0] > 0).mean()
+    # Vertices round.
+    assert np.abs(found - found[0]).max() < noise
 
 
 def test_blocks_are_twice_as_many_as_cells():
