@@ -112,7 +112,7 @@ kernel void next_margins(const int size, global const float *needed, const int4 
         const float s = block_spacing(first, i, count_b, earlier[b], length_along(&blocks, b));
         for (int j = 0; j < (DIM == 2 ? 1 : earlier[c]); ++j) {
             const float other = needed[block_place(a, seam % 2, i, j)];
-            if (!(other > margin))
+            if (!(other > margin)) /* one as deep changes nothing */
                 continue;
             const float t = DIM == 2 ? 0.0f : block_spacing(second, j, count_c, earlier[c], length_along(&blocks, c));
             if (s * s + t * t < factor * factor * other * other)
