@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from os import fsdecode, fspath
+from os import fsdecode, fsencode, fspath
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -102,6 +102,13 @@ def check_path(name: str, value: object) -> str:
     path = fsdecode(path)
     if "\0" in path:
         raise InputError(f"{name} is {path!r}, expected the name of a file, without zero bytes")
+    try:
+        fsencode(path)
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{name} is {path!r}, expected the name of a file, in characters that the file system knows "
+            f"({error.reason})"
+        ) from None
     return path
 
 

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 
+from .errors import DeviceError
+
 _PROBE = """
 #if PROBE_FP64
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -31,6 +33,25 @@ _PROBE_SIZE = 64
 
 _lock = threading.Lock()
 _verdicts: dict[int, str] = {}
+_process: int | None = None
+"""The process in which OpenCL is at work."""
+
+
+def check_process() -> None:
+    """Refuse a process that was forked from one where OpenCL is at work: without its threads, calls wait for ever.
+
+    Raises
+    ------
+    DeviceError
+    """
+    global _process
+    if _process is None:
+        _process = os.getpid()
+    if _process != os.getpid():
+        raise DeviceError(
+            "this process was forked from one that has used OpenCL, whose threads did not come along; start processes "
+            "anew, as by multiprocessing.get_context('spawn'), or fork before anything of clvoro is used"
+        )
 
 
 def has_fp64(device: cl.Device) -> bool:

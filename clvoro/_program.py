@@ -22,6 +22,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ._device_array import DeviceArray, make_array
+from ._runtimes import cache_remedy
 from ._workspace import Workspace
 from .errors import BuildError
 
@@ -107,6 +108,10 @@ class Kernels(SimpleNamespace):
         try:
             kernel = self._pool.take(self._program, name)
         except cl.LogicError as error:
+            if f"void {name}(" in source_text(f"{self._stage}.cl"):
+                raise BuildError(
+                    f"cl_kernels/{self._stage}.cl was built without its kernel {name}. {cache_remedy()}"
+                ) from error
             raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
         kernel.stage = self._stage  # type: ignore[attr-defined]
         setattr(self, name, kernel)

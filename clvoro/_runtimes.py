@@ -12,18 +12,23 @@ of platforms:
 `OCL_ICD_VENDORS` would *replace* the system's runtimes, and stays the user's.
 
 PoCL lists no device and PyOpenCL's cache of binaries raises if the user's cache folder cannot be
-written (a container under a foreign user id, a cluster's read-only home). The process then gets a
-cache of its own.
+written (a container under a foreign user id, a cluster's read-only home), and PoCL ends the process
+if its disk is full. The process then gets a cache of its own.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import os
 import sys
+import tempfile
 from importlib import metadata
 from pathlib import Path
 
+_ROOM = 1 << 22
+"""Bytes that must be left where kernels are cached: those of a run take two to twenty million."""
 _DISTRIBUTION = "intel-opencl-rt"
 _LIBRARY = "libintelocl.so"
 
@@ -35,25 +40,50 @@ def prepare() -> None:
 
 
 def provide_cache() -> Path | None:
-    """Point `XDG_CACHE_HOME` to a temporary folder if the user's cache folder cannot be written.
+    """Point `XDG_CACHE_HOME` to a temporary folder if the user's cache folder cannot be written, or is full.
 
     Returns
     -------
     pathlib.Path or None
-        The temporary folder, if one was needed. It goes away with this process.
+        The temporary folder, if one was needed and there is a place for it. It goes away with this process.
     """
     if not sys.platform.startswith("linux"):
         return None
-    try:
+    with contextlib.suppress(OSError, RuntimeError):  # no such folder can be made, or nobody's home
         place = _cache_home()
         place.mkdir(parents=True, exist_ok=True)
-        if os.access(place, os.W_OK | os.X_OK):
+        if _has_room(place):
             return None
-    except (OSError, RuntimeError):  # no such folder can be made, or nobody's home
-        pass
-    folder = _temporary_folder()
-    os.environ["XDG_CACHE_HOME"] = str(folder)
-    return folder
+    for parent in (None, "/dev/shm"):
+        with contextlib.suppress(OSError):
+            if _has_room(parent):
+                folder = _temporary_folder(parent)
+                os.environ["XDG_CACHE_HOME"] = str(folder)
+                return folder
+    return None  # devices that do not work then are reported with `cache_remedy`
+
+
+def _has_room(folder: Path | str | None) -> bool:
+    """Tell whether files can be made in `folder`, with `_ROOM` bytes; None: where temporary files go."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            os.posix_fallocate(file.fileno(), 0, _ROOM)
+    except OSError as error:  # not every file system can tell by this call
+        return error.errno in (errno.EINVAL, errno.EOPNOTSUPP)
+    return True
+
+
+def cache_remedy() -> str:
+    """Return what to do about kernels in caches that are damaged or full: runtimes do not recover from that."""
+    try:
+        home = _cache_home()
+    except RuntimeError:  # nobody's home
+        home = Path("~/.cache")
+    pocl = os.environ.get("POCL_CACHE_DIR") or home / "pocl"
+    return (
+        f"If kernels in a cache are damaged (after a power cut, say), remove {pocl} and {home / 'pytools'}; if its "
+        "disk is full or not to be written, set XDG_CACHE_HOME to another folder"
+    )
 
 
 def _cache_home() -> Path:
@@ -142,13 +172,12 @@ def _write_home(home: Path, entries: dict[str, str]) -> Path:
     return home
 
 
-def _temporary_folder() -> Path:
+def _temporary_folder(parent: str | None = None) -> Path:
     """Make a private temporary folder that goes away with this process."""
     import atexit
     import shutil
-    import tempfile
 
-    folder = Path(tempfile.mkdtemp(prefix="clvoro-cache-"))
+    folder = Path(tempfile.mkdtemp(prefix="clvoro-cache-", dir=parent))
     owner = os.getpid()  # a forked child runs the hook too, and must leave the folder
 
     def remove() -> None:

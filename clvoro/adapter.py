@@ -6,12 +6,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
+from typing import NoReturn
 
 import numpy as np
 import pyopencl as cl
 
 from . import device
 from ._arrays import Naming, check_callable, check_number, check_points
+from ._probe import check_process
 from ._program import Engine
 from .domain import Domain
 from .errors import InputError, InputTypeError, MemoryLimitError
@@ -29,7 +31,8 @@ class Adapter:
     """Adapts Voronoi meshes on one device.
 
     Kernels are built when they are first needed, and kept; so is memory. One adapter does one thing at a time: calls
-    from other threads wait.
+    from other threads wait. Processes that are forked once OpenCL is at work cannot use it (`DeviceError`): have them
+    spawned.
 
     Parameters
     ----------
@@ -73,6 +76,7 @@ class Adapter:
                 f"ctx is {ctx!r} of type {type(ctx).__name__}, expected a pyopencl.Context or None; write "
                 "clvoro.create_context(device), with a device or a part of its name"
             )
+        check_process()
         self.ctx = device.create_context() if ctx is None else ctx
         self.dtype = real
         if real == np.float64:
@@ -87,9 +91,16 @@ class Adapter:
     def __repr__(self) -> str:
         return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
 
+    def __reduce__(self) -> NoReturn:
+        raise InputTypeError(
+            "an Adapter belongs to its device and process, and is neither copied nor pickled; make another one where "
+            "it is needed, as by clvoro.Adapter(adapter.ctx, adapter.dtype)"
+        )
+
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """One call at a time: the stages' buffers are shared. Other threads wait; a callback must not call back."""
+        check_process()
         if self._owner == threading.get_ident():
             raise InputError(
                 "the adapter is at work: a callback may not use it; expected another Adapter for it"
@@ -268,7 +279,7 @@ class Adapter:
             are bounded by what grows from there; see `Layers`. Their cells count as being of the right size.
         checkpoint : path, optional
             File to which the run's state is written every so often, and where the callback stops it. It is replaced
-            at one stroke: whenever the process dies, the file is a whole one.
+            at one stroke: whenever the process dies, the file is a whole one. No file but a checkpoint is replaced.
         checkpoint_every : float
             Seconds from one checkpoint to the next; 0: after every step.
         resume : path, optional
@@ -292,6 +303,8 @@ class Adapter:
 
         Warns
         -----
+        CheckpointWarning
+            If a checkpoint cannot be written, as the disk is full; the run goes on, and the one before stays.
         MisfitWarning, CoarseSizeWarning
             If a part of the input hardly meets the domain, as in another unit of length.
         PrecisionWarning

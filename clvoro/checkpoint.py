@@ -11,7 +11,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 import time
+import warnings
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +22,7 @@ import numpy as np
 
 from ._arrays import check_path
 from .cells import Cells
-from .errors import InputError
+from .errors import CheckpointWarning, InputError, OutputError
 from .plans import Action, Step
 from .results import Displacements
 from .stages import Stages
@@ -61,25 +63,37 @@ class Checkpointer:
         from .io import check_writable
 
         path = check_path("checkpoint", path)
-        if Path(path).is_dir():
-            raise InputError(f"checkpoint is {str(path)!r}, a folder, expected the name of a file")
+        if os.path.isdir(path) or not path:
+            raise InputError(f"checkpoint is {path!r}, a folder, expected the name of a file")
         check_writable(path)
+        _check_own(path)
         self.path, self.every, self.made_by = Path(path), every, made_by
         self.plan = fingerprint(plan)
         self._last = time.monotonic()
 
     def offer(self, loop: Loop, stop: bool) -> None:
-        """Write a checkpoint if it is time, or if the run stops here."""
-        if stop or time.monotonic() - self._last >= self.every:
+        """Write a checkpoint if it is time, or if the run stops here.
+
+        One that cannot be written, as the disk is full, costs neither the run nor the one from before.
+        """
+        if not stop and time.monotonic() - self._last < self.every:
+            return
+        try:
             self.write(loop)
-            self._last = time.monotonic()
+        except OutputError as error:
+            warnings.warn(
+                f"{error}. The run goes on without this checkpoint; the one before is as it was",
+                CheckpointWarning,
+                stacklevel=2,
+            )
+        self._last = time.monotonic()
 
     def write(self, loop: Loop) -> None:
         """Write the state of `loop`, which is between two actions; what was at `path` is replaced when all is written.
 
         Raises
         ------
-        InputError
+        OutputError
             If the file cannot be written.
         """
         from .io.arrays import write_arrays
@@ -118,6 +132,16 @@ class Checkpointer:
         about = {"made_by": self.made_by, "plan": self.plan, "state": state}
         arrays["about"] = np.array(json.dumps(about))
         write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)
+
+
+def _check_own(path: str) -> None:
+    """Refuse to replace a file that is no checkpoint, unless it is empty."""
+    from .io.arrays import is_kind
+
+    if os.path.exists(path) and os.path.getsize(path) and not is_kind(path, FORMAT):
+        raise InputError(
+            f"checkpoint is {path!r}, a file that is there and is no checkpoint; choose another name, or remove it"
+        )
 
 
 def methods_of(plan: list[Action]) -> list[Any]:

@@ -8,7 +8,16 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from .errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError
+from .errors import (
+    Aborted,
+    BuildError,
+    ClvoroError,
+    DeviceError,
+    InputError,
+    InputTypeError,
+    OutputError,
+)
+from .streams import steady_streams
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -16,7 +25,7 @@ _EPILOG = """\
 exit codes:
   0 done                2 bad usage or input (check: a file that cannot be read)
   1 the run failed      3 no usable device
-    (check: wrong)    130 interrupted (Ctrl-C; what there was has been written)
+    (check: wrong)    130 interrupted (Ctrl-C, SIGTERM, SIGHUP; what there was has been written)
 
 examples:
   clvoro run paper                      the paper's validation case, into out/paper
@@ -113,6 +122,17 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
+    with steady_streams() as out:
+        code = _carry_out(argv)
+        out.flush()
+        if out.error is not None and not isinstance(out.error, BrokenPipeError):
+            lost = f"cannot write to the standard output: {out.error.strerror or out.error}"
+            code = _complain(lost, code or FAILED)
+    return code
+
+
+def _carry_out(argv: Sequence[str] | None) -> int:
+    """Do what is asked for, and turn what goes wrong into a message and an exit code."""
     try:
         arguments = build_parser().parse_args(argv)
         command = {"run": _run, "check": _check, "devices": _devices, "cases": _cases}[
@@ -121,14 +141,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return command(arguments)
+    except (OutputError, BuildError) as error:
+        return _complain(error, FAILED)
     except (InputError, InputTypeError) as error:
         return _complain(error, BAD_INPUT)
-    except BuildError as error:
-        return _complain(error, FAILED)
     except DeviceError as error:
         return _complain(error, NO_DEVICE)
     except (ClvoroError, OSError) as error:
         return _complain(error, FAILED)
+    except MemoryError as error:
+        remedy = "give the process more, or ask for fewer cells"
+        return _complain(f"the host is out of memory ({error}); {remedy}", FAILED)
     except (KeyboardInterrupt, Aborted):
         return _complain("interrupted, nothing more has been written", INTERRUPTED)
 

@@ -118,6 +118,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     InputTypeError
         If `device` is of another type.
     """
+    _probe.check_process()
     if isinstance(device, cl.Device):
         return _checked_context(_describe(device, "given"), fp64)
     if device is not None and not isinstance(device, str):
@@ -162,6 +163,7 @@ def list_devices() -> list[DeviceInfo]:
     >>> any(device.works for device in clvoro.list_devices())
     True
     """
+    _probe.check_process()
     crashed = _probe.crashing_platforms()
     found, broken = _candidates(skip=crashed)
     reasons = {c.index: _probe.verdict(c.device) for c in found}
@@ -211,6 +213,8 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
         lines.append("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
         if entry is not None and entry.reason:
             lines.append(f"       {one_line(entry.reason, 300)}")
+    if any(d.kind in ("cpu", "-") and not d.works for d in devices):
+        lines.append(f"{_runtimes.cache_remedy()}.")
     if any(d.default for d in devices):
         lines.append("* is used when nothing is asked for.")
     elif os.environ.get("PYOPENCL_CTX"):
@@ -370,5 +374,7 @@ def _complaint(
     lines += [f"  there is {c.index} {c.title} ({c.kind})" for c in others]
     if not found and not broken:
         lines.append("  the OpenCL loader knows no platform")
+    elif failures or broken:
+        lines.append(f"  {_runtimes.cache_remedy()}")
     lines.append(f"  remedy: {INSTALL_HINT}; `clvoro devices` shows the verdict on each device")
     return "\n".join(lines)

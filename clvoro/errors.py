@@ -13,6 +13,10 @@ class InputTypeError(ClvoroError, TypeError):
     """An argument has the wrong type."""
 
 
+class OutputError(InputError):
+    """A file cannot be written: no such folder, no right, no space."""
+
+
 class DeviceError(ClvoroError, RuntimeError):
     """No usable OpenCL device, or the device lacks what was asked of it."""
 
@@ -35,6 +39,10 @@ class SolverError(ClvoroError, ArithmeticError):
 
 class Aborted(BaseException):
     """The user wants to quit at once; unlike KeyboardInterrupt, which a run answers with what it has so far."""
+
+
+class CheckpointWarning(UserWarning):
+    """A checkpoint could not be written; the run goes on, and the one from before is still there."""
 
 
 class CoarseSizeWarning(UserWarning):

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import numpy as np
 
 from .cases import Case
 from .errors import Aborted, ClvoroError, InputError
-from .io import check_writable, save, write_history
+from .io import save, write_history
 from .memory import in_bytes
+from .outputs import check_folder, do_all, refuse_own_files, require_plots
 from .polygon import Polygon
 from .profile import Profile
 from .results import Result
@@ -33,6 +35,8 @@ _REPEATED = (
 
 _MANY = 5000
 """Cells from which files and pictures take so long that one says so."""
+_STOPPING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGXCPU")
+"""Signals after which a run ends, with what there is: Ctrl-C, a batch system's, a lost terminal's."""
 _MUCH = 2**26
 """Bytes on the device from which on one says how many."""
 
@@ -89,9 +93,12 @@ class Job:
         arguments, size = self.case.run_arguments(), self.case.size_field()
         self._refuse_unknown(arguments, Adapter.run)
         arguments |= self._checkpoints()
+        named = {"checkpoint": self.checkpoint, "resume": self.resume}
+        named |= {source.name: source for source in self.case.sources()}
+        refuse_own_files(self.out, named)
         check_folder(self.out)
         if self.report:
-            _require_plots()
+            require_plots()
         dtype = self.case.run.get("dtype", "float64")
         adapter = Adapter(create_context(self.device, fp64=dtype == "float64"), dtype=dtype)
         device = adapter.ctx.devices[0]
@@ -199,7 +206,7 @@ class Job:
 
     @contextmanager
     def _stopping_cleanly(self) -> Iterator[None]:
-        """Let the first Ctrl-C (or SIGTERM) end the run after its step, and the second at once."""
+        """Let the first of the signals end the run after its step, and the second at once."""
 
         def stop(number: int, _: object) -> None:
             if self.interrupted:
@@ -212,8 +219,10 @@ class Job:
 
         previous = {}
         try:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                previous[number] = signal.signal(number, stop)
+            for number in (getattr(signal, name, None) for name in _STOPPING):
+                # What is ignored stays so: nohup does that, and a shell with what it starts in the background.
+                if number and signal.getsignal(number) not in (None, signal.SIG_IGN):
+                    previous[number] = signal.signal(number, stop)
         except ValueError:  # not the main thread: signals are someone else's
             pass
         try:
@@ -229,31 +238,43 @@ class Job:
         if not self.quiet and (sys.stderr.isatty() or len(main.points) > _MANY):
             work = "mesh and report" if self.report else "mesh"
             print(f"{self.case.name}: writing {work} into {self.out}", file=sys.stderr, flush=True)
-        save(main, self.out / "mesh.vtu")
-        save(main, self.out / "mesh.npz")
-        write_history(main, self.out / "history.csv")
+        tasks: list[Callable[[], object]] = [
+            partial(save, main, self.out / "mesh.vtu"),
+            partial(save, main, self.out / "mesh.npz"),
+            partial(write_history, main, self.out / "history.csv"),
+        ]
         for other, result in others:
-            save(result, self.out / f"mesh-{other}.npz")
-            write_history(result, self.out / f"history-{other}.csv")
+            tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
+            tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
         note = "; interrupted: the mesh beside it is that of an earlier step" * self.interrupted
         header = (
             f"Written by clvoro {__version__} on {where}{note}.",
             "Repeat it with: clvoro run case.toml",
         )
-        path = self._repeatable(main).write(self.out, header)
+        repeatable = self._repeatable(main)
+        tasks.append(partial(repeatable.write, self.out, header))
         if self.report:
-            from .report import write_report
-
-            write_report(
-                results,
-                self.out,
-                initial=self._initial(adapter, size, main),
-                size=size,
-                title=self.case.title,
-                case=path.read_text(encoding="utf-8"),
-                facts={"device": where, "precision": str(adapter.dtype)},
-                formats=self.formats,
+            tasks.append(
+                lambda: self._report(adapter, size, results, where, repeatable.text(header))
             )
+        do_all(tasks)
+
+    def _report(
+        self, adapter: Any, size: Any, results: dict[str, Result], where: str, case: str
+    ) -> None:
+        from .report import write_report
+
+        *_, main = results.values()
+        write_report(
+            results,
+            self.out,
+            initial=self._initial(adapter, size, main),
+            size=size,
+            title=self.case.title,
+            case=case,
+            facts={"device": where, "precision": str(adapter.dtype)},
+            formats=self.formats,
+        )
 
     def _repeatable(self, main: Result) -> Case:
         """Return the case with all settings that took their default values written out."""
@@ -315,35 +336,6 @@ class Job:
         print(f"written: {self.out / first} and what lies beside it")
         for name, profile in profiles.items():
             print(f"\nwhere the time of {name} went:\n{profile.table()}")
-
-
-def check_folder(folder: Path) -> None:
-    """Make `folder` if need be and check that a file can be written there.
-
-    Raises
-    ------
-    InputError
-        Before any work is done that would then be lost.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"out is {str(folder)!r}, where no folder can be made ({error.strerror}); "
-            "give a folder of your own with --out"
-        ) from error
-    check_writable(folder)
-
-
-def _require_plots() -> None:
-    """Say before the run that the report cannot be drawn."""
-    try:
-        import matplotlib  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ClvoroError(
-            "the report needs Matplotlib, which is not installed; pip install 'clvoro[plot]', "
-            "or run with --no-report"
-        ) from error
 
 
 def _default(function: Callable[..., Any], name: str) -> Any:

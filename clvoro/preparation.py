@@ -38,6 +38,7 @@ GRADIENT_STEP = 0.2
 """Step over h in which the exact projection sees the gradient of the size field."""
 STEPS = 100
 """Steps of a method that repeats one kind of step, unless the caller says otherwise."""
+_MOST_STEPS = 10**6  # of a run: its plan, which names each, and its history are lists
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def check_options(
         tol=check_number("tol", tol, least=0),
         k=check_number("k", k, above=0),
         alpha=None if alpha is None else check_number("alpha", alpha, above=0),
-        max_steps=None if max_steps is None else check_integer("max_steps", max_steps, 0),
+        max_steps=None if max_steps is None else check_integer("max_steps", max_steps, 0, _MOST_STEPS),
         n_cells=None if n_cells is None else check_integer("n_cells", n_cells, 1),
         error_target=None if error_target is None else check_number("error_target", error_target, above=0),
         layers=(layers,) if isinstance(layers, Layers) else tuple(layers),

@@ -207,7 +207,8 @@ class DensityTree:
         reached = self.cover.reached
         jumps = reached & (high > _JUMP * low)
         sliver = np.zeros(len(boxes))
-        sliver[jumps] = 0.056 * volumes[jumps] * (low[jumps] ** -dim - high[jumps] ** -dim)
+        with np.errstate(over="ignore"):  # as many cells as that are refused where they are counted
+            sliver[jumps] = 0.056 * volumes[jumps] * (low[jumps] ** -dim - high[jumps] ** -dim)
         self._errors = np.maximum(self._differences, sliver)
         by_error = np.argsort(self._errors, kind="stable")
         within = np.cumsum(self._errors[by_error]) <= tolerance * self.integral

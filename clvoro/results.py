@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ._probe import check_process
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
@@ -136,6 +138,7 @@ class Diagram:
             raise AttributeError(f"{name}: a diagram in {self.domain.dim}D has none")
         value = self._arrays[name]
         if callable(value):
+            check_process()  # it may be on a device still
             value = self._arrays[name] = value()
         return value
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .io import save
-from .io.atomic import atomic_file
+from .io.atomic import atomic_file, writing
 from .results import Result
 
 if TYPE_CHECKING:
@@ -51,32 +51,39 @@ def run_frames(
         One per frame, the first included.
     """
     folder = out / "frames"
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     arguments = {k: v for k, v in case.run_arguments().items() if k in _KEPT}
     if case.methods[-1] is not None:
         arguments["method"] = case.methods[-1]
     result, rows, shown = first, [], {}
     wanted = np.unique(np.linspace(0, case.frames - 1, min(PICTURED, case.frames)).round())
-    for frame in range(case.frames):
-        time = frame / case.frames
-        if frame:
-            if stop():
-                break
-            tell(f"frame {frame + 1} of {case.frames}")
-            result = adapter.run(
-                case.domain, case.size_field(time), points=result.points,
-                callback=lambda _: stop(), **arguments,
-            )  # fmt: skip
-        save(result, folder / f"mesh-{frame:03d}.vtu")
-        rows.append(_row(frame, time, result))
-        if pictures and frame in wanted:
-            shown[time] = result
-    with atomic_file(out / "frames.csv") as file:
-        lines = [",".join(COLUMNS), *(",".join(f"{row[c]:.6g}" for c in COLUMNS) for row in rows)]
-        file.write(("\n".join(lines) + "\n").encode())
+    try:
+        for frame in range(case.frames):
+            time = frame / case.frames
+            if frame:
+                if stop():
+                    break
+                tell(f"frame {frame + 1} of {case.frames}")
+                result = adapter.run(
+                    case.domain, case.size_field(time), points=result.points,
+                    callback=lambda _: stop(), **arguments,
+                )  # fmt: skip
+            save(result, folder / f"mesh-{frame:03d}.vtu")
+            rows.append(_row(frame, time, result))
+            if pictures and frame in wanted:
+                shown[time] = result
+    finally:  # a frame that fails does not cost what is known of those before
+        _write_rows(rows, out / "frames.csv")
     if shown and case.domain.dim == 2:
         _draw(shown, out / "pictures" / "frames.png")
     return rows
+
+
+def _write_rows(rows: list[dict[str, Any]], path: Path) -> None:
+    with atomic_file(path) as file:
+        lines = [",".join(COLUMNS), *(",".join(f"{row[c]:.6g}" for c in COLUMNS) for row in rows)]
+        file.write(("\n".join(lines) + "\n").encode())
 
 
 def _row(frame: int, time: float, result: Result) -> dict[str, Any]:

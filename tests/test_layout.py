@@ -19,7 +19,7 @@ SOURCES = sorted([*KERNELS.glob("*.cl"), *KERNELS.glob("common/*.h")])
 HOUSE = PACKAGE.parent
 CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
-FACES = {"cli", "jobs", "sequence", "report", "io", "cases", "__init__", "__main__"}
+FACES = {"cli", "jobs", "outputs", "sequence", "report", "io", "cases", "__init__", "__main__"}
 """What stands on the library, which does without: command line, pictures, files."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")
 """An expression in Python that stands for the kernels of a file."""

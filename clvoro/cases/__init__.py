@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from .._files import read_text
+from .._files import open_plain, read_text
 from ..domain import Domain
 from ..errors import InputError
 from ..io.atomic import atomic_file
@@ -18,10 +18,10 @@ from . import schema, toml
 from .checks import file_name
 from .domains import build_domain, build_layers
 from .fields import build_size, load_array, named_files
-from .files import FOLDER, locate
+from .files import FOLDER, WRITTEN, locate
 from .naca import naca4
 
-__all__ = ["Case", "builtin_cases", "load_case", "naca4"]
+__all__ = ["WRITTEN", "Case", "builtin_cases", "load_case", "naca4"]
 
 _RUN_ORDER = (
     "method", "methods", "effort", "levels", "error_target", "start", "points", "n_cells",
@@ -138,29 +138,46 @@ class Case:
             **({"sequence": {"frames": self.frames}} if self.frames > 1 else {}),
         }
 
+    def sources(self) -> list[Path]:
+        """Return the paths of the files that the case names."""
+        return [locate(self.folder, node[key]).resolve() for node, key in self._entries()]
+
+    def _entries(self) -> list[tuple[dict[str, Any], str]]:
+        """Return where the case names files: tables, and the keys in them."""
+        entries = [(node, "file") for node in named_files(self.size)]
+        entries += [(self.place, "file")] * ("file" in self.place)
+        entries += [(self.run, "points")] * ("points" in self.run)
+        return entries
+
+    def _moved(self) -> tuple[Case, dict[str, Path]]:
+        """Return the case with all its files beside it, and where these are now: {name: source}."""
+        moved = replace(
+            self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place)
+        )
+        taken: dict[str, Path] = {}
+        for (node, key), source in zip(moved._entries(), self.sources(), strict=True):
+            target = source.name
+            while WRITTEN.fullmatch(target) or taken.setdefault(target, source) != source:
+                target = f"other-{target}"
+            node[key] = target
+        return moved, taken
+
+    def text(self, header: tuple[str, ...] = ()) -> str:
+        """Return what `write` writes into `case.toml`."""
+        return toml.write(self._moved()[0].table(), header)
+
     def write(self, folder: Path, header: tuple[str, ...] = ()) -> Path:
         """Write `case.toml` into `folder`, with copies of the files that it names; return its path.
 
         Reading it gives this case again, wherever the folder is moved to.
         """
-        moved = replace(
-            self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place)
-        )
-        entries = [(node, "file") for node in named_files(moved.size)]
-        entries += [(moved.place, "file")] * ("file" in moved.place)
-        entries += [(moved.run, "points")] * ("points" in moved.run)
-        taken: dict[str, Path] = {}
-        for node, key in entries:
-            source = locate(self.folder, node[key]).resolve()
-            target = source.name
-            while taken.setdefault(target, source) != source:
-                target = f"other-{target}"
-            node[key] = target
+        for target, source in self._moved()[1].items():
             if source != (folder / target).resolve():
-                shutil.copyfile(source, folder / target)
+                with open_plain(source) as given, atomic_file(folder / target) as file:
+                    shutil.copyfileobj(given, file)
         path = folder / "case.toml"
         with atomic_file(path) as file:
-            file.write(toml.write(moved.table(), header).encode())
+            file.write(self.text(header).encode())
         return path
 
 

@@ -44,12 +44,15 @@ def file_name(value: object, place: str) -> str:
     """Check for what can name a file or folder here, and none elsewhere, on any system."""
     name = text(value, place)
     alone = PureWindowsPath(name).name == name != ".."  # it knows all separators, and drives
-    if not alone or len(name.encode("utf-8", "replace")) > _LONGEST_NAME or _CONTROL.search(name):
+    spelt = name.encode(
+        "utf-8", "replace"
+    )  # with a ? for what is no character, as in names of files
+    if not alone or len(spelt) > _LONGEST_NAME or _CONTROL.search(name) or spelt.decode() != name:
         raise refuse(
             place,
             name[: _LONGEST_NAME + 1],
-            "a name without slashes, no '.' or '..' (results go to out/NAME; "
-            "--out chooses another folder)",
+            "a name in UTF-8 without slashes, no '.' or '..' (results go to out/NAME; "
+            "--out chooses another folder); the case may give one: name = ...",
         )
     return name
 

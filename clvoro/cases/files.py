@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
 """Where the built-in cases and their files lie."""
+WRITTEN = re.compile(
+    r"(mesh|history)(-.*)?\.(vtu|npz|csv)|case\.toml|report\.html|frames\.csv|frames|pictures"
+)
+"""Names of what a run writes into its folder."""
 
 
 def locate(folder: Path, name: str) -> Path:

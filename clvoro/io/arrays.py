@@ -95,6 +95,20 @@ def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str,
         return {name: read_member(archive, info) for name, info in members.items()}
 
 
+def is_kind(path: str | PathLike[str], kind: str) -> bool:
+    """Tell whether `path` is a file that `write_arrays` wrote for this kind, of whatever version."""
+    try:
+        with (
+            explained(path, f"a {kind}"),
+            open_plain(path) as file,
+            zipfile.ZipFile(file) as archive,
+        ):
+            found = read_member(archive, archive.getinfo("format.npy"))
+            return bool(found.shape == () and found.item() == kind)
+    except InputError:
+        return False
+
+
 def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str, zipfile.ZipInfo]:
     """Return the members by name, after a look at what kind of file it is and how much it holds."""
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}

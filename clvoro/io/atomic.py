@@ -13,7 +13,10 @@ from os import PathLike
 from pathlib import Path
 from typing import IO
 
-from ..errors import InputError
+from ..errors import OutputError
+
+_KEPT = 40
+"""Characters, of up to four bytes, that temporary names have of the file's: with more they may become too long."""
 
 
 def check_writable(path: str | PathLike[str]) -> None:
@@ -23,11 +26,11 @@ def check_writable(path: str | PathLike[str]) -> None:
 
     Raises
     ------
-    InputError
+    OutputError
         If it cannot; says why.
     """
     path = Path(path)
-    with _explained(path):
+    with writing(path):
         target = path / "any" if path.is_dir() else _target(path)
         temporary = _temporary_name(target)
         os.close(_create(temporary))
@@ -43,11 +46,11 @@ def atomic_file(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
 
     Raises
     ------
-    InputError
+    OutputError
         If the file cannot be written: no such folder, no right, no space.
     """
     path = Path(path)
-    with _explained(path):
+    with writing(path):
         target = _target(path)
         temporary = _temporary_name(target)
         file = os.fdopen(_create(temporary), "w+b")
@@ -71,9 +74,9 @@ def atomic_folder(path: str | PathLike[str]) -> Iterator[Path]:
     What the block leaves in that folder is put beside `path`, the file of that name last.
     """
     path = Path(path)
-    with _explained(path):
+    with writing(path):
         target = _target(path)
-        folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+        folder = Path(tempfile.mkdtemp(prefix=f".{target.name[:_KEPT]}.", dir=target.parent))
         try:
             yield folder / target.name
             made = sorted(folder.iterdir(), key=lambda file: file.name == target.name)
@@ -91,18 +94,17 @@ def _target(path: Path) -> Path:
     """Return where `path` leads, through symbolic links; refuse all but plain files in folders."""
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
-        raise InputError(
+        raise OutputError(
             f"cannot write {path}: there is no folder {target.parent}; create it first"
         )
     if target.exists() and not stat.S_ISREG(target.stat().st_mode):
         kind = "a folder" if target.is_dir() else "no plain file"
-        raise InputError(f"cannot write {path}: it is {kind}; choose another name")
+        raise OutputError(f"cannot write {path}: it is {kind}; choose another name")
     return target
 
 
 def _temporary_name(target: Path) -> Path:
-    # A long name must not become too long by the additions.
-    return target.with_name(f".{target.name[:80]}.{secrets.token_hex(4)}.tmp")
+    return target.with_name(f".{target.name[:_KEPT]}.{secrets.token_hex(4)}.tmp")
 
 
 def _create(path: Path) -> int:
@@ -111,12 +113,12 @@ def _create(path: Path) -> int:
 
 
 @contextlib.contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """Turn an operating system's error into one that names `path` and the remedy."""
     try:
         yield
     except OSError as error:
-        raise InputError(
+        raise OutputError(
             f"cannot write {path}: {error.strerror or error}; choose a place that can be written "
             "and has space"
         ) from error

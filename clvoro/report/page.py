@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..io.atomic import atomic_file
+from ..io.atomic import atomic_file, writing
 from ..polygon import Polygon
 from ..results import Result
 from ..summary import beside_boundary, summary
@@ -80,7 +80,8 @@ def write_report(
         method = results.settings.get("method") or "result"
         results = {str(method): results}
     target = Path(folder)
-    (target / "pictures").mkdir(parents=True, exist_ok=True)
+    with writing(target / "pictures"):
+        (target / "pictures").mkdir(parents=True, exist_ok=True)
     written, figures = [], []
     for name, caption, draw in pictures_of(results, initial, size):
         figure = draw()

@@ -399,7 +399,7 @@ def as_field(size: object) -> Field:
     if isinstance(size, np.ndarray) and size.ndim == 0:
         size = size.item()
     if isinstance(size, Real) and not isinstance(size, (bool, np.bool_)):
-        return Constant(float(size))
+        return Constant(size)  # type: ignore[arg-type]
     if callable(size):
         return Function(size)
     from .distance import Shape  # which stands on this
@@ -423,9 +423,12 @@ def positive(what: str, value: object) -> float:
     """Return `value` as a float, or raise the error that `what` must be positive and finite."""
     if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
         raise InputTypeError(f"{what} is {value!r}, expected a positive number")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
     if not (number > 0 and math.isfinite(number)):
-        raise InputError(f"{what} is {value!r}, expected a positive, finite number")
+        raise InputError(f"{what} is {value!r:.60}, expected a positive, finite number")
     return number
 
 
