@@ -9,37 +9,50 @@
 #include "common/reduce.h"
 #include "common/rows.h"
 
-#define REAL8 CLVORO_JOIN(REAL, 8)
-#define CONVERT_REAL8 CLVORO_JOIN(convert_, REAL8)
+/* Whether two cells may have several faces: on both sides of a seam, or of a hole. */
+#if defined(PERIODIC) || defined(POLYGON)
+#define SEVERAL true
+#else
+#define SEVERAL false
+#endif
 
-/* The measure that cell j has of its face with cell i, -1 if it has none; eight of its faces at a time on a CPU, as in
+/* Where the row of cell j names cell i first, negative if it does not; eight entries at a time on a CPU, as in
    row_difference. */
-inline REAL measured_by(int j, int i, int last, global const int *starts, global const int *neighbours,
-                        global const FACE *face_measures)
+inline int place_of(int i, int j, int last, global const int *starts, global const int *neighbours)
 {
     const int end = starts[j + 1];
     int k = starts[j];
-    REAL measure = -1;
 #if GROUP_SIZE == 1
     for (; k < end && k <= last; k += 8) {
-        const int8 is_i = (vload8(0, neighbours + k) == i) & (k + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < end);
-        const REAL8 there = CONVERT_REAL8(vload8(0, face_measures + k));
-        const REAL8 m = select((REAL8)(-1), there, MASK8(REAL)(is_i));
-        const REAL4 m4 = fmax(m.lo, m.hi);
-        const REAL2 m2 = fmax(m4.lo, m4.hi);
-        measure = fmax(measure, fmax(m2.s0, m2.s1));
+        const int8 at = k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), named = (vload8(0, neighbours + k) == i) & (at < end);
+        const int8 places = select((int8)(INT_MAX), at, named);
+        const int4 p4 = min(places.lo, places.hi);
+        const int2 p2 = min(p4.lo, p4.hi);
+        const int place = min(p2.s0, p2.s1);
+        if (place < end)
+            return place;
     }
 #endif
     for (; k < end; ++k)
         if (neighbours[k] == i)
-            measure = fmax(measure, (REAL)face_measures[k]);
+            return k;
+    return -1;
+}
+
+/* The measure of face k and of those behind it, up to `end`, that lead to the same cell. */
+inline REAL measure_from(int k, int end, global const int *neighbours, global const FACE *face_measures)
+{
+    REAL measure = face_measures[k];
+    for (int l = k + 1; SEVERAL && l < end; ++l)
+        measure += neighbours[l] == neighbours[k] ? (REAL)face_measures[l] : 0;
     return measure;
 }
 
-/* Weights. The two cells of a face have measured it each for itself, with roundings of their own: both take the mean of
-   the two, so that A is symmetric to the last bit. A face that only one of them has seen is shorter than rounding, and
-   gets the weight 0, as do walls. rho_ij is the geometric mean, symmetric and closest to rho at the face where log rho
-   is smooth. */
+/* Weights, where `weights` is 0 so far: each is put into the rows of both cells by the one of the lower number, so that
+   A is symmetric to the last bit. The two have measured the face each for itself, with roundings of their own: it is
+   the mean of the two. A face that only one of them has seen is shorter than rounding, and keeps the weight 0, as do
+   walls and, of several faces of two cells, all but the first. rho_ij is the geometric mean, symmetric and closest to
+   rho at the face where log rho is smooth. */
 kernel void assemble(int n, int weighted, global const int *starts, global const int *neighbours,
                      global const FACE *face_measures, global const REAL *points, global const REAL *density,
                      global STORE *weights)
@@ -48,25 +61,27 @@ kernel void assemble(int n, int weighted, global const int *starts, global const
     if (i >= n)
         return;
     const REAL root_i = weighted ? sqrt(density[i]) : R(1);
-    const int last = starts[n] - 8;
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+    const int last = starts[n] - 8, end = starts[i + 1];
+    for (int k = starts[i]; k < end; ++k) {
         const int j = neighbours[k];
-        REAL weight = 0;
-        if (j >= 0 && j != i) {
-            const REAL other = measured_by(j, i, last, starts, neighbours, face_measures);
-            REAL square = 0;
-            EACH_AXIS(a)
-            {
-                const REAL d = DIFFERENCE(a, points[i * DIM + a], points[j * DIM + a]);
-                square += d * d;
-            }
-            if (other >= 0) {
-                weight = R(0.5) * (face_measures[k] + other) / sqrt(square);
-                if (weighted)
-                    weight *= root_i * sqrt(density[j]);
-            }
+        if (j <= i)
+            continue;
+        const int there = place_of(i, j, last, starts, neighbours);
+        if (there < 0 || (SEVERAL && place_of(j, i, last, starts, neighbours) < k))
+            continue;
+        REAL square = 0;
+        EACH_AXIS(a)
+        {
+            const REAL d = DIFFERENCE(a, points[i * DIM + a], points[j * DIM + a]);
+            square += d * d;
         }
+        const REAL here = measure_from(k, end, neighbours, face_measures);
+        const REAL other = measure_from(there, starts[j + 1], neighbours, face_measures);
+        REAL weight = R(0.5) * (here + other) / sqrt(square);
+        if (weighted)
+            weight *= root_i * sqrt(density[j]);
         weights[k] = weight;
+        weights[there] = weight;
     }
 }
 

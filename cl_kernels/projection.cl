@@ -41,16 +41,16 @@
 #define RECORD_RUNNING 2
 #define RECORD_CURVATURE 3
 
-/* eps = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = -log Q of the cell and of its neighbours,
-   `worst` the least Q of them. Bad cells and those around them are let off their size a little, for they are what costs
-   quality; cells that are far off give way less than those that are nearly right, which caps the largest error. A
-   lenience or bound of 0 leaves its factor out. */
+/* eps = min(3, penalty (1 + max (q / lenience)^2)) / (1 + (r / bound)^2), q = (1 - Q) / sqrt Q of the cell and of its
+   neighbours, next to -log Q without the cost of a logarithm; `worst` is the least Q of them. Bad cells and those
+   around them are let off their size a little, for they are what costs quality; cells that are far off give way less
+   than those that are nearly right, which caps the largest error. A lenience or bound of 0 leaves its factor out. */
 inline float penalty_of(float penalty, float lenience, float worst, float bound, float excess)
 {
     float e = penalty;
     if (lenience > 0) {
-        const float q = log(fmax(worst, 1e-6f)) / lenience;
-        e = fmin(e * (1 + q * q), fmax(3.0f, penalty));
+        const float q = (1 - worst) / lenience;
+        e = fmin(e * (1 + q * q / fmax(worst, 1e-6f)), fmax(3.0f, penalty));
     }
     const float r = bound > 0 ? excess / bound : 0;
     return e / (1 + r * r);

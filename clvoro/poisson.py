@@ -143,6 +143,7 @@ class Poisson:
             _check("density", density, (n,))
         store = np.dtype(np.float32) if tolerance >= ROUGH else engine.real
         weights = engine.scratch(len(neighbours), store)
+        weights.fill(0)
         engine.run(
             self._kernels_in(store, face_measures.dtype).assemble, n, np.int32(n),
             np.int32(density is not None), starts, neighbours, face_measures, points,

@@ -92,7 +92,8 @@ class Projection:
             grad log h.
         eps : float
         lenience : float
-            -log Q at which the eps of a cell and its neighbours is twice as large; 0: quality does not matter.
+            (1 - Q) / sqrt Q, which is next to -log Q, at which the eps of a cell and its neighbours is twice as large;
+            0: quality does not matter.
         bound : float
             Excess at which a cell's eps is half; 0: the same eps for all.
         max_iterations : int

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 
-from clvoro import create_context, krylov
+from clvoro import Box, create_context, krylov
 from clvoro._program import Engine
 from clvoro.errors import InputError, SolverError
 from clvoro.krylov import ConjugateGradient
@@ -138,6 +138,23 @@ def test_one_sided_face_has_no_weight(make):
     assert A[0, 2] == 0
     assert A[1, 2] == 0
     assert A[0, 1] == -2.5
+
+
+def test_cells_with_several_faces():
+    """Around a periodic box, or a hole, two cells may have more than one: all count, on both sides alike."""
+    ctx = create_context()
+    domain = Box((0, 0), (1, 1), periodic=(True, False))
+    engine = Engine(
+        ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.defines(np.dtype(np.float64))
+    )
+    points = np.array([[0.2, 0.5], [0.6, 0.5], [0.5, 0.9]])
+    starts, neighbours = np.array([0, 4, 8, 10]), np.array([1, -3, 1, 2, 0, 2, 0, -3, 0, 1])
+    measures = np.array([1.0, 1, 0.5, 0.1, 0.51, 0.2, 1.01, 1, 0.1, 0.2])
+    _, laplacian = assembled(engine, (points, starts, neighbours, measures, None))
+    A = as_matrix(laplacian).toarray()
+    assert np.array_equal(A, A.T)
+    assert A[0, 1] == pytest.approx(-(1.5 + 1.52) / 2 / 0.4, rel=1e-14)
+    assert A[1, 2] == pytest.approx(-0.2 / np.hypot(0.1, 0.4), rel=1e-14)
 
 
 def test_faces_measured_differently_are_averaged(make):

@@ -269,13 +269,13 @@ def test_not_finite(engine, points):
 
 
 def test_lenience(engine, points, assembled):
-    """eps grows with -log Q of the worst cell around, up to 3."""
+    """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3."""
     quality = np.random.default_rng(15).uniform(0.3, 1, N)
     host = patch.fetch(patch.tessellate(engine, points))
     worst = quality.copy()
     inner = host.neighbours >= 0
     np.minimum.at(worst, host.owners[inner], quality[host.neighbours[inner]])
-    eps = np.minimum(0.2 * (1 + (np.log(worst) / 0.3) ** 2), 3)
+    eps = np.minimum(0.2 * (1 + (1 - worst) ** 2 / worst / 0.3**2), 3)
     assert 5 < (eps == 3).sum() < N - 5
     made = Assembled(
         engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, lenience=0.3, quality=quality

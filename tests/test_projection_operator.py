@@ -55,7 +55,7 @@ class Given:
             worst[i] = min(worst[i], self.quality[j])
         J[np.arange(self.n), np.arange(self.n)] -= dim * self.gradient
         J[:, self.held] = 0
-        eps = np.minimum(EPS * (1 + (np.log(worst) / LENIENCE) ** 2), 3)
+        eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / LENIENCE**2), 3)
         return J, eps / (1 + (self.excess / BOUND) ** 2)
 
 
