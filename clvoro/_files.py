@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from typing import IO
 
@@ -33,6 +36,22 @@ def open_plain(path: str | PathLike[str]) -> IO[bytes]:
         file.close()
         raise
     return file
+
+
+@contextmanager
+def unlogged(library: str) -> Iterator[None]:
+    """Keep what a library logs from being printed: how its reader got into trouble, beside what we say of it.
+
+    Who has a handler of his own on its log goes on to see it.
+    """
+    log, nowhere = logging.getLogger(library), logging.NullHandler()
+    was, log.propagate = log.propagate, False
+    log.addHandler(nowhere)
+    try:
+        yield
+    finally:
+        log.removeHandler(nowhere)
+        log.propagate = was
 
 
 def read_text(path: str | PathLike[str], longest: int) -> str:

@@ -229,8 +229,13 @@ def some_layers(
     rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, wild: bool = True
 ) -> list[clvoro.Layers]:
     """One to three layers, as a rule of up to some thousand generators; `wild`: also too thick or thin, or nowhere."""
-    number = len(domain.vertices) if isinstance(domain, clvoro.Polygon) else 4
-    edges = shapely.boundary(domain.geometry).length if number != 4 else 2 * domain.extent.sum()
+    if isinstance(domain, clvoro.Polygon):
+        walls = np.arange(len(domain.vertices))
+        edges = shapely.boundary(domain.geometry).length
+    else:
+        walls = np.flatnonzero(np.repeat(~np.array(domain.periodic), 2) | wild)
+        edges = 2 * domain.extent.sum()
+    number = len(walls)
     room, made = domain.measure / edges, []
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         width = min(edges / 10 ** rng.uniform(1, 3), np.inf if wild else 0.3 * room)
@@ -246,14 +251,15 @@ def some_layers(
             first = int(rng.integers(number))
             some = range(first, min(number, first + int(rng.integers(1, 30))))
             chosen = np.flatnonzero(rng.random(number) < 0.5)
-            options["edges"] = some if rng.random() < 0.5 or not (wild or len(chosen)) else chosen
+            some = some if rng.random() < 0.5 or not (wild or len(chosen)) else chosen
+            options["edges"] = walls[np.array(some, int)]
         if wild and rng.random() < 0.4:
             strange = {
                 "height": lambda: edges * 10.0 ** rng.uniform(-300, 300),
                 "count": lambda: int(rng.choice([0, 50, 10**6, 10**18])),
                 "growth": lambda: rng.choice([1 + 1e-15, 1e3, 1e300, 0.5, np.nan]),
                 "spacing": lambda: edges * 10.0 ** rng.uniform(-300, 300),
-                "edges": lambda: [[], [number], [-1], [0, 0], 3][rng.integers(5)],
+                "edges": lambda: [[], [len(walls)], [-1], [0, 0], 3][rng.integers(5)],
             }
             name = str(rng.choice(list(strange)))
             options[name] = strange[name]()

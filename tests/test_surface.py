@@ -1,6 +1,7 @@
 """Triangulated surfaces: distance against brute force, reading, closedness, self-intersection."""
 
 import builtins
+import warnings
 
 import numpy as np
 import pytest
@@ -377,6 +378,19 @@ def test_broken_files_are_refused(tmp_path):
         sizing.Surface.read(tmp_path / "absent.stl")
     with pytest.raises(InputError, match=r"\.stl, \.obj, \.ply, \.off"):
         sizing.Surface.read(tmp_path / "part.step")
+
+
+def test_normals_that_are_none_do_not_matter(tmp_path, caplog):
+    """A surface has those of its triangles; what its reader thinks of it is not printed."""
+    pytest.importorskip("trimesh")
+    corners = "vertex 0 0 0 vertex 1 0 0 vertex 0 1 0"
+    (tmp_path / "part.stl").write_text(
+        f"solid\nfacet normal 0 zero 1\nouter loop\n{corners}\nendloop\nendfacet\nendsolid\n"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # as numpy has it at last
+        assert len(sizing.Surface.read(tmp_path / "part.stl")) == 1
+    assert not caplog.records
 
 
 def test_missing_reader_is_named(tmp_path, monkeypatch):

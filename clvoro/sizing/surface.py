@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .._files import open_plain
+from .._files import open_plain, unlogged
 from ..errors import InputError, InputTypeError
 from .shapes import coordinates
 from .tree import Tree
@@ -124,7 +124,7 @@ class Surface:
         extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
         try:
             # What is no number among the coordinates is refused below.
-            with open_plain(path) as file, np.errstate(all="ignore"):
+            with open_plain(path) as file, np.errstate(all="ignore"), unlogged("trimesh"):
                 mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
             vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
         except MemoryError:
