@@ -215,7 +215,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     )  # fmt: skip
     if isinstance(domain, Polygon):
         check_edges(check, domain, g, slack)
-        check_cells(check, g, slack)
+        check_cells(check, domain, g, slack)
     _check_nearest(check, g, slack)
 
 

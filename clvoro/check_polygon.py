@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from scipy.spatial import KDTree
 
 from .outlines import face_ends, next_faces
 
 if TYPE_CHECKING:
-    from scipy.spatial import KDTree
-
     from .findings import Check
     from .polygon import Polygon
     from .rebuilt import Rebuilt
@@ -80,7 +79,7 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     )  # fmt: skip
 
 
-def check_cells(check: Check, g: Rebuilt, slack: float) -> None:
+def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
     """Check that each cell holds its generator: its faces go around it once."""
     d = check.diagram
     begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)
@@ -92,8 +91,13 @@ def check_cells(check: Check, g: Rebuilt, slack: float) -> None:
     off = np.linalg.norm(begin + np.clip(t, 0, 1)[:, None] * edge, axis=1)
     near = np.full(len(d), np.inf)
     np.minimum.at(near, g.owner, off)
+    wrong = np.flatnonzero((np.abs(turns - 1) > 1e-3) & (near > slack))
+    if wrong.size and len(d) > 1:
+        # Of two on the boundary in the same place but for roundings, either may be the one inside, and have all of it.
+        beside = KDTree(d.points).query(d.points[wrong], k=2)[0][:, 1]
+        wrong = wrong[(beside > slack) | (domain.boundary_distance(d.points[wrong]) > slack)]
     check.note(
-        "generators in their cells", (np.abs(turns - 1) > 1e-3) & (near > slack),
+        "generators in their cells", np.isin(np.arange(len(d)), wrong),
         lambda i: f"the faces of cell {i} go {turns[i]:.3g} times around its generator, expected once",
     )  # fmt: skip
 
@@ -133,7 +137,7 @@ def hidden(
         along = domain.vertices[domain.next_vertex[edge]] - domain.vertices[edge]
         along /= np.linalg.norm(along, axis=1)[:, None]
         right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
-        away[place[(right > slack) & (d.neighbours[faces] < 0)[place]]] = True
+        away[place[(right > 4 * unit) & (d.neighbours[faces] < 0)[place]]] = True
     away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
     # Nor is anything seen through a point, or from one.
     away[place[near_shared_corners(domain, lines, slack)]] = True

@@ -335,16 +335,44 @@ def test_lists_grow_where_a_cell_meets_many(mesh, adapter):
     np.testing.assert_allclose(got, new.centroids[:, 0], rtol=0, atol=1e-11)
 
 
-def test_cells_of_many_faces(adapter):
-    """A ring of generators around one: the cell in the middle has 90 faces."""
-    box = Box((0, 0), (1, 1))
-    angle = 2 * np.pi * np.arange(90) / 90
-    ring = 0.5 + 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
-    old = adapter.diagram(box, np.vstack([[0.5, 0.5], ring]))
-    new = adapter.diagram(box, old.points + np.array([0.01, 0]))
+@DIMS
+def test_cells_of_many_faces(adapter, dim):
+    """A ring or a sphere of generators around one: the cell in the middle has 90 faces."""
+    box = Box((0,) * dim, (1,) * dim)
+    turns = 2 * np.pi * np.arange(90)
+    height = (2 * np.arange(90) + 1) / 90 - 1 if dim == 3 else np.zeros(90)
+    angle = turns / 90 if dim == 2 else turns * (np.sqrt(5) - 1) / 2
+    around = np.sqrt(1 - height**2)
+    sphere = np.column_stack([around * np.cos(angle), around * np.sin(angle), height])[:, :dim]
+    old = adapter.diagram(box, 0.5 + 0.3 * np.vstack([np.zeros(dim), sphere]))
+    new = adapter.diagram(box, old.points + 0.01 * np.eye(dim)[0])
     assert np.diff(old.neighbour_starts).max() == 90
     got = old.transfer(old.centroids[:, 1], new, 2, limited=False, adapter=adapter)
     np.testing.assert_allclose(got, new.centroids[:, 1], rtol=0, atol=1e-11)
+    # All of it within one old cell, of which nothing else needs room.
+    wide = adapter.diagram(
+        box, np.array([0.5] * dim) + np.array([[-0.49], [-0.41]]) * np.eye(dim)[0]
+    )
+    again = clvoro.Adapter(adapter.ctx)
+    got = wide.transfer(wide.centroids[:, 0], new, 2, limited=False, adapter=again)
+    # Singular systems are solved to the root of eps.
+    np.testing.assert_allclose(got, new.centroids[:, 0], rtol=0, atol=1e-7)
+
+
+def test_faces_that_are_the_same_but_for_what_rounds(adapter):
+    """Two prisms on each other: where the other mesh has their common face about as much higher as its corners round,
+    some of the corners are beyond it and others between them are not."""
+    angle = 2 * np.pi * np.arange(40) / 40
+    ring = 0.5 + 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    layer = np.column_stack([np.vstack([[0.5, 0.5], ring]), np.full(41, 0.25)])
+    box, q = Box((0, 0, 0), (1, 1, 1)), np.random.default_rng(68).normal(size=82)
+    old = adapter.diagram(box, np.vstack([layer, layer + np.array([0, 0, 0.5])]))
+    for roundings in (*range(-20, -4), *range(5, 21)):
+        higher = layer + np.array([0, 0, 0.5 + roundings * 2.0**-53])
+        new = adapter.diagram(box, np.vstack([layer, higher]))
+        got = old.transfer(q, new, adapter=adapter)
+        assert mass_defect(old, new, q, got) < 1e-13
+        np.testing.assert_allclose(got, q, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -456,6 +484,20 @@ def test_other_bad_input(mesh, adapter):
     with pytest.raises(InputError, match="expected the same domain"):
         old.transfer(np.ones(9), adapter.diagram(Box((0, 0), (1, 1)), [[0.5, 0.5]]))
     assert old.transfer(np.ones((9, 0)), new).shape == (8, 0)
+
+
+@DIMS
+def test_cells_of_generators_that_coincide_are_refused(mesh, adapter, dim):
+    old, new = mesh(dim, 60, 1), mesh(dim, 50, 2)
+    points = new.points.copy()
+    beside = new.neighbours[slice(*new.neighbour_starts[7:9])]
+    points[7] = points[beside[beside >= 0][0]]
+    names = ("volumes", "centroids", "neighbour_starts", "neighbours")
+    arrays = {name: getattr(new, name) for name in names}
+    with pytest.raises(InputError, match=r"diagram\.check\(\)"):
+        old.transfer(
+            np.ones(60), Diagram(new.domain, {**arrays, "points": points}), adapter=adapter
+        )
 
 
 def test_what_is_no_voronoi_diagram_is_refused(mesh, adapter):

@@ -4,7 +4,19 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from reference_polygon import euler_excess, faults, polygon_voronoi
-from shores import POLYGONS, TOUCHING, UNIT, coast, comb, koch, lattice, scattered, slit, spit
+from shores import (
+    DIAMOND,
+    POLYGONS,
+    TOUCHING,
+    UNIT,
+    coast,
+    comb,
+    koch,
+    lattice,
+    scattered,
+    slit,
+    spit,
+)
 
 import clvoro
 from clvoro._program import Engine
@@ -183,6 +195,22 @@ def test_an_island_whose_shore_goes_to_another(adapters, order):
     domain = clvoro.Polygon.from_pieces(pieces[::order])
     cells = compare(adapters, domain, np.array([(0.5, 0.5), (0.95, 0.5)]))
     assert cells.areas == pytest.approx([0.04, 0.84])
+
+
+NOTCHED = np.array([(-1, -1), (0.5, -1), (0.5, 0.5), (0.75, 0), (0.75, -0.5), (1, 1), (-1, 1)])
+
+
+@pytest.mark.parametrize(
+    ("generator", "island"), [((2.5, 4), DIAMOND * 2 - 1), ((4, 4), DIAMOND * 2 - 1), ((4, 4), NOTCHED)]
+)  # fmt: skip
+def test_corners_of_an_island_level_with_the_generator(adapters, generator, island):
+    """A ray from the generator meets them; the island, in a lake, and the land around that are both in its region."""
+    lake = np.array([(2.75, 2.75), (5.25, 2.75), (5.25, 5.25), (2.75, 5.25)])
+    domain = clvoro.Polygon.from_pieces([[UNIT * 13 - 1, lake], [island + 4]])
+    # Of one in the square from 2.25 to 5.75: the images of the generator at its sides.
+    x, y = generator
+    points = [generator, (4.5 - x, y), (11.5 - x, y), (x, 4.5 - y), (x, 11.5 - y)]
+    compare(adapters, domain, np.array(points, float))
 
 
 def test_what_is_thinner_than_rounding_is_refused_or_right(adapters):
