@@ -212,9 +212,15 @@ def some_generators(rng: np.random.Generator, domain: Any, real: str, wild: bool
 
 
 def few_layers(rng: np.random.Generator, domain: Any, wild: bool) -> list[clvoro.Layers]:
-    layers = some_layers(rng, domain, wild)
-    while not wild and count_rows(domain, layers) > MOST_ROWS:
+    """Layers; unless `wild`, of not too many rows, and such as leave room, which is tried some times."""
+    for _ in range(30):
         layers = some_layers(rng, domain, wild)
+        if wild:
+            break
+        with contextlib.suppress(InputError):
+            if count_rows(domain, layers) <= MOST_ROWS:
+                free_domain(domain, layers)
+                break
     return layers
 
 
