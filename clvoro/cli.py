@@ -59,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("case", metavar="CASE", help="a TOML file, or a built-in case's name")
     run.add_argument(
-        "--out", metavar="DIR", type=Path, help="where to write (default: out/NAME of the case)"
+        "--out", metavar="DIR", type=_path, help="where to write (default: out/NAME of the case)"
     )
     run.add_argument(
         "--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices"
@@ -84,13 +84,16 @@ def build_parser() -> argparse.ArgumentParser:
         "--levels", metavar="N", help="coarser levels to begin with, or auto (the default)"
     )
     run.add_argument(
-        "--checkpoint", metavar="FILE", type=Path, help="write the run's state there every so often"
+        "--checkpoint",
+        metavar="FILE",
+        type=_path,
+        help="write the run's state there every so often",
     )
     run.add_argument(
         "--checkpoint-every", metavar="SECONDS", type=float, help="time between (default: 60)"
     )
     run.add_argument(
-        "--resume", metavar="FILE", type=Path, help="go on from a checkpoint of the same case"
+        "--resume", metavar="FILE", type=_path, help="go on from a checkpoint of the same case"
     )
     run.add_argument("--no-report", action="store_true", help="no pictures and no page")
     run.add_argument(
@@ -118,6 +121,13 @@ def build_parser() -> argparse.ArgumentParser:
     cases = commands.add_parser("cases", help="list the built-in cases, or print one")
     cases.add_argument("case", metavar="NAME", nargs="?", help="print this case's TOML text")
     return parser
+
+
+def _path(text: str) -> Path:
+    """Return `text` as a path: an empty one, of a script's variable that is not set, would be the working folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("it is empty, expected a name")
+    return Path(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -197,6 +197,10 @@ class Job:
             "resume": self.resume,
         }
         given = {name: value for name, value in given.items() if value is not None}
+        if "checkpoint_every" in given and self.checkpoint is None:
+            raise InputError(
+                "checkpoint_every is given, and no checkpoint; say which file: --checkpoint FILE"
+            )
         if given and len(self.case.methods) > 1:
             raise InputError(
                 f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "

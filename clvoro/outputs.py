@@ -69,16 +69,18 @@ def do_all(tasks: Iterable[Callable[[], object]]) -> None:
 
 def require_plots() -> None:
     """Say before the run that the report cannot be drawn."""
+    # Pictures become files: nothing is shown, and what a notebook has its processes use need not be there.
+    os.environ["MPLBACKEND"] = "agg"
     try:
         import matplotlib
 
-        matplotlib.use("agg")  # pictures become files: nothing is shown, and no display needed
+        matplotlib.use("agg")
     except ModuleNotFoundError as error:
         raise ClvoroError(
             "the report needs Matplotlib, which is not installed; pip install 'clvoro[plot]', "
             "or run with --no-report"
         ) from error
-    except Exception as error:  # by MPLBACKEND or a matplotlibrc, whatever is wrong there
+    except Exception as error:  # whatever is wrong with its settings or folders
         raise ClvoroError(
             f"the report needs Matplotlib, which cannot be used ({error}); mend that, or run with --no-report"
         ) from error

@@ -289,6 +289,20 @@ def test_frames_before_one_that_fails_are_kept(here, capsys):
 # Names.
 
 
+@pytest.mark.parametrize("option", ["--out", "--checkpoint", "--resume"])
+def test_names_of_variables_that_are_not_set(here, capsys, option):
+    with pytest.raises(SystemExit) as left:
+        call(option, "")
+    assert left.value.code == cli.BAD_INPUT
+    assert f"argument {option}: it is empty, expected a name" in capsys.readouterr().err
+    assert os.listdir(here) == ["small.toml"]
+
+
+def test_checkpoints_that_nobody_would_write(here, capsys):
+    assert call("--checkpoint-every", "5") == cli.BAD_INPUT
+    assert "say which file: --checkpoint FILE" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(os.name == "nt", reason="names are text there")
 def test_names_that_are_no_text(here, capsys):
     (here / os.fsdecode(b"b\xff.toml")).write_text(CASE)
@@ -366,6 +380,10 @@ def test_the_hosts_memory_ends(here, monkeypatch, capsys):
 
 def test_pictures_need_no_display(here, monkeypatch, capsys):
     import matplotlib
+
+    monkeypatch.setenv("MPLBACKEND", "module://of.a.notebook")
+    outputs.require_plots()
+    assert os.environ["MPLBACKEND"] == "agg"  # before it is imported, and by its children
 
     def fail(_):
         raise ValueError("no such backend")
