@@ -61,25 +61,22 @@ kernel void correct_out(int n, REAL omega, global const int *partner, global con
         u[i] = x[i] + omega * pairwise(i, partner, own, both, t);
 }
 
-/* Sum of b - A x over the members of group g. */
-inline REAL group_defect(int g, int n, global const int *starts, global const int *columns, global const REAL *weights,
-                         global const REAL *b, global const REAL *x, global const int *member_starts,
-                         global const int *members)
+/* Sum over the members of group g. */
+inline REAL group_total(int g, global const int *member_starts, global const int *members, global const REAL *t)
 {
     REAL sum = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s)
-        sum += b[members[s]] - row_difference(members[s], n, starts, columns, weights, x);
+        sum += t[members[s]];
     return sum;
 }
 
 /* b of a group = sum of its members' defects. */
-kernel void restrict_defect(int groups, int n, global const int *starts, global const int *columns,
-                            global const REAL *weights, global const REAL *b, global const REAL *x,
-                            global const int *member_starts, global const int *members, global REAL *coarse_b)
+kernel void restrict_defect(int groups, global const REAL *t, global const int *member_starts,
+                            global const int *members, global REAL *coarse_b)
 {
     const int g = get_global_id(0);
     if (g < groups)
-        coarse_b[g] = group_defect(g, n, starts, columns, weights, b, x, member_starts, members);
+        coarse_b[g] = group_total(g, member_starts, members, t);
 }
 
 /* Every member takes its group's correction. */
@@ -90,17 +87,24 @@ kernel void prolong(int n, global const int *group, global const REAL *e, global
         x[i] += e[group[i]];
 }
 
-/* One group of work-items, where cells are few: a step of smoothing. */
-inline void relax_alone(int n, REAL omega, global const int *starts, global const int *columns,
-                        global const REAL *weights, global const int *partner, global const REAL *own,
-                        global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
+/* One group of work-items, where cells are few: t = b - A x. */
+inline void defect_alone(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                         global const REAL *b, global const REAL *x, global REAL *t)
 {
     barrier(CLK_GLOBAL_MEM_FENCE);
     for (BLOCK_LOOP(i, n))
         t[i] = b[i] - row_difference(i, n, starts, columns, weights, x);
     barrier(CLK_GLOBAL_MEM_FENCE);
-    for (BLOCK_LOOP(j, n))
-        x[j] += omega * pairwise(j, partner, own, both, t);
+}
+
+/* One group: a step of smoothing. */
+inline void relax_alone(int n, REAL omega, global const int *starts, global const int *columns,
+                        global const REAL *weights, global const int *partner, global const REAL *own,
+                        global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
+{
+    defect_alone(n, starts, columns, weights, b, x, t);
+    for (BLOCK_LOOP(i, n))
+        x[i] += omega * pairwise(i, partner, own, both, t);
 }
 
 /* One group: all that is done on a level on the way down, with the same bits as by the kernels above. */
@@ -112,9 +116,9 @@ kernel void descend_alone(int n, REAL late, REAL early, global const int *starts
     for (BLOCK_LOOP(i, n))
         x[i] = late * pairwise(i, partner, own, both, b);
     relax_alone(n, early, starts, columns, weights, partner, own, both, b, x, t);
-    barrier(CLK_GLOBAL_MEM_FENCE);
+    defect_alone(n, starts, columns, weights, b, x, t);
     for (BLOCK_LOOP(g, groups))
-        coarse_b[g] = group_defect(g, n, starts, columns, weights, b, x, member_starts, members);
+        coarse_b[g] = group_total(g, member_starts, members, t);
 }
 
 /* One group: the same on the way up. */

@@ -136,7 +136,8 @@ class Cycle:
             self._add(depth, "first_rounded", n, _LATE, *level.blocks, r, b, x)
         self._relax(depth, _EARLY)
         if lists:
-            self._add(depth, "restrict_defect", count, np.int32(n), *level.rows, b, x, *lists)
+            self._add(depth, "defect", n, *level.rows, b, x, t)
+            self._add(depth, "restrict_defect", count, t, *lists)
 
     def _solve(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
         """Solve on the coarsest level; from `r` and into `u`, if there are any."""
