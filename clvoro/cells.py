@@ -161,14 +161,14 @@ class Cells:
         while True:
             with engine.workspace.frame():
                 rows = self.take_rows(n, spare=spare)
-                flags, generator, m = self._clip(rows, box, points, total, n, binned, exact)
+                flags, _, m = self._clip(rows, box, points, total, n, binned, exact)
                 if not flags & CROWDED:
                     if flags & ~DOUBT:
-                        raise CloseError(points, total, generator)
+                        raise CloseError(points, total)
                     old = rows.places, rows.places
-                    t, flags, generator = self._measure(rows, box, points, n, *old, m, flags, exact)
+                    t = self._measure(rows, box, points, n, *old, m, flags, exact)
                     if t is None:
-                        raise CloseError(points, total, generator)
+                        raise CloseError(points, total)
                     return t
                 # All anew: as many as have been asked for by now, and more by those that were not yet.
                 spare = 2 * (int(rows.flags.get()[4]) - n)
@@ -224,7 +224,7 @@ class Cells:
         flags, _, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
         if flags & ~DOUBT:
             return None
-        return self._measure(rows, box, points, n, *old, m, flags, exact=False)[0]
+        return self._measure(rows, box, points, n, *old, m, flags, exact=False)
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with what is known of faces in full precision, in arrays of its own."""
@@ -286,8 +286,8 @@ class Cells:
         m: int,
         flags: int,
         exact: bool,
-    ) -> tuple[Tessellation | None, int, int]:
-        """Write graph and measures of the rows; None if its doubtful cells do not fit. Return the flags, too."""
+    ) -> Tessellation | None:
+        """Write graph and measures of the rows; None if its doubtful cells do not fit."""
         engine, corners, starts = self.engine, box.device_corners(self.engine.real), rows.starts
         self._reserve_faces(n, m)
         new, faces = self._views, self._of_faces
@@ -301,26 +301,23 @@ class Cells:
             neighbours, faces["face_measures"], faces["face_centroids"], new["volumes"],
             new["offsets"], new["covariances"],
         )  # fmt: skip
-        generator = 0
         if flags & DOUBT:
             engine.run_each(
                 self._kernels.check_doubtful, n, rows.places, rows.counts, starts, neighbours,
                 new["volumes"], points, *corners, self._share(exact), rows.flags,
             )  # fmt: skip
-            flags, generator, _ = self._read_flags()
-            if flags & ~DOUBT:
-                return None, flags, generator
+            if self._read_flags()[0] & ~DOUBT:
+                return None
         copied = [(starts, new["starts"])]
         if not direct:
             copied.append((neighbours, faces["neighbours"]))
         for array, to in copied:
             cl.enqueue_copy(engine.queue, buffer_of(to), buffer_of(array), byte_count=array.nbytes)
-        t = Tessellation(
+        return Tessellation(
             n=n, points=points, starts=new["starts"], neighbours=faces["neighbours"],
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
             offsets=new["offsets"], covariances=new["covariances"],
         )  # fmt: skip
-        return t, flags, generator
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)

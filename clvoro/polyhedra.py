@@ -199,9 +199,9 @@ class Polyhedra:
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
-            flags, generator, m = (int(v) for v in self._report.get())
+            flags, _, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | DOUBT | NARROW):
-                raise CloseError(points, n, generator)
+                raise CloseError(points, n)
             if m > self._room:
                 # All anew: what did not fit was not kept. With the radii from before, as the last bits depend on them,
                 # and should not on how much room there was.
@@ -216,9 +216,8 @@ class Polyhedra:
                 capacity, again = 2 * capacity, True
                 if capacity > MOST_FACES:
                     raise ClvoroError(
-                        f"the cell of generator {generator} has more than {MOST_FACES} faces; so "
-                        "many generators on a common sphere are not supported: remove or perturb "
-                        "some"
+                        f"a cell has more than {MOST_FACES} faces; so many generators on a common sphere "
+                        "are not supported: remove or perturb some"
                     )
                 self._report.set(np.array([flags & (DOUBT | NARROW), 2**31 - 1, m], np.int32))
             else:
@@ -230,9 +229,9 @@ class Polyhedra:
             k.match_faces, rows, row_places, row_counts, labels, measures, cells["volumes"], points,
             share, np.int32(flags & DOUBT), kept, starts, self._report,
         )  # fmt: skip
-        flags, generator, _ = (int(v) for v in self._report.get())
+        flags, _, _ = (int(v) for v in self._report.get())
         if flags & ~(DOUBT | NARROW):
-            raise CloseError(points, n, generator)
+            raise CloseError(points, n)
         self._scan.exclusive(starts, starts, rows)
         faces, cells["starts"] = self._faces(m), self._of_cells["starts"][: rows + 1]
         engine.run_each(

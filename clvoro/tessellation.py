@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl.array as cla
+from scipy.spatial import KDTree
 
 from .errors import InputError
 
@@ -20,8 +21,6 @@ EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
 # Bits of common/face_rows.h; its others mean generators that coincide, and cells that collapsed.
 FULL, DOUBT, NARROW = 1, 8, 16
-NEAR = 16
-"""Generators around a cell that is none, of which two are too close: its neighbours and some."""
 
 
 class CloseError(InputError):
@@ -31,24 +30,22 @@ class CloseError(InputError):
     ----------
     points : (n or more, d) real, on the device
         In its coordinates.
-    n, generator : int
-        How many there are, and one whose cell has shown it: those that are too close may be beside it.
+    n : int
+        How many there are.
 
     Attributes
     ----------
     place : (d,) float
-        Of one of the two closest generators there.
+        Of one of the two that are closest to each other: cells far away may be the first to show it.
     gap : float
         From that to the other.
     """
 
-    def __init__(self, points: cla.Array, n: int, generator: int) -> None:
+    def __init__(self, points: cla.Array, n: int) -> None:
         x = points.get()[:n].astype(np.float64)
-        near = x[np.argsort(((x - x[generator]) ** 2).sum(axis=1), kind="stable")[:NEAR]]
-        apart = np.sqrt(((near[:, None] - near) ** 2).sum(axis=2))
-        np.fill_diagonal(apart, np.inf)
-        first = apart.min(axis=1).argmin()
-        self.place, self.gap, self.real = near[first], float(apart[first].min()), points.dtype
+        gaps = KDTree(x).query(x, k=2)[0][:, 1]
+        first = gaps.argmin()
+        self.place, self.gap, self.real = x[first], float(gaps[first]), points.dtype
         super().__init__(self._text(self.place, self.gap))
 
     def _text(self, place: np.ndarray, gap: float) -> str:

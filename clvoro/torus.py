@@ -126,7 +126,7 @@ class Torus:
             # Room for what is made anew.
             del images, binned, args, t, folded
         if flags & COLLAPSED:
-            raise CloseError(points, n, generator)
+            raise CloseError(points, n)
         if flags & FAR:
             place = whereabouts(self.domain, points[generator].get())
             raise FewCellsError(

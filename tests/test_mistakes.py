@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import shapely
+from scipy.spatial import KDTree
 
 import clvoro
 from clvoro import cli, sizing
@@ -303,3 +304,14 @@ def test_generators_that_are_too_close_are_named_by_their_place(ctx, dim, period
     assert np.array(place[1].split(), float) == pytest.approx(np.full(dim, 2.75), abs=step + 1e-8)
     assert place[2] == f"{step:.3g}"
     assert ("or use dtype='float64'" in said) == (real == "float32")
+
+
+def test_the_closest_generators_are_named_whichever_cell_shows_it(ctx):
+    """In space a cell far from a cluster of some roundings' width may be the first that cannot be cut by it."""
+    rng = np.random.default_rng(4)
+    cluster = 0.6 + 1e-15 * rng.standard_normal((120, 3))
+    points = np.unique(np.concatenate([cluster, rng.random((40, 3))]), axis=0)
+    least = KDTree(points).query(points, k=2)[0][:, 1].min()
+    with pytest.raises(InputError, match="too close") as refused:
+        clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), points)
+    assert f", {least:.3g} apart" in str(refused.value)
