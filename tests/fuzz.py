@@ -19,13 +19,35 @@ import sys
 import time
 import traceback
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 import clvoro
+from tests import fuzz_commands as commands
+from tests import fuzz_work as work
 from tests.fuzz_sizes import OwnError
-from tests.fuzz_work import WORK, Wrong
+from tests.fuzz_work import Wrong
+
+WORK = {
+    "diagram": (partial(work.try_diagram, work.in_plane), 0.3),
+    "solid": (partial(work.try_diagram, work.in_space), 0.12),
+    "polygon": (work.try_polygon, 0.15),
+    "periodic": (partial(work.try_diagram, work.with_seams), 0.12),
+    "run": (partial(work.try_run, work.in_plane), 0.15),
+    "solid-run": (partial(work.try_run, work.in_space), 0.08),
+    "polygon-run": (work.try_polygon_run, 0.1),
+    "periodic-run": (partial(work.try_run, work.with_seams), 0.12),
+    "layers": (work.try_layers, 0.1),
+    "resumed": (work.try_resumed, 0.06),
+    "moved": (work.try_moved, 0.05),
+    "case": (commands.try_case, 0.06),
+    "turns": (work.try_turns, 0.08),
+    "command": (commands.try_command, 0.06),
+    "file": (commands.try_file, 0.1),
+}
+"""What is tried by kind of input, and how often."""
 
 SLOWEST = 180
 """Seconds after which an input counts as one that hangs."""

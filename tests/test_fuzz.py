@@ -5,7 +5,7 @@ import collections
 import pytest
 
 from tests import fuzz
-from tests.fuzz_work import WORK
+from tests.fuzz import WORK
 
 
 @pytest.mark.slow
