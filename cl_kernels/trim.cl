@@ -10,7 +10,6 @@
    they share the longest face, and stay where they are only if there is none. */
 
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
-#define ON_BOUNDARY (4 * REAL_EPS)
 
 /* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
 
@@ -47,7 +46,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
                 chord_loops[cursor.chord] = loops;
             const segment_t s = next_segment(&cursor, &cell, &c);
             around += winding(s, 0);
-            near = fmin(near, squared_distance_to(s));
+            near = fmin(near, squared_distance_to(s, 0));
             open |= !on_chord;
             lost |= !on_chord && s.label < 0; /* at a wall of the box, which is far outside */
         } while (!is_complete(&cursor, begin) && ++count < most);
@@ -106,10 +105,9 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
                 loop_pieces[place] = ring;
                 continue;
             }
-            const REAL2 y = chord_begin(&c, loop_chords[place]) - (REAL2)(cell.x[0], cell.x[1]);
             for (int other = first; outer > 1 && other < first + loops; ++other)
                 if (loop_pieces[other] == other && is_open(&cell, &c, loop_chords[other]) &&
-                    winds_around(&cell, &c, loop_chords[other], y))
+                    lies_within(&cell, &c, loop_chords[other], loop_chords[place]))
                     loop_pieces[place] = other;
         }
     loop_roots[main] = cell.i;

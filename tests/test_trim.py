@@ -197,6 +197,26 @@ def test_an_island_whose_shore_goes_to_another(adapters, order):
     assert cells.areas == pytest.approx([0.04, 0.84])
 
 
+def test_holes_that_touch_the_boundary_of_their_piece(adapters):
+    """A generator on a piece beside it, of whose cell both are: by the corners of the hole its piece is not known."""
+    land = [(0, 0), (2, 0), (4, 0), (4, 1), (0, 1)]
+    beside = [(1.8, -0.6), (2.2, -0.6), (2.2, -0.2), (1.8, -0.2)]
+    hole = [(2, 0), (1.75, 0.25), (2.25, 0.25)]
+    others = [[(1.75, 0.25), (0.5, 0.25), (0.5, 0.5)], [(2.25, 0.25), (3.5, 0.5), (3.5, 0.25)]]
+    points = np.array([(2, -0.4), (0.3, 0.5), (3.6, 0.55)])
+    for more in ([], others[:1], others):
+        for first in range(3):
+            holes = [np.roll(hole, -first, axis=0), *more]
+            domain = clvoro.Polygon.from_pieces([[land, *holes], [beside]])
+            if not more:  # rings whose parts of a cell touch in points belong together here, not in the reference
+                compare(adapters, domain, points)
+            for real, adapter in adapters.items():
+                diagram = adapter.diagram(domain, points)
+                assert faults(diagram, real) == []
+                # Coordinates up to 4 round.
+                assert diagram.volumes[0] == pytest.approx(0.16, abs=4 * float(np.finfo(real).eps))
+
+
 NOTCHED = np.array([(-1, -1), (0.5, -1), (0.5, 0.5), (0.75, 0), (0.75, -0.5), (1, 1), (-1, 1)])
 
 

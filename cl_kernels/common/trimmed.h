@@ -3,6 +3,8 @@
    cell's own faces, counter-clockwise, to the place where the next chord enters. */
 #include "common/boundary.h"
 
+#define ON_BOUNDARY (4 * REAL_EPS) /* so near to it rounding may put what is on it */
+
 /* A convex cell: its generator, faces, and the chords in it in the order of their numbers. */
 typedef struct {
     int i, n, chord_count;
@@ -188,13 +190,13 @@ inline int winding(segment_t s, REAL2 y)
     return 0;
 }
 
-inline REAL squared_distance_to(segment_t s)
+inline REAL squared_distance_to(segment_t s, REAL2 y)
 {
-    const REAL2 e = s.q - s.p;
+    const REAL2 p = s.p - y, e = s.q - s.p;
     const REAL e2 = dot(e, e);
-    const REAL t = e2 > 0 ? clamp(-dot(s.p, e) / e2, R(0), R(1)) : 0;
-    const REAL2 y = s.p + t * e;
-    return dot(y, y);
+    const REAL t = e2 > 0 ? clamp(-dot(p, e) / e2, R(0), R(1)) : 0;
+    const REAL2 nearest = p + t * e;
+    return dot(nearest, nearest);
 }
 
 /* The beginning of the loop that begins with `chord`; -1: around the cell. */
@@ -203,15 +205,29 @@ inline cursor_t loop_begin(int chord)
     return chord >= 0 ? along_chord(chord) : around_cell();
 }
 
-/* Is y, relative to the generator, inside of a loop? */
-inline bool winds_around(const convex_t *cell, const chords_t *c, int chord, REAL2 y)
+/* Does the hole whose loop begins with `hole` lie within the loop that begins with `chord`? By a corner or a middle of
+   its edges that is not on that: the hole may touch it. */
+inline bool lies_within(const convex_t *cell, const chords_t *c, int chord, int hole)
 {
-    cursor_t cursor = loop_begin(chord);
-    int turns = 0;
-    do
-        turns += winding(next_segment(&cursor, cell, c), y);
-    while (!is_complete(&cursor, chord));
-    return turns > 0;
+    const REAL2 x = (REAL2)(cell->x[0], cell->x[1]);
+    for (int middles = 0; middles < 2; ++middles) {
+        int at = hole;
+        do {
+            const REAL2 p = chord_begin(c, at), q = chord_end(c, at), y = (middles ? p + (q - p) / 2 : p) - x;
+            cursor_t cursor = loop_begin(chord);
+            REAL near = REAL_MAX;
+            int turns = 0;
+            do {
+                const segment_t s = next_segment(&cursor, cell, c);
+                turns += winding(s, y);
+                near = fmin(near, squared_distance_to(s, y));
+            } while (!is_complete(&cursor, chord));
+            if (near > ON_BOUNDARY * ON_BOUNDARY)
+                return turns > 0;
+            at = chord_after(c, at);
+        } while (at != hole);
+    }
+    return false;
 }
 
 /* Does a loop leave the boundary for faces of the cell? */
