@@ -5,22 +5,38 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
-_CONTAINER = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+"""Where Linux says what control groups may take, and which ones this process is in."""
+
+
+def _group_limits() -> Iterator[float]:
+    """Yield the limits of this process's control groups, as containers and batch systems set them."""
+    paths = {(GROUPS, "memory.max", "."), (GROUPS / "memory", "memory.limit_in_bytes", ".")}
+    with contextlib.suppress(ValueError, OSError):  # not as expected, or none
+        for line in OWN_GROUPS.read_text().splitlines():
+            _, kinds, path = line.split(":", 2)
+            if not kinds:
+                paths.add((GROUPS, "memory.max", path.strip("/")))
+            elif "memory" in kinds.split(","):
+                paths.add((GROUPS / "memory", "memory.limit_in_bytes", path.strip("/")))
+    for root, name, path in paths:
+        for group in (Path(path), *Path(path).parents):
+            with contextlib.suppress(ValueError, OSError):  # "max", or no such file
+                yield int((root / group / name).read_text())
 
 
 def host_memory() -> float:
-    """Return the bytes that the machine has, or fewer if a container or the shell (ulimit -v) allows fewer.
+    """Return the bytes that the machine has, or fewer if a container, a batch system or the shell (ulimit -v) says so.
 
     Infinite where the system does not say.
     """
     limits = [math.inf]
     with contextlib.suppress(AttributeError, ValueError, OSError):  # systems other than POSIX
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    for path in _CONTAINER:
-        with contextlib.suppress(ValueError, OSError):  # "max", or no such file
-            limits.append(int(Path(path).read_text()))
+    limits += _group_limits()
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 

@@ -19,7 +19,7 @@ import numpy as np
 from .cases import Case
 from .errors import Aborted, ClvoroError, InputError
 from .io import save, write_history
-from .memory import in_bytes
+from .memory import available_memory, in_bytes
 from .outputs import check_folder, do_all, refuse_own_files, require_plots
 from .polygon import Polygon
 from .profile import Profile
@@ -154,7 +154,7 @@ class Job:
 
             def told(needed: float) -> None:
                 if shown is not None and (shown.live or needed >= _MUCH):
-                    there = in_bytes(adapter.ctx.devices[0].global_mem_size)
+                    there = in_bytes(available_memory(adapter.ctx.devices[0]))
                     shown.tell(f"{title}: takes {in_bytes(needed)} of the device's {there}")
 
             adapter.told = told

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pyopencl as cl
 
+from ._host_memory import host_memory
 from ._primitives import scan_width
 from ._program import Engine
 from .domain import Domain
@@ -256,6 +258,12 @@ def in_bytes(amount: float) -> str:
     return f"{amount / 2 ** (10 * power):.3g} {('bytes', 'KiB', 'MiB', 'GiB')[power]}"
 
 
+def available_memory(device: cl.Device) -> float:
+    """Return the bytes that `device` has; of a CPU, no more than this process may take."""
+    own = device.global_mem_size
+    return min(own, host_memory()) if device.type & cl.device_type.CPU else own
+
+
 def check_memory(engine: Engine, n: float, needed: float) -> float:
     """Return `needed`, the bytes that a mesh of `n` cells takes (`memory_needed`), if there are as many.
 
@@ -266,7 +274,7 @@ def check_memory(engine: Engine, n: float, needed: float) -> float:
     MemoryLimitError
         Saying how many cells were asked for, how much memory they need and how much there is.
     """
-    available = engine.queue.device.global_mem_size
+    available = available_memory(engine.queue.device)
     if n > MOST_CELLS:
         raise MemoryLimitError(
             f"the run asks for {n:.3g} cells, expected at most {MOST_CELLS:.3g}, which the device's 32-bit "

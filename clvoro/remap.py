@@ -13,7 +13,7 @@ from ._program import Engine
 from .bins import Bins
 from .device import create_context
 from .errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
-from .memory import in_bytes
+from .memory import available_memory, in_bytes
 from .overlap import transfer_on_host
 from .polygon import Polygon
 from .results import Diagram, Result
@@ -135,10 +135,10 @@ def _transferred(
     sizes = ((len(mesh), len(mesh.neighbours)) for mesh in (source, target))
     needed = transfer_needed(engine, *sizes, columns.shape[1], order)
     device = queue.device
-    if needed > device.global_mem_size:
+    if needed > available_memory(device):
         raise MemoryLimitError(
             f"carrying {columns.shape[1]} columns from {len(source)} cells to {len(target)} needs "
-            f"{in_bytes(needed)} on the device; {device.name.strip()} has {in_bytes(device.global_mem_size)}. Carry "
+            f"{in_bytes(needed)} on the device; {device.name.strip()} has {in_bytes(available_memory(device))}. Carry "
             "fewer columns at a time, or use another device"
         )
     bins, stage = Bins(engine), Transfer(engine)

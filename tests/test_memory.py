@@ -21,6 +21,7 @@ from clvoro.memory import (
     PEAK,
     SURPLUS_RATE,
     TRIMMED_PEAK,
+    available_memory,
     check_memory,
     fixed_bytes,
     images_expected,
@@ -387,7 +388,7 @@ def test_periodic_boxes_hold_images_and_folded_graphs(bench, monkeypatch, ctx, d
 def test_what_does_not_fit_is_refused(ctx, dim, real):
     """Of the run and what comes after it, the larger counts."""
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
-    room = ctx.devices[0].global_mem_size
+    room = available_memory(ctx.devices[0])
     size = engine.real.itemsize
     reals, integers = PEAK[dim]
     most = max(reals * size + 4 * integers, OUTPUT[dim][size])

@@ -18,7 +18,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro import _runtimes, checkpoint, cli, outputs, progress
+from clvoro import _host_memory, _runtimes, checkpoint, cli, outputs, progress
 from clvoro._program import KernelPool, Kernels
 from clvoro.errors import (
     BuildError,
@@ -26,9 +26,11 @@ from clvoro.errors import (
     DeviceError,
     InputError,
     InputTypeError,
+    MemoryLimitError,
     OutputError,
 )
 from clvoro.io import npz
+from clvoro.memory import in_bytes
 from clvoro.resume import Saved
 
 ROOT = Path(__file__).parent.parent
@@ -376,6 +378,37 @@ def test_the_hosts_memory_ends(here, monkeypatch, capsys):
     monkeypatch.setattr(clvoro, "create_context", fail)
     assert call() == cli.FAILED
     assert "out of memory (Unable to allocate 7 PiB); give" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("own", "limits", "least"),
+    [
+        ("0::/job/step\n", {"job/memory.max": "3e9", "job/step/memory.max": "max"}, None),
+        ("0::/job/step\n", {"job/memory.max": "3000000", "job/step/memory.max": "max"}, 3e6),
+        ("0::/\n", {"memory.max": "4000000\n"}, 4e6),
+        ("5:cpu:/x\n3:memory,pids:/job\n", {"memory/job/memory.limit_in_bytes": "5000000"}, 5e6),
+        (None, {"memory/memory.limit_in_bytes": "6000000"}, 6e6),
+        ("no such line", {}, None),
+    ],
+)
+def test_limits_of_containers_and_batch_systems_hold(
+    adapter, tmp_path, monkeypatch, own, limits, least
+):
+    """What would not fit is refused: beyond such a limit a process is killed without a word."""
+    whole = _host_memory.host_memory()
+    for name, text in limits.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    if own is not None:
+        (tmp_path / "self").write_text(own)
+    monkeypatch.setattr(_host_memory, "GROUPS", tmp_path)
+    monkeypatch.setattr(_host_memory, "OWN_GROUPS", tmp_path / "self")
+    assert _host_memory.host_memory() == (least or whole)
+    device = adapter.queue.device
+    if least and device.type & cl.device_type.CPU:
+        assert adapter.memory_needed(BOX, 0.05) < least
+        with pytest.raises(MemoryLimitError, match=rf"has {in_bytes(least)}\."):
+            adapter.run(BOX, 0.005)
 
 
 def test_pictures_need_no_display(here, monkeypatch, capsys):
