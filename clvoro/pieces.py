@@ -29,4 +29,7 @@ def balance_pieces(mesh: Mesh, weights: cla.Array) -> None:
     source, weight = mesh.source[:n].get(), weights[:n].get().astype(float)
     sums, total = (np.bincount(piece, v, domain.n_pieces) for v in (source, weight))
     mean = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
-    mesh.source[:n].set((source - weight * mean[piece]).astype(source.dtype))
+    balanced = source - weight * mean[piece]
+    # With no cell beside it nothing can take up what would round.
+    balanced[np.bincount(piece, minlength=domain.n_pieces)[piece] == 1] = 0
+    mesh.source[:n].set(balanced.astype(source.dtype))

@@ -81,3 +81,17 @@ def test_one_generator_on_the_boundary_has_its_precision(adapters):
                 report = adapter.diagram(domain, middle[None]).check()
                 assert report, report
                 assert real in str(report)
+
+
+@pytest.mark.parametrize("method", ["coupled", "weighted", "exact"])
+def test_pieces_of_one_cell_each_have_no_potential(adapters, method):
+    """Their source is the mean of itself: what is left of it but rounding would find no way to anyone."""
+    corner, rng = np.array([(0, 0), (1, 0), (0.3, 0.7)]), np.random.default_rng(5)
+    domain = clvoro.Polygon.from_pieces(
+        [[corner * rng.uniform(0.1, 0.9) + (k % 4, k // 4)] for k in range(12)]
+    )
+    points = np.array([domain.inner_point(piece) for piece in range(12)])
+    for adapter in adapters.values():
+        result = adapter.run(domain, 0.3, points=points, method=method, max_steps=2)
+        report = result.check()
+        assert report, report
