@@ -43,10 +43,8 @@ class Steady:
         except OSError as error:
             self.error = self.error or error
             # What is in its buffer would fail once more when the process ends.
-            with contextlib.suppress(OSError, ValueError):
-                nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, self.stream.fileno())
-                os.close(nowhere)
+            with contextlib.suppress(OSError, ValueError), open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), self.stream.fileno())
         except RuntimeError:  # by a signal's handler, in the middle of another message
             pass
 
