@@ -114,7 +114,8 @@ EFFORTS = {
     "best": Effort(
         60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, aim=0.0039, relaxation=1.5, momentum=0.8,
         eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0,
-        mends=((30, Mend(0.037)), (50, Mend(0.037, split=True)), (70, Mend(0.037))), flaw=0.006,
+        mends=((30, Mend(0.037)), (50, Mend(0.037, split=True)), (70, Mend(0.037)), (80, Mend(0.037))),
+        flaw=0.006,
     ),
 }  # fmt: skip
 
