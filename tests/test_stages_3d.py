@@ -206,7 +206,8 @@ def expected_children(host, h):
         if j < 0:
             axis, upper = divmod(-1 - j, 2)
             wall = (BOX.lower, BOX.upper)[upper][axis]
-            way = min(abs(host.points[i, axis] - wall) / 2, h[i] / 4)
+            gap, room = abs(host.points[i, axis] - wall), min(h[i], BOX.extent[axis] / 2)
+            way = min(gap / 2, h[i] / 4) if gap > room / 8 else room / 2
             child = host.points[i].copy()
             child[axis] = wall - way if upper else wall + way
             children.append(child)
