@@ -43,6 +43,7 @@ from _common import (
 
 import clvoro
 from clvoro._program import Engine
+from clvoro.krylov import Solution
 from clvoro.mesh import Mesh
 from clvoro.methods import Method, ProjectedMethod, WeightedMethod
 from clvoro.plans import Step, plan_adaptive
@@ -81,6 +82,9 @@ NEEDS = {
     "projection.update": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
 }
 """What each kernel must read or write, and compute. Faces and the projection's vectors are single: integers here."""
+
+ITERATED = ("descend", "update")
+"""Kernels that are enqueued ahead, and find nothing to do once the iteration is over: only its calls count."""
 
 PEAK = """
 kernel void multiply_add(const int size, const REAL a, const REAL b, global REAL *out)
@@ -128,8 +132,8 @@ def fresh_mesh(adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarr
 
 def take_steps(
     mesh: Mesh, method: Method, repeat: int, clock: Callable[[], float]
-) -> dict[str, list[float]]:
-    """Seconds of the parts of `repeat` steps, by `clock`."""
+) -> tuple[dict[str, list[float]], int]:
+    """Seconds of the parts of `repeat` steps, by `clock`, and the iterations of their solves."""
     queue = mesh.engine.queue
     parts: dict[str, list[float]] = {"displace": [], "diagram": [], "rest": []}
 
@@ -143,6 +147,7 @@ def take_steps(
     tessellator = mesh.tessellator
     original = tessellator.tessellate
     spent = 0.0
+    solutions: list[Solution | None] = []
 
     def tessellate(*args: Any, **named: Any) -> Any:
         nonlocal spent
@@ -158,14 +163,14 @@ def take_steps(
     try:
         for _ in range(repeat):
             with mesh.engine.workspace.frame():
-                parts["displace"].append(timed(lambda: method.displace(mesh)))
+                parts["displace"].append(timed(lambda: solutions.append(method.displace(mesh))))
                 moving = timed(lambda: method.move(mesh))
             rest = moving + timed(finish)
             parts["diagram"].append(spent)
             parts["rest"].append(rest - spent)
     finally:
         tessellator.tessellate = original  # type: ignore[method-assign]
-    return parts
+    return parts, sum(solution.iterations for solution in solutions if solution)
 
 
 def measure(
@@ -178,7 +183,8 @@ def measure(
 ) -> dict[str, Any]:
     mesh, method = fresh_mesh(adapter, adapter.queue, points, n), KINDS[kind]()
     take_steps(mesh, method, WARM_UP, clock)
-    parts = {k: statistics.median(v) for k, v in take_steps(mesh, method, repeat, clock).items()}
+    taken, _ = take_steps(mesh, method, repeat, clock)
+    parts = {k: statistics.median(v) for k, v in taken.items()}
     cold = []
     for _ in range(3):
         mesh.engine.queue.finish()
@@ -192,15 +198,18 @@ def measure(
     mesh, method = fresh_mesh(adapter, queue, points, n), KINDS[kind]()
     take_steps(mesh, method, WARM_UP, clock)
     with Profile(queue) as profile:
-        take_steps(mesh, method, repeat, clock)
+        _, iterations = take_steps(mesh, method, repeat, clock)
+    counted = [
+        (f"{stage}.{kernel}", cost, iterations if kernel in ITERATED else cost.calls)
+        for (stage, kernel), cost in profile.costs.items()
+    ]
     read = sum(span.read for span in profile.spans) / repeat
     return {
         "kind": kind, "cells": mesh.n, **parts, "step": sum(parts.values()),
         "solve": profile.of(*SOLVERS) / repeat, "cold": statistics.median(cold), "read": read,
         "rate": mesh.n / parts["diagram"],
         "kernels": {
-            f"{stage}.{kernel}": (cost.seconds / cost.calls, cost.calls / repeat)
-            for (stage, kernel), cost in profile.costs.items()
+            name: (cost.seconds / calls, calls / repeat) for name, cost, calls in counted
         },
         "bandwidth": profile.bandwidth,
     }  # fmt: skip
