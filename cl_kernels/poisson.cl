@@ -67,7 +67,9 @@ kernel void assemble(int n, int weighted, global const int *starts, global const
         if (j <= i)
             continue;
         const int there = place_of(i, j, last, starts, neighbours);
-        if (there < 0 || (SEVERAL && place_of(j, i, last, starts, neighbours) < k))
+        if (there < 0)
+            continue;
+        if (SEVERAL && place_of(j, i, last, starts, neighbours) < k)
             continue;
         REAL square = 0;
         EACH_AXIS(a)
