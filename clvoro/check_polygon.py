@@ -128,7 +128,8 @@ def hidden(
     way = goal - at[place]
     # The corner itself may be off the domain by a few roundings.
     part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
-    lines = shapely.linestrings(np.stack([at[place] + part[:, None] * way, goal], axis=1))
+    ends = np.stack([at[place] + part[:, None] * way, goal], axis=1)
+    lines = np.asarray(shapely.linestrings(ends))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
     # Which leads over slits that are no wider: from their sides nothing behind them is seen.
     before = np.argsort(next_faces(d))
