@@ -135,7 +135,8 @@ def test_children(engine, box, t, fixed):
         if j < 0:
             axis, upper = divmod(-1 - j, 2)
             wall = box.extent[axis] if upper else 0
-            way = min(abs(child[axis] - wall) / 2, h[i] / 4)
+            gap, room = abs(child[axis] - wall), min(h[i], box.extent[axis] / 2)
+            way = min(gap / 2, h[i] / 4) if gap > room / 8 else room / 2
             child[axis] = wall - way if upper else way
         elif j > i and host.face_measures[k] > SHORT_FACE * host.volumes[i] ** (1 - 1 / box.dim):
             child = child + ways[k] / 2
