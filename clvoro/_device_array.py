@@ -104,7 +104,8 @@ def read_number(array: cla.Array, index: int) -> Any:
         raise IndexError(f"index {index} of an array of {len(array)}")
     host = np.empty(1, array.dtype)
     start = array.offset + index * array.dtype.itemsize
-    cl.enqueue_copy(cast("cl.CommandQueue", array.queue), host, array.base_data, src_offset=start)
+    queue, buffer = cast("cl.CommandQueue", array.queue), cast("cl.Buffer", array.base_data)
+    cl.enqueue_copy(queue, host, buffer, src_offset=start)
     return host.item()
 
 

@@ -8,8 +8,8 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from os import PathLike
-from typing import IO
 
 LONGEST_GEOMETRY = 1 << 28
 """Bytes of a polygon's file: the coasts of the whole Earth, at some hundred metres, take fewer."""
@@ -18,7 +18,7 @@ _PIECE = 1 << 20
 _NOWAIT = getattr(os, "O_NONBLOCK", 0)
 
 
-def open_plain(path: str | PathLike[str]) -> IO[bytes]:
+def open_plain(path: str | PathLike[str]) -> BufferedReader:
     """Open a plain file for reading, through symbolic links; every reader of the package does so.
 
     Raises

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -186,10 +187,11 @@ class Cells:
         """Make the rows of the first `n` of `total` generators and match them: see `_match` for what is returned."""
         engine, corners = self.engine, box.device_corners(self.engine.real)
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
-        some = self._wrap is not None
-        if some:
+        wrap = self._wrap
+        some = wrap is not None
+        if wrap is not None:
             engine.run_each(
-                self._wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
+                wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
                 binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
                 rows.slots, rows.counts, rows.places, group=1,
             )  # fmt: skip
@@ -341,7 +343,7 @@ class Cells:
             self._flags,
         )  # fmt: skip
 
-    def _reset_flags(self, first: int, slots: int, **part: int) -> None:
+    def _reset_flags(self, first: int, slots: int, **part: Any) -> None:
         """Take the flags back, or a part of them, where `slots` from the `first` on are to spare."""
         if (first, slots) not in self._no_flags:
             if len(self._no_flags) >= 4:

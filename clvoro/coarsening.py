@@ -255,7 +255,8 @@ class Coarsening:
         columns, weights = array("columns", entries, np.int32), array("weights", entries)
         scale = self.engine.real.type(factor)
         run(k.merge_rows, count, number, scale, *rows, starts, columns, weights)
-        if level is not None:  # what lies between has its use in choosing mates only: roundings do no harm
+        if level is not None:
+            # What lies between two passes is for the choice of mates only, where roundings do no harm.
             run(k.share_weights, count, number, starts, columns, weights)
         return Graph(starts, columns, weights)
 

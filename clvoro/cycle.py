@@ -123,6 +123,7 @@ class Cycle:
         """Smooth from zero, and hand the defect down; the right side is rounded from `r`, if there is one."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
         lists: tuple[object, ...] = ()
+        count = 0
         if level.groups is not None:
             lists = level.groups.starts, level.groups.members, self._vectors[depth + 1][0]
             count = len(level.groups)

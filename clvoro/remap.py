@@ -132,8 +132,8 @@ def _transferred(
     # Whatever the meshes were made in: parts of cells are differences.
     real = np.dtype(np.float64 if queue.device.double_fp_config else np.float32)
     engine, box = Engine(ctx, queue, source.domain.dim, real), source.domain
-    sizes = ((len(mesh), len(mesh.neighbours)) for mesh in (source, target))
-    needed = transfer_needed(engine, *sizes, columns.shape[1], order)
+    before, after = ((len(mesh), len(mesh.neighbours)) for mesh in (source, target))
+    needed = transfer_needed(engine, before, after, columns.shape[1], order)
     device = queue.device
     if needed > available_memory(device):
         raise MemoryLimitError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl.array as cla
@@ -121,4 +121,5 @@ def restored(
         array[:known].set(saved[name])
         if len(array) > known:
             array[known:].fill(0)
-    return Tessellation(n=len(points), points=points, **arrays)
+    fields: dict[str, Any] = dict(arrays)
+    return Tessellation(n=len(points), points=points, **fields)

@@ -7,9 +7,10 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from io import BufferedIOBase
 from os import PathLike, fspath, fstat
 from pathlib import Path
-from typing import IO
+from typing import cast
 
 import numpy as np
 
@@ -144,7 +145,7 @@ def check_expansion(
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """Read one array; the sizes are checked against the member's before memory is asked for."""
     with archive.open(info) as stream:
-        return _read(stream, info.filename, info.file_size)
+        return _read(cast(BufferedIOBase, stream), info.filename, info.file_size)
 
 
 def read_array(path: Path, member: str = "points") -> np.ndarray:
@@ -167,7 +168,7 @@ def read_array(path: Path, member: str = "points") -> np.ndarray:
         return _read(file, Path(path).name, fstat(file.fileno()).st_size)
 
 
-def _read(stream: IO[bytes], name: str, size: int) -> np.ndarray:
+def _read(stream: BufferedIOBase, name: str, size: int) -> np.ndarray:
     try:
         shape, fortran, dtype = _read_header(stream)
     except (
@@ -185,8 +186,9 @@ def _read(stream: IO[bytes], name: str, size: int) -> np.ndarray:
     if min(shape, default=1) < 0 or length != size - stream.tell() or not dtype.itemsize:
         raise FileError(f"{name} has not the length that its shape {shape!s:.60} asks for")
     data = np.empty(length, np.uint8)  # once, not as bytes first
+    whole = data.data
     done = 0
-    while done < length and (more := stream.readinto(data[done : done + _PIECE])):
+    while done < length and (more := stream.readinto(whole[done : done + _PIECE])):
         done += more
     if done < length or stream.read(1):  # which also compares the checksum
         raise FileError(f"{name} is cut off")
@@ -194,7 +196,7 @@ def _read(stream: IO[bytes], name: str, size: int) -> np.ndarray:
     return np.asarray(array, order="C")
 
 
-def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _read_header(stream: BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
         return np.lib.format.read_array_header_1_0(stream)

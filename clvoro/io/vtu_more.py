@@ -22,7 +22,7 @@ def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
     """
     n, v = len(diagram), len(diagram.vertices)
     given = {"CellData.label": arrays["CellData.label"]}
-    expected = {"CellData.label": np.arange(n)}
+    expected: dict[str, np.ndarray] = {"CellData.label": np.arange(n)}
     if diagram.domain.dim == 2:
         for name in ("Points.", "CellData.generator"):
             given[f"z of {name}"] = z = arrays[name][:, 2]
