@@ -110,10 +110,11 @@ class Loop:
             reason = "interrupted"
             self.mesh.update()
         # Whatever stopped the run, the mesh has the size and the count that were asked for.
+        coarse = self.level > 0
         while self.level > 0:
             self.refine()
         self.settle()
-        if self.inserted or self.deleted or not self.rows:
+        if coarse or self.inserted or self.deleted or not self.rows:
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         return self.result(reason in (COMPLETED, STALLED), reason, settings)

@@ -29,3 +29,8 @@ def test_the_table_counts_what_there_was():
 def test_parts_that_were_cut_off_pass_the_check(seed):
     """Around corners of holes, and in a cell with two faces towards one neighbour: both were refused once."""
     assert fuzz.attempt("layers", seed)[0] == "mesh"
+
+
+def test_run_that_stops_early_among_layers_alone_ends_on_its_finest_level():
+    """Where all generators are of layers, refinement adds none: the history had no row of what it came to."""
+    assert fuzz.attempt("layers", 910000469)[0] == "mesh"
