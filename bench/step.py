@@ -77,6 +77,7 @@ NEEDS = {
     "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
     "shape.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
+    "poisson.assemble": (2 + 1, 6 + 1 + 6 + 12, 3 * 20),
     "projection.assemble": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),
     "projection.descend": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
     "projection.update": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),

@@ -114,17 +114,21 @@ kernel void begin(int n, int zero, int centre, global const REAL *b, global cons
     set_residual(n, zero, centre, b, w, x, r, p, partial, state, scratch);
 }
 
+/* One group: the sum of row q of what so many `groups` have left, as `total_sum` is in a kernel of all of them. */
+inline REAL sum_of(global const REAL *partial, int q, int groups, local REAL *scratch)
+{
+    REAL sum = 0;
+    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
+        sum += partial[q * groups + g];
+    return group_sum(sum, scratch);
+}
+
 /* One group: state[4], state[5] = the squared norms of b and r, for the host to read. */
 kernel void sum_norms(global const REAL *partial, global REAL *state, const int groups)
 {
     local REAL scratch[GROUP_SIZE];
-    REAL norm_b = 0, norm_r = 0;
-    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE) {
-        norm_b += partial[NORM_B * groups + g];
-        norm_r += partial[NORM_R(0) * groups + g];
-    }
-    norm_b = group_sum(norm_b, scratch);
-    norm_r = group_sum(norm_r, scratch);
+    const REAL norm_b = sum_of(partial, NORM_B, groups, scratch);
+    const REAL norm_r = sum_of(partial, NORM_R(0), groups, scratch);
     if (get_local_id(0) == 0) {
         state[4] = norm_b;
         state[5] = norm_r;
@@ -227,10 +231,7 @@ kernel void look(int k, global const REAL *partial, global const REAL *state, gl
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
-    REAL norm = 0;
-    for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
-        norm += partial[NORM_R(k) * groups + g];
-    norm = group_sum(norm, scratch);
+    const REAL norm = sum_of(partial, NORM_R(k), groups, scratch);
     if (get_local_id(0) == 0) {
         now[RECORD_NORM] = norm;
         now[RECORD_RUNNING] = !(norm <= state[0]);

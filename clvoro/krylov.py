@@ -85,12 +85,13 @@ class ConjugateGradient:
         self._kernels: dict[np.dtype, Kernels] = {}
         self.partial = engine.zeros(_ROWS * engine.groups)
         """Partial sums; a fused operator leaves those of (x, A x) in row `CURVATURE`."""
-        self._state = engine.zeros(6)
+        self.state = engine.zeros(6)
         self._record_capacity = 0
         self._alone = engine.zeros(_STATE + 4)
         self._most_alone = most_alone(engine)
 
-    def _kernels_in(self, store: np.dtype) -> Kernels:
+    def kernels_in(self, store: np.dtype) -> Kernels:
+        """Return the kernels whose vectors are in `store`."""
         if store not in self._kernels:
             self._kernels[store] = self.engine.kernels(
                 "krylov", {"STORE": self.engine.name_of(store)}
@@ -161,73 +162,15 @@ class ConjugateGradient:
         n = len(rhs)
         if max_iterations > self._record_capacity:
             self._record_capacity = max_iterations
-            self._record = self.engine.zeros(4 * (max_iterations + 1))
+            self.record = self.engine.zeros(4 * (max_iterations + 1))
             self._alone = self.engine.zeros(_STATE + 4 * (max_iterations + 1))
-        diagonal = isinstance(precondition, cla.Array)
-        if rows is not None and diagonal and n <= self._most_alone:
+        if rows is not None and isinstance(precondition, cla.Array) and n <= self._most_alone:
             return self._solve_alone(
                 store, rows, rhs, x, precondition, tolerance, max_iterations, centre, from_zero, verify
             )  # fmt: skip
-        kernels, launch = self._kernels_in(store), self.engine.run_blocks
-        r, u, p, q = (self.engine.scratch(n, store) for _ in range(4))
-        size, zero, mean = np.int32(n), np.int32(0), np.int32(centre)
-        groups, group = np.int32(self.engine.groups), self.engine.group_size
-        # The recurrence stops a little lower, so that the true residual is within the tolerance.
-        limit = self.engine.real.type(0.95 * tolerance)
-        tail = (self.partial, self._state, self._record)
-        direction = Launch(self.engine, kernels.direction, zero, size, limit, u, p, *tail)
-        if diagonal:
-            update = Launch(
-                self.engine,
-                kernels.update_jacobi,
-                zero,
-                size,
-                mean,
-                precondition,
-                p,
-                q,
-                x,
-                r,
-                u,
-                *tail,
-            )
-        else:
-            update = Launch(self.engine, kernels.update, zero, size, mean, p, q, x, r, *tail)
-
-        def alone(kernel: cl.Kernel, *args: object) -> None:
-            """Enqueue a kernel of one work-group."""
-            self.engine.run(kernel, group, *args, group=group)
-
-        def look(k: int) -> None:
-            """Have row k of the record tell whether there is an iteration k."""
-            alone(kernels.look, np.int32(k), *tail, groups)
-
-        def measure(zero: bool = False) -> float:
-            """Set r to the true residual and return its relative norm; negative: b is zero."""
-            if not zero:
-                apply(x, q)
-            anew = np.int32(zero)
-            launch(kernels.residual, size, anew, rhs, q, self.partial)
-            launch(
-                kernels.begin, size, anew, mean, rhs, q, x, r, p, self.partial, self._state
-            )  # fmt: skip
-            alone(kernels.sum_norms, self.partial, self._state, groups)
-            return self._relate(*self._state.get()[2:])
-
-        def iterate(k: int) -> None:
-            if not isinstance(precondition, cla.Array):
-                precondition(r, u, q)
-                launch(kernels.dot_product, size, np.int32(_GAMMA + (k & 1)), r, u, self.partial)
-            direction.set_first(k)
-            direction()
-            apply(p, q)
-            if not fused:
-                launch(kernels.dot_product, size, np.int32(CURVATURE), p, q, self.partial)
-            update.set_first(k)
-            update()
-
+        system = _System(self, apply, precondition, rhs, x, store, tolerance, fused, centre)
         iterations, history, reason = 0, [], "max_iterations"
-        residual = measure(from_zero)
+        residual = system.measure(from_zero)
         if residual < 0:
             x.fill(0)
             return Solution(0, 0.0, np.zeros(1), True, "zero right side")
@@ -237,21 +180,18 @@ class ConjugateGradient:
                 break
             if iterations >= max_iterations:
                 break
-            if diagonal:
-                launch(kernels.jacobi, size, precondition, r, u, self.partial)
             most = max_iterations - iterations
-            iterations += self._cycle(iterate, look, most, tolerance, residual, lookahead, history)
+            iterations += self._cycle(system, most, tolerance, residual, lookahead, history)
             if not verify and self._left <= tolerance:
                 residual, reason = self._left, "converged"
                 break
-            before, residual = residual, measure()
+            before, residual = residual, system.measure()
             # A restart gains digits as long as the recurrence, not x's precision, was the limit.
             if residual > max(tolerance, 0.5 * before) and iterations < max_iterations:
                 reason = "stagnated"
                 break
         if centre:
-            launch(kernels.add_up, size, x, self.partial)
-            launch(kernels.remove_mean, size, x, self.partial)
+            system.centre()
         residuals = np.array([*history, residual])
         return Solution(iterations, residual, residuals, residual <= tolerance, reason)
 
@@ -272,7 +212,7 @@ class ConjugateGradient:
         engine, real, n = self.engine, self.engine.real.type, len(rhs)
         vectors = (engine.scratch(n, store) for _ in range(4))
         given = (*rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._alone)
-        kernel, done, history, most = self._kernels_in(store).solve_alone, 0, [], math.inf
+        kernel, done, history, most = self.kernels_in(store).solve_alone, 0, [], math.inf
         while True:
             left = max_iterations - done
             Launch(
@@ -281,7 +221,7 @@ class ConjugateGradient:
                 real(min(most, float(np.finfo(real).max))), *given, groups=1,
             )()  # fmt: skip
             host = self._alone[: _STATE + 4 * min(left, _FIRST_READ)].get()
-            residual = self._relate(*host[2:6])
+            residual = self.relate(*host[2:6])
             if residual < 0:
                 x.fill(0)
                 return Solution(0, 0.0, np.zeros(1), True, "zero right side")
@@ -301,8 +241,8 @@ class ConjugateGradient:
             from_zero, most = False, max(tolerance, 0.5 * residual)
         return Solution(done, residual, np.array([*history, residual]), converged, reason)
 
-    def _relate(self, taken: float, _: float, norm_b: float, norm_r: float) -> float:
-        """Return the relative residual by the state of the device; negative: b is zero."""
+    def relate(self, taken: float, _: float, norm_b: float, norm_r: float) -> float:
+        """Return the relative residual by words 2 to 5 of the device's state; negative: b is zero."""
         if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
             raise SolverError(
                 f"the linear solve got a right side, start or operator that is not finite: "
@@ -316,8 +256,7 @@ class ConjugateGradient:
 
     def _cycle(
         self,
-        iterate: Callable[[int], None],
-        look: Callable[[int], None],
+        system: _System,
         most: int,
         tolerance: float,
         residual: float,
@@ -326,12 +265,13 @@ class ConjugateGradient:
     ) -> int:
         """Iterate from the residual in place until it stops, or `most` times; return how often."""
         done, ahead, first = 0, min(8, lookahead), residual
+        system.begin()
         while done < most:
             end = min(done + ahead, most)
             for k in range(done, end):
-                iterate(k)
-            look(end)
-            rows = self._record[4 * done : 4 * (end + 1)].get()
+                system.iterate(k)
+            system.look(end)
+            rows = self.record[4 * done : 4 * (end + 1)].get()
             stop = self._follow(rows, done, tolerance, history)
             if stop is not None:
                 return stop
@@ -373,3 +313,96 @@ class ConjugateGradient:
             "positive definite",
             [*history, residual],
         )
+
+
+class _System:
+    """One linear system, the vectors of its iteration, and what all work-groups do to them together."""
+
+    def __init__(
+        self,
+        solver: ConjugateGradient,
+        apply: Apply,
+        precondition: cla.Array | Precondition,
+        rhs: cla.Array,
+        x: cla.Array,
+        store: np.dtype,
+        tolerance: float,
+        fused: bool,
+        centre: bool,
+    ) -> None:
+        self._solver, self._engine, n = solver, solver.engine, len(rhs)
+        self._apply, self._precondition, self._fused = apply, precondition, fused
+        self._rhs, self._x = rhs, x
+        self._kernels = k = solver.kernels_in(store)
+        self._r, self._u, self._p, self._q = (self._engine.scratch(n, store) for _ in range(4))
+        self._size, self._centre = np.int32(n), np.int32(centre)
+        # The recurrence stops a little lower, so that the true residual is within the tolerance.
+        limit = self._engine.real.type(0.95 * tolerance)
+        self._tail = (solver.partial, solver.state, solver.record)
+        first = np.int32(0)
+        self._direction = Launch(
+            self._engine, k.direction, first, self._size, limit, self._u, self._p, *self._tail
+        )  # fmt: skip
+        vectors = self._p, self._q, x, self._r
+        if isinstance(precondition, cla.Array):
+            self._update = Launch(
+                self._engine, k.update_jacobi, first, self._size, self._centre, precondition, *vectors, self._u,
+                *self._tail,
+            )  # fmt: skip
+        else:
+            self._update = Launch(
+                self._engine, k.update, first, self._size, self._centre, *vectors, *self._tail
+            )  # fmt: skip
+
+    def measure(self, zero: bool = False) -> float:
+        """Set r to the true residual, of x or of `zero`, and return its relative norm; negative: b is zero."""
+        if not zero:
+            self._apply(self._x, self._q)
+        k, anew = self._kernels, np.int32(zero)
+        partial, state, _ = self._tail
+        self._launch(k.residual, self._size, anew, self._rhs, self._q, partial)
+        self._launch(
+            k.begin, self._size, anew, self._centre, self._rhs, self._q, self._x, self._r, self._p, partial, state
+        )  # fmt: skip
+        self._alone(k.sum_norms, partial, state, np.int32(self._engine.groups))
+        return self._solver.relate(*state.get()[2:])
+
+    def begin(self) -> None:
+        """Make the first u of the residual in place."""
+        if isinstance(self._precondition, cla.Array):
+            self._launch(
+                self._kernels.jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
+            )  # fmt: skip
+
+    def iterate(self, k: int) -> None:
+        """Enqueue iteration k."""
+        if not isinstance(self._precondition, cla.Array):
+            self._precondition(self._r, self._u, self._q)
+            self._dot_product(_GAMMA + (k & 1), self._r, self._u)
+        self._direction.set_first(k)
+        self._direction()
+        self._apply(self._p, self._q)
+        if not self._fused:
+            self._dot_product(CURVATURE, self._p, self._q)
+        self._update.set_first(k)
+        self._update()
+
+    def look(self, k: int) -> None:
+        """Have row k of the record tell whether there is an iteration k."""
+        self._alone(self._kernels.look, np.int32(k), *self._tail, np.int32(self._engine.groups))
+
+    def centre(self) -> None:
+        """Take the mean of x away."""
+        for kernel in (self._kernels.add_up, self._kernels.remove_mean):
+            self._launch(kernel, self._size, self._x, self._tail[0])
+
+    def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:
+        self._launch(self._kernels.dot_product, self._size, np.int32(row), a, b, self._tail[0])
+
+    def _launch(self, kernel: cl.Kernel, *args: object) -> None:
+        self._engine.run_blocks(kernel, *args)
+
+    def _alone(self, kernel: cl.Kernel, *args: object) -> None:
+        """Enqueue a kernel of one work-group."""
+        group = self._engine.group_size
+        self._engine.run(kernel, group, *args, group=group)

@@ -307,6 +307,23 @@ def test_warm_start(make):
     assert again.residual <= 1e-8
 
 
+def test_from_far_away(make):
+    """A start may be worse than none: its residual is a thousand times the right side."""
+    engine, graph = make(), graphs.random_graph(900, seed=61)
+    poisson, laplacian = assembled(engine, graph)
+    rng, A = np.random.default_rng(62), as_matrix(laplacian)
+    b, start = (rng.standard_normal(900) for _ in range(2))
+    start *= 1e3 * np.linalg.norm(b) / np.linalg.norm(A @ start)
+    x = engine.upload(start)
+    solution = poisson.solve(
+        laplacian, engine.upload(b), x, tolerance=1e-8, preconditioner="jacobi"
+    )
+    assert solution.converged
+    expected = direct(A, b - b.mean())
+    # Condition number about 1e4.
+    assert np.abs(x.get() - expected).max() <= 1e-4 * np.abs(expected).max()
+
+
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("real", REALS)
 def test_repeats_bit_by_bit(make, real, preconditioner):
@@ -319,6 +336,26 @@ def test_repeats_bit_by_bit(make, real, preconditioner):
     two = Poisson(engine).solve(laplacian, b, second, **options)
     assert np.array_equal(one.residuals, two.residuals)
     assert np.array_equal(first.get(), second.get())
+
+
+@pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
+@pytest.mark.parametrize("left", [np.nan, 1e3])
+def test_what_earlier_solves_have_left_counts_for_nothing(make, preconditioner, left):
+    """In the sums, the state and the records, which stay."""
+    engine, found = make(), []
+    b = engine.upload(np.random.default_rng(60).standard_normal(900))
+    for soiled in (False, True):
+        poisson, laplacian = assembled(engine, graphs.random_graph(900, seed=59))
+        solver, options = poisson._krylov, {"tolerance": 1e-6, "preconditioner": preconditioner}
+        poisson.solve(laplacian, b, engine.zeros(900), max_iterations=300, **options)
+        for array in (solver.partial, solver.state, solver.record, solver._alone) * soiled:
+            array.fill(left)
+        x = engine.zeros(900)
+        solution = poisson.solve(laplacian, b, x, max_iterations=300, **options)
+        assert solution.converged
+        found.append((solution.residuals, x.get()))
+    for one, other in zip(*found, strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_result_does_not_depend_on_when_the_host_looks(make):
