@@ -91,6 +91,18 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([[0], np.cumsum(counts)]), corners[kept]
 
 
+def cell_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of each cell in 2D as ragged rows: starts (n + 1,) and vertices, counter-clockwise.
+
+    A corner that comes twice in a row is given once. Several loops are joined by bridges, as in the diagram.
+    """
+    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
+    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
+    kept = corners != corners[following(starts)]
+    counts = np.bincount(cell[kept], minlength=len(diagram))
+    return np.concatenate([[0], np.cumsum(counts)]), corners[kept]
+
+
 @dataclass(frozen=True)
 class Faces:
     """Every face once: those between two cells first, in the order of (owner, neighbour), then the walls'.

@@ -5,25 +5,28 @@ Every writer works on a temporary file beside the target and puts it in place wh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 
 from .._arrays import check_path
 from ..errors import InputError, InputTypeError
 from ..results import Result
-from .atomic import check_writable
+from .atomic import check_writable, make_folder
 from .foam import write_foam
-from .formats import write_foreign
+from .formats import check_plane, write_foreign
 from .history import write_history
+from .mpas import write_mpas
 from .npz import load as load_npz
 from .npz import write_npz
+from .ugrid import write_ugrid
 from .vtu import write_vtu
 from .vtu_read import load_vtu
 
-__all__ = ["check_writable", "load", "save", "write_history"]
+__all__ = ["check_writable", "load", "make_folder", "save", "write_history"]
 
 _WRITERS = {".npz": write_npz, ".vtu": write_vtu}
+_CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas}
 
 
 def load(path: str | PathLike[str]) -> Result:
@@ -50,6 +53,10 @@ def load(path: str | PathLike[str]) -> Result:
 
     """
     path = check_path("path", path)
+    if Path(path).suffix.lower() == ".nc":
+        raise InputError(
+            f"cannot load {path}: netCDF files are written for other programs and not read; load a .npz or .vtu"
+        )
     return (load_vtu if Path(path).suffix.lower() == ".vtu" else load_npz)(path)
 
 
@@ -58,6 +65,7 @@ def save(
     path: str | PathLike[str],
     *,
     patches: Mapping[str, Iterable[int]] | None = None,
+    convention: str | None = None,
 ) -> None:
     """Write `result` to `path`; the suffix chooses the format.
 
@@ -69,11 +77,16 @@ def save(
         programs (polygons or polyhedra with h, error, quality and more as cell data);
         ``.../constant/polyMesh`` is a folder for OpenFOAM, and ``CASE/name.foam`` the same within a
         case, for ParaView, too, both made if need be (2D: one layer of prisms between patches of type `empty`; seams of
-        periodic boxes: pairs of cyclic patches); ``.vtk``, ``.ply`` and ``.obj`` hold 2D meshes and are written
+        periodic boxes: pairs of cyclic patches); ``.nc`` holds 2D meshes as netCDF, for models of oceans and
+        atmospheres, QGIS, ParaView and xarray; ``.vtk``, ``.ply`` and ``.obj`` hold 2D meshes and are written
         through meshio (``pip install "clvoro[formats]"``), the latter two without cell data.
     patches : mapping, optional
         For OpenFOAM and a polygonal domain: names of patches, and the numbers of the edges in each, as in
         `Polygon.edge_numbers`. Edges in none are in the patch of their ring, ``outer``, ``hole-1``, ...
+    convention : {"ugrid", "mpas"}, optional
+        For netCDF: what is in the file. With "ugrid", the default, cells as polygons with size, error, quality and
+        area, and for each edge the number of its wall; at seams as in ``.vtu``. With "mpas" what the MPAS mesh
+        specification asks for: cells, edges and vertices with all that models on C grids take, seams joined.
 
     Raises
     ------
@@ -87,11 +100,27 @@ def save(
             "Adapter.run returned"
         )
     path = Path(check_path("path", path))
-    if path.name == "polyMesh" or path.suffix.lower() == ".foam":
-        write_foam(result, path, patches)
-        return
-    if patches is not None:
+    suffix = path.suffix.lower()
+    is_foam = path.name == "polyMesh" or suffix == ".foam"
+    if patches is not None and not is_foam:
         raise InputError(
             f"cannot write patches to {path}: they are for OpenFOAM; save as .foam or leave them out"
         )
-    _WRITERS.get(path.suffix.lower(), write_foreign)(result, path)
+    if convention is not None and suffix != ".nc":
+        raise InputError(
+            f"cannot write {path} by a convention: they are for netCDF; save as .nc or leave it out"
+        )
+    if is_foam:
+        write_foam(result, path, patches)
+    elif suffix == ".nc":
+        check_plane(result, path)
+        _chosen(convention)(result, path)
+    else:
+        _WRITERS.get(suffix, write_foreign)(result, path)
+
+
+def _chosen(convention: object) -> Callable[[Result, Path], None]:
+    name = "ugrid" if convention is None else convention
+    if not isinstance(name, str) or name not in _CONVENTIONS:
+        raise InputError(f"convention is {name!r:.60}, expected 'ugrid' or 'mpas'")
+    return _CONVENTIONS[name]

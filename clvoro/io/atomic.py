@@ -13,7 +13,7 @@ from os import PathLike
 from pathlib import Path
 from typing import IO
 
-from ..errors import OutputError
+from ..errors import InputError, OutputError
 
 _KEPT = 40
 """Characters, of up to four bytes, that temporary names have of the file's: with more they may become too long."""
@@ -35,6 +35,22 @@ def check_writable(path: str | PathLike[str]) -> None:
         temporary = _temporary_name(target)
         os.close(_create(temporary))
         os.unlink(temporary)
+
+
+def make_folder(path: str | PathLike[str]) -> None:
+    """Make the folder `path`, and those that it lies in, where there are none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made: the name is the caller's to choose.
+    """
+    try:
+        os.makedirs(path, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {path}: no folder can be made there ({error.strerror}); choose another place"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
 from ..results import Result
-from .atomic import atomic_file, atomic_folder
+from .atomic import atomic_file, atomic_folder, make_folder
 from .polymesh import PolyMesh, poly_mesh
 
 _FILES = {
@@ -42,10 +41,10 @@ def write_foam(
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:
-        _make(marker.parent)
+        make_folder(marker.parent)
         with atomic_file(marker):  # first: it says whether the case's folder can be written
             pass
-    _make(folder)
+    make_folder(folder)
     note = (
         f"nPoints:{len(mesh.points)} nCells:{len(result.diagram)} nFaces:{len(mesh.owner)} "
         f"nInternalFaces:{len(mesh.neighbour)}"
@@ -66,16 +65,6 @@ def write_foam(
                 file.write(f"{head}{count}\n(\n")
                 file.writelines(body)
                 file.write(")\n")
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {folder}: no folder can be made there ({error.strerror}); choose "
-            "another place"
-        ) from error
 
 
 def _header(name: str, kind: str, note: str) -> str:

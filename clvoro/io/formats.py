@@ -17,7 +17,9 @@ from .vtu import cell_data, in_space
 # more than a warning. The value tells whether cell data are kept, too.
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
-_SAFE = ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .vtk, .ply or .obj"
+_SAFE = (
+    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (UGRID, MPAS), .vtk, .ply or .obj"
+)
 
 
 def write_foreign(result: Result, path: Path) -> None:
@@ -27,11 +29,7 @@ def write_foreign(result: Result, path: Path) -> None:
         what = f"the format {suffix} is unknown or cannot hold" if suffix else "no suffix chooses"
         tail = " polygons" if suffix else " a format"
         raise InputError(f"cannot write {path}: {what}{tail}; use {_SAFE}")
-    if result.diagram.domain.dim != 2:
-        raise InputError(
-            f"cannot write {path}: the mesh has {result.diagram.domain.dim} dimensions, and only 2 "
-            f"are written to {suffix}; save it as .vtu, .foam or .npz"
-        )
+    check_plane(result, path)
     try:
         import meshio
     except ImportError as error:
@@ -49,6 +47,15 @@ def write_foreign(result: Result, path: Path) -> None:
     # meshio prints to the terminal; what matters of it arrives as an exception.
     with atomic_folder(path) as temporary, contextlib.redirect_stdout(io.StringIO()):
         mesh.write(temporary)
+
+
+def check_plane(result: Result, path: Path) -> None:
+    """Refuse a mesh in three dimensions."""
+    if result.diagram.domain.dim != 2:
+        raise InputError(
+            f"cannot write {path}: the mesh has {result.diagram.domain.dim} dimensions, and only 2 "
+            f"are written to {path.suffix.lower()}; save it as .vtu, .foam or .npz"
+        )
 
 
 def _by_sides(result: Result) -> tuple[list[tuple[str, np.ndarray]], list[np.ndarray]]:

@@ -13,8 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..domain import Domain
-from ..errors import ClvoroError, InputError
-from ..faces import Faces, face_corners, face_keys, face_owners, faces_once, following, take_rows
+from ..errors import ClvoroError, InputError, InputTypeError
+from ..faces import (
+    Faces,
+    cell_corners,
+    face_corners,
+    face_keys,
+    face_owners,
+    faces_once,
+    take_rows,
+)
 from ..polygon import Polygon
 from ..results import Diagram
 from ..walls import wall_groups
@@ -226,6 +234,11 @@ def _space(points: np.ndarray) -> np.ndarray:
 
 def _named(domain: Domain, patches: Mapping[str, Iterable[int]]) -> tuple[list[str], np.ndarray]:
     """Return names of the patches, and the one that each edge of the polygon belongs to."""
+    if not isinstance(patches, Mapping):
+        raise InputTypeError(
+            f"patches is {patches!r:.60} of type {type(patches).__name__}, expected names with the numbers of edges in "
+            "each, as {'inlet': [0, 1]}"
+        )
     if not isinstance(domain, Polygon):
         raise InputError(
             "patches are groups of a polygon's edges, and the domain is no polygon; leave them out"
@@ -233,7 +246,12 @@ def _named(domain: Domain, patches: Mapping[str, Iterable[int]]) -> tuple[list[s
     rings, groups = wall_groups(domain)
     groups = groups + len(patches)
     for k, (name, numbers) in enumerate(patches.items()):
-        wanted = np.unique(np.array(list(numbers), np.int64))
+        given = np.array(list(numbers) if isinstance(numbers, Iterable) else numbers)
+        if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+            raise InputTypeError(
+                f"patches has for {name} {numbers!r:.60}, expected the numbers of edges in a list"
+            )
+        wanted = np.unique(given.astype(np.int64))
         unknown = np.setdiff1d(wanted, domain.edge_numbers)
         if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_][\w.-]*", name):
             raise InputError(
@@ -287,13 +305,9 @@ def _extruded(
     points[v:, 2] = thickness
     a, b = sides.reshape(-1, 2).T
     walls = np.stack([a, b, b + v, a + v], axis=1)
-    # Corners that are the same vertex twice are one.
-    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
-    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
-    kept = corners != corners[following(starts)]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(cell[kept], minlength=len(diagram)))])
-    corners, everyone = corners[kept], np.arange(len(diagram))
-    key = np.sort(cell[kept].astype(np.int64) * v + corners)
+    starts, corners = cell_corners(diagram)
+    everyone = np.arange(len(diagram))
+    key = np.sort(np.repeat(everyone, np.diff(starts)) * v + corners)
     twice = key[1:][np.diff(key) == 0] // max(v, 1)
     if twice.size:
         raise InputError(

@@ -20,10 +20,10 @@ from xml.parsers import expat
 import numpy as np
 
 from .._files import open_plain
+from ..check.rebuilt import rebuild
 from ..domain import Box, Domain
 from ..errors import InputError
 from ..polygon import Polygon
-from ..rebuilt import rebuild
 from ..results import HISTORY_DTYPE, Diagram, Result
 from ..walls import wall_count
 from .arrays import EXPANSION, LEAST

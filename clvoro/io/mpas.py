@@ -1,0 +1,252 @@
+"""Meshes in the plane by the MPAS mesh specification 1.0, for models on C grids of Voronoi cells and their dual.
+
+Cells, edges and vertices are numbered from 1, and 0 is what is not there. An edge on the boundary is placed in its
+middle, and its `dcEdge` is sqrt(3) times its length, as MPAS's own tools have it. `vertexDegree` is 3 unless more edges
+meet somewhere, as they do between cocircular generators.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..errors import InputError
+from ..faces import neighbour_points
+from ..results import Diagram, Result
+from .half_edges import HalfEdges, half_edges
+from .netcdf import NetCDF
+from .trisk import find_weights
+
+
+def write_mpas(result: Result, path: Path) -> None:
+    """Write the mesh; in a periodic box edges and vertices at the seams are there once, within the box.
+
+    Raises
+    ------
+    InputError
+        If a cell has several loops of edges, or something of it is half a period away: MPAS takes the nearest image.
+    """
+    _describe(result, path).write()  # when all that it was made of has been let go of
+
+
+def _describe(result: Result, path: Path) -> NetCDF:
+    diagram, domain = result.diagram, result.diagram.domain
+    halves = half_edges(diagram, glued=True)
+    _check_loops(halves, path)
+    shape = _measure(diagram, halves)
+    _check_reach(shape, np.array(domain.periodic) * domain.extent, path)
+    around = _walk_around(halves)
+    n, e, v = len(diagram), len(halves.first), len(around.corners)
+    width, degree = int(halves.counts.max()), around.edges.shape[1]
+    periods = np.where(domain.periodic, domain.extent, 0.0)
+    file = NetCDF(
+        path,
+        result,
+        {
+            "nCells": n, "nEdges": e, "nVertices": v, "maxEdges": width, "maxEdges2": 2 * width, "TWO": 2,
+            "vertexDegree": degree,
+        },
+        {
+            "on_a_sphere": "NO", "sphere_radius": np.float64(0), "is_periodic": "YES" if periods.any() else "NO",
+            "x_period": periods[0], "y_period": periods[1], "mesh_spec": "1.0", "Conventions": "MPAS",
+        },
+    )  # fmt: skip
+    first = halves.first
+    places = {
+        "Cell": diagram.points,
+        "Edge": domain.wrap(diagram.points[halves.cell[first]] + shape.foot[first]),
+        "Vertex": domain.wrap(diagram.vertices[halves.begin[around.corners[:, 0]]]),
+    }
+    for name, points in places.items():
+        plural = ("nVertices" if name == "Vertex" else f"n{name}s",)
+        for axis, values in zip("xy", points.T, strict=True):
+            file.add(f"{axis}{name}", plural, values)
+        for unused in ("z", "lat", "lon"):
+            file.add(f"{unused}{name}", plural, np.zeros(len(points)))
+        file.add(f"indexTo{name}ID", plural, np.arange(1, len(points) + 1))
+    _add_graph(file, halves, around)
+    _add_measures(file, halves, around, shape)
+    weights = find_weights(
+        halves, shape.kites / shape.areas[halves.cell], shape.lengths, shape.distances
+    )
+    wide = ("nEdges", "maxEdges2")
+    file.add("nEdgesOnEdge", ("nEdges",), weights.counts)
+    for name, items in (("edges", weights.edges + 1), ("weights", weights.values)):
+        file.add_rows(f"{name}OnEdge", wide, weights.counts, items, 0)
+    file.add("meshDensity", ("nCells",), (result.size.min() / result.size) ** 4)
+    return file
+
+
+def _add_graph(file: NetCDF, halves: HalfEdges, around: _Around) -> None:
+    first, corners = halves.first, around.corners
+    across = np.where(halves.twin >= 0, halves.cell[halves.twin] + 1, 0)
+    ends = around.vertex[halves.next]
+    # On a cell the k-th vertex lies between edges k and k + 1, at a vertex the k-th cell.
+    on_cell = {"cells": across, "edges": halves.edge + 1, "vertices": ends + 1}
+    for name, items in on_cell.items():
+        file.add_rows(f"{name}OnCell", ("nCells", "maxEdges"), halves.counts, items, 0)
+    file.add("nEdgesOnCell", ("nCells",), halves.counts)
+    pairs = {"cells": (halves.cell + 1, across), "vertices": (around.vertex + 1, ends + 1)}
+    for name, (one, other) in pairs.items():
+        file.add(f"{name}OnEdge", ("nEdges", "TWO"), np.stack([one[first], other[first]], axis=1))
+    at_vertex = {
+        "cells": np.where(corners >= 0, halves.cell[corners] + 1, 0),
+        "edges": around.edges + 1,
+    }
+    for name, table in at_vertex.items():
+        file.add(f"{name}OnVertex", ("nVertices", "vertexDegree"), table)
+
+
+def _add_measures(file: NetCDF, halves: HalfEdges, around: _Around, shape: _Shape) -> None:
+    kites = np.where(around.corners >= 0, shape.kites[around.corners], 0.0)
+    file.add("kiteAreasOnVertex", ("nVertices", "vertexDegree"), kites)
+    file.add("areaTriangle", ("nVertices",), kites.sum(axis=1))
+    file.add("areaCell", ("nCells",), shape.areas)
+    values = {"dvEdge": shape.lengths, "dcEdge": shape.distances, "angleEdge": shape.angles}
+    for name, of_edges in values.items():
+        file.add(name, ("nEdges",), of_edges)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Where things are, as seen from the generators, and how large.
+
+    Attributes
+    ----------
+    corner : (h, 2) float
+        Beginnings of half-edges.
+    foot : (h, 2) float
+        The places of edges: where the line between the generators crosses them.
+    line : (h, 2) float
+        To the generators across; zeros on walls.
+    kites : (h,) float
+        Signed areas between generator, edge, the half-edge's beginning and the edge before it.
+    areas : (n,) float
+        Of the cells, as sums of their kites: what leaves one arrives elsewhere.
+    lengths, distances, angles : (e,) float
+        Of the edges: their own length, the distance of the generators, and the angle of the normal to the x axis.
+    """
+
+    corner: np.ndarray
+    foot: np.ndarray
+    line: np.ndarray
+    kites: np.ndarray
+    areas: np.ndarray
+    lengths: np.ndarray
+    distances: np.ndarray
+    angles: np.ndarray
+
+
+def _measure(diagram: Diagram, halves: HalfEdges) -> _Shape:
+    own, first, edge = diagram.points[halves.cell], halves.first, halves.edge
+    begin, end = (diagram.vertices[v] - own for v in (halves.begin, halves.end))
+    inner = halves.twin >= 0
+    line, middle = np.zeros_like(own), (begin + end) / 2
+    line[inner] = neighbour_points(diagram, halves.rows[inner]) - own[inner]
+    lengths = diagram.face_measures[halves.rows[first]]
+    distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
+    # In polygons a cell may have got a piece of another one, whose edges are on no bisector of its generator.
+    off = np.abs(((middle - line / 2) * line).sum(axis=1))[first] / distances
+    on_bisector = inner[first] & (off <= _roundings(diagram, distances))
+    foot = np.where(on_bisector[edge][:, None], line / 2, middle)
+    kites = (_cross(begin, foot) + _cross(foot[halves.previous], begin)) / 2
+    along = (end - begin)[first]
+    outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    normals = np.where(inner[first][:, None], line[first], outward)
+    return _Shape(
+        begin, foot, line, kites, np.bincount(halves.cell, kites, len(diagram)), lengths, distances,
+        np.arctan2(normals[:, 1], normals[:, 0]),
+    )  # fmt: skip
+
+
+def _roundings(diagram: Diagram, distances: np.ndarray) -> np.ndarray:
+    """Return how far edges may be off the bisectors of generators `distances` (e,) apart, (e,)."""
+    domain = diagram.domain
+    single, double = (domain.place(diagram.points, np.dtype(t)) for t in (np.float32, np.float64))
+    # What single precision holds is of no more.
+    eps = np.finfo(np.float32 if np.array_equal(single, double) else np.float64).eps
+    places = eps * domain.extent.max() + np.finfo(np.float64).eps * np.abs(diagram.vertices).max()
+    # Corners round by more, the sharper the angle in which two bisectors meet: then they are off a third one.
+    return np.sqrt(eps) * distances + 64 * places
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+@dataclass(frozen=True)
+class _Around:
+    """What meets at each vertex, counter-clockwise; on the boundary from the boundary on.
+
+    Attributes
+    ----------
+    vertex : (h,) int
+        Number of the vertex in which each half-edge begins.
+    corners : (v, k) int
+        Of each vertex the half-edges that begin there, -1 behind them. Each follows its edge, and is a corner of its
+        cell.
+    edges : (v, k) int
+        Of each vertex its edges; on the boundary one more than corners.
+    """
+
+    vertex: np.ndarray
+    corners: np.ndarray
+    edges: np.ndarray
+
+
+def _walk_around(halves: HalfEdges) -> _Around:
+    """Find the vertices from how half-edges are joined: a seam is none for them, and both sides of a slit differ."""
+    h = len(halves.cell)
+    onward = halves.twin[halves.previous]
+    joined = np.flatnonzero(onward >= 0)
+    graph = coo_array((np.ones(len(joined), np.int8), (joined, onward[joined])), shape=(h, h))
+    label = connected_components(graph, directed=False)[1]
+    # The least half-edge numbers the vertex; an open round begins with the edge on the boundary.
+    rank = np.lexsort((np.arange(h), halves.twin >= 0, label))
+    begins = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]
+    least = np.full(len(begins), h)
+    np.minimum.at(least, label, np.arange(h))
+    by_least = np.argsort(least)
+    number = np.empty(len(begins), np.int64)
+    number[by_least] = np.arange(len(begins))
+    corners, current = [], begins[by_least]
+    start = current
+    while (current >= 0).any():
+        corners.append(current)
+        following = np.where(current >= 0, onward[current], -1)
+        current = np.where(following == start, -1, following)
+    corners = np.stack(corners, axis=1)
+    cells = (corners >= 0).sum(axis=1)
+    is_open = halves.twin[start] < 0
+    degree = max(3, int((cells + is_open).max()))
+    corners = np.pad(corners, ((0, 0), (0, degree - corners.shape[1])), constant_values=-1)
+    edges = np.where(corners >= 0, halves.edge[corners], -1)
+    last = np.flatnonzero(is_open)
+    final = corners[last, cells[last] - 1]
+    edges[last, cells[last]] = halves.edge[halves.previous[final]]
+    return _Around(number[label], corners, edges)
+
+
+def _check_loops(halves: HalfEdges, path: Path) -> None:
+    loops = np.bincount(halves.cell[halves.next <= np.arange(len(halves.cell))])
+    several = np.flatnonzero(loops > 1)
+    if several.size:
+        raise InputError(
+            f"cannot write {path}: cell {several[0]} ({several.size} in all) goes around a part of the boundary, and "
+            "MPAS's cells have no holes; use smaller cells there, leave out the hole, or leave out convention='mpas'"
+        )
+
+
+def _check_reach(shape: _Shape, periods: np.ndarray, path: Path) -> None:
+    """Refuse what readers would take for its image: they know places up to whole periods."""
+    reach = np.abs([shape.corner, shape.line]).max(axis=(0, 1))
+    far = np.flatnonzero((periods > 0) & (reach > 0.499 * periods))
+    if far.size:
+        raise InputError(
+            f"cannot write {path}: cells reach {reach[far[0]]:.3g} across a period of {periods[far[0]]:.3g}, and MPAS "
+            "takes the nearest image of what is half a period away; use more cells, or leave out convention='mpas'"
+        )

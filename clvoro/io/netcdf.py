@@ -1,0 +1,129 @@
+"""Files of netCDF-3 with 64-bit offsets, which every version of its library reads."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.io import netcdf_file
+
+from ..errors import InputError
+from ..results import Result
+from .atomic import atomic_file
+
+_MOST = (
+    2**31 - 4
+)  # bytes of a variable, which the format's readers take for a signed number of 32 bits
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """Values, or the items of ragged rows, and the type in which they are written."""
+
+    dimensions: tuple[str, ...]
+    values: np.ndarray
+    attributes: Mapping[str, str | np.generic]
+    counts: np.ndarray | None = None
+    missing: int = 0
+
+    @property
+    def kind(self) -> np.dtype:
+        return np.dtype(np.float64 if self.values.dtype.kind == "f" else np.int32)
+
+
+class NetCDF:
+    """What a file is going to hold.
+
+    Parameters
+    ----------
+    path : Path
+    result : Result
+        Whose settings go along.
+    dimensions : mapping
+        Lengths by name.
+    attributes : mapping
+        Of the file: texts and NumPy's numbers.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        result: Result,
+        dimensions: Mapping[str, int],
+        attributes: Mapping[str, str | np.generic],
+    ) -> None:
+        self.path, self.dimensions = path, dict(dimensions)
+        settings = json.dumps(result.settings, default=repr)
+        self.attributes = {**attributes, "source": "clvoro", "clvoro_settings": settings}
+        self._variables: dict[str, _Variable] = {}
+
+    def add(
+        self,
+        name: str,
+        dimensions: tuple[str, ...],
+        values: np.ndarray,
+        **attributes: str | np.generic,
+    ) -> None:
+        """Add a variable of integers or real numbers.
+
+        Raises
+        ------
+        InputError
+            If the format has no room for it.
+        """
+        assert values.shape == tuple(self.dimensions[d] for d in dimensions), name
+        self._add(name, _Variable(dimensions, values, attributes))
+
+    def add_rows(
+        self,
+        name: str,
+        dimensions: tuple[str, str],
+        counts: np.ndarray,
+        items: np.ndarray,
+        missing: int,
+        **attributes: str | np.generic,
+    ) -> None:
+        """Add a table of ragged rows: row i has `counts[i]` of the `items`, and `missing` behind them.
+
+        Raises
+        ------
+        InputError
+            If the format has no room for it.
+        """
+        self._add(name, _Variable(dimensions, items, attributes, counts, missing))
+
+    def _add(self, name: str, variable: _Variable) -> None:
+        lengths = [self.dimensions[d] for d in variable.dimensions]
+        size = math.prod(lengths) * variable.kind.itemsize
+        if size > _MOST:
+            raise InputError(
+                f"cannot write {self.path}: {name} ({' x '.join(map(str, lengths))}) takes {size} bytes, and variables "
+                f"of netCDF-3 have at most {_MOST}; use fewer cells, or save as .npz or .vtu"
+            )
+        self._variables[name] = variable
+
+    def write(self) -> None:
+        """Write the file, once; the same contents give the same bytes."""
+        with atomic_file(self.path) as file:
+            made = netcdf_file(file, "w", version=2)
+            for name, value in self.attributes.items():
+                setattr(made, name, value)
+            for name, length in self.dimensions.items():
+                made.createDimension(name, length)
+            for name in list(self._variables):
+                # What has been converted is let go of.
+                given = self._variables.pop(name)
+                variable = made.createVariable(name, given.kind, given.dimensions)
+                for key, value in given.attributes.items():
+                    setattr(variable, key, value)
+                if given.counts is None:
+                    variable[...] = given.values
+                else:
+                    filled = np.arange(variable.shape[1]) < given.counts[:, None]
+                    variable[...] = given.missing
+                    variable[filled] = given.values
+            made.flush()  # closing it would write it all once more, and close the file
