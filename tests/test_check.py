@@ -9,7 +9,9 @@ from solids import solid_diagram, solid_result
 
 import clvoro
 from clvoro import cli
-from clvoro.findings import CheckError
+from clvoro.check.findings import CheckError
+from clvoro.check.rebuilt import Rebuilt
+from clvoro.check.values import borders_on_lost_faces
 from clvoro.io.vtu_read import load_vtu
 from clvoro.results import Diagram
 
@@ -213,6 +215,36 @@ COMMON = {
     "starts": ({"neighbour_starts": put(3, 500)}, "shapes"),
     "short": ({"volumes": lambda v: v[:-1]}, "shapes"),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
+    """Four cells of a lattice meet at each edge but for rounding. Two of them share a face no wider than that, which
+    may be none: the device has measured it, and a cell's quality differs by more roundings than others' may."""
+    adapter, eps = clvoro.Adapter(ctx, dtype), float(np.finfo(dtype).eps)
+    box = clvoro.Box((0, 0, 0), (1, 1.1, 1), periodic=periodic)
+    for m, spread in ((5, 30), (7, 30), (10, 200)):
+        middles = np.stack(np.meshgrid(*[np.arange(m)] * 3), -1).reshape(-1, 3) + 0.5
+        noise = spread * eps * np.random.default_rng(3).standard_normal(middles.shape)
+        result = adapter.run(
+            box, 1 / m, (middles / m + noise) * box.extent, method="lloyd", max_steps=0
+        )
+        result.check().demand()
+        quality = result.quality.copy()
+        quality[17] *= 1 + 2e4 * eps * m
+        assert "quality" in names_of(dataclasses.replace(result, quality=quality).check())
+
+
+def test_only_where_faces_may_have_been_left_out_quality_may_be_off(ctx):
+    box = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, False, False))
+    points = np.random.default_rng(5).random((300, 3))
+    result = clvoro.Adapter(ctx).run(box, 0.15, points, method="lloyd", max_steps=1)
+    g = Rebuilt(result.diagram)
+    assert not borders_on_lost_faces(result.diagram, g, np.arange(300)).any()
+    cubes = (np.stack(np.meshgrid(*[np.arange(6)] * 3), -1).reshape(-1, 3) + 0.5) / 6
+    d = clvoro.Adapter(ctx).diagram(box, cubes)
+    assert borders_on_lost_faces(d, Rebuilt(d), np.arange(6**3)).all()
 
 
 @pytest.mark.parametrize("case", list(COMMON))

@@ -5,8 +5,8 @@ import pytest
 from shores import UNIT, scattered, slit
 
 import clvoro
+from clvoro.check.rebuilt import Rebuilt
 from clvoro.errors import InputError
-from clvoro.rebuilt import Rebuilt
 from clvoro.results import Diagram
 
 REALS = ("float64", "float32")
@@ -61,6 +61,15 @@ def test_slits_that_are_no_wider_than_some_roundings_hide_what_is_behind_them(ad
             assert report, report
             checked += 1
     assert checked > 15
+    # Narrower than a rounding of the coordinate along it, which is far larger than that across.
+    x = 68.53 + 1.28e-13 * np.arange(2)
+    sides = [(x[1], 37913.1), ((x[0] + x[1]) / 2, 37909.5), (x[0], 37913.1)]
+    far = [(68.52, 37908.0), (68.54, 37908), (68.54, 37913.1), *sides, (68.52, 37913.1)]
+    domain = clvoro.Polygon(far)
+    assert domain.is_slit(np.array([sides[0], far[2]]), 1e-11).tolist() == [True, False]
+    others = [(68.535, 37913.1), (68.525, 37910.0), (68.532, 37912.0)]
+    report = adapters["float64"].diagram(domain, np.array([sides[2], *others])).check()
+    assert report, report
     # And what is not hidden is found: two generators beside the slit, exchanged.
     domain = clvoro.Polygon(slit(1e-6))
     points = np.array([(0.3, 0.8), (0.7, 0.6), (0.8, 0.9)])

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .errors import ClvoroError
+from ..errors import ClvoroError
 
 if TYPE_CHECKING:
-    from .results import Diagram
+    from ..results import Diagram
 
 ROUNDINGS = 256
 """How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be

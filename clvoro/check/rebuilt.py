@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .faces import neighbour_points
-from .outlines import face_ends, next_faces
-from .polygon import Polygon
-from .walls import wall_planes
+from ..faces import neighbour_points
+from ..outlines import face_ends, next_faces
+from ..polygon import Polygon
+from ..walls import wall_planes
 
 if TYPE_CHECKING:
-    from .results import Diagram
+    from ..results import Diagram
 
 ADOPTED = 1024
 """Roundings of a position by which a face may be off the bisector of its generators and still be a part of it."""

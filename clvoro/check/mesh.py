@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
-from .check_faces import check_corners, check_measures
-from .check_polygon import check_cells, check_edges, check_outlines, hidden
-from .check_values import check_values
-from .faces import face_keys
+from ..faces import face_keys
+from ..polygon import Polygon
+from ..walls import surface, wall_count, wall_distance
+from .faces import check_corners, check_measures
 from .findings import ROUNDINGS, Check, MisfitError, Report
-from .polygon import Polygon
+from .polygon import check_cells, check_edges, check_outlines, hidden
 from .rebuilt import Doubts, Rebuilt
-from .walls import surface, wall_count, wall_distance
+from .values import check_values
 
 if TYPE_CHECKING:
-    from .results import Diagram, Result
+    from ..results import Diagram, Result
 
 
 def check_diagram(diagram: Diagram) -> Report:

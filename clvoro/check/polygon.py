@@ -8,13 +8,13 @@ import numpy as np
 import shapely
 from scipy.spatial import KDTree
 
-from .outlines import face_ends, next_faces
+from ..outlines import face_ends, next_faces
 
 if TYPE_CHECKING:
+    from ..polygon import Polygon
+    from ..results import Diagram
     from .findings import Check
-    from .polygon import Polygon
     from .rebuilt import Rebuilt
-    from .results import Diagram
 
 
 def check_outlines(check: Check) -> None:
@@ -139,6 +139,8 @@ def hidden(
         along /= np.linalg.norm(along, axis=1)[:, None]
         right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
         away[place[(right > 4 * unit) & (d.neighbours[faces] < 0)[place]]] = True
+    # In those of a few roundings nobody can tell what is on this side.
+    away |= domain.is_slit(at, 16 * unit)
     away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
     # Nor is anything seen through a point, or from one.
     away[place[near_shared_corners(domain, lines, slack)]] = True

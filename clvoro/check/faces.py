@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .faces import face_keys, take_rows
+from ..faces import face_keys, take_rows
+from ..outlines import face_ends
+from ..polygon import Polygon
+from ..walls import wall_planes
 from .findings import ROUNDINGS
-from .outlines import face_ends
-from .polygon import Polygon
-from .walls import wall_planes
 
 if TYPE_CHECKING:
     from .findings import Check
