@@ -85,8 +85,11 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
                 remedy = f"pass its coordinates, array[:, :{d}]"
         if array.ndim == 2 and array.shape[1] < d:
             remedy = f"points have {d} coordinates here"
-        if array.ndim == 1 and len(array) != d:
-            remedy = "pass numpy.column_stack([x, y]), say"
+        if array.ndim == 1:
+            one = len(array) == d
+            remedy = (
+                "pass [point] for a single one" if one else "pass numpy.column_stack([x, y]), say"
+            )
         raise InputError(f"{name} has shape {array.shape}, expected (n, {d}); {remedy}")
     return array.astype(np.float64)
 
@@ -138,11 +141,14 @@ def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
     return i, j
 
 
-def check_integer(name: str, value: object, least: int, most: float = 2**63 - 1) -> int:
-    """Return `value` as an int of at least `least`, at most `most`."""
+def check_integer(
+    name: str, value: object, least: int, most: float = 2**63 - 1, beside: str = ""
+) -> int:
+    """Return `value` as an int of at least `least`, at most `most`; errors say what is allowed `beside` integers."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        expected = f"an integer or {beside}" if beside else "an integer"
         raise InputTypeError(
-            f"{name} is {value!r} of type {type(value).__name__}, expected an integer"
+            f"{name} is {value!r} of type {type(value).__name__}, expected {expected}"
         )
     if value < least:
         raise InputError(f"{name} is {value}, expected at least {least}")

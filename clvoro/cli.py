@@ -23,9 +23,13 @@ OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 
 _EPILOG = """\
 exit codes:
-  0 done                2 bad usage or input (check: a file that cannot be read)
-  1 the run failed      3 no usable device
-    (check: wrong)    130 interrupted (Ctrl-C, SIGTERM, SIGHUP; what there was has been written)
+  0    done
+  1    the run failed, or a file could not be written; check: a mesh is wrong
+  2    bad usage or input, also a place where no folder can be made (--out);
+       check: a file cannot be read
+  3    no usable device
+  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; what there was has been
+       written)
 
 examples:
   clvoro run paper                      the paper's validation case, into out/paper
@@ -75,13 +79,24 @@ def build_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--cells", metavar="N", type=int, help="number of cells (default: from h)")
     run.add_argument("--steps", metavar="N", type=int, help="largest number of steps")
-    run.add_argument("--tol", type=float, metavar="T", help="stop when gains fall below this share")
-    run.add_argument("--k", type=float, metavar="K", help="largest displacement over h in a step")
+    repeated = "(methods of one kind of step)"
+    run.add_argument(
+        "--tol", type=float, metavar="T", help=f"stop when gains fall below this share {repeated}"
+    )
+    run.add_argument(
+        "--k", type=float, metavar="K", help=f"largest displacement over h in a step {repeated}"
+    )
     run.add_argument("--seed", type=int, metavar="S", help="of the random start")
     run.add_argument("--dtype", choices=("float64", "float32"), help="precision on the device")
-    run.add_argument("--effort", choices=("fast", "default", "best"), help="work against quality")
     run.add_argument(
-        "--levels", metavar="N", help="coarser levels to begin with, or auto (the default)"
+        "--effort",
+        choices=("fast", "default", "best"),
+        help="work against quality (adaptive, exact)",
+    )
+    run.add_argument(
+        "--levels",
+        metavar="N",
+        help="coarser levels to begin with, or auto (the default; adaptive, exact)",
     )
     run.add_argument(
         "--checkpoint",

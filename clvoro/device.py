@@ -144,7 +144,8 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
         if not reason:
             return cl.Context([candidate.device])
         failures.append(f"{candidate.index} {candidate.title}: {reason}")
-    raise DeviceError(_complaint(subject, found, failures, broken))
+    chosen = index is not None or "PYOPENCL_CTX" in os.environ
+    raise DeviceError(_complaint(subject, found, failures, broken, chosen, fp64))
 
 
 def list_devices() -> list[DeviceInfo]:
@@ -365,8 +366,13 @@ def _complaint(
     found: Sequence[_Candidate],
     failures: Sequence[str],
     broken: Sequence[tuple[str, str, str]],
+    chosen: bool,
+    fp64: bool,
 ) -> str:
-    """Put together the message: what was looked for, what was there, what to do."""
+    """Put together the message: what was looked for, what was there, what to do.
+
+    `chosen` tells that what is taken unasked may be another than the best of what was `found`.
+    """
     lines = [subject]
     lines += [f"  tried {text}" for text in failures]
     lines += [f"  platform {title}: {reason}" for _, title, reason in broken]
@@ -376,5 +382,11 @@ def _complaint(
         lines.append("  the OpenCL loader knows no platform")
     elif failures or broken:
         lines.append(f"  {_runtimes.cache_remedy()}")
-    lines.append(f"  remedy: {INSTALL_HINT}; `clvoro devices` shows the verdict on each device")
+    remedy = INSTALL_HINT
+    left = [c for c in others if c.kind != "simulator" and (has_fp64(c.device) or not fp64)]
+    if left:
+        best = min(left, key=lambda c: c.rank)
+        how = f"ask for {best.index!r}" if chosen else "leave the device out"
+        remedy = f"{how} to use {best.title}, or install the OpenCL driver of the one that you want"
+    lines.append(f"  remedy: {remedy}; `clvoro devices` shows the verdict on each device")
     return "\n".join(lines)

@@ -55,3 +55,11 @@ class MisfitWarning(UserWarning):
 
 class PrecisionWarning(UserWarning):
     """A run cannot meet its size field as well as usual in the precision asked for; says what limits it."""
+
+
+class SizeErrorWarning(UserWarning):
+    """A mesh does not meet its size field, which changes faster than cells can follow; says where."""
+
+
+class UnusedOptionWarning(UserWarning):
+    """An option of a run was given that its method does not use; names the methods that do."""

@@ -20,6 +20,7 @@ from .cases import Case
 from .errors import Aborted, ClvoroError, InputError
 from .io import save, write_history
 from .memory import available_memory, in_bytes
+from .options import Options, uses, warn_of_unused
 from .outputs import check_folder, do_all, refuse_own_files, require_plots
 from .polygon import Polygon
 from .profile import Profile
@@ -92,6 +93,7 @@ class Job:
 
         arguments, size = self.case.run_arguments(), self.case.size_field()
         self._refuse_unknown(arguments, Adapter.run)
+        warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods], 2)
         arguments |= self._checkpoints()
         named = {"checkpoint": self.checkpoint, "resume": self.resume}
         named |= {source.name: source for source in self.case.sources()}
@@ -140,6 +142,8 @@ class Job:
     ) -> Result:
         from .progress import Progress
 
+        # What another method of the case uses is not for this one.
+        arguments = {k: v for k, v in arguments.items() if uses(method or Options.method, k)}
         if method is not None:
             arguments["method"] = method
         most = arguments.get("max_steps", _default(type(adapter).run, "max_steps"))
@@ -255,7 +259,7 @@ class Job:
             f"Written by clvoro {__version__} on {where}{note}.",
             "Repeat it with: clvoro run case.toml",
         )
-        repeatable = self._repeatable(main)
+        repeatable = self._repeatable(results)
         tasks.append(partial(repeatable.write, self.out, header))
         if self.report:
             tasks.append(
@@ -280,16 +284,17 @@ class Job:
             formats=self.formats,
         )
 
-    def _repeatable(self, main: Result) -> Case:
+    def _repeatable(self, results: dict[str, Result]) -> Case:
         """Return the case with all settings that took their default values written out."""
-        known = {key: main.settings.get(key) for key in _REPEATED}
+        settings: dict[str, Any] = {}
+        for result in results.values():  # the last one is the main one
+            settings |= result.settings
+        known = {key: settings.get(key) for key in _REPEATED}
         if known["start"] == "points":
             known["start"] = None
-        if len(self.case.methods) > 1:  # of which each may choose its own
-            known["levels"] = None
-        if len(self.case.methods) == 1:
-            known["method"] = main.settings.get("method")
-        return self.case.with_run(**known)
+        if len(self.case.methods) > 1:  # of which each may choose its own levels
+            return self.case.with_run(**{**known, "levels": None}, methods=self.case.run["methods"])
+        return self.case.with_run(**known, method=settings.get("method"))
 
     def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
         """Return the mesh before the first step."""

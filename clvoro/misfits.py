@@ -1,4 +1,4 @@
-"""Units and places that do not agree: what is told of before a run begins, though it could be meant."""
+"""What could be meant, but hardly is: units and places that do not agree, and sizes that no cells can follow."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from .domain import Domain
-from .errors import MisfitWarning
+from .errors import MisfitWarning, SizeErrorWarning
 from .layers import Layers, columns_of
+from .results import Result
 from .sizing.field import Field
 
 COARSER, FINER = 2.0, 1e-3
 """Layers so much coarser or finer than the size field asks for beside them are a mistake."""
 SAMPLE = 64
 """Places along a layer at which that is seen."""
+MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
+"""Of finished meshes of fields that cells can follow means of |e| are 0.02 at most, and the largest 0.3; where sizes
+jump 1 : 2 from one cell to the next, the largest is 1."""
 
 
 def warn_of_misfits(
@@ -66,3 +70,32 @@ def misfits_of_layer(name: str, layer: Layers, field: Field, domain: Domain) -> 
                 "the same unit? Otherwise give spacing, the width along the wall"
             ]
     return []
+
+
+def warn_of_errors(result: Result, stacklevel: int) -> None:
+    """Warn if the mesh of a run whose plan is completed does not meet its size field, and of where it does so least.
+
+    Parameters
+    ----------
+    stacklevel : int
+        As in `warn_of_misfits`.
+
+    Warns
+    -----
+    SizeErrorWarning
+    """
+    amounts = np.abs(result.error)
+    worst = int(amounts.argmax())
+    mean, largest = float(amounts.mean()), float(amounts[worst])
+    if mean < MEAN_ERROR and largest < LARGEST_ERROR:
+        return
+    place = ", ".join(f"{x:.6g}" for x in result.points[worst])
+    asked = float(result.size[worst])
+    made = float(result.diagram.volumes[worst]) ** (1 / result.points.shape[1])
+    warnings.warn(
+        f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at ({place}) has the size "
+        f"{made:.3g} where {asked:.3g} is asked for; sizes change there by more than cells can follow from one to the "
+        "next: bound their growth, as by sizing.Graded(size, growth=1.2), or use more cells",
+        SizeErrorWarning,
+        stacklevel=stacklevel + 1,
+    )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from .cases import WRITTEN
 from .errors import ClvoroError, InputError
-from .io import check_writable
+from .io import check_writable, make_folder
 
 
 def refuse_own_files(folder: Path, named: Mapping[str, Path | None]) -> None:
@@ -38,13 +38,7 @@ def check_folder(folder: Path) -> None:
     InputError, OutputError
         Before any work is done that would then be lost.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"out is {str(folder)!r}, where no folder can be made ({error.strerror}); "
-            "give a folder of your own with --out"
-        ) from error
+    make_folder(folder)
     check_writable(folder)
     for name in ("mesh.vtu", "mesh.npz", "history.csv", "case.toml", "report.html"):
         if (folder / name).is_dir():

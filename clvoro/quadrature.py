@@ -13,6 +13,7 @@ import numpy as np
 from .boxes import Boxes, hilbert_tables
 from .cover import cover_of
 from .errors import InputTypeError, SizeFieldError
+from .sizing.remedy import remedy_for
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -95,7 +96,7 @@ class DensityTree:
             raise InputTypeError(
                 f"field is {type(field).__name__}, expected a field of clvoro.sizing"
             )
-        self.field, self.boxes = field, Boxes(domain)
+        self.field, self._domain, self.boxes = field, domain, Boxes(domain)
         self.cover = cover_of(self.boxes, domain)
         dim = domain.dim
         while (
@@ -136,11 +137,13 @@ class DensityTree:
                 where = ", ".join(f"{c:.6g}" for c in part[bad[0]])
                 raise SizeFieldError(
                     f"the size field is {h[bad[0]]:g} at ({where}), expected a positive, finite "
-                    "size on the whole domain; bound it, for instance by "
-                    "clvoro.sizing.maximum(field, 1e-3)"
+                    f"size on the whole domain; {self._remedy(float(h[bad[0]]))}"
                 )
             found[first : first + _BATCH] = h
         return found
+
+    def _remedy(self, value: float) -> str:
+        return remedy_for(value, self._domain, getattr(self.field, "on_device", False))
 
     def _integrate(self, chosen: np.ndarray) -> None:
         """Apply the rules to the boxes where `chosen` is true."""
@@ -160,7 +163,7 @@ class DensityTree:
             where = ", ".join(f"{c:.6g}" for c in points[i, j])
             raise SizeFieldError(
                 f"the size field is {h[i, j]:g} at ({where}): the number of cells overflows; "
-                "bound it, for instance by clvoro.sizing.maximum(field, 1e-3)"
+                f"{self._remedy(float(h[i, j]))}"
             )
         offset = at - 0.5
         self.cells[chosen] = self.cover.weigh(density @ weight, chosen)

@@ -10,6 +10,7 @@ import numpy as np
 
 from .io import save
 from .io.atomic import atomic_file, writing
+from .options import Options, uses
 from .results import Result
 
 if TYPE_CHECKING:
@@ -53,9 +54,10 @@ def run_frames(
     folder = out / "frames"
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    arguments = {k: v for k, v in case.run_arguments().items() if k in _KEPT}
-    if case.methods[-1] is not None:
-        arguments["method"] = case.methods[-1]
+    method = case.methods[-1] or Options.method
+    arguments = {
+        k: v for k, v in case.run_arguments().items() if k in _KEPT and uses(method, k)
+    } | {"method": method}
     result, rows, shown = first, [], {}
     wanted = np.unique(np.linspace(0, case.frames - 1, min(PICTURED, case.frames)).round())
     try:

@@ -208,6 +208,10 @@ def test_sizes_from_a_solution(tmp_path):
         ("size = 0.1\n[run]\nseed = 1.5", ["run.seed", "1.5", "whole"]),
         ("size = 0.1\n[run]\nstart = 'densty'", ["run.start", "did you mean 'density'"]),
         ("size = 0.1\n[run]\nmethod = 'lloyd'\nmethods = ['lloyd']", ["method and methods"]),
+        (
+            "size = 0.1\n[run]\nmethods = ['lloyd', 'lloyd']",
+            ["run.methods[1]", "'lloyd'", "each name once"],
+        ),
         ("size = -0.1", ["size", "-0.1", "above 0"]),
         ("size = nan", ["size", "finite"]),
         ("sise = 0.1", ["'sise'", "did you mean 'size'"]),

@@ -116,6 +116,29 @@ def test_choice_by_name_kind_and_index(machine, query, expected):
     assert device.create_context(query) == [expected]
 
 
+@pytest.mark.parametrize(
+    ("devices", "query", "remedy"),
+    [
+        ([INTEL, POCL], "nvidia", f"leave the device out to use {POCL.platform.name} / {POCL.name}, or install the "),
+        ([POCL, BIG_GPU], "amd", f"leave the device out to use {BIG_GPU.platform.name} / {BIG_GPU.name}, or install "),
+        ([POCL], "gpu", "install the OpenCL driver of the one that you want"),
+        # Indices ask one platform alone, beside which there may be better ones.
+        ([POCL, BIG_GPU], "0:7", "ask for '1:0' to use "),
+        ([GRIND], "gpu", "pocl-opencl-icd"),
+        ([POCL], "pocl", "pocl-opencl-icd"),  # and it does not work
+        ([SMALL_GPU, INTEL, POCL], "pocl", f"use {INTEL.platform.name} / "),  # the GPU has no float64
+    ],
+)  # fmt: skip
+def test_remedies_name_what_there_is(machine, monkeypatch, devices, query, remedy):
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    machine(*devices, broken=[POCL] if query == "pocl" else [])
+    with pytest.raises(DeviceError) as caught:
+        device.create_context(query, fp64=True)
+    told = str(caught.value).split("remedy: ")[1]
+    assert remedy in told
+    assert ("install a CPU runtime" in told) == ("pocl-opencl-icd" in remedy)
+
+
 def test_float64_passes_over_devices_without_it(machine):
     machine(SMALL_GPU, POCL)
     assert device.create_context() == [SMALL_GPU]
@@ -136,15 +159,14 @@ def test_messages_name_what_was_found_and_what_to_install(machine):
     for part in (
         "'vendor'",
         "Tensor 9000: it cannot build",
-        "Some CPU",
-        "pocl-opencl-icd",
-        "[cpu]",
+        "there is 0:0 Intel(R) OpenCL / Some CPU (cpu)",
+        "leave the device out",
     ):
         assert part in text
     with pytest.raises(InputTypeError, match="device got a int"):
         device.create_context(0)
     machine()
-    with pytest.raises(DeviceError, match="knows no platform"):
+    with pytest.raises(DeviceError, match=r"knows no platform\n.*pocl-opencl-icd.*\[cpu\]"):
         device.create_context()
     assert "pocl-opencl-icd" in device.format_devices(device.list_devices())
 

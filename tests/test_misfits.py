@@ -1,6 +1,7 @@
 """Units and places that do not agree are told of, and what is right beside them is not."""
 
 import json
+import re
 import warnings
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 import clvoro
 from clvoro import cli, sizing
-from clvoro.errors import CoarseSizeWarning, InputError, MisfitWarning
+from clvoro.errors import CoarseSizeWarning, InputError, MisfitWarning, SizeErrorWarning
 from clvoro.misfits import misfits_of_layer
 
 BOX = clvoro.Box((0, 0), (2, 1))
@@ -203,3 +204,33 @@ def test_the_command_line_warns(tmp_path, capfd, centre, said):
     errors = capfd.readouterr().err
     assert code == 0
     assert ("warning: the shapes of Distance" in errors) == said
+
+
+JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
+"""Of a twentieth of a cell at the wall: the cells beside it ask for what no neighbour of theirs can be."""
+
+
+@pytest.mark.parametrize(("method", "effort"), [("adaptive", "fast"), ("exact", "default")])
+def test_mesh_that_does_not_meet_its_sizes(ctx, method, effort):
+    """It ends (the count that "exact" wants to have exactly would swing for ever there), and says where it is worst."""
+    square, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)
+    with pytest.warns(SizeErrorWarning, match="mean .e. is .*sizing.Graded") as told:
+        result = adapter.run(square, JUMP, method=method, effort=effort, seed=1)
+    assert result.converged
+    worst = np.abs(result.error).argmax()
+    x, y = (float(v) for v in re.search(r"\(([^)]*)\)", str(told[0].message))[1].split(","))
+    assert result.points[worst] == pytest.approx((x, y), rel=1e-5)
+    assert told[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SizeErrorWarning)
+        adapter.run(square, sizing.Graded(JUMP, growth=1.2), method=method, effort=effort, seed=1)
+        # Of what is not finished, and of methods that do not promise it, one is not told.
+        adapter.run(
+            square,
+            JUMP,
+            method=method,
+            effort="fast",
+            seed=1,
+            callback=lambda row: row["step"] == 9,
+        )
+        adapter.run(square, JUMP, method="lloyd", max_steps=2, seed=1)

@@ -1,8 +1,12 @@
 """What a newcomer may pass by mistake: each ends right, or in an error that says what to write instead."""
 
+import copy
+import dataclasses
 import json
+import pickle
 import re
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +16,8 @@ from scipy.spatial import KDTree
 import clvoro
 from clvoro import cli, sizing
 from clvoro.errors import ClvoroError, InputError, InputTypeError, SizeFieldError
+from clvoro.quadrature import DensityTree
+from clvoro.start import count_cells
 
 BOX = clvoro.Box((0, 0), (1, 1))
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -81,6 +87,45 @@ def test_sizes(adapter, size, kind, parts):
     refused(lambda: adapter.run(BOX, size), *parts, kind=kind)
 
 
+BAD_SIZES = {
+    "negative": lambda p: p[:, 0] - 0.5,
+    "zero": lambda p: 0 * p[:, 0],
+    "tiny": lambda p: 1e-200 + 0 * p[:, 0],
+    "inf": lambda p: np.full(len(p), np.inf),
+    "huge": lambda p: np.full(len(p), 1e30),
+}
+
+
+@pytest.mark.parametrize("edges", [(1e6, 1e6, 1e6), (1e6, 1), (2e-3, 3e-3)])
+@pytest.mark.parametrize("what", list(BAD_SIZES))
+def test_bounds_that_errors_propose_fit_the_domain(adapter, what, edges):
+    box, field = clvoro.Box((0,) * len(edges), edges), sizing.Function(BAD_SIZES[what])
+    by_run = partial(adapter.run, box, field)
+    for call in (by_run,) if what == "huge" else (by_run, partial(DensityTree, field, box)):
+        with pytest.raises(SizeFieldError) as caught:
+            call()
+        bound = re.search(r"clvoro\.sizing\.(m\w+)\(field, ([^)]+)\)", str(caught.value))
+        assert bound, caught.value
+        bounded = getattr(sizing, bound[1])(field, float(bound[2]))
+        assert 0 < count_cells(bounded, box) <= 1e6 * (1 + 1e-9)  # so says the message; sums round
+
+
+def test_sizes_that_are_no_numbers(adapter):
+    """Of which the larger and the smaller one with a bound are none."""
+    for field, remedy in (
+        (lambda p: np.nan * p[:, 0], "numpy.nan_to_num"),
+        (sizing.Expression("sqrt(x - 1)"), "fmax(x, 0)"),
+    ):
+        for call in (
+            partial(adapter.run, BOX, field),
+            partial(DensityTree, sizing.as_field(field), BOX),
+        ):
+            with pytest.raises(SizeFieldError, match="is nan at") as caught:
+                call()
+            assert remedy in str(caught.value)
+            assert "mum(field" not in str(caught.value)
+
+
 def test_arguments_in_the_wrong_order(adapter):
     refused(lambda: adapter.run(0.1, BOX), "exchange them", kind=InputTypeError)
     refused(lambda: sizing.Distance(0.1, sizing.Circle((0, 0), 1), growth=1.2), "Distance(Circle(")
@@ -116,6 +161,19 @@ def test_functions_of_other_kinds_are_taken(adapter):
     )):  # fmt: skip
         made = adapter.run(BOX, size, points=POINTS, method="lloyd", max_steps=0)
         assert (made.size == 0.2).all()
+
+
+@pytest.mark.parametrize(
+    ("combine", "part"),
+    [
+        (lambda f: f - f, "no -"), (lambda f: 1 - f, "no -"), (lambda f: f - 0.1, "no -"), (lambda f: -f, "no -"),
+        (lambda f: f**2, "no **"), (lambda f: min(f, 0.1), "minimum("), (lambda f: max(0.1, f), "minimum("),
+        (lambda f: np.array([0.1]) - f, "no -"),
+    ],
+)  # fmt: skip
+def test_arithmetic_that_size_fields_do_not_have(combine, part):
+    for field in (sizing.Constant(0.1), sizing.Expression("0.1 + x"), sizing.Function(np.sum)):
+        refused(lambda f=field: combine(f), repr(field), part, kind=InputTypeError)
 
 
 def test_resolutions_of_graded_fields(adapter):
@@ -191,6 +249,23 @@ def test_polygons(make, parts):
     refused(make, *parts)
 
 
+@pytest.mark.parametrize("domain", [BOX, clvoro.Polygon(SQUARE)])
+def test_places_in_domains(domain):
+    for points in (
+        [(0.5, 0.5), (2, 0)],
+        Foreign([(0.5, 0.5), (2, 0)]),
+        np.array([(0.5, 0.5), (2, 0)], np.float32),
+    ):
+        assert domain.contains(points).tolist() == [True, False]
+    assert domain.contains([(np.nan, 0)]).tolist() == [False]
+    assert domain.contains([]).shape == (0,)
+    refused(
+        lambda: domain.contains((0.5, 0.5)), "points has shape (2,)", "[point]", kind=InputError
+    )
+    refused(lambda: domain.contains(np.zeros((3, 4, 2))), "shape (3, 4, 2)", kind=InputError)
+    refused(lambda: domain.contains("in"), "points is a str", kind=InputTypeError)
+
+
 def test_polygons_of_other_kinds_are_taken(tmp_path):
     square = clvoro.Polygon(SQUARE)
     assert clvoro.Polygon.from_geojson(Geographic()) == square
@@ -221,9 +296,45 @@ def test_versions_of_files(result, tmp_path):
         refused(lambda: clvoro.load(tmp_path / "b.npz"), remedy, kind=InputError)
 
 
-def test_names_of_arrays(result):
-    with pytest.raises(AttributeError, match="a Diagram has no 'volume'"):
-        _ = result.diagram.volume
+def test_names_of_arrays(adapter, result):
+    with pytest.raises(AttributeError, match="a Diagram has no 'areas'; it has points, volumes, "):
+        _ = result.diagram.areas
+    with pytest.raises(
+        AttributeError, match=r"face_vertices: a diagram in 2D has none; it has .*cell_vertices$"
+    ):
+        _ = result.diagram.face_vertices
+    solid = adapter.diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), [(0.5, 0.5, 0.5)])
+    with pytest.raises(
+        AttributeError, match=r"cell_vertices: a diagram in 3D has none; it has .*face_vertices$"
+    ):
+        _ = solid.cell_vertices
+    assert not hasattr(copy.copy(result.diagram), "_cells")
+
+
+def test_arrays_are_read_only(result, tmp_path):
+    """One assignment would spoil the points of result and diagram, beside which the others stay as they were."""
+    result.save(tmp_path / "a.npz")
+    result.save(tmp_path / "a.vtu")
+    assert result.points is result.diagram.points
+    again = pickle.loads(pickle.dumps(result))
+    assert again.points is again.diagram.points
+    loaded = clvoro.load(tmp_path / "a.npz"), clvoro.load(tmp_path / "a.vtu")
+    replaced = dataclasses.replace(result, error=np.zeros(len(POINTS)))
+    for mesh in (result, again, copy.deepcopy(result), copy.copy(result), replaced, *loaded):
+        diagram = mesh.diagram
+        arrays = {name: getattr(diagram, name) for name in dir(diagram) if name in diagram._NAMES}
+        arrays |= {k: a for k, a in vars(mesh).items() if isinstance(a, np.ndarray)}
+        arrays |= {} if mesh.final is None else vars(mesh.final)
+        assert {"points", "volumes", "shifts", "error", "history"} <= set(arrays)
+        for name, array in arrays.items():
+            assert not array.flags.writeable, name
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = 0
+    given = POINTS.copy()
+    diagram = clvoro.Diagram(BOX, {"points": given})
+    given[0] = 0.5  # the caller's own is left alone
+    assert not diagram.points.flags.writeable
+    assert result.error.copy().flags.writeable
 
 
 def test_colours(result):

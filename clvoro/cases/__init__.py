@@ -14,6 +14,7 @@ from .._files import open_plain, read_text
 from ..domain import Domain
 from ..errors import InputError
 from ..io.atomic import atomic_file
+from ..options import uses
 from . import schema, toml
 from .checks import file_name
 from .domains import build_domain, build_layers
@@ -106,9 +107,16 @@ class Case:
         return tuple(self.run.get("methods", [self.run.get("method")]))
 
     def with_run(self, **changes: Any) -> Case:
-        """Return this case with other keys in `[run]`; those that are None stay as they are."""
+        """Return this case with other keys in `[run]`; those that are None stay as they are.
+
+        With the case's own methods go the keys that the new ones do not use, unless they are among `changes`.
+        """
         changes = {key: value for key, value in changes.items() if value is not None}
-        dropped = {"method", "methods"} if {"method", "methods"} & set(changes) else set()
+        dropped: set[str] = set()
+        if {"method", "methods"} & set(changes):
+            methods = changes.get("methods", [changes.get("method")])
+            unused = {key for key in self.run if not any(uses(method, key) for method in methods)}
+            dropped = {"method", "methods", *unused}
         run = {key: value for key, value in self.run.items() if key not in dropped}
         return replace(self, run=schema.run({**run, **changes}, f"{self.name}: run"))
 

@@ -100,7 +100,12 @@ def whole(least: int) -> Check:
 
 def auto_or_whole(value: object, place: str) -> str | int:
     """Check for "auto" or a whole number."""
-    return "auto" if value == "auto" else whole(0)(value, place)
+    if value == "auto":
+        return "auto"
+    try:
+        return whole(0)(value, place)
+    except InputError:
+        raise refuse(place, value, "a whole number, 0 or more, or 'auto'") from None
 
 
 def one_of(*names: str) -> Check:
@@ -147,6 +152,20 @@ def list_of(check_item: Check, least: int = 1) -> Check:
             hint = "; put it in [ ], or under a heading in double brackets" if single else ""
             raise refuse(place, value, f"a list with {least} or more entries{hint}")
         return [check_item(v, f"{place}[{i}]") for i, v in enumerate(value)]
+
+    return check
+
+
+def names_of(*allowed: str) -> Check:
+    """Return the check for a list of some of the names `allowed`, each of them once."""
+    listed = list_of(one_of(*allowed))
+
+    def check(value: object, place: str) -> list[object]:
+        names = listed(value, place)
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise refuse(f"{place}[{i}]", name, "each name once")
+        return names
 
     return check
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import InputError
-from ..preparation import METHODS
+from ..options import METHODS
 from .checks import (
     Check,
     Kinds,
@@ -16,6 +16,7 @@ from .checks import (
     auto_or_whole,
     file_name,
     list_of,
+    names_of,
     not_negative,
     number,
     one_of,
@@ -186,7 +187,7 @@ _RUN = Table(
     {},
     {
         "method": one_of(*METHODS),
-        "methods": list_of(one_of(*METHODS)),
+        "methods": names_of(*METHODS),
         "start": one_of("density", "uniform"),
         "points": text,
         "n_cells": whole(1),

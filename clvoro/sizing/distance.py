@@ -12,7 +12,8 @@ import numpy as np
 from ..domain import Box, Domain
 from ..errors import InputError, InputTypeError
 from ..polygon import Polygon as PolygonalDomain
-from .field import Field, positive, slope_of
+from .arguments import positive, slope_of
+from .field import Field
 from .shapes import Circle, Edges, Polygon, Polyline, Segment
 from .surface import Surface, box_surface
 from .tree import Tree

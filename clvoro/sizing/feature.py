@@ -9,9 +9,10 @@ import numpy as np
 
 from ..errors import InputError, InputTypeError
 from ..polygon import Polygon
+from .arguments import positive, slope_of
 from .covering import covered_share
 from .distance import Distance
-from .field import Constant, Field, positive, slope_of
+from .field import Constant, Field
 from .gaps import gaps, radii_of_curvature
 from .shapes import Edges
 

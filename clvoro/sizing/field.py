@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from numbers import Real
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 from .._arrays import check_callable
 from ..errors import ClvoroError, InputError, InputTypeError, SizeFieldError
+from .arguments import positive
 
 if TYPE_CHECKING:
     from ..domain import Domain
     from .bind import Binder
 
-_MOST_GROWTH = 10  # more is meant as a percentage
 _MOST_PARTS = 256  # the time to build kernels grows faster than they do: 3 s for 200, 20 s for 400
 
 
@@ -136,6 +136,31 @@ class Field:
         if not all(isinstance(f, (Field, Real)) or callable(f) for f in operands):
             return NotImplemented
         return _folded(operation, [as_field(f) for f in operands])
+
+    def __sub__(self, other: object) -> NoReturn:
+        raise InputTypeError(
+            f"{self!r} is subtracted from or negated, and sizes are positive: size fields have no -; write one "
+            "Expression, or a function such as lambda points: field(points) - 0.1 * points[:, 0]"
+        )
+
+    __rsub__ = __sub__
+
+    def __neg__(self) -> NoReturn:
+        self.__sub__(None)
+
+    def __pow__(self, other: object) -> NoReturn:
+        raise InputTypeError(
+            f"{self!r} is raised to a power, and size fields have no **; write one Expression, or a function such as "
+            "lambda points: field(points) ** 0.5"
+        )
+
+    def __lt__(self, other: object) -> NoReturn:
+        raise InputTypeError(
+            f"{self!r} is compared with {other!r:.60}, and neither is smaller everywhere; write "
+            "clvoro.sizing.minimum(...) or maximum(...), which choose at each point"
+        )
+
+    __gt__ = __le__ = __ge__ = __lt__
 
     # NumPy leaves operators between its arrays and a field to the field, which then refuses them.
     __array_ufunc__ = None
@@ -417,35 +442,3 @@ def as_field(size: object) -> Field:
         f"size is {type(size).__name__}, expected a number, a callable h(points (n, d)) -> (n,) "
         f"or a field of clvoro.sizing{hint}"
     )
-
-
-def positive(what: str, value: object) -> float:
-    """Return `value` as a float, or raise the error that `what` must be positive and finite."""
-    if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
-        raise InputTypeError(f"{what} is {value!r}, expected a positive number")
-    try:
-        number = float(value)
-    except OverflowError:  # an integer of hundreds of digits
-        number = math.inf
-    if not (number > 0 and math.isfinite(number)):
-        raise InputError(f"{what} is {value!r:.60}, expected a positive, finite number")
-    return number
-
-
-def slope_of(what: str, growth: object, slope: object) -> float:
-    """Return dh/dx from exactly one of a growth rate per cell, ln(growth), and itself."""
-    if (growth is None) == (slope is None):
-        raise InputError(
-            f"{what} got growth={growth} and slope={slope}, expected exactly one of them"
-        )
-    if growth is not None:
-        rate = positive(f"{what} growth", growth)
-        if not 1 <= rate <= _MOST_GROWTH:
-            raise InputError(
-                f"{what} growth is {growth}, expected 1 to {_MOST_GROWTH}: the ratio of neighbouring cells, such as "
-                "1.2 where each is a fifth larger; write slope= for dh/dx"
-            )
-        return math.log(rate)
-    if not (isinstance(slope, Real) and 0 <= float(slope) < math.inf):
-        raise InputError(f"{what} slope is {slope!r}, expected a finite number >= 0")
-    return float(slope)

@@ -13,8 +13,9 @@ from .._host_memory import host_memory
 from ..domain import Domain
 from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..polygon import Polygon
+from .arguments import slope_of
 from .covering import uncovered
-from .field import Field, as_field, counted, slope_of
+from .field import Field, as_field, counted
 from .raster import Raster
 
 if TYPE_CHECKING:

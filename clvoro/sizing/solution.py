@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, InputTypeError
-from .field import positive
+from .arguments import positive
 from .filling import filled
 from .raster import Raster, check_corners
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import SizeFieldError
 from .bind import bind
 from .field import Constant, Field, as_field
+from .remedy import remedy_for
 
 if TYPE_CHECKING:
     import pyopencl.array as cla
@@ -245,11 +246,11 @@ class Sizing:
             raise self._error(points[bad[0]], float(sizes[bad[0]]))
 
     def _error(self, place: np.ndarray, value: float) -> SizeFieldError:
-        where = ", ".join(f"{c:.6g}" for c in place)
+        where, most = ", ".join(f"{c:.6g}" for c in place), MOST_SIZE * self._scale
         return SizeFieldError(
             f"the size field {self.field!r} is {value:g} at ({where}), expected a positive, finite "
-            f"size on the whole domain, at most {MOST_SIZE * self._scale:.3g} here; bound it, for instance by "
-            "maximum(field, 1e-3)"
+            f"size on the whole domain, at most {most:.3g} here; "
+            f"{remedy_for(value, self.domain, self.field.on_device, most)}"
         )
 
 
