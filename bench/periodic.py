@@ -27,9 +27,9 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro.memory import images_expected
+from clvoro.forecast import images_expected
 from clvoro.sizing import Expression
-from clvoro.start import count_cells
+from clvoro.start import density_tree
 from clvoro.tessellator import Tessellator
 
 CHANNELS = {2: "0.05 + 0.9 * fmin(y, 1 - y)", 3: "0.1 + 0.6 * fmin(y, 1 - y)"}
@@ -105,7 +105,7 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
         one += int(inside.sum()) if any(step) else 0
     return {
         "dim": dim, "cells": n, "images": images.count / n - 1, "one margin": one / n,
-        "expected": images_expected(box, size, n, count_cells(size, box)),
+        "expected": images_expected(box, size, n, density_tree(size, box)),
     }  # fmt: skip
 
 

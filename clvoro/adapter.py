@@ -20,7 +20,9 @@ from .errors import InputError, InputTypeError, MemoryLimitError
 from .fetch import fetch_diagram
 from .layers import Layers
 from .memory import check_memory, memory_needed
-from .preparation import Preparation, check_options
+from .misfits import warn_of_errors
+from .options import Options
+from .preparation import Preparation
 from .results import Diagram, Result
 from .run import Files, carry_out
 from .stages import Stages
@@ -257,10 +259,11 @@ class Adapter:
             Most steps, over all levels. By default 100, or what the plan of "adaptive" and "exact" takes.
         tol : float
             Stop when mean error and mean quality have improved by less than this share over ten steps;
-            0 takes all steps. "adaptive" and "exact" end with their plan.
+            0 takes all steps. Not of "adaptive" and "exact", which end with their plan.
         alpha, k : float
-            Of the paper's (3.4), (3.5): largest relaxation coefficient (by default d), and bound of the
-            displacement over h.
+            Of the paper's (3.4), (3.5), for methods that repeat one kind of step: largest relaxation coefficient of the
+            correction (by default d; not of the weighted ones), and bound of its length over h ("weighted-lloyd" and
+            "weighted": of the whole displacement's). "lloyd" reports such a correction, and does not move by it.
         seed : int
             Of the random start.
         callback : callable, optional
@@ -272,8 +275,8 @@ class Adapter:
             Coarser levels that "adaptive" and "exact" begin with: 2^levels h. From the caller's `points` it is the
             number of refinements that lead from them to the finest level.
         error_target : float, optional
-            Mean |log(L / h)| that the last steps of "adaptive" aim at, by default .0025 (.0035 for "fast", .0039 for
-            "best"). The larger, the better the cells' shape.
+            Mean |log(L / h)| that the last steps of "adaptive" aim at, as do those of "exact" before its projection, by
+            default .0025 (.0035 for "fast", .0039 for "best"). The larger, the better the cells' shape.
         layers : Layers or sequence of them
             Rows of generators along walls, in 2D, that stay where they are: the first of the result. Beyond them sizes
             are bounded by what grows from there; see `Layers`. Their cells count as being of the right size.
@@ -309,10 +312,15 @@ class Adapter:
             If a part of the input hardly meets the domain, as in another unit of length.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.
+        SizeErrorWarning
+            If the sizes of a mesh that "adaptive" or "exact" has finished are far from those asked for.
+        UnusedOptionWarning
+            If an option is given that the method does not use.
         """
-        options = check_options(
+        options = Options(
             method=method, start=start, effort=effort, levels=levels, seed=seed, tol=tol, k=k, alpha=alpha,
-            max_steps=max_steps, n_cells=n_cells, error_target=error_target, layers=layers,
+            max_steps=max_steps, n_cells=n_cells, error_target=error_target,
+            layers=layers,  # type: ignore[arg-type]
         )  # fmt: skip
         if callback is not None and not callable(callback):
             raise InputTypeError(
@@ -334,10 +342,13 @@ class Adapter:
                 kept.release()  # a diagram's buffers, or a failed run's, are not part of what this one takes
             stages = self._stages_for(domain)
             host = None if points is None else check_points(points, domain)
-            return carry_out(
+            result = carry_out(
                 stages, domain, size, host, options, Files(checkpoint, every, resume),
                 self._shown(callback), self.told,
             )  # fmt: skip
+        if options.planned and result.converged:
+            warn_of_errors(result, stacklevel=2)
+        return result
 
     def memory_needed(
         self,
@@ -352,8 +363,9 @@ class Adapter:
     ) -> float:
         """Return how many bytes `run` takes on the device with these arguments, as it is told before it begins.
 
-        It holds to a tenth; where sizes change several-fold from one cell to the next a run may take less, by a quarter
-        at most. Reading all arrays of the diagram afterwards is allowed for: in 3D it takes more than the run.
+        A run does not exceed it by more than a tenth. Where sizes change several-fold from one cell to the next it may
+        take less, by two fifths in most fields, in a kink across a periodic box by more. Reading all arrays of the
+        diagram afterwards is allowed for: in 3D it takes more than the run.
 
         Parameters
         ----------
@@ -374,10 +386,7 @@ class Adapter:
         >>> 4e6 < bytes_ < 5e6
         True
         """
-        options = check_options(
-            method=method, start="density", effort="default", levels=levels, seed=0, tol=0, k=1, alpha=None,
-            max_steps=None, n_cells=n_cells, error_target=None, layers=layers,
-        )  # fmt: skip
+        options = Options(method=method, n_cells=n_cells, levels=levels, layers=layers)  # type: ignore[arg-type]
         with self._alone():
             stages = self._stages_for(domain)
             host = None if points is None else check_points(points, domain)

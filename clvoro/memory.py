@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pyopencl as cl
 
@@ -12,10 +10,10 @@ from ._primitives import scan_width
 from ._program import Engine
 from .domain import Domain
 from .errors import MemoryLimitError
-from .margins import block_count, block_counts
+from .forecast import IMAGE_REACH, shore_expected
+from .margins import block_count
 from .poisson import most_iterations
 from .polygon import Polygon
-from .quadrature import DensityTree
 
 MOST_CELLS = 100_000_000
 """Cells that 32-bit indices into the rows of neighbours allow for."""
@@ -39,145 +37,11 @@ FOLDED = {2: (9, 57), 3: (40, 25)}
 """What comes to the peak of a run in a periodic box, where graphs are folded: per cell, but not per image."""
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
 """What comes to one diagram, likewise, in bytes by dimension and size of a real."""
-IMAGE_REACH = {2: 1.55, 3: 1.75}
-"""How deep margins of equal cells are, in their sizes."""
-DEPTHS = 6
-"""Places in the depth of a margin where the density of cells is looked at."""
-STEEP_FROM, STEEP_TO = 1.4, 2.4
-"""Ratios of sizes, within reach of a cell, from which on it is near something steep, and up to which more so."""
-MOST_SURPLUS, SURPLUS_RATE = 0.7, 2.0
-"""Generators, over those that a size field asks for, that a run takes at most where cells are near something steep, and
-by how much more quickly than the mean of that it comes to as many. Measured on jumps of 1 : 5 to 1 : 20, kinks, stripes
-and chequers, 4000 to 30,000 cells: 0.02 to 0.6, nowhere more than 0.05 over what is told here."""
-STEEP_SHARE, STEEPEST, BEYOND_RATE = 0.25, 2.9, 3.2
-"""Where all but this share of the cells are near what is steeper still, as in a kink of few cells, up to which ratio
-that counts, and by how much: a coarse level there takes up to 2.5 times the generators that it is asked for."""
-SAMPLE = 1024
-"""Places where that is looked at."""
-SHORE_SAMPLE = 4096
-"""Places of a polygon's boundary where the size of cells is looked at, at least."""
-ACROSS = 0.95
-"""Cells at a boundary to its length over their size, which is looked at half a size inside."""
 PARTIAL_SUMS, SCANS, ARRAYS = 80, 8, 64
 """What there is whatever the number of cells: reals to each work-group of sums, scans, and arrays in the workspace, of
 each of which up to a unit is left."""
 FEW = 6000
 """Cells from which on linear solves are by multigrid, whose iterations are few: there is room to record each one."""
-_STEPS = {2: (0.7548776662, 0.5698402910), 3: (0.8191725134, 0.6710436067, 0.5497004779)}
-"""Whose multiples, less whole numbers, fill the unit square, or cube, evenly: powers of the inverse of the root of
-x^(d + 1) = x + 1."""
-
-
-def images_expected(
-    domain: Domain, size: Callable[[np.ndarray], np.ndarray], n: float, integral: float
-) -> float:
-    """Return how many images of generators a periodic box of `n` cells takes, per generator.
-
-    These are the cells beyond each block of the seams, as deep as balls around places of the seam go there (`seam.py`).
-    A ball is as large as cells are at its middle, but goes no farther into smaller ones than cells of their size do.
-
-    Parameters
-    ----------
-    size : callable
-        h(points (k, d)) -> (k,), which sizes of cells are in proportion to.
-    integral : float
-        Of h^-d over the domain.
-    """
-    d, count = domain.dim, int(block_counts(domain.extent, n)[: domain.dim].max())
-    factor, share = (integral / n) ** (1 / d), 1.0
-    places = (np.arange(count) + 0.5) / count
-    for axis in np.flatnonzero(domain.periodic):
-        along = [a for a in range(d) if a != axis]
-        unit = np.stack(np.meshgrid(*[places] * (d - 1), indexing="ij"), axis=-1).reshape(-1, d - 1)
-        away2 = []  # squares of how far blocks are apart: along one axis, then along both
-        for a in along:
-            away = np.abs(places[:, None] - places)
-            if domain.periodic[a]:
-                away = np.minimum(away, 1 - away)
-            away2.append(((away * domain.extent[a]) ** 2).astype(np.float32))
-        apart2 = away2[0] if d == 2 else away2[0][:, None, :, None] + away2[1][:, None, :]
-        apart2 = apart2.reshape(len(unit), len(unit))
-        apart = np.sqrt(apart2)
-        images = 0.0
-        for end in (0.0, 1.0):
-            places_at = np.insert(unit, axis, end, axis=1) * domain.extent + domain.lower
-            h = factor * size(places_at)
-            radius = ((IMAGE_REACH[d] * h).astype(np.float32) + apart).min(axis=1)
-            deep = np.sqrt((radius**2 - apart2).max(axis=1).clip(0))
-            deep = np.minimum(deep, domain.extent[axis])
-            # What lies beyond one end lies within the other one.
-            places_at[:, axis] = (domain.upper if end == 0 else domain.lower)[axis]
-            for part in (np.arange(DEPTHS) + 0.5) / DEPTHS:
-                inside = places_at.copy()
-                inside[:, axis] += part * deep * (-1 if end == 0 else 1)
-                density = (factor * size(inside)) ** -d
-                images += (
-                    float((deep * density).mean()) * domain.measure / domain.extent[axis] / DEPTHS
-                )
-        share *= 1 + images / n
-    return share - 1
-
-
-def surplus_expected(
-    domain: Domain, size: Callable[[np.ndarray], np.ndarray], tree: DensityTree, reach: float
-) -> float:
-    """Return how many generators more than the integral of h^-d a run takes at times, per generator.
-
-    Sizes count where generators are. Where they change several-fold from one cell to the next, cells on the finer side
-    own parts of the coarser one, and are taken for too large until others have come beside them.
-
-    Parameters
-    ----------
-    size : callable
-        h(points (k, d)) -> (k,).
-    tree : DensityTree
-        Of it, or of what is in proportion.
-    reach : float
-        How far cells are looked around, in their sizes.
-    """
-    d, reached, boxes = domain.dim, np.cumsum(tree.cells), tree.boxes
-    marks = (np.arange(SAMPLE) + 0.5) / SAMPLE * reached[-1]
-    box = np.minimum(np.searchsorted(reached, marks, side="right"), len(reached) - 1)
-    inside = (0.5 + np.arange(1, SAMPLE + 1)[:, None] * np.array(_STEPS[d])) % 1
-    places = boxes.origin + boxes.root * boxes.corner[box] + inside * boxes.edges()[box]
-    places = places[domain.contains(places)]
-    if not len(places):
-        return 0.0
-    h = np.asarray(size(places))
-    ways = np.concatenate([np.eye(d), -np.eye(d)])
-    beside = (places[:, None] + reach * h[:, None, None] * ways).reshape(-1, d)
-    known, sizes = domain.contains(beside), np.repeat(h, 2 * d)
-    if known.any():
-        sizes[known] = size(beside[known])
-    ratios = sizes.reshape(-1, 2 * d).max(axis=1) / h
-    steep = (ratios.clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean()
-    beyond = np.quantile(ratios, STEEP_SHARE).clip(STEEP_TO, STEEPEST) - STEEP_TO
-    return float(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * steep)) + BEYOND_RATE * beyond)
-
-
-def shore_expected(domain: Polygon, size: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Return how many cells are at the boundary of a polygon.
-
-    Parameters
-    ----------
-    size : callable
-        h(points (k, 2)) -> (k,), that of the cells.
-    """
-    begins = domain.vertices
-    along = begins[domain.next_vertex] - begins
-    lengths = np.hypot(*along.T)
-    parts = np.maximum(1, np.ceil(lengths / (lengths.sum() / SHORE_SAMPLE))).astype(int)
-    edge = np.repeat(np.arange(len(parts)), parts)
-    part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)
-    places = begins[edge] + ((part + 0.5) / parts[edge])[:, None] * along[edge]
-    h = np.array(size(places))
-    # Interior lies on the left of an edge.
-    inwards = np.column_stack([-along[:, 1], along[:, 0]])[edge] / lengths[edge, None]
-    inner = places + 0.5 * h[:, None] * inwards
-    known = domain.contains(inner)
-    if known.any():
-        h[known] = size(inner[known])
-    return ACROSS * float((lengths[edge] / parts[edge] / h).sum())
 
 
 def fixed_bytes(engine: Engine, n: float) -> float:

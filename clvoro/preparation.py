@@ -1,30 +1,23 @@
-"""What a run begins with: options that are checked, its size field and number of cells, generators, mesh and plan."""
+"""What a run begins with: its size field and number of cells, generators, mesh and plan."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
-from numbers import Real
 
 import numpy as np
 
-from ._arrays import Naming, check_choice, check_integer, check_number
+from ._arrays import Naming
 from .domain import Domain
-from .errors import CoarseSizeWarning, InputError, InputTypeError
+from .errors import CoarseSizeWarning, InputError
+from .forecast import images_expected, shore_expected, surplus_expected
 from .geojson import may_be_degrees
-from .layers import Layers, apart_from, bounded, count_rows, free_domain, place_layers
-from .memory import (
-    check_memory,
-    images_expected,
-    memory_needed,
-    shore_expected,
-    surplus_expected,
-)
+from .layers import apart_from, bounded, count_rows, free_domain, place_layers
+from .memory import check_memory, memory_needed
 from .mesh import Mesh
-from .methods import PUBLISHED, Relaxation, make_method
+from .methods import Relaxation, make_method
 from .misfits import warn_of_misfits
-from .plans import EFFORTS, Action, auto_levels, is_near, plan_adaptive, plan_steps
+from .options import Options
+from .plans import Action, auto_levels, is_near, plan_adaptive, plan_steps
 from .polygon import Polygon
 from .precision import check_precision
 from .quadrature import DensityTree
@@ -32,80 +25,10 @@ from .sizing import Sizing, as_field
 from .stages import Stages
 from .start import density_tree, sample_density, sample_uniform
 
-METHODS = ("adaptive", "exact", *PUBLISHED)
-STARTS = ("density", "uniform")
 GRADIENT_STEP = 0.2
 """Step over h in which the exact projection sees the gradient of the size field."""
 STEPS = 100
 """Steps of a method that repeats one kind of step, unless the caller says otherwise."""
-_MOST_STEPS = 10**6  # of a run: its plan, which names each, and its history are lists
-
-
-@dataclass(frozen=True)
-class Options:
-    """What `Adapter.run` was asked for; see there."""
-
-    method: str
-    start: str
-    effort: str
-    levels: int | str
-    seed: int
-    tol: float
-    k: float
-    alpha: float | None
-    max_steps: int | None
-    n_cells: int | None
-    error_target: float | None
-    layers: tuple[Layers, ...]
-
-    @property
-    def planned(self) -> bool:
-        """Whether a plan leads from coarse to fine, and not one kind of step is repeated."""
-        return self.method not in PUBLISHED
-
-
-def check_options(
-    method: str,
-    start: str,
-    effort: str,
-    levels: int | str,
-    seed: int,
-    tol: float,
-    k: float,
-    alpha: float | None,
-    max_steps: int | None,
-    n_cells: int | None,
-    error_target: float | None,
-    layers: Layers | Sequence[Layers],
-) -> Options:
-    """Return the options of a run, if they are as they should be; `levels` awaits the number of cells.
-
-    Raises
-    ------
-    InputError, InputTypeError
-    """
-    check_choice("method", method, METHODS)
-    check_choice("start", start, STARTS)
-    check_choice("effort", effort, tuple(EFFORTS))
-    if not isinstance(layers, Layers | Sequence):
-        hint = f"; write clvoro.Layers({layers!r})" if isinstance(layers, Real) else ""
-        raise InputTypeError(
-            f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}"
-        )
-    return Options(
-        method=method,
-        start=start,
-        effort=effort,
-        levels=levels,
-        seed=check_integer("seed", seed, 0, np.inf),
-        tol=check_number("tol", tol, least=0),
-        k=check_number("k", k, above=0),
-        alpha=None if alpha is None else check_number("alpha", alpha, above=0),
-        max_steps=None if max_steps is None else check_integer("max_steps", max_steps, 0, _MOST_STEPS),
-        n_cells=None if n_cells is None else check_integer("n_cells", n_cells, 1),
-        error_target=None if error_target is None else check_number("error_target", error_target, above=0),
-        layers=(layers,) if isinstance(layers, Layers) else tuple(layers),
-    )  # fmt: skip
 
 
 class Preparation:
@@ -194,10 +117,6 @@ class Preparation:
                 )
             warnings.warn(message, CoarseSizeWarning, stacklevel=4)
         most, images = max(self.target, 0 if points is None else len(points)), None
-        if any(domain.periodic) and not given:
-            images = images_expected(domain, self.sizing, most, asked)
-        held = self.sizing.held + self.sizing.taken_for(most)
-        self._check_memory(most, images, held=held, shore=0.0)
         scaled = options.planned and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
@@ -207,9 +126,16 @@ class Preparation:
                 self.levels = min(self.levels, most_levels)
         surplus, shore = 0.0, None
         if options.planned and self._tree is not None:
-            # A coarser level has steeper sizes, and hands its generators on to the next.
-            reach = self.factor * (2 if self.levels else 1)
-            surplus = surplus_expected(domain, self.sizing, self._tree, reach)
+            # A coarser level has steeper sizes, and hands its generators on to the next; in the plane, where there is
+            # none, as many come on the finest.
+            reach = self.factor * (2 if self.levels or d == 2 else 1)
+            coarse = self.levels > 0
+            surplus = surplus_expected(domain, self.sizing, self._tree, reach, coarse=coarse)
+        if any(domain.periodic) and self._tree is not None:
+            free = most * self._tree.integral / asked
+            images = images_expected(domain, self.sizing, free, self._tree)
+        held = self.sizing.held + self.sizing.taken_for(most)
+        self._check_memory(most, images, held=held, shore=0.0)
         if isinstance(domain, Polygon) and not given:
             shore = shore_expected(domain, lambda p: (asked / most) ** 0.5 * self.sizing(p))
         needed = self._check_memory(most, images, surplus, held, shore)
@@ -223,7 +149,7 @@ class Preparation:
             if points is None:
                 return auto_levels(self.target, d)
             return max(0, round(np.log2(self.target / len(points)) / d))
-        count = check_integer("levels", levels, 0)
+        count = int(levels)
         most = int(np.log2(max(self.target, 1)) / d)
         if points is None and count > most:
             raise InputError(

@@ -3,6 +3,7 @@
 import importlib
 import json
 from argparse import Namespace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +14,25 @@ import clvoro
 from clvoro import cli, jobs, poisson, remap, sizing
 from clvoro._program import Engine
 from clvoro.errors import MemoryLimitError
+from clvoro.forecast import (
+    IMAGE_REACH,
+    MOST_SURPLUS,
+    STEEP_FROM,
+    STEEP_TO,
+    SURPLUS_RATE,
+    images_expected,
+    surplus_expected,
+)
 from clvoro.memory import (
     FOLDED,
     MOST_CELLS,
-    MOST_SURPLUS,
     OUTPUT,
     PEAK,
-    SURPLUS_RATE,
     TRIMMED_PEAK,
     available_memory,
     check_memory,
     fixed_bytes,
-    images_expected,
     memory_needed,
-    surplus_expected,
 )
 from clvoro.remap import transfer_values
 from clvoro.start import count_cells, density_tree
@@ -36,6 +42,10 @@ BENCH = Path(__file__).parent.parent / "bench"
 CASES = [(2, "F2", 8000), (3, "S1", 4000)]
 """Dimension, field and cells: parts that do not grow with them, and cells at walls, are 5 % of the figures here."""
 SQUARE = clvoro.Box((0, 0), (1, 1))
+TORUS = clvoro.Box((0, 0), (1, 1), periodic=True)
+LEAST_HELD = 0.6
+"""Share of what is told that is taken at least, where sizes jump."""
+QUICK_STRIP = "strip at a seam", "float64"
 needs_bench = pytest.mark.skipif(not BENCH.is_dir(), reason="the tests lie outside a source tree")
 
 
@@ -80,9 +90,9 @@ def test_figures_are_what_runs_hold(bench, dim, field, n):
     ],
 )  # fmt: skip
 def test_steep_sizes_are_allowed_for(bench, name, real):
-    """Generators beyond those that are asked for are told beforehand; they may be a quarter fewer."""
+    """Generators beyond those that are asked for are told beforehand; see `LEAST_HELD`."""
     found = bench.measure(Namespace(device=None, dtype=real), name, 6000, "adaptive", "default")
-    assert 0.75 <= found["held"] <= 1.1, found
+    assert LEAST_HELD <= found["held"] <= 1.1, found
 
 
 def lake():
@@ -256,7 +266,76 @@ def test_jumps_at_seams_hold_what_is_told(bench, real):
     box = clvoro.Box((0, 0), (1, 1), periodic=True)
     size = sizing.Expression("x < 0.5 ? 0.011 : 0.11")
     held, told = held_and_told(bench, box, size, real, effort="fast")
-    assert 0.75 <= held / told <= 1.1
+    assert LEAST_HELD <= held / told <= 1.1
+
+
+STRIPS = {
+    "strip": (SQUARE, "x < 0.02 ? 0.0025 : 0.08"),
+    "ring": (SQUARE, "fabs(hypot(x - 0.5, y - 0.5) - 0.3) < 0.01 ? 0.0035 : 0.08"),
+    "strip at a shore": (lake(), "x < 0.12 ? 0.002 : 0.08"),
+    "slab": (clvoro.Box((0, 0, 0), (1, 1, 1)), "x < 0.1 ? 0.03 : 0.2"),
+    "strip at a seam": (TORUS, "x < 0.03 ? 0.003 : 0.08"),
+    "thin strip at a seam": (TORUS, "x < 0.01 ? 0.002 : 0.08"),
+    "strip beside a seam": (TORUS, "y > 0.01 && y < 0.03 ? 0.0025 : 0.08"),
+    "strip away from seams": (TORUS, "fabs(x - 0.5) < 0.02 ? 0.004 : 0.08"),
+    "strips at both seams": (TORUS, "x < 0.02 || y < 0.02 ? 0.0035 : 0.08"),
+    "corner of seams": (TORUS, "x < 0.1 && y < 0.1 ? 0.0018 : 0.08"),
+    "diagonal through seams": (TORUS, "fabs(x - y) < 0.015 ? 0.0035 : 0.08"),
+    "ring between seams": (TORUS, "fabs(hypot(x - 0.5, y - 0.5) - 0.3) < 0.01 ? 0.0035 : 0.08"),
+}
+"""Domain and formula: 2000 to 4000 cells, nearly all of them in a narrow part."""
+
+
+@needs_bench
+@pytest.mark.parametrize(
+    ("name", "real"),
+    [
+        pytest.param(name, real, marks=() if case == QUICK_STRIP else pytest.mark.slow)
+        for case in product(STRIPS, ("float64", "float32"))
+        for name, real in [case]
+    ],
+)
+def test_strips_hold_what_is_told(bench, name, real):
+    """Of what is told beside jumps a part is not taken, most where few cells lie between them."""
+    domain, formula = STRIPS[name]
+    held, told = held_and_told(bench, domain, sizing.Expression(formula), real, effort="fast")
+    assert LEAST_HELD <= held / told <= 1.1
+
+
+def test_what_is_told_does_not_depend_on_where_seams_are():
+    """Images by balls alone where cells are alike; of a strip all cells wherever it meets a seam."""
+    for box in (TORUS, clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)):
+        d, n = box.dim, 20000
+        even, deep = (
+            density_tree(sizing.Constant(1.0), box),
+            IMAGE_REACH[box.dim] * n ** (-1 / box.dim),
+        )
+        found = images_expected(box, sizing.Constant(1.0), n, even)
+        # A sample of 16,384 cells, of which a tenth lies in each margin.
+        assert found == pytest.approx((1 + 2 * deep) ** d - 1, rel=0.03)
+    surpluses, images = [], []
+    for formula in ("fabs(x - 0.5) < 0.01", "x < 0.005 || x > 0.985", "x > 0.98", "y < 0.02"):
+        strip = sizing.Expression(f"{formula} ? 0.0025 : 0.08")
+        tree = density_tree(strip, TORUS)
+        surpluses.append(surplus_expected(TORUS, strip, tree, 2.0))
+        images.append(images_expected(TORUS, strip, tree.integral, tree))
+    # Two of eight cells across are near a jump, on either side; the sample may be off by a tenth.
+    share = 4 / 8 * (STEEP_TO - STEEP_FROM)
+    assert surpluses == pytest.approx(
+        [MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * share))] * 4, rel=0.1
+    )
+    assert images[0] < 0.5
+    assert 1 < min(images[1:]) <= max(images[1:]) < 1.1 * min(images[1:]) < 2
+
+
+def test_a_strip_is_no_kink():
+    """Few cells between two jumps, 1 : 8, are no field in which each cell is several times larger than the next."""
+    cube = clvoro.Box((0, 0, 0), (1, 1, 1))
+    slab = sizing.Expression("fabs(x - 0.5) < 0.03 ? 0.025 : 0.2")
+    assert surplus_expected(cube, slab, density_tree(slab, cube), 2.0) <= MOST_SURPLUS
+    kink = sizing.Expression("0.001 + fabs(x - 0.5)")
+    given = SQUARE, kink, density_tree(kink, SQUARE), 2.0
+    assert surplus_expected(*given) > 2 > MOST_SURPLUS >= surplus_expected(*given, coarse=False)
 
 
 @needs_bench
@@ -368,7 +447,8 @@ def test_periodic_boxes_hold_images_and_folded_graphs(bench, monkeypatch, ctx, d
     found = bench.measure(Namespace(device=None, dtype="float64"), "", n, "adaptive", "default")
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))
     cells = found["cells"]
-    images = images_expected(box, field, cells, count_cells(field, box))
+    tree = density_tree(field, box)
+    images = images_expected(box, field, cells, tree)
     figures = [
         sum(f * size * share for f, size in zip(numbers, (8, 4), strict=True))
         for numbers, share in ((PEAK[dim], 1 + images), (FOLDED[dim], 1))
@@ -378,7 +458,8 @@ def test_periodic_boxes_hold_images_and_folded_graphs(bench, monkeypatch, ctx, d
     expected = max(run + fixed, output)
     assert memory_needed(engine, cells, box, images) == pytest.approx(expected * cells)
     run += fixed
-    assert 0.9 <= found["run"] / run <= 1.1
+    # Where large cells are few, balls are not as deep along all of a seam.
+    assert (0.9 if dim == 2 else 0.85) <= found["run"] / run <= 1.1
     assert 0.75 <= found["output"] / output <= 1.1 or found["output"] < found["run"]
     assert run > 1.5 * memory_needed(engine, cells) / cells or dim == 3
 
