@@ -74,14 +74,6 @@ inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
     return dot(x - a + d / 2, d) / dot(e, d);
 }
 
-/* What lies so near to a face is on it. */
-#define ON_FACE (4 * REAL_EPS)
-
-inline bool is_on_face(REAL beyond, REAL d2)
-{
-    return beyond * beyond <= ON_FACE * ON_FACE * d2;
-}
-
 /* On which side of the faces between generators at x and x + d does a corner v of the polygon count that lies on their
    line? On that of its own generator at `own`, if v is a point of the cell of x. Elsewhere on the left of edge e.
    Positive: of x + d. */
@@ -91,6 +83,29 @@ inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
     const bool touches = is_on_face(dot(v - own - between / 2, between), dot(between, between));
     const REAL side = touches ? dot(own - v, d) : 0;
     return side != 0 ? side : e.s0 * d.s1 - e.s1 * d.s0;
+}
+
+/* How an edge can leave a cell: to which one behind, where on the edge, in which order of those there, and by how much
+   rounding may have put the place off; edges on faces are not in doubt. */
+typedef struct {
+    int behind;
+    REAL at, rank, doubt;
+} exit_t;
+
+/* Does an edge leave by `a` before `b`? Where rounding may have it either way, the nearer of the two generators behind
+   is the first. They may be so close to each other that the cell's faces with them lie alike but for rounding, while
+   the edge is clearly on one side of the face between them, which is at right angles to those. */
+inline bool leaves_before(exit_t a, exit_t b, REAL2 start, REAL2 e, global const REAL *points)
+{
+    if (fabs(a.at - b.at) <= a.doubt + b.doubt) {
+        const REAL2 y = start + (a.doubt < b.doubt ? a.at : b.at) * e;
+        const REAL nearer = beyond_bisector(y, b.behind, a.behind, points);
+        const int i = 2 * a.behind, j = 2 * b.behind;
+        const REAL2 d = (REAL2)(points[i] - points[j], points[i + 1] - points[j + 1]);
+        if (!is_on_face(nearer, dot(d, d)))
+            return nearer > 0;
+    }
+    return a.at < b.at || (a.at == b.at && a.rank < b.rank);
 }
 
 /* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, from cell `origin` to cell `target`; -1 if there is
@@ -108,9 +123,10 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
     const REAL2 x = (REAL2)(points[2 * cell], points[2 * cell + 1]);
     const REAL2 start = (REAL2)(points[2 * origin], points[2 * origin + 1]);
     const REAL2 goal = (REAL2)(points[2 * target], points[2 * target + 1]);
-    const REAL e2 = dot(e, e), short2 = 16 * ON_FACE * ON_FACE;
-    REAL first = REAL_MAX, first_rank = 0, least = squared_distance(goal, cell, points);
-    int next = -1, towards = -1;
+    const REAL e2 = dot(e, e);
+    REAL least = squared_distance(goal, cell, points);
+    exit_t first = {-1, 0, 0, 0};
+    int towards = -1;
     for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
         const int j = neighbours[k];
         if (j < 0)
@@ -124,33 +140,31 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
         const REAL along = dot(e, d), dd = dot(d, d);
         const bool begins_on = is_on_face(dot(a - x - d / 2, d), dd),
                    ends_on = is_on_face(dot(a + e - x - d / 2, d), dd);
-        REAL at = 0, rank = -REAL_MAX;
+        exit_t way = {j, 0, -REAL_MAX, -REAL_MAX};
         if (begins_on && ends_on) {
             if (side_of(a + e, goal, x, d, e) <= 0)
                 continue;
-            at = side_of(a, start, x, d, e) > 0 ? 0 : 1;
+            way.at = side_of(a, start, x, d, e) > 0 ? 0 : 1;
         } else {
             if (along <= 0)
                 continue;
-            at = crossing(cell, j, a, e, points);
-            rank = 0;
-            if (begins_on && at * at * e2 <= short2) {
-                at = 0;
-                rank = dot(a - start, d) / along;
-            } else if (ends_on && (1 - at) * (1 - at) * e2 <= short2) {
-                at = 1;
-                rank = dot(a + e - goal, d) / along;
+            way.at = crossing(cell, j, a, e, points);
+            way.rank = 0;
+            way.doubt = ON_FACE * sqrt(dd) / along;
+            if (begins_on && is_at_corner(way.at, e2)) {
+                way.at = 0;
+                way.rank = dot(a - start, d) / along;
+            } else if (ends_on && is_at_corner(1 - way.at, e2)) {
+                way.at = 1;
+                way.rank = dot(a + e - goal, d) / along;
             }
         }
-        if (at < first || (at == first && rank < first_rank)) {
-            first = at;
-            first_rank = rank;
-            next = j;
-        }
+        const bool past = !(way.at < 1 || (way.at == 1 && way.rank < 0));
+        if (!past && (first.behind < 0 || leaves_before(way, first, a, e, points)))
+            first = way;
     }
-    const bool past = !(first < 1 || (first == 1 && first_rank < 0));
-    *t = past ? 1 : fmax(*t, first);
-    return past ? towards : next;
+    *t = first.behind < 0 ? 1 : fmax(*t, first.at);
+    return first.behind < 0 ? towards : first.behind;
 }
 
 /* Per edge: walk along it. Without chord_cells only the number of chords is counted. `generators` are those in the

@@ -1,5 +1,4 @@
-#include "common/domain.h"
-#include "common/outline.h"
+#include "common/apart.h"
 #include "common/sites.h"
 
 /* Insertion and deletion of generators: the paper's 2.3.1, where the lattice (in 2D) and the count ask for it.
@@ -331,26 +330,35 @@ kernel void mark_flaws(const int size, global const ulong *chosen, global const 
 /* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
    generators go behind all kept rows, with new labels. */
 kernel void apply_changes(const int size, global const int *place, global const int *birth_place, const int next_label,
-                          DOMAIN_ARGS, global const REAL *points, global const int *labels, global const REAL *velocity,
-                          global const ulong *signatures, global const REAL *ever, global const REAL *shifts,
-                          global const REAL *births, global REAL *new_points, global int *new_labels,
-                          global REAL *new_velocity, global ulong *new_signatures, global REAL *new_ever)
+                          const int fixed, DOMAIN_ARGS, global const REAL *points, global const int *labels,
+                          global const REAL *velocity, global const ulong *signatures, global const REAL *ever,
+                          global const REAL *shifts, global const REAL *births, global REAL *new_points,
+                          global int *new_labels, global REAL *new_velocity, global ulong *new_signatures,
+                          global REAL *new_ever, global const int *starts, global const int *neighbours,
+                          global const FACE *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
-    REAL x[DIM], y[DIM];
+    const bool kept = place[i + 1] > place[i], born = birth_place[i + 1] > birth_place[i];
+    REAL x[DIM], y[DIM], child[DIM];
+    bool moved = false;
     EACH_AXIS(a)
-    x[a] = points[DIM * i + a];
-    if (place[i + 1] > place[i]) {
+    {
+        x[a] = points[DIM * i + a];
+        y[a] = x[a] + shifts[DIM * i + a];
+        child[a] = x[a] + births[DIM * i + a];
+        moved |= shifts[DIM * i + a] != 0;
+    }
+    if (moved)
+        keep_inside(x, y, DOMAIN);
+    if (born)
+        keep_inside(x, child, DOMAIN);
+#ifdef POLYGON
+    if (born && kept)
+        moved &= !take_apart(x, y, child, (REAL2)(births[2 * i] - shifts[2 * i], births[2 * i + 1] - shifts[2 * i + 1]),
+                             fixed, neighbours, face_centroids, starts[i], starts[i + 1], tangents, DOMAIN);
+#endif
+    if (kept) {
         const int p = place[i];
-        bool moved = false;
-        EACH_AXIS(a)
-        {
-            const REAL shift = shifts[DIM * i + a];
-            moved |= shift != 0;
-            y[a] = x[a] + shift;
-        }
-        if (moved)
-            keep_inside(x, y, DOMAIN);
         EACH_AXIS(a)
         {
             new_points[DIM * p + a] = y[a];
@@ -360,14 +368,11 @@ kernel void apply_changes(const int size, global const int *place, global const 
         new_signatures[p] = signatures[i];
         new_ever[p] = ever[i];
     }
-    if (birth_place[i + 1] > birth_place[i]) {
+    if (born) {
         const int q = place[size] + birth_place[i];
         EACH_AXIS(a)
-        y[a] = x[a] + births[DIM * i + a];
-        keep_inside(x, y, DOMAIN);
-        EACH_AXIS(a)
         {
-            new_points[DIM * q + a] = y[a];
+            new_points[DIM * q + a] = child[a];
             new_velocity[DIM * q + a] = 0;
         }
         new_labels[q] = next_label + birth_place[i];

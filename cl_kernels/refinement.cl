@@ -1,5 +1,4 @@
-#include "common/domain.h"
-#include "common/outline.h"
+#include "common/apart.h"
 
 /* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular
    lattice over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbour, so that
@@ -29,6 +28,24 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbours
         longest = neighbours[m] >= 0 || m == k || face_measures[m] < face_measures[k] ||
                   (face_measures[m] == face_measures[k] && m > k);
     return longest;
+}
+
+/* How far cell i reaches from a wall with the direction t at the distance `gap` from its generator, up to `most`: in a
+   strip that is far thinner than h, generators beyond it are there that it has brought on coarser levels. */
+inline REAL room_inwards(int i, REAL most, REAL gap, REAL2 t, global const int *starts, global const int *neighbours,
+                         global const REAL *points)
+{
+    REAL room = most;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbours[k];
+        if (j < 0)
+            continue;
+        const REAL2 d = (REAL2)(points[2 * j] - points[2 * i], points[2 * j + 1] - points[2 * i + 1]);
+        const REAL inwards = d.s1 * t.s0 - d.s0 * t.s1;
+        if (inwards > 0)
+            room = fmin(room, fmax(gap, R(0)) + dot(d, d) / (2 * inwards));
+    }
+    return room;
 }
 #else
 #define is_wall_side(k, begin, end, neighbours, face_measures, volume) (neighbours[k] < 0)
@@ -73,10 +90,11 @@ kernel void place_children(const int size, global const int *starts, global cons
 #ifdef POLYGON
             const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]), t = BOUNDARY_TANGENT(j);
             const REAL gap = m.s0 * t.s1 - m.s1 * t.s0;
-            const REAL way = gap > h[i] / 8 ? fmin(gap / 2, h[i] / 4) : h[i] / 4;
+            const REAL room = room_inwards(i, h[i] / 2, gap, t, starts, neighbours, points);
+            const REAL way = gap > h[i] / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {x[0] + m.s0 - way * t.s1, x[1] + m.s1 + way * t.s0};
-            keep_inside(x, y, DOMAIN);
+            keep_apart(x, y, h[i] / 16, place_at_face(x, m, j, way, fixed, tangents, DOMAIN), DOMAIN);
             child[0] = y[0];
             child[1] = y[1];
 #else
@@ -103,9 +121,10 @@ kernel void place_children(const int size, global const int *starts, global cons
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {child[0], child[1]};
             if (met || leaves_at(x, y, DOMAIN) <= 1) {
-                y[0] = x[0] + face_centroids[2 * k];
-                y[1] = x[1] + face_centroids[2 * k + 1];
-                keep_inside(x, y, DOMAIN);
+                const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
+                y[0] = x[0] + m.s0;
+                y[1] = x[1] + m.s1;
+                keep_apart(x, y, h[i] / 16, place_at_face(x, m, j, 0, fixed, tangents, DOMAIN), DOMAIN);
             }
             child[0] = y[0];
             child[1] = y[1];

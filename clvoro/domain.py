@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ._arrays import check_rows
 from .errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
@@ -71,7 +72,13 @@ class Domain(ABC):
 
     @abstractmethod
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool."""
+        """Tell for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If they are no numbers of that shape.
+        """
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
         """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
@@ -202,6 +209,7 @@ class Box(Domain):
 
         In a periodic direction every finite position does.
         """
+        points = check_rows("points", points, self.dim)
         inside = (points >= self.lower) & (points <= self.upper)
         return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
 

@@ -342,10 +342,11 @@ class PopulationControl:
             engine.empty(m, np.uint64), engine.empty(m), inserted, deleted,
         )  # fmt: skip
         engine.run_each(
-            self._kernels.apply_changes, n, marks.kept, marks.born, np.int32(next_label),
+            self._kernels.apply_changes, n, marks.kept, marks.born, np.int32(next_label), np.int32(self._fixed),
             *domain.device_args(engine), t.points, rows.labels, rows.velocity,
             rows.signatures, rows.ever, marks.shifts, marks.births, new.points, new.labels,
-            new.velocity, new.signatures, new.ever,
+            new.velocity, new.signatures, new.ever, t.starts, t.neighbours, t.face_centroids,
+            *t.outlines,
         )  # fmt: skip
         return new
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from ._arrays import check_rows
 from .domain import Domain
 from .rings import project
 
@@ -89,7 +90,7 @@ class Region(Domain):
         The boundary is included, and with it what lies off it by less than eight roundings of the largest
         coordinate: points on slanted edges can be met no better.
         """
-        points = np.asarray(points, dtype=float)
+        points = check_rows("points", points, 2)
         inside = self.covers(points)
         near = self.lower - np.full(2, self._rounding), self.upper + np.full(2, self._rounding)
         rest = np.flatnonzero(~inside & ((points >= near[0]) & (points <= near[1])).all(axis=1))
@@ -151,6 +152,18 @@ class Region(Domain):
         )
         edge[rows] = edges
         return edge, project(points, self.vertices[edge], self.vertices[self.next_vertex[edge]])
+
+    def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether the boundary runs by more than once, within `within`; (n,) bool."""
+        rows, edges = self._edges.query(
+            shapely.points(points), predicate="dwithin", distance=within
+        )
+        after, count = self.next_vertex[edges], len(self.next_vertex)
+        on = np.hypot(*(self.vertices[after] - points[rows]).T) <= within
+        on &= np.isin(rows * count + after, rows * count + edges)
+        return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(
+            rows[on], minlength=len(points)
+        )
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the domain to each of `points` (n, 2): itself, or one on the boundary."""

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import shapely
+import shores
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError
@@ -245,3 +247,20 @@ def test_domains_without_walls_in_2d_are_refused():
             place_layers(domain, [Layers(0.1)])
     with pytest.raises(InputTypeError, match="Layers"):
         place_layers(BOX, [0.1])
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
+    """Cells of narrow tips reach around corners, into the layers on the other side: these were given generators."""
+    for seed in (4, 6, 15):
+        tips = int(np.random.default_rng(seed).integers(12, 40))
+        star = clvoro.Polygon(shores.star(tips, seed, (0.5, 0.5), 0.5))
+        layer = clvoro.Layers(0.004, count=2, growth=2.0, spacing=0.03, edges=range(0, tips, 2))
+        result = clvoro.Adapter(ctx, dtype).run(
+            star, 0.03, layers=layer, levels=1, effort="fast", max_steps=20, seed=1
+        )
+        result.check().demand()
+        others = result.points[len(place_layers(star, [layer])) :]
+        away = shapely.distance(free_domain(star, [layer]).geometry, shapely.points(others))
+        assert away.max() <= 16 * np.finfo(dtype).eps
+        assert (result.history["inserted"] > 0).sum() >= 2, "by refinement, and to meet the count"

@@ -12,7 +12,7 @@ from test_check import add, put, spoilt, swap
 
 import clvoro
 from clvoro import cli
-from clvoro.errors import InputError
+from clvoro.errors import InputError, InputTypeError
 from clvoro.io import vtu
 from clvoro.io.vtu_read import load_vtu
 from clvoro.outlines import count_sides, face_ends, next_faces
@@ -540,10 +540,12 @@ def test_openfoam_patches(pond, tmp_path) -> None:
         ({"a": [99]}, r"has for a the edges \[99\]"), ({"a": []}, "has for a no edges"),
         ({"a": [1], "b": [0, 1]}, "edge 1 both in a and in b"), ({"a b": [1]}, "the name 'a b'"),
         ({"outer": [1]}, "the name outer, which is that of a ring"),
+        ([0, 1], r"patches is \[0, 1\] of type list.*'inlet': \[0, 1\]"), ({"a": 3}, "has for a 3, expected the numb"),
+        ({"a": [0.5]}, r"has for a \[0\.5\]"), ({"a": "01"}, "has for a '01'"),
     ],
 )  # fmt: skip
-def test_wrong_patches_are_refused(pond, tmp_path, patches: dict, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=says):
         pond.save(tmp_path / "case.foam", patches=patches)
     assert not list(tmp_path.iterdir())
 

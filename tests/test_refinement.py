@@ -57,7 +57,10 @@ def test_children(ctx, real, n):
 
 
 def children_in(shape, tangents, host, h, labels, fixed):
-    """Middles that a longer common face has not given yet, if in sight, else those of faces; by shapely."""
+    """Middles that a longer common face has not given yet, if in sight, else those of faces; by shapely.
+
+    Where a corner of the boundary would put them all but on their generator, they are at the face.
+    """
 
     def leaves(x, y):
         """When the way from x to y leaves the domain; 1 if it does not."""
@@ -71,6 +74,13 @@ def children_in(shape, tangents, host, h, labels, fixed):
         t = leaves(x, y)
         return y if t == 1 else x + t / 2 * (y - x)
 
+    def apart(x, y, other, least):
+        y = kept(x, y)
+        # What is out of sight may belong to the layers, if there are any.
+        other = kept(x, other) if fixed else other
+        gap, another = np.hypot(*(y - x)), np.hypot(*(other - x))
+        return other if gap < least and another > gap else y
+
     children, sizes = [], host.face_measures
     for k, (i, j) in enumerate(zip(host.owners, host.neighbours, strict=True)):
         x, m, row = host.points[i], host.face_centroids[k], np.flatnonzero(host.owners == i)
@@ -83,12 +93,17 @@ def children_in(shape, tangents, host, h, labels, fixed):
         if j >= 0:
             middle = (x + host.points[j]) / 2
             seen = longest and leaves(x, middle) == 1
-            children.append(middle if seen else kept(x, x + m))
+            children.append(middle if seen else apart(x, x + m, x + m, h[i] / 16))
         elif longest:
             inwards = np.array([-tangents[-1 - j, 1], tangents[-1 - j, 0]])
             gap = -m @ inwards
-            way = min(gap / 2, h[i] / 4) if gap > h[i] / 8 else h[i] / 4
-            children.append(kept(x, x + m + way * inwards))
+            d = host.points[host.neighbours[row][host.neighbours[row] >= 0]] - x
+            ahead = d @ inwards > 0
+            reach = (d**2).sum(axis=1)[ahead] / (2 * (d @ inwards)[ahead])
+            room = (max(gap, 0) + reach).min(initial=h[i] / 2)
+            way = min(gap / 2, h[i] / 4) if gap > h[i] / 8 else room / 2
+            goal = x + m + way * inwards
+            children.append(apart(x, goal, kept(x + m, goal), h[i] / 16))
     return np.array(children)
 
 

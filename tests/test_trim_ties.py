@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 from reference_polygon import faults
-from shores import blocks
+from shores import blocks, slit, spit
 
 import clvoro
 
@@ -66,3 +66,38 @@ def test_corners_where_many_faces_meet(adapters, seed):
     if rng.random() < 0.5:
         points = np.concatenate([points, rng.integers(0, 9, (4, 2)) / 8])
     check(adapters, shape, points)
+
+
+@pytest.mark.parametrize("real", [0, 1])
+def test_generators_as_close_as_a_slit_is_wide(adapters, real):
+    """Their faces with a third lie alike but for rounding, and which of them the slit's sides cross first is a matter
+    of the face between the two: on either side of it a cell ends half the slit beyond the domain.
+    """
+    adapter = adapters[real]
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        width = float(np.finfo(adapter.dtype).eps) * 10 ** rng.uniform(2, 6)
+        domain = clvoro.Polygon(slit(width))
+        near = [0.5, 1] + rng.uniform(-1, 1, (3, 2)) * (width, 0.3)
+        near[:, 1] = np.minimum(near[:, 1], 2 - near[:, 1])
+        points = np.concatenate([domain.vertices[3:6:2], near, rng.random((3, 2))])
+        points = points[domain.contains(points)]
+        placed = domain.place(points, adapter.dtype)
+        diagram = adapter.diagram(domain, points[np.unique(placed, axis=0, return_index=True)[1]])
+        assert faults(diagram, adapter.dtype.name) == []
+        report = diagram.check()
+        assert report, report
+
+
+@pytest.mark.parametrize("make", [slit, spit])
+@pytest.mark.parametrize("real", [0, 1])
+def test_faces_across_the_tip_of_a_wedge(adapters, real, make):
+    """Near it the sides cross a face closer to each other than rounding, in an order that they have all the same."""
+    adapter = adapters[real]
+    domain = clvoro.Polygon(make(100 * float(np.finfo(adapter.dtype).eps)))
+    tip = np.array([(0.5, 0.3), (2, 0.5)])[int(make is spit)]
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        points = np.concatenate([rng.random((20, 2)), tip + rng.normal(0, 0.05, (20, 2))])
+        diagram = adapter.diagram(domain, points[domain.contains(points)])
+        assert faults(diagram, adapter.dtype.name) == []

@@ -57,3 +57,18 @@ inline REAL2 chord_begin(const chords_t *c, int chord)
 {
     return begins_inside(c, chord) ? c->vertices[c->edges[chord]] : chord_end(c, chord - 1);
 }
+
+/* What lies so near to a face is on it. */
+#define ON_FACE (4 * REAL_EPS)
+
+inline bool is_on_face(REAL beyond, REAL d2)
+{
+    return beyond * beyond <= ON_FACE * ON_FACE * d2;
+}
+
+/* A crossing of an edge, of squared length e2, with a face so near to the corner, t of the edge away, is at it, if that
+   is on the face. */
+inline bool is_at_corner(REAL t, REAL e2)
+{
+    return t * t * e2 <= 16 * ON_FACE * ON_FACE;
+}

@@ -4,6 +4,7 @@
 #include "common/boundary.h"
 
 #define ON_BOUNDARY (4 * REAL_EPS) /* so near to it rounding may put what is on it */
+#define MUCH (64 * ON_FACE)        /* by which no crossing rounds, but of edges that go along faces */
 
 /* A convex cell: its generator, faces, and the chords in it in the order of their numbers. */
 typedef struct {
@@ -51,8 +52,9 @@ inline bool same_place(REAL2 p, REAL2 q)
     return p.s0 == q.s0 && p.s1 == q.s1;
 }
 
-/* Where chords cross a cell's boundary, in counter-clockwise order: by face, along the face, and, where a corner of the
-   polygon lies on the face, as if it lay a little inside the cell that it is counted to, as in chords.cl. */
+/* Where chords cross a cell's boundary, in counter-clockwise order: by face, along the face, and, what rounding puts in
+   one place there, by turn: how much further along the face than the nearest corner of the polygon or, where that lies
+   on the face, as if it lay a little inside the cell that it is counted to, as in chords.cl. */
 typedef struct {
     int face;
     REAL along, turn;
@@ -66,14 +68,28 @@ inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord
     const REAL2 x = (REAL2)(cell->points[2 * o], cell->points[2 * o + 1]);
     const REAL2 d = (REAL2)(cell->points[2 * q], cell->points[2 * q + 1]) - x, along = (REAL2)(-d.s1, d.s0);
     const REAL2 e = c->vertices[c->next_vertex[edge]] - c->vertices[edge];
-    const int v = c->ends[chord] < R(0.5) ? edge : c->next_vertex[edge], owner = c->owners[v];
-    const REAL2 inside = (REAL2)(cell->points[2 * owner], cell->points[2 * owner + 1]) - c->vertices[v];
-    const REAL sign = cell->i == o ? 1 : -1, ahead = c->cells[chord] == o ? 1 : -1;
+    const REAL t = c->ends[chord], sign = cell->i == o ? 1 : -1;
+    const int v = t < R(0.5) ? edge : c->next_vertex[edge];
+    const REAL2 corner = c->vertices[v];
+    place_t place;
+    place.face = place_in_row(cell->row, cell->n, j);
+    /* From the corner on, where the polygon's edges are told apart also by less than the crossing's place rounds. Not
+       where the corner is on the face, nor where the walk has put the crossing elsewhere. */
+    const REAL behind = dot(corner - x - d / 2, d), dd = dot(d, d), e2 = dot(e, e);
+    const REAL walked = t < R(0.5) ? t : t - 1, s = -behind / dot(e, d);
+    const bool at_corner = walked == 0 || (is_on_face(behind, dd) && is_at_corner(walked, e2));
+    if (!at_corner && (s - walked) * (s - walked) * e2 <= MUCH * MUCH) {
+        const REAL further = s * dot(e, along);
+        place.along = sign * (dot(corner - x, along) + further);
+        place.turn = sign * further;
+        return place;
+    }
+    const int owner = c->owners[v];
+    const REAL2 inside = (REAL2)(cell->points[2 * owner], cell->points[2 * owner + 1]) - corner;
+    const REAL ahead = c->cells[chord] == o ? 1 : -1;
     /* The edge goes ahead over the face, though rounding may have it otherwise. */
     const REAL across = fmax(ahead * dot(e, d), R(0)), shift = -ahead * dot(inside, d) * dot(e, along);
     const REAL turn = across > 0 ? shift / across : (shift > 0 ? REAL_MAX : (shift < 0 ? -REAL_MAX : 0));
-    place_t place;
-    place.face = place_in_row(cell->row, cell->n, j);
     place.along = sign * dot(chord_end(c, chord) - x, along);
     place.turn = sign * (turn + dot(inside, along));
     return place;
