@@ -87,14 +87,14 @@ kernel void match_faces(const int size, global const int *places, global const i
         counts[i] = n;
         return;
     }
-    const bool some = flags[2]; /* which the kernels before have written: no race with other work-items here */
+    const bool some = flags[1]; /* which the kernels before have written: no race with other work-items here */
     if (repaired ? fits[i] : !some) {
         /* All its faces are seen from both sides, as it fits its neighbours', or every new row is certain. */
         for (int left = n, k = 0; left > 0; left -= 32, ++k)
             keep[place + k] = left < 32 ? (1u << left) - 1 : ~0u;
         counts[i] = n;
         if (n < 3)
-            raise_flag(flags, FLAG_COLLAPSED, i);
+            atomic_or(flags, FLAG_COLLAPSED);
         return;
     }
     uint word = 0;
@@ -113,7 +113,7 @@ kernel void match_faces(const int size, global const int *places, global const i
             word |= 1u << (k % 32);
             ++count;
         } else if (!doubtful) {
-            raise_flag(flags, FLAG_COLLAPSED, i);
+            atomic_or(flags, FLAG_COLLAPSED);
         } else {
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -126,7 +126,7 @@ kernel void match_faces(const int size, global const int *places, global const i
             const REAL cut = fabs(u.s0 * v.s1 - u.s1 * v.s0);
             if (!(cut < 512 * REAL_EPS && cut <= share * listed_area(&rows, i, points, lower, upper) &&
                   cut <= share * listed_area(&rows, j, points, lower, upper)))
-                raise_flag(flags, FLAG_COLLAPSED, i);
+                atomic_or(flags, FLAG_COLLAPSED);
             if (repaired) {
                 /* Now `before` and `after` follow each other. */
                 atomic_and(fits + i, 0);
@@ -143,7 +143,7 @@ kernel void match_faces(const int size, global const int *places, global const i
     }
     counts[i] = count;
     if (count < 3)
-        raise_flag(flags, FLAG_COLLAPSED, i);
+        atomic_or(flags, FLAG_COLLAPSED);
 }
 
 /* Per generator i: its faces as row i of the graph, and its cell's measures. All vectors are relative to x_i.
@@ -258,5 +258,5 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             right = false;
     }
     if (!right)
-        raise_flag(flags, FLAG_COLLAPSED, i);
+        atomic_or(flags, FLAG_COLLAPSED);
 }

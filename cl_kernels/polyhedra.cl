@@ -3,12 +3,6 @@
 #include "common/seams.h"
 #include "common/search.h"
 
-inline void raise_flag(global int *report, int flag, int generator)
-{
-    atomic_or(report, flag);
-    atomic_min(report + 1, generator);
-}
-
 inline REAL4 vertex_at(const cell_t *cell, int v)
 {
     return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
@@ -53,7 +47,7 @@ inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *
 
    row_places, row_counts (n,)   where in the arrays of faces the cell's are, and how many; cells come in no particular
                                  order, the next kernels bring them into it
-   labels, measures, centroids   of the faces; report[2] counts them
+   labels, measures, centroids   of the faces
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
 kernel void clip_cells(const int size, const int rows, global const REAL *binned, global const int *items,
                        global float *reach, global const int2 *bins, global const FRAME *grid_frames,
@@ -87,7 +81,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
         w = need < 4 * w ? need : 2 * w;
     }
     if (flag != 0) {
-        raise_flag(report, flag, i);
+        atomic_or(report, flag);
         row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
         return;
     }
@@ -109,7 +103,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
         start[f.s0] = start[f.s1] = start[f.s2] = v;
     }
     const int face_count = cell.n / 2 + 2; /* Euler's formula */
-    const int place = atomic_add(report + 2, face_count);
+    const int place = take_places(report, face_count);
     const bool fits = place + face_count <= room;
     const REAL reach_length = sqrt(cell.reach2), near2 = sqrt(REAL_EPS) * cell.reach2;
     const REAL slim = 512 * noise_length(reach_length);
@@ -179,7 +173,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
         atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
     /* In a box as thin as rounding all faces are below it. */
     if (count < 4 || !(volume > 0 && lost <= share * volume))
-        raise_flag(report, FLAG_COLLAPSED, i);
+        atomic_or(report, FLAG_COLLAPSED);
     const REAL inverse = 1 / volume;
     first *= inverse / 4;
     square = square * (inverse / 20) - first * first;
@@ -231,14 +225,14 @@ kernel void match_faces(const int size, global const int *row_places, global con
             const REAL other = mutual ? measures[row_places[j] + q] : 0;
             apart += fabs(measures[k] - other) * distance / 6;
             if (!mutual && !(measures[k] < 2048 * REAL_EPS * distance))
-                raise_flag(report, FLAG_COLLAPSED, i);
+                atomic_or(report, FLAG_COLLAPSED);
         }
         kept[k] = mutual;
         count += mutual;
     }
     counts[i] = count;
     if (count < 4 || !(apart <= share * volumes[i]))
-        raise_flag(report, FLAG_COLLAPSED, i);
+        atomic_or(report, FLAG_COLLAPSED);
 }
 
 /* Per generator i: its faces, those kept, as row i of the graph; all if there is no doubt.

@@ -132,7 +132,7 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
    write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up.
 
    In LANES a work-item takes so many generators, and there are so many fewer work-items. Of these only every one in
-   `stride` is done, and what is not as it should be counted in flags[3]; or, as the `rest`, the others. */
+   `stride` is done, and what is not as it should be counted in flags[2]; or, as the `rest`, the others. */
 kernel void check_rows(const int size, const int stride, const int rest, global const int *starts,
                        global const int *neighbours, global const REAL *points, const REAL4 box_lower,
                        const REAL4 box_upper, global int *fits, global int *marks, global int *flags)
@@ -151,7 +151,7 @@ kernel void check_rows(const int size, const int stride, const int rest, global 
     const int found = check_row(item, starts, neighbours, points, lower, upper, fits, marks);
 #endif
     if (found && stride > 1 && !rest)
-        atomic_add(flags + 3, found);
+        atomic_add(flags + 2, found);
 }
 
 /* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */

@@ -54,7 +54,7 @@ class Cells:
         self.engine = engine
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
-        self._flags = engine.empty(6, np.int32)
+        self._flags = engine.empty(5, np.int32)
         self._no_flags: dict[tuple[int, int], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
@@ -162,7 +162,7 @@ class Cells:
         while True:
             with engine.workspace.frame():
                 rows = self.take_rows(n, spare=spare)
-                flags, _, m = self._clip(rows, box, points, total, n, binned, exact)
+                flags, m = self._clip(rows, box, points, total, n, binned, exact)
                 if not flags & CROWDED:
                     if flags & ~DOUBT:
                         raise CloseError(points, total)
@@ -172,7 +172,7 @@ class Cells:
                         raise CloseError(points, total)
                     return t
                 # All anew: as many as have been asked for by now, and more by those that were not yet.
-                spare = 2 * (int(rows.flags.get()[4]) - n)
+                spare = 2 * (int(rows.flags.get()[3]) - n)
 
     def _clip(
         self,
@@ -183,7 +183,7 @@ class Cells:
         n: int,
         binned: BinnedPoints,
         exact: bool,
-    ) -> tuple[int, int, int]:
+    ) -> tuple[int, int]:
         """Make the rows of the first `n` of `total` generators and match them: see `_match` for what is returned."""
         engine, corners = self.engine, box.device_corners(self.engine.real)
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
@@ -207,7 +207,7 @@ class Cells:
             self._enlarge(n)
             # Only the cells that had too many faces, whose rows are empty; doubts about others stay.
             some = True
-            self._reset_flags(n, len(rows.counts), byte_count=8)
+            self._reset_flags(n, len(rows.counts), byte_count=4)
 
     def complete(
         self,
@@ -223,7 +223,7 @@ class Cells:
         between the right two; 0 is put where a face that rounding has made is left out.
         """
         n, old = previous.n, (previous.starts, previous.neighbours)
-        flags, _, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
+        flags, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
         if flags & ~DOUBT:
             return None
         return self._measure(rows, box, points, n, *old, m, flags, exact=False)
@@ -240,14 +240,14 @@ class Cells:
         )  # fmt: skip
         return replace(t, face_measures=measures, face_centroids=centroids)
 
-    def _read_flags(self) -> tuple[int, int, int]:
-        """Read what has gone wrong, the first generator concerned, and m.
+    def _read_flags(self) -> tuple[int, int]:
+        """Read what has gone wrong, and m.
 
         With `DOUBT` where any cell is doubtful, and `CROWDED` where there were too few spare slots.
         """
-        wrong, generator, doubtful, m, spare, slots = (int(v) for v in self._flags.get())
+        wrong, doubtful, m, spare, slots = (int(v) for v in self._flags.get())
         wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
-        return wrong, generator, m
+        return wrong, m
 
     def _match(
         self,
@@ -259,8 +259,8 @@ class Cells:
         old_neighbours: cla.Array,
         exact: bool,
         fits: cla.Array | None = None,
-    ) -> tuple[int, int, int]:
-        """Make the rows symmetric; return the flags, the first generator concerned and the number of faces."""
+    ) -> tuple[int, int]:
+        """Make the rows symmetric; return the flags and the number of faces."""
         engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, old_starts,
@@ -273,7 +273,7 @@ class Cells:
         word = starts.dtype.itemsize
         cl.enqueue_copy(
             engine.queue, buffer_of(rows.flags), buffer_of(starts), byte_count=word, src_offset=n * word,
-            dst_offset=3 * word,
+            dst_offset=2 * word,
         )  # fmt: skip
         return self._read_flags()
 
@@ -349,7 +349,7 @@ class Cells:
             if len(self._no_flags) >= 4:
                 self._no_flags.clear()
             # To be copied on the device: the host would have to wait for a transfer.
-            start = self.engine.upload([0, 2**31 - 1, 0, 0, first, slots], np.int32)
+            start = self.engine.upload([0, 0, 0, first, slots], np.int32)
             self._no_flags[first, slots] = start
         start = self._no_flags[first, slots]
         cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
@@ -358,8 +358,8 @@ class Cells:
         """Double the capacities, for `n` cells."""
         if self.row_capacity >= LARGEST_ROW:
             raise ClvoroError(
-                f"a cell has more than {self.row_capacity} faces; so many cocircular generators "
-                "are not supported: remove or perturb some"
+                f"a cell has more than {self.row_capacity} faces, and so many are not supported: remove or perturb "
+                "cocircular generators, or give thin layers a spacing nearer to the size of the cells beside them"
             )
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
         self._enlarged_for = n

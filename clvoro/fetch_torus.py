@@ -67,6 +67,28 @@ class _FetchedTorus(_Fetched):
         return seen
 
     @cached_property
+    def merged(self) -> np.ndarray:
+        """Vertex that stands for each one of the extended diagram, in 2D.
+
+        A face that was dropped, as its other cell does not see it, ends in one vertex: whoever has kept a face beside
+        it has one or the other.
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        count, starts = self.shared.count, self.whole.starts.get()[: self.n + 1]
+        if len(self.places) == starts[-1]:
+            return np.arange(count)
+        dropped = np.setdiff1d(np.arange(starts[-1]), self.places)
+        ends = np.arange(1, starts[-1] + 1)
+        ends[starts[1:] - 1] = starts[:-1]
+        vertices = self.shared.cell_vertices.get()
+        pairs = vertices[dropped], vertices[ends[dropped]]
+        graph = coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))
+        parts = connected_components(graph, directed=False)[1]
+        return np.unique(parts, return_index=True)[1][parts]
+
+    @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices of the extended diagram that are corners of the box's cells, and the number of each corner's."""
         return np.unique(self.extended_corners(), return_inverse=True)
@@ -79,7 +101,7 @@ class _FetchedTorus(_Fetched):
     def extended_corners(self) -> np.ndarray:
         """Corners of the result, as vertices of the extended diagram."""
         if self.engine.dim == 2:
-            return self.shared.cell_vertices.get()[self.extended_places]
+            return self.merged[self.shared.cell_vertices.get()[self.extended_places]]
         starts = self.face_vertex_starts()
         shift = self.loop_starts[self.extended_places] - starts[:-1]
         places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))

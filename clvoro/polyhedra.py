@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -42,6 +43,32 @@ FIRST_REACH = 2.0
 """How far it looks for neighbours at first, in units of the spacing that the bins know."""
 
 
+@dataclass(frozen=True)
+class _CutCells:
+    """Cells as they are cut, each by itself, on the device; see `clip_cells` in `polyhedra.cl`.
+
+    Attributes
+    ----------
+    places, counts : (n,) int32
+        Where the faces of each begin in the arrays of faces, and how many they are.
+    labels, measures, centroids
+        Of `m` faces.
+    cells : dict
+        Volumes, offsets and covariances.
+    doubtful : bool
+        Rounding might let a neighbour see a face otherwise.
+    """
+
+    places: cla.Array
+    counts: cla.Array
+    labels: cla.Array
+    measures: cla.Array
+    centroids: cla.Array
+    cells: dict[str, cla.Array]
+    m: int
+    doubtful: bool
+
+
 class Polyhedra:
     """Tessellate a box in 3D.
 
@@ -60,7 +87,7 @@ class Polyhedra:
             }  # fmt: skip
             self._walks = engine.kernels("walks", defines)
             self._wrap = self._walks.wrap_cells
-        self._report = engine.empty(3, np.int32)
+        self._report = engine.empty(2, np.int32)
         self._capacity = self._room = self._n = 0
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
@@ -85,7 +112,7 @@ class Polyhedra:
         self._of_faces: dict[str, cla.Array] = {}
         self._capacity = n
 
-    def _take_faces(self, m: int) -> tuple[cla.Array, ...]:
+    def _take_faces(self, m: int) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return labels, measures and centroids of `m` faces of a diagram at work, in no order yet."""
         if m >= 2**31 // 3:
             raise MemoryLimitError(
@@ -157,33 +184,43 @@ class Polyhedra:
         """
         rows = n if rows is None else rows
         self._reserve_cells(rows)
-        engine, k = self.engine, self._kernels(FACE_CAPACITY)
+        share = self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
+        cut = self._cut(box, points, n, binned, previous, rows, share, seams)
+        return self._match(cut, points, n, share)
+
+    def _cut(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | None,
+        rows: int,
+        share: np.floating,
+        seams: tuple[object, ...],
+    ) -> _CutCells:
+        """Cut the first `rows` cells, again with more room for as long as any needs it."""
+        engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
-        labels, measures, centroids = self._take_faces(
-            most if rows != self._n else max(most, self._room)
-        )
+        faces = self._take_faces(most if rows != self._n else max(most, self._room))
         self._n = rows
-        row_places, row_counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
+        places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
         lower, upper = box.device_corners(engine.real)
         cells = {name: a[:rows] for name, a in self._of_cells.items() if name != "starts"}
+        of_cells = cells["volumes"], cells["offsets"], cells["covariances"], self._report
         warm = previous is not None and previous.n == rows
         old = (
             (previous.starts, previous.neighbours)
             if previous is not None and warm
-            else (row_counts, row_counts)
+            else (counts, counts)
         )
         capacity, again = FACE_CAPACITY, False
         first_reach, first = engine.real.type(FIRST_REACH), engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
-        share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
-        self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
+        self._report.set(np.zeros(2, np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         while True:
-            room = np.int32(self._room)
-            written = (
-                row_places, row_counts, labels, measures, centroids, cells["volumes"],
-                cells["offsets"], cells["covariances"], self._report,
-            )  # fmt: skip
+            room, written = np.int32(self._room), (places, counts, *faces, *of_cells)
             if self._wrap is not None and not again:
                 with engine.workspace.frame():
                     order = self._ordered(binned, rows)
@@ -199,7 +236,7 @@ class Polyhedra:
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
-            flags, _, m = (int(v) for v in self._report.get())
+            flags, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | DOUBT | NARROW):
                 raise CloseError(points, n)
             if m > self._room:
@@ -208,9 +245,9 @@ class Polyhedra:
                 cl.enqueue_copy(
                     engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
                 )
-                labels, measures, centroids = self._take_faces(m + m // 32 + 64)
+                faces = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
-                self._report.set(np.array([0, 2**31 - 1, 0], np.int32))
+                self._report.set(np.zeros(2, np.int32))
             elif flags & FULL:
                 # Those cells alone, with more room.
                 capacity, again = 2 * capacity, True
@@ -219,29 +256,33 @@ class Polyhedra:
                         f"a cell has more than {MOST_FACES} faces; so many generators on a common sphere "
                         "are not supported: remove or perturb some"
                     )
-                self._report.set(np.array([flags & (DOUBT | NARROW), 2**31 - 1, m], np.int32))
+                self._report.set(np.array([flags & (DOUBT | NARROW), m], np.int32))
             else:
-                break
+                return _CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
+
+    def _match(self, cut: _CutCells, points: cla.Array, n: int, share: np.floating) -> Tessellation:
+        """Keep the faces that both cells see, and bring them into the order of rows."""
+        engine, k, m = self.engine, self._kernels(FACE_CAPACITY), cut.m
+        rows, cells, doubt = len(cut.counts), cut.cells, np.int32(cut.doubtful)
         # The previous graph stays until all is done.
         starts, neighbours = engine.scratch(rows + 1, np.int32), engine.scratch(m, np.int32)
         kept = engine.scratch(m, np.uint8)
         engine.run_each(
-            k.match_faces, rows, row_places, row_counts, labels, measures, cells["volumes"], points,
-            share, np.int32(flags & DOUBT), kept, starts, self._report,
+            k.match_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cells["volumes"],
+            points, share, doubt, kept, starts, self._report,
         )  # fmt: skip
-        flags, _, _ = (int(v) for v in self._report.get())
+        flags = int(self._report.get()[0])
         if flags & ~(DOUBT | NARROW):
             raise CloseError(points, n)
         self._scan.exclusive(starts, starts, rows)
-        faces, cells["starts"] = self._faces(m), self._of_cells["starts"][: rows + 1]
+        faces, of_rows = self._faces(m), self._of_cells["starts"][: rows + 1]
         engine.run_each(
-            k.place_faces, rows, row_places, row_counts, labels, measures, centroids, kept,
-            np.int32(flags & DOUBT), starts, neighbours, faces["face_measures"],
-            faces["face_centroids"],
+            k.place_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.centroids,
+            kept, doubt, starts, neighbours, faces["face_measures"], faces["face_centroids"],
         )  # fmt: skip
-        engine.run_each(k.put_graph, rows, starts, neighbours, cells["starts"], faces["neighbours"])
+        engine.run_each(k.put_graph, rows, starts, neighbours, of_rows, faces["neighbours"])
         return Tessellation(
-            n=rows, points=points, starts=cells["starts"], neighbours=faces["neighbours"],
+            n=rows, points=points, starts=of_rows, neighbours=faces["neighbours"],
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
             offsets=cells["offsets"], covariances=cells["covariances"], narrow=bool(flags & NARROW),
         )  # fmt: skip

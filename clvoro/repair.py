@@ -122,7 +122,7 @@ class Repair:
             return True
         stride = np.int32(SAMPLE)
         self.engine.run(kernel, part, np.int32(n), stride, np.int32(0), *args)
-        if int(flags.get()[3]) > WRONG_SHARE * n / SAMPLE:
+        if int(flags.get()[2]) > WRONG_SHARE * n / SAMPLE:
             return False
         self.engine.run(kernel, items - part, np.int32(n), stride, one, *args)
         return True

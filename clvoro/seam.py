@@ -261,4 +261,8 @@ class Seam:
         folded = Tessellation(
             n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n]
         )
-        return Folded(folded, graph[1], places), not words[0], flags & ~DROPPED, int(words[2])
+        enough = not words[0]
+        if not enough:
+            # The next attempt takes the place of this one: the graph from before is where that begins, too.
+            self._turn = 1 - self._turn
+        return Folded(folded, graph[1], places), enough, flags & ~DROPPED, int(words[2])

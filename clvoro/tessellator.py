@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pyopencl.array as cla
@@ -87,8 +88,13 @@ class Tessellator:
             t = self.tessellate(points, len(points))
             stages.bins.clear()
             return t
-        cells = stages.folded if self.torus is not None and stages.engine.dim == 2 else stages.cells
-        return cells.restore(points, saved, spare)
+        if self.torus is not None and stages.engine.dim == 2:
+            return stages.folded.restore(points, saved, spare)
+        t = stages.cells.restore(points, saved, spare)
+        if self.torus is not None:
+            # The next one may take several attempts, each of which begins with this graph, and has its own there.
+            t = replace(t, starts=t.starts.copy(), neighbours=t.neighbours.copy())
+        return t
 
     def tessellate(
         self,

@@ -28,6 +28,7 @@ def point_sets():
     ring = 0.375 + 0.3 * np.column_stack([np.cos(turn), np.sin(turn)])
     spot = np.array([0.4, 0.3])
     trio = np.array([[0, 0], [1, 0], [0, 1]])
+    fan, gaps = np.array([[4e-3, 0], [0, 0], [0, 1], [0, -1]]), 10.0 ** -np.linspace(4, 9, 60)
     return {
         **{f"{n} random": random[:n] for n in (1, 2, 3, 7, 8, 9, 100)},
         "random": random,
@@ -54,6 +55,10 @@ def point_sets():
             )
             for gap in (1e-6, 1e-8, 1e-9, 1e-10)
         },
+        # The nearest of three in a row has a face as short as they are apart.
+        "rows of three": np.concatenate(
+            [(p + fan * [1, gap]) for p, gap in zip(random, gaps, strict=False)] + [random[60:900]]
+        ),
         "around a hole": spot + 0.3 * np.exp(-7 * rng.random((4000, 1))) * unit(rng, 4000),
         "pairs": np.concatenate([random[:500], random[:500] + 1e-6 * (random[500:1000] - 0.5)]),
     }
@@ -144,6 +149,16 @@ def test_most_cells_are_wrapped(engine, name, share):
     """Else the kernel would be right but useless; lattices, where every decision is near to rounding, are left."""
     counts, _ = wrapped_rows(engine, np.clip(POINTS[name], 0, [1, 0.75]))
     assert np.count_nonzero(counts) >= share * len(counts)
+
+
+@pytest.mark.parametrize(("count", "is_wrapped"), [(14, True), (15, True), (16, True), (17, False)])
+def test_cells_have_up_to_sixteen_faces(engine, count, is_wrapped):
+    turn = 2 * np.pi * np.arange(count) / count
+    ring = [0.5, 0.375] + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)])
+    ring += 1e-3 * np.random.default_rng(61002).random(ring.shape)
+    counts, rows = wrapped_rows(engine, np.concatenate([[[0.5, 0.375]], ring]))
+    assert counts[0] == (count if is_wrapped else 0)
+    assert not is_wrapped or rows[0, :count].tolist() == list(range(1, count + 1))
 
 
 @pytest.mark.parametrize("first_reach", [0.2, 0.7, 5.0])

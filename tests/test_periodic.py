@@ -12,6 +12,7 @@ from clvoro.errors import InputError, InputTypeError
 from clvoro.faces import face_owners
 from clvoro.io.vtu_read import load_vtu
 from clvoro.quality import measure_mesh
+from clvoro.seam import Seam
 from clvoro.torus import FewCellsError
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
@@ -394,6 +395,26 @@ def test_faces_that_one_side_does_not_see_are_dropped(adapter):
     drop_faces(adapter)
 
 
+@pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
+def test_face_that_one_side_does_not_see_ends_in_one_vertex(adapter, box, monkeypatch):
+    """Four cells meet in each corner but for rounding, and those beyond a seam are cut in another order."""
+    eps, fold, dropped = float(np.finfo(adapter.dtype).eps), Seam.fold, []
+
+    def folded(self, *arguments):
+        found = fold(self, *arguments)
+        dropped.append(found[0].places is not None)
+        return found
+
+    monkeypatch.setattr(Seam, "fold", folded)
+    for n in (12, 13):
+        middles = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), -1).reshape(-1, 2) + 0.5) / n
+        for seed in range(25):
+            noise = np.random.default_rng(seed).standard_normal((n * n, 2))
+            x = np.array(box.lower) + (middles + 10 * eps * noise) * box.extent
+            adapter.diagram(box, x).check().demand()
+    assert 0 < sum(dropped) < len(dropped)
+
+
 def test_coarse_levels_with_too_few_cells_are_left_out(double):
     from clvoro.plans import auto_levels
 
@@ -586,3 +607,47 @@ def test_values_are_carried_over_the_seams(adapter, periodic, order):
 
     # Four times the cells: errors fall by 2 and by 4, limiting and random cells taking something of that.
     assert mean_error(1200) < mean_error(300) / (1.6 if order == 1 else 2.4)
+
+
+@pytest.mark.parametrize("restored", [False, True])
+def test_each_attempt_begins_with_the_graph_from_before(adapter, monkeypatch, restored):
+    """Where margins are too narrow cells are made again, and what has been made must not have taken its place."""
+    from clvoro.checkpoint import DIAGRAM
+    from clvoro.tessellator import Tessellator
+
+    n, stages = 300, adapter._stages_for(SLAB)
+    points, begun = some_points(SLAB, n), []
+    x = stages.engine.upload(SLAB.place(points, adapter.dtype))
+    tessellator = Tessellator(stages, SLAB)
+    previous = tessellator.tessellate(x, n)
+    if restored:
+        saved = {name: getattr(previous, name).get() for name in DIAGRAM}
+        m = saved["starts"][-1]
+        saved |= {
+            name: saved[name][:m] for name in ("neighbours", "face_measures", "face_centroids")
+        }
+        previous = tessellator.restore(x, saved, 0)
+    rows = previous.starts.get(), previous.neighbours.get()[: previous.starts.get()[-1]]
+    extend, unfold = Seam.extend, Seam.unfold
+
+    def narrow(seam, domain, points, n, margins, factor, grow):
+        short = len(begun) < 3
+        return extend(
+            seam, domain, points, n, margins, 0.4 if short else factor, grow and not short
+        )
+
+    def seen(seam, images, graph):
+        begun.append((graph.starts.get(), graph.neighbours.get()[: len(rows[1])]))
+        assert all(
+            map(np.array_equal, begun[-1], rows)
+        )  # before they are read: there would be other labels
+        return unfold(seam, images, graph)
+
+    monkeypatch.setattr(Seam, "extend", narrow)
+    monkeypatch.setattr(Seam, "unfold", seen)
+    again = tessellator.tessellate(x, n, previous)
+    assert len(begun) > 3
+    volumes = again.volumes.get() * SLAB.frame[1] ** 3
+    stages.release()
+    off = np.abs(volumes - adapter.diagram(SLAB, points).volumes)
+    assert off.max() < ROUNDING[adapter.dtype.name] * volumes.mean()

@@ -10,17 +10,11 @@
 #error "build with -DSLOT=faces that have room in a slot, whose bits in a word"
 #endif
 
-/* Bits of flags[0], in which kernels report what went wrong; flags[2] is not 0 where there are doubtful cells. The next
-   spare slot is flags[4], and flags[5] how many slots there are. */
+/* Bits of flags[0], in which kernels report what went wrong; flags[1] is not 0 where there are doubtful cells. The next
+   spare slot is flags[3], and flags[4] how many slots there are. */
 #define FLAG_FULL 1     /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than spare slots are left for */
-#define FLAG_COINCIDE 2 /* two generators at the same place; flags[1] is the smallest index of one */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision; flags[1] likewise */
-
-inline void raise_flag(global int *flags, int flag, int generator)
-{
-    atomic_or(flags, flag);
-    atomic_min(flags + 1, generator);
-}
+#define FLAG_COINCIDE 2 /* two generators at the same place */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision */
 
 #define ELSEWHERE INT_MAX
 
@@ -76,14 +70,14 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
     if (flag == 0 && cell->n > SLOT) {
         /* Which of them is chance; what they will hold is not. */
         const int taken = (cell->n + SLOT - 1) / SLOT;
-        to = atomic_add(flags + 4, taken);
-        if (to + taken > flags[5]) {
+        to = atomic_add(flags + 3, taken);
+        if (to + taken > flags[4]) {
             flag = FLAG_FULL;
             to = place;
         }
     }
     if (flag) {
-        raise_flag(flags, flag, cell->generator);
+        atomic_or(flags, flag);
         cell->n = 0;
     }
     const int n = cell->n;
@@ -98,6 +92,6 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
     }
     counts[to] = doubtful ? -n : n;
     if (doubtful)
-        atomic_or(flags + 2, 1);
+        atomic_or(flags + 1, 1);
     return to;
 }

@@ -23,7 +23,7 @@
 typedef struct {
     int steps;
     double8 x[HULL_CAPACITY + 1], y[HULL_CAPACITY + 1];
-    long8 at[HULL_CAPACITY + 1];
+    long8 at[HULL_CAPACITY];
     int8 places[HULL_CAPACITY];
     long8 sizes, doubt, lost; /* corners; is a decision near to rounding; does the hull leave out x? */
 } hull_t;
@@ -77,7 +77,6 @@ inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
     }
     hull->x[steps] = x;
     hull->y[steps] = y;
-    hull->at[steps] = from;
     for (int k = 0; k < steps; ++k)
         for (int lane = 0; lane < LANES; ++lane)
             LANE((int *)hull->places, k, lane) =
@@ -93,13 +92,17 @@ inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
 
 /* Measure the cells: squared distance of the farthest corner, and the least ratio of the square of a face's length to
    that of its generator's distance. A hull is in doubt if any candidate but an edge's own two ends is outside of the
-   edge, or so near to it that rounding may decide. */
+   edge, or so near to it that rounding may decide.
+
+   The face of the nearest, where hulls begin and end, is not looked at: by bisectors no nearer than its own, at an
+   angle t, it is cut off no nearer to its foot than a quarter of t times that generator's distance. Where it is small,
+   the turns there are near to rounding: by the third power of t. */
 inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, double8 *least)
 {
-    double8 x = 0, y = 0, first_x = 0, first_y = 0;
+    double8 x = 0, y = 0;
     long8 outside = 0;
     *reach2 = 0;
-    *least = 1;
+    *least = INFINITY;
     for (int k = 0; k < hull->steps; ++k) {
         const double8 ax = hull->x[k], ay = hull->y[k], bx = hull->x[k + 1], by = hull->y[k + 1];
         const double8 scale = 0.5 / fma(ax, by, -ay * bx);
@@ -107,23 +110,15 @@ inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, dou
         x = (by - ay) * scale;
         y = (ax - bx) * scale;
         *reach2 = max(*reach2, fma(x, x, y * y));
-        if (k > 0) {
-            const double8 ex = x - before_x, ey = y - before_y;
-            *least = min(*least, fma(ex, ex, ey * ey) * fma(ax, ax, ay * ay));
-        } else {
-            first_x = x;
-            first_y = y;
-        }
+        /* From the generator itself to the first corner it is as far as half way to the nearest, or farther. */
+        const double8 ex = x - before_x, ey = y - before_y;
+        *least = min(*least, fma(ex, ex, ey * ey) * fma(ax, ax, ay * ay));
         const double8 bound = 0.5 - TURN_ROUNDING * list->largest2 * scale;
         for (int c = 0; c < list->length; c += CHAINS)
             _Pragma("unroll") for (int chain = 0; chain < CHAINS; ++chain) outside =
                 fma(list->x[c + chain], x, list->y[c + chain] * y) > bound ? outside + COUNT : outside;
     }
     hull->doubt |= outside != 2 * COUNT * hull->steps;
-    /* The largest hulls have not begun again. */
-    const double8 ex = first_x - x, ey = first_y - y, ax = hull->x[0], ay = hull->y[0];
-    const double8 ratio = fma(ex, ex, ey * ey) * fma(ax, ax, ay * ay);
-    *least = hull->sizes == hull->steps ? min(*least, ratio) : *least;
 }
 
 /* Is any decision that made or measured the hulls near to rounding? A hull that leaves out x is of no use, but

@@ -4,8 +4,8 @@
 
 /* Bits of the word in which kernels report what went wrong. */
 #define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
-#define FLAG_COINCIDE 2  /* two generators at the same place; report[1] is the smallest index of one */
-#define FLAG_COLLAPSED 4 /* generators too close for the precision; report[1] likewise */
+#define FLAG_COINCIDE 2  /* two generators at the same place */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision */
 #define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be matched with their neighbours */
 #define FLAG_NARROW 16   /* nor is it that some faces may be no wider than their vertices round; see loops.cl */
 

@@ -100,7 +100,7 @@ inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t
 #ifdef SEAMS
     look_at_walked(cells, walk, done, places, binned, out);
 #endif
-    int place = atomic_add(out->report + 2, total);
+    int place = take_places(out->report, total);
     const bool fits = place + total <= out->room;
     for (int lane = 0; lane < LANES; ++lane) {
         if (!lanes[lane])

@@ -1,0 +1,22 @@
+"""Vertices in the plane, each once, however many cells meet there."""
+
+import numpy as np
+import pytest
+from test_diagram import check_invariants
+
+import clvoro
+
+BOX = clvoro.Box((0, 0), (1, 1))
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_many_cells_at_a_point_of_a_wall(ctx, dtype):
+    """Or nearly so, as rounding has it: some touch the wall there, others do not."""
+    rng, adapter = np.random.default_rng(61101), clvoro.Adapter(ctx, dtype)
+    turn = np.pi * (np.arange(9) + 0.5) / 9
+    for _ in range(16):
+        ring = rng.uniform(0.2, 0.4) * np.column_stack([np.cos(turn), np.sin(turn)])
+        points = (rng.uniform(0.45, 0.55, 2) * [1, 0] + ring)[rng.permutation(9)]
+        points = points[:, ::-1] if rng.random() < 0.5 else points
+        points = 1 - points if rng.random() < 0.5 else points
+        check_invariants(adapter.diagram(BOX, points), float(np.finfo(dtype).eps))
