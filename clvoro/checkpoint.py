@@ -30,7 +30,7 @@ from .stages import Stages
 if TYPE_CHECKING:
     from .loop import Loop
 
-FORMAT, VERSION = "clvoro-checkpoint", 5
+FORMAT, VERSION = "clvoro-checkpoint", 6
 MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
 PER_FACE = ("neighbours", "face_measures", "face_centroids")
 DIAGRAM = (
@@ -121,8 +121,7 @@ class Checkpointer:
         arrays["history"] = np.concatenate(loop.rows)
         state = {
             "position": loop.position, "level": loop.level, "n_start": loop.n_start,
-            "steps": loop.steps, "inserted": loop.inserted, "deleted": loop.deleted,
-            "next_label": mesh.next_label, "spare": len(t.neighbours) - m,
+            "steps": loop.steps, "next_label": mesh.next_label, "spare": len(t.neighbours) - m,
             "coarsening": float(mesh.coarsening).hex(),
             "elapsed": time.perf_counter() - loop.began,
             "methods": [state_of(method) for method in methods_of(loop.plan)],

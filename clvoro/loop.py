@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from ._primitives import Summary
 from .checkpoint import Checkpointer
+from .errors import InputTypeError
 from .krylov import Solution
 from .mesh import Mesh
 from .plans import Action, Mend, Refine, Reorganise, Rest, Settle, Step, work_of
@@ -18,6 +21,10 @@ SAMPLING_GAIN = 0.36
 """Error in counting by sizes at generators over that on the next coarser level: measured on a kinked field."""
 WINDOW = 10
 """Steps over which error and quality are watched for progress."""
+LESS, MOST_SWINGS = 0.9, 2
+"""Where a count comes to be too large after it has been too small, or the other way round, it has at most this share of
+the cells missing that it has had at best; the second time that it has not, it is left at that. Counts of smooth fields
+swing once on their way."""
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 """Why runs end that have converged."""
 
@@ -42,7 +49,13 @@ class Loop:
     Attributes
     ----------
     position : int
-        Actions of the plan that are done; a checkpoint sets it.
+        Actions of the plan that are done; a checkpoint sets it, and what follows.
+    begun, steps : int
+        Steps that have begun, and that are done.
+    rows : list of (1,) array
+        Of the history.
+    labelled : int
+        Labels that had been given when the last row was added.
     checkpoint : Checkpointer or None
     """
 
@@ -59,7 +72,8 @@ class Loop:
         self.n_start = mesh.n
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
         self.rows: list[np.ndarray] = []
-        self.steps, self.inserted, self.deleted = 0, 0, 0
+        self.begun, self.steps = 0, 0
+        self.labelled = mesh.next_label
         self.solution: Solution | None = None
         self.initial: Displacements | None = None
         # Of a plan's last step; where no plan tells which that will be, they are evaluated once more in the end.
@@ -110,11 +124,10 @@ class Loop:
             reason = "interrupted"
             self.mesh.update()
         # Whatever stopped the run, the mesh has the size and the count that were asked for.
-        coarse = self.level > 0
         while self.level > 0:
             self.refine()
         self.settle()
-        if coarse or self.inserted or self.deleted or not self.rows:
+        if not self.told():
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         return self.result(reason in (COMPLETED, STALLED), reason, settings)
@@ -126,6 +139,7 @@ class Loop:
 
     def step(self, action: Step) -> None:
         """Displace and move all generators, and tessellate anew."""
+        self.begun = self.steps + 1
         with self.mesh.engine.workspace.frame():
             self.solution = action.method.displace(self.mesh)
             if self.initial is None:
@@ -147,16 +161,12 @@ class Loop:
         # What the solver holds is of no use for other generators, and the largest of what is not needed here.
         self.mesh.stages.clear("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
-        inserted, deleted = self.mesh.reorganise(nuclei, self.held, theta=action.theta)
-        self.inserted += inserted
-        self.deleted += deleted
+        self.mesh.reorganise(nuclei, self.held, theta=action.theta)
 
     def mend(self, action: Mend) -> None:
         """Delete or split the worst cells."""
         self.mesh.stages.clear("poisson")
-        inserted, deleted = self.mesh.mend(action.flaw, action.split)
-        self.inserted += inserted
-        self.deleted += deleted
+        self.mesh.mend(action.flaw, action.split)
 
     def missing(self) -> float:
         """Cells that are missing: to the count that is held, or to what the size field asks for."""
@@ -185,16 +195,24 @@ class Loop:
 
         `ahead`: to what makes the next level's count.
         """
+        least, before, swings = math.inf, 0.0, 0
         while True:
             if share == 0 and self.held is None:
                 break
             missing = self.missing_ahead() if ahead else self.missing()
             if abs(missing) <= share * self.mesh.n:
                 break
+            # Each one that comes beside a jump of sizes changes what they all ask for: the count may swing for ever.
+            # In one direction it ends by itself, however few come or go at a time.
+            if abs(missing) < LESS * least:
+                least, swings = abs(missing), 0
+            elif missing * before < 0:
+                swings += 1
+            before = missing
+            if swings == MOST_SWINGS:
+                break
             target = self.mesh.n + round(missing) if ahead else self.held
             inserted, deleted = self.mesh.reorganise(0, target, climb=False)
-            self.inserted += inserted
-            self.deleted += deleted
             if inserted == deleted:
                 break
         if self.held is not None:
@@ -206,33 +224,60 @@ class Loop:
         self.mesh.stages.clear("poisson")
         self.mesh.engine.workspace.clear()
         finer = self.mesh.refine()
-        self.inserted += finer.n - self.mesh.n
         # Together: an interruption between them would refine once too often.
         self.mesh, self.level = finer, self.level - 1
 
     def record(self, progress: float) -> bool:
         """Append a row to the history; True if the callback wants to stop."""
         self.add_row(progress)
-        return bool(self.callback is not None and self.callback(self.rows[-1][0].copy()))
+        if self.callback is None:
+            return False
+        answer = self.callback(self.rows[-1][0].copy())
+        try:
+            return bool(answer)
+        except ValueError as error:  # NumPy's, of arrays
+            raise InputTypeError(
+                f"callback returned {answer!r:.60} of type {type(answer).__name__}, expected True to stop, False or "
+                f"None to go on ({error})"
+            ) from error
+
+    def told(self) -> bool:
+        """Tell whether the last row is of the mesh as it is: not amid a step, of these generators, with their sizes."""
+        if not self.rows:
+            return False
+        row, mesh = self.rows[-1][0], self.mesh
+        same = (row["step"], row["level"], row["cells"]) == (self.begun, self.level, mesh.n)
+        # Before the first step sizes are not yet scaled to the count that is held.
+        scaled = self.held is None or self.steps > 0
+        return bool(same and scaled and self.labelled == mesh.next_label)
 
     def add_row(self, progress: float) -> None:
         """Append a row to the history."""
         mesh = self.mesh
-        s, n = mesh.assess(), mesh.n
+        s, n, labelled = mesh.assess(), mesh.n, mesh.next_label
         row = np.zeros(1, HISTORY_DTYPE)
         row["step"], row["level"], row["cells"] = self.steps, self.level, n
         row["progress"] = progress
-        row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
-        row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
-        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
+        self.describe(row, s)
         row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever"].sum / n
-        row["inserted"], row["deleted"] = self.inserted, self.deleted
-        self.inserted = self.deleted = 0
+        # Generators get a label each when they are inserted.
+        row["inserted"] = labelled - self.labelled
+        before = self.rows[-1]["cells"] if self.rows else self.n_start
+        row["deleted"] = before + row["inserted"] - n
         if self.solution is not None:
             row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n
             row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
         row["seconds"] = time.perf_counter() - self.began
-        self.rows.append(row)
+        # Together, without a call in between: an interruption there would tell of some insertions twice.
+        self.rows += [row]
+        self.labelled = labelled
+
+    def describe(self, row: np.ndarray, s: dict[str, Summary]) -> None:
+        """Write to `row` how good the mesh is, by its summaries `s`."""
+        mesh, n = self.mesh, self.mesh.n
+        row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
+        row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
+        row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
 
     def why_ended(self, stop: bool, over: bool = False) -> str:
         """Return why nothing more is done; "" if there is something: `over` says that the plan has no more."""
@@ -272,7 +317,9 @@ class Loop:
             with mesh.engine.workspace.frame():
                 self.last.displace(mesh)
                 final = self.displacements()
-        mesh.complete()
+        if mesh.complete():
+            # Faces of no more than rounding may have come and gone, and with them sides of cells.
+            self.describe(self.rows[-1], mesh.assess())
         labels = np.sort(mesh.labels.get())
         size = mesh.values(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)

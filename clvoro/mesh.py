@@ -397,17 +397,22 @@ class Mesh:
             self._order, self._ordered = np.argsort(self.labels.get(), kind="stable"), self.labels
         return array.get()[self._order].astype(np.float64) * factor
 
-    def complete(self) -> None:
-        """Let go of what only steps take, and evaluate what there is in full precision: for `finish`."""
+    def complete(self) -> bool:
+        """Let go of what only steps take, and evaluate what there is in full precision: for `finish`.
+
+        Return whether the diagram has been made anew for that.
+        """
         self.stages.clear("poisson")
         self.engine.workspace.clear()
-        if not self.tessellator.is_whole(self.t):
+        whole = self.tessellator.is_whole(self.t)
+        if not whole:
             # Nothing follows from the present diagram any more, and the new one needs room.
             self.tessellation = None
             self.stages.clear("folded")
             self.tessellation = self.tessellator.make_whole(self.points, self.n)
         self.tessellation, self._unfolded = self.tessellator.final(self.t)
         self._evaluate_metric()
+        return not whole
 
     def finish(self) -> Diagram:
         """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .adapter import Adapter
+    from .check.findings import Report
     from .domain import Domain
-    from .findings import Report
     from .quality import Measures
 
 HISTORY_DTYPE = np.dtype(
@@ -42,11 +42,42 @@ HISTORY_DTYPE = np.dtype(
         ("seconds", "f8"),  # wall time since the run began
     ]
 )
-"""One row per step of a run, and one more if the count of cells has changed after the last."""
+"""One row per step of a run, and one more if cells or the sizes asked for have changed after the last."""
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    """Return a view that cannot be written to: what the caller has is another's, or both's."""
+    if array.flags.writeable:
+        array = array.view()
+        array.flags.writeable = False
+    return array
+
+
+class _Sealed:
+    """A dataclass whose arrays cannot be written to, one that comes from a pickle included."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, _read_only(value))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        _seal(state)
+
+
+def _seal(arrays: Mapping[str, object]) -> None:
+    """Make those of `arrays` that are some read-only as they are, where nobody else has them."""
+    for array in arrays.values():
+        if isinstance(array, np.ndarray):
+            array.flags.writeable = False
 
 
 class Diagram:
     """A Voronoi diagram clipped to its domain. Every attribute is a NumPy array, fetched when first asked for.
+
+    The arrays are read-only, as are those of a `Result`: what one shares with the other stays as it was made. Take a
+    `copy()` to change one.
 
     In a polygonal domain a cell is the part of its generator's Voronoi region (all that is nearer to it than to the
     others, as the crow flies) that lies in the domain and is connected to the generator there. Parts of the region that
@@ -127,26 +158,31 @@ class Diagram:
 
     def __init__(self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]):
         self.domain = domain
-        self._arrays = dict(arrays)
+        self._arrays = {n: a if callable(a) else _read_only(a) for n, a in arrays.items()}
 
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in Diagram._NAMES:
-            raise AttributeError(f"a Diagram has no {name!r}", name=name, obj=self)
+            # A copy that is being made has no arrays yet, and is asked for what begins so.
+            there = "" if name.startswith("_") else f"; it has {', '.join(self._there())}"
+            raise AttributeError(f"a Diagram has no {name!r}{there}", name=name, obj=self)
         if name == "shifts" and name not in self._arrays:
-            self._arrays[name] = np.zeros((len(self.neighbours), self.domain.dim), np.int8)
+            none = np.zeros((len(self.neighbours), self.domain.dim), np.int8)
+            self._arrays[name] = _read_only(none)
         if name not in self._arrays:
-            raise AttributeError(f"{name}: a diagram in {self.domain.dim}D has none")
+            raise AttributeError(
+                f"{name}: a diagram in {self.domain.dim}D has none; it has {', '.join(self._there())}"
+            )
         value = self._arrays[name]
         if callable(value):
             check_process()  # it may be on a device still
-            value = self._arrays[name] = value()
+            value = self._arrays[name] = _read_only(value())
         return value
 
+    def _there(self) -> list[str]:
+        return [n for n in Diagram._NAMES if n == "shifts" or n in self._arrays]
+
     def __dir__(self) -> list[str]:
-        return [
-            *super().__dir__(),
-            *(n for n in Diagram._NAMES if n == "shifts" or n in self._arrays),
-        ]
+        return [*super().__dir__(), *self._there()]
 
     def __getstate__(self) -> dict[str, Any]:
         # Arrays that have not been asked for are fetched: they may be on a device still.
@@ -154,6 +190,7 @@ class Diagram:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
+        _seal(self._arrays)
 
     def triangles(self) -> np.ndarray:
         """Return the dual triangulation in the plane: triples of generators whose cells meet in a vertex.
@@ -247,7 +284,7 @@ class Diagram:
 
 
 @dataclass(frozen=True)
-class Displacements:
+class Displacements(_Sealed):
     """The two halves of one step, before they are combined: the paper's Figure 6.
 
     Attributes
@@ -264,8 +301,8 @@ class Displacements:
 
 
 @dataclass(frozen=True)
-class Result:
-    """A finished (or interrupted) run.
+class Result(_Sealed):
+    """A finished (or interrupted) run. Its arrays are read-only; take a `copy()` to change one.
 
     Attributes
     ----------
@@ -281,7 +318,8 @@ class Result:
         polygonal domain it is that of the polygon in which faces on the boundary are one straight side as long as they
         turn by no more than 30 degrees in sum; holes within a cell are no sides.
     history : structured array of `HISTORY_DTYPE`
-        One row per step: ``history["mean_error"]``, ...
+        One row per step: ``history["mean_error"]``, ...; the last one tells of this mesh. One more follows where a run
+        is stopped before all is done (on a coarser level, before sizes are scaled to `n_cells`, or amid a step).
     converged : bool
         Whether the run ended by itself: at its tolerance, or with its plan.
     stop_reason : str
@@ -293,7 +331,7 @@ class Result:
         Where a count of cells was asked for, `size` is the size field times this common factor, which makes the count
         fit (methods "adaptive" and "exact"); else 1.
     settings : dict
-        What is needed to repeat the run.
+        What is needed to repeat the run: of the options those that its method uses.
     origin : (n,) int32 or None
         Index, in the points that the run began with, of the generator that each row continues; -1 where it was
         inserted. Rows stand in this order, inserted ones last. What is not listed was deleted.

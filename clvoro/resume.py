@@ -41,8 +41,6 @@ _COUNTS = (
     "level",
     "n_start",
     "steps",
-    "inserted",
-    "deleted",
     "next_label",
     "spare",
     "seam_cells",
@@ -243,8 +241,10 @@ class Saved:
     def set(self, loop: Loop) -> None:
         """Set a loop, which has the mesh from `restore`, to where the run was."""
         state = self.state
-        for name in ("position", "level", "n_start", "steps", "inserted", "deleted"):
+        for name in ("position", "level", "n_start", "steps"):
             setattr(loop, name, state[name])
+        loop.begun = loop.steps
+        loop.labelled = loop.n_start + int(self.arrays["history"]["inserted"].sum())
         for method, values in zip(methods_of(loop.plan), state["methods"], strict=True):
             for name in state_of(method):
                 setattr(method, name, values[name])

@@ -13,7 +13,8 @@ from .checkpoint import Checkpointer
 from .domain import Domain
 from .loop import Loop
 from .made_by import describe
-from .preparation import Options, Preparation
+from .options import Options, uses
+from .preparation import Preparation
 from .results import Result
 from .resume import Saved
 from .stages import Stages
@@ -99,12 +100,13 @@ def _begin(
 
 
 def _settings(prepared: Preparation) -> dict[str, Any]:
-    """Return what the result says of how it was made."""
+    """Return what the result says of how it was made: what was asked for, as far as it matters to the method."""
     options = prepared.options
-    return {
+    told = {
         **vars(options),
         "start": options.start if prepared.points is None else "points",
         "levels": prepared.levels,
         "dtype": prepared.stages.engine.real.name,
         "layers": [repr(layer) for layer in options.layers],
     }
+    return {name: value for name, value in told.items() if uses(options.method, name)}

@@ -17,8 +17,8 @@ from clvoro.errors import (
     MemoryLimitError,
     SizeFieldError,
 )
+from clvoro.options import METHODS
 from clvoro.plans import EFFORTS
-from clvoro.preparation import METHODS
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)
@@ -343,6 +343,11 @@ def test_interruption_keeps_what_there_is(adapter, options, rows):
     assert (result.converged, result.stop_reason) == (False, "interrupted")
     assert result.history["step"][-1] == rows - 1
     check(result, F1)
+
+
+def test_values_of_the_callback_that_are_neither_true_nor_false_are_refused(adapter):
+    with pytest.raises(InputTypeError, match=r"callback returned array.*expected True to stop"):
+        adapter.run(BOX, F1, callback=lambda row: np.ones(2))
 
 
 def test_errors_of_the_callback_pass_through(adapter):

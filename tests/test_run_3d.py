@@ -7,7 +7,7 @@ import reference3d
 import clvoro
 from clvoro import sizing
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
-from clvoro.preparation import METHODS
+from clvoro.options import METHODS
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 1))
 S1 = sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.04, slope=0.3)
