@@ -3,6 +3,7 @@
 import base64
 import binascii
 import os
+import signal
 
 import pytest
 from hypothesis import settings
@@ -12,6 +13,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Examples are the same in every run, and the first build of a kernel may take its time.
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)
 settings.load_profile("clvoro")
+
+# A shell has its background jobs ignore Ctrl-C, nohup lost terminals; tests that send such signals want them heard.
+for number, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    if hasattr(signal, number) and signal.getsignal(getattr(signal, number)) is signal.SIG_IGN:
+        signal.signal(getattr(signal, number), handler)
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,9 @@
 """Throw everything at clvoro: `python -m tests.fuzz --minutes 10`.
 
 Each input is made from one seed: generators in the plane and in space (clusters down to one ulp, lattices, circles,
-lines, walls, corners, one to three points, scales 1e-300 to 1e300), periodic boxes, polygons, layers, size fields of
-all kinds, options, runs that are interrupted and go on, meshes that follow a field, cases, and files with bits changed.
+lines, walls, corners, one to three points, scales 1e-300 to 1e300), periodic boxes, polygons, rings of which some make
+one, layers, size fields of all kinds, options, runs that are interrupted and go on, meshes that follow a field, cases,
+and files with bits changed.
 It must end in a mesh that passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError that says what
 is wrong), and without a warning of NumPy's or Python's. Whatever else happens is printed with its seed and saved;
 `python -m tests.fuzz --repeat SEED` does it again. In the end a table says how many inputs of each kind ended in a
@@ -25,19 +26,22 @@ from pathlib import Path
 import numpy as np
 
 import clvoro
+from tests import fuzz_boundaries as boundaries
 from tests import fuzz_commands as commands
 from tests import fuzz_work as work
+from tests.fuzz_judge import Wrong
 from tests.fuzz_sizes import OwnError
-from tests.fuzz_work import Wrong
 
 WORK = {
     "diagram": (partial(work.try_diagram, work.in_plane), 0.3),
     "solid": (partial(work.try_diagram, work.in_space), 0.12),
-    "polygon": (work.try_polygon, 0.15),
+    "polygon": (boundaries.try_polygon, 0.15),
     "periodic": (partial(work.try_diagram, work.with_seams), 0.12),
     "run": (partial(work.try_run, work.in_plane), 0.15),
     "solid-run": (partial(work.try_run, work.in_space), 0.08),
-    "polygon-run": (work.try_polygon_run, 0.1),
+    "polygon-run": (boundaries.try_polygon_run, 0.1),
+    "hard-polygon": (boundaries.try_hard, 0.08),
+    "rings": (boundaries.try_rings, 0.08),
     "periodic-run": (partial(work.try_run, work.with_seams), 0.12),
     "layers": (work.try_layers, 0.1),
     "resumed": (work.try_resumed, 0.06),

@@ -18,7 +18,8 @@ from clvoro.jobs import Job
 from clvoro.resume import Saved
 from tests import fuzz_files as files
 from tests.fuzz_cases import some_case
-from tests.fuzz_work import WILD, Wrong, adapter, demand, some_real
+from tests.fuzz_judge import Wrong, adapter, demand, some_real
+from tests.fuzz_work import WILD
 
 _files: dict[str, bytes] = {}
 
@@ -75,7 +76,7 @@ def try_command(rng: np.random.Generator) -> str:
         mesh = folder / "out" / str(rng.choice(["mesh.npz", "mesh.vtu"]))
         if not mesh.exists() or command("check", str(mesh)):
             raise Wrong(f"{' '.join(run[3:])}: no right {mesh.name}")
-        if state.exists() and command(*run, "--resume", str(state)):
+        if state.exists() and command(*run, "--checkpoint", str(state), "--resume", str(state)):
             raise Wrong(f"{' '.join(run[3:])}: not resumed from its own state")
         made = clvoro.load(folder / "out" / "mesh.npz")
         use(rng, made, folder)

@@ -141,8 +141,15 @@ def expression(rng, domain, h, depth):
 
 
 def jump(rng, domain, h, depth):
+    """Two sizes on either side of a line; or some far finer cells in a strip, which nothing grows away from."""
     middle = float(rng.uniform(domain.lower[0], domain.upper[0]))
-    return sizing.Expression(f"x < {middle!r} ? {h!r} : {h / ratio(rng, domain)!r}")
+    if rng.random() < 0.5:
+        return sizing.Expression(f"x < {middle!r} ? {h!r} : {h / ratio(rng, domain)!r}")
+    fine = h / 10 ** rng.uniform(0.5, 2 if domain.dim == 2 else 0.8)
+    place = float(rng.choice([middle, domain.lower[0], domain.upper[0]]))
+    return sizing.Expression(
+        f"fabs(x - {place!r}) < {fine * rng.uniform(0.2, 4)!r} ? {float(fine)!r} : {h!r}"
+    )
 
 
 def function(rng, domain, h, depth):

@@ -15,53 +15,15 @@ import clvoro
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
 from clvoro.layers import count_rows, free_domain, place_layers
-from tests.fuzz_inputs import (
-    placed,
-    placed_in_polygon,
-    some_box,
-    some_layers,
-    some_periodic_box,
-    some_polygon,
-)
-from tests.fuzz_sizes import fail, fine_size, some_size
-from tests.reference_polygon import faults
+from tests.fuzz_inputs import placed, some_box, some_layers, some_periodic_box, some_polygon
+from tests.fuzz_judge import Wrong, adapter, demand, run_by, some_real
+from tests.fuzz_options import some_options
+from tests.fuzz_sizes import fine_size, some_size
 
 WILD = 0.25
 """Share of inputs that need not end in a mesh, of kinds where most should."""
 MOST_ROWS = 5000
 """Generators of layers, of inputs that are tried."""
-CALLBACKS: list[Any] = [
-    lambda row: fail(), lambda row: "yes", lambda row: np.ones(2), lambda row: np.bool_(row["step"] > 2),
-    lambda: None, 3, lambda row: 0.0,
-]  # fmt: skip
-_adapters: dict[str, clvoro.Adapter] = {}
-
-
-class Wrong(Exception):  # noqa: N818
-    """An input led to something other than a right mesh or a clear error."""
-
-
-def adapter(dtype: str) -> clvoro.Adapter:
-    if dtype not in _adapters:
-        _adapters[dtype] = clvoro.Adapter(dtype=dtype)
-    return _adapters[dtype]
-
-
-def some_real(rng: np.random.Generator) -> str:
-    return str(rng.choice(["float64", "float64", "float32"]))
-
-
-def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
-    """Raise unless `mesh` is right."""
-    report = mesh.check()
-    if not report:
-        raise Wrong(str(report))
-    diagram = mesh.diagram if isinstance(mesh, clvoro.Result) else mesh
-    if isinstance(diagram.domain, clvoro.Polygon):
-        found, outside = faults(diagram, real), ~diagram.domain.contains(mesh.points)
-        if found or outside.any():
-            raise Wrong("; ".join([*found, f"{outside.sum()} outside"]))
-
 
 # Boxes that are tried: for diagrams and for runs.
 
@@ -93,25 +55,12 @@ def try_diagram(boxes: Boxes, rng: np.random.Generator) -> str:
     return "mesh"
 
 
-def try_polygon(rng: np.random.Generator) -> str:
-    domain, real = some_polygon(rng), some_real(rng)
-    points = placed_in_polygon(rng, domain)
-    # Boxes show what becomes of generators that coincide.
-    first = np.unique(domain.place(points, np.dtype(real)), axis=0, return_index=True)[1]
-    demand(adapter(real).diagram(domain, points[np.sort(first)]), real)
-    return "mesh"
-
-
 # Runs.
 
 
 def try_run(boxes: Boxes, rng: np.random.Generator) -> str:
     wild = rng.random() < WILD
     return run(rng, boxes(rng, wild), wild)
-
-
-def try_polygon_run(rng: np.random.Generator) -> str:
-    return run(rng, some_polygon(rng), rng.random() < WILD)
 
 
 def run(rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, wild: bool) -> str:
@@ -124,16 +73,6 @@ def run(rng: np.random.Generator, domain: clvoro.Box | clvoro.Polygon, wild: boo
     return "mesh"
 
 
-def run_by(made_by: clvoro.Adapter, *arguments: Any, **options: Any) -> clvoro.Result:
-    """Run; that generators come too close to each other is the caller's fault only where they are his."""
-    try:
-        return made_by.run(*arguments, **options)
-    except InputError as error:
-        if "too close to each other" in str(error) and "points" not in options:
-            raise Wrong(f"by itself the run has come to this: {error}") from error
-        raise
-
-
 def written_and_read(result: clvoro.Result, real: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for suffix, reader in ((".npz", clvoro.load), (".vtu", load_vtu)):
@@ -141,65 +80,6 @@ def written_and_read(result: clvoro.Result, real: str) -> None:
             demand(reader(Path(folder) / f"m{suffix}"), real)
         with contextlib.suppress(InputError):  # which has no room for cells around holes
             result.save(Path(folder) / "polyMesh")
-
-
-def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> dict[str, Any]:
-    """Options of a run; `wild`: such as are refused, or mean little."""
-    d = domain.dim
-    methods = ["adaptive", "exact", "coupled", "lloyd", "poisson", "weighted", "weighted-lloyd"]
-    options: dict[str, Any] = {
-        "method": str(rng.choice(methods, p=[0.35, 0.2, 0.13, 0.08, 0.08, 0.1, 0.06])),
-        "effort": str(rng.choice(["fast", "default", "best"], p=[0.6, 0.3, 0.1])),
-        "seed": int(rng.integers(0, 2**31)), "start": str(rng.choice(["density", "uniform"])),
-    }  # fmt: skip
-    # Most runs in boxes go on to their end.
-    if rng.random() < (0.7 if isinstance(domain, clvoro.Polygon) else 0.4):
-        options["max_steps"] = int(rng.integers(0, 15 if d == 2 else 6))
-    periods = domain.extent[list(domain.periodic)]
-    most = domain.measure / fine_size(rng, domain) ** d  # cells that fit into periods, too
-    optional = {
-        "n_cells": lambda: int(most * rng.uniform(1, 1.5)) + (1 if periods.size else 12),
-        "k": lambda: float(rng.choice([0.1, 1.0, 2.0])),
-        "alpha": lambda: float(rng.choice([0.3, 1.0, 3.0])),
-        "tol": lambda: float(rng.choice([0.0, 0.5, 0.9])),
-        "levels": lambda: 0 if periods.size else int(rng.integers(0, 2)),
-        "error_target": lambda: float(rng.choice([1e-4, 0.01, 0.1])),
-        "points": lambda: some_generators(rng, domain, real, wild),
-    }
-    if wild:
-        optional |= {
-            "method": lambda: "nonsense",
-            "n_cells": lambda: int(rng.choice([1, 2, 3, 17, 40, 10**9, -1])),
-            "k": lambda: rng.choice([1e-9, 100.0, -1.0, np.nan]),
-            "alpha": lambda: rng.choice([1e-9, 100.0, np.inf]),
-            "tol": lambda: rng.choice([1e9, -1.0]),
-            "levels": lambda: rng.choice([np.int64(2), 50, -1]),
-            "error_target": lambda: rng.choice([1e-9, 10.0, 0.0]),
-            "effort": lambda: ["slow", None, 3][rng.integers(3)],
-            "start": lambda: ["random", None, 0][rng.integers(3)],
-            "seed": lambda: [-1, 1.5, 2**70, "1", None][rng.integers(5)],
-            "max_steps": lambda: [-1, 2.5, "3"][rng.integers(3)],
-            "callback": lambda: CALLBACKS[rng.integers(len(CALLBACKS))],
-        }
-    options |= {name: make() for name, make in optional.items() if rng.random() < 0.12}
-    if "points" in options and not wild:
-        if options["method"] not in ("adaptive", "exact"):
-            options.pop("n_cells", None)  # which these methods keep
-        elif periods.size:  # few generators are too few across a period, and many levels below
-            options.pop("points")
-    return options
-
-
-def some_generators(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> np.ndarray:
-    if isinstance(domain, clvoro.Polygon):
-        return placed_in_polygon(rng, domain)
-    if not any(domain.periodic) or wild:
-        return placed(rng, domain, real, wild)
-    # As dense as the periods want it.
-    counts = np.maximum(np.ceil(domain.extent / fine_size(rng, domain)).astype(int), 1)
-    x = np.stack(np.meshgrid(*[(np.arange(c) + 0.5) / c for c in counts], indexing="ij"), axis=-1)
-    x = x.reshape(-1, domain.dim) + rng.uniform(-0.3, 0.3, (counts.prod(), domain.dim)) / counts
-    return domain.lower + x * domain.extent
 
 
 def few_layers(rng: np.random.Generator, domain: Any, wild: bool) -> list[clvoro.Layers]:

@@ -18,6 +18,10 @@ from clvoro._program import Engine
 from clvoro.device import create_context
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
+SHORE = [(0, 0), (3, -0.3), (4, 1), (2.6, 1.2), (2.5, 2.2), (1, 2)]
+ISLAND = [(1, 0.8), (1.6, 0.7), (1.5, 1.2)]
+TORUS = clvoro.Box((0, 0), (1, 1), periodic=True)
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 SIZE = "0.07 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)"
 WORK = [
     {"method": "coupled", "max_steps": 3, "seed": 1},
@@ -97,21 +101,67 @@ def test_processes_find_the_same_bits(ctx, alone):
     assert found == [alone[0], alone[3], alone[1]]
 
 
+FAST = {"effort": "fast"}
+RING = "0.015 + 0.03*fabs(hypot(x-0.9, y-0.75)-0.3)"
+LARGE = {
+    "plane": (BOX, RING, FAST, "float64"),
+    "float32": (BOX, RING, FAST, "float32"),
+    "multigrid": (BOX, RING, {"method": "coupled", "max_steps": 4}, "float64"),
+    "exact": (BOX, "0.016 + 0.01*x", {"method": "exact", **FAST}, "float64"),
+    "layers": (BOX, "0.022", {"layers": clvoro.Layers(0.008, count=3, growth=1.2), **FAST}, "float64"),
+    "polygon": (clvoro.Polygon(SHORE, [ISLAND]), "0.018 + 0.01*x", FAST, "float64"),
+    "periodic": (TORUS, "0.011 + 0.004*sin(6.283185307179586*x)", FAST, "float64"),
+    "space": (CUBE, "0.045 + 0.02*x", FAST, "float64"),
+    "periodic space": (clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), "0.053", FAST, "float64"),
+}  # fmt: skip
+"""Runs of 5,000 to 15,000 cells: by many work-groups, unlike the small ones'."""
+
+
+def run_large(name):
+    """Return the cores that the device has, the cells of the run, and its digest."""
+    domain, size, options, real = LARGE[name]
+    adapter, field = clvoro.Adapter(dtype=real), clvoro.sizing.Expression(size)
+    if name == "multigrid":  # in a process of its own
+        clvoro.poisson.expected_costs = lambda *_: (2.0, 1.0)
+    result = adapter.run(domain, field, seed=7, **options)
+    return adapter.queue.device.max_compute_units, len(result.points), digest(result)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(LARGE))
+def test_one_core_finds_the_bits_of_two(ctx, name):
+    """With `python -m pytest -m slow -k cores tests/test_concurrency.py`, some seconds each."""
+    if ctx.devices[0].platform.name != "Portable Computing Language":
+        pytest.skip("no other is told how many cores to take")
+    program = "import sys; sys.path.insert(0, 'tests'); import conftest, test_concurrency as t\n"
+    program += "print(*t.run_large(sys.argv[1]))"
+    found = []
+    for cores in (1, 2):
+        done = subprocess.run(
+            [sys.executable, "-c", program, name], cwd=Path(__file__).parent.parent, text=True, check=True,
+            capture_output=True, env={**os.environ, "POCL_MAX_PTHREAD_COUNT": str(cores)},
+        )  # fmt: skip
+        found.append(done.stdout.split())
+    (one, cells, bits), (two, *others) = found
+    if two != "2":
+        pytest.skip("there is one core")
+    assert one == "1"
+    assert 5000 <= int(cells) <= 15000
+    assert [cells, bits] == others
+
+
 def resident():
     """Memory of this process in MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-SHORE = [(0, 0), (3, -0.3), (4, 1), (2.6, 1.2), (2.5, 2.2), (1, 2)]
-TORUS = clvoro.Box((0, 0), (1, 1), periodic=True)
-CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 FEW = {"method": "coupled", "max_steps": 2}
 PLANNED = {"effort": "fast", "max_steps": 12}
 GROWS = {
     "box": (BOX, 0.06, FEW),
     "polygon": (
-        clvoro.Polygon(SHORE, [[(1, 0.8), (1.6, 0.7), (1.5, 1.2)]]), 0.12, FEW,
+        clvoro.Polygon(SHORE, [ISLAND]), 0.12, FEW,
     ),
     "periodic": (TORUS, 0.05, FEW),
     "space": (CUBE, 0.2, FEW),

@@ -2,10 +2,14 @@
 
 import collections
 
+import numpy as np
 import pytest
 
-from tests import fuzz
+import clvoro
+from clvoro.errors import InputError
+from tests import fuzz, shores
 from tests.fuzz import WORK
+from tests.fuzz_judge import Wrong, demand_truth
 
 
 @pytest.mark.slow
@@ -13,7 +17,7 @@ from tests.fuzz import WORK
 def test_inputs_mostly_end_in_a_mesh(kind):
     """And never in anything but that or an error: `attempt` raises."""
     ends = collections.Counter(fuzz.attempt(kind, seed)[0] for seed in range(12))
-    assert kind == "file" or ends["mesh"] >= 0.6 * (ends.total() - ends["left out"])
+    assert kind in ("file", "rings") or ends["mesh"] >= 0.6 * (ends.total() - ends["left out"])
 
 
 def test_the_table_counts_what_there_was():
@@ -23,6 +27,38 @@ def test_the_table_counts_what_there_was():
     assert row.split() == ["run", "5", "3", "1", "1", "60%"]
     assert head.split()[:5] == ["kind", "inputs", "mesh", "error", "failed"]
     assert error == "run: 1 x InputError: k is # expected"
+
+
+def test_refusals_have_to_be_true():
+    """Of edges or generators that are said to be too close to each other, some are."""
+    error = InputError(
+        "edges of it are too close to each other, or generators are, for the precision"
+    )
+    apart, near = np.array([(0.2, 0.2), (0.8, 0.2)]), np.array([(0.2, 0.2), (0.2 + 1e-7, 0.2)])
+    eps = float(np.finfo(np.float32).eps)
+    for wide, points in ((100 * eps, None), (0.1, apart), (np.inf, None), (np.inf, apart)):
+        domain = clvoro.Polygon(shores.slit(wide) if wide < 1 else shores.UNIT)
+        with pytest.raises(Wrong, match="edges of it are too close"):
+            demand_truth(error, domain, "float32", points)
+    demand_truth(error, clvoro.Polygon(shores.slit(eps)), "float32", None)
+    demand_truth(error, clvoro.Polygon(shores.UNIT), "float32", near)
+    with pytest.raises(Wrong):
+        demand_truth(error, clvoro.Polygon(shores.UNIT), "float64", near)
+    demand_truth(InputError("n is 3, expected at least 4"), domain, "float32", None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("polygon", 703016),
+        ("polygon-run", 50000082),
+        ("hard-polygon", 70000154),
+        ("hard-polygon", 70000338),
+    ],
+)
+def test_polygons_that_failed_once(kind, seed):
+    """Generators as near as a slit is wide; a face across its tip; edges along faces where three cells meet; spits."""
+    assert fuzz.attempt(kind, seed)[0] == "mesh"
 
 
 @pytest.mark.parametrize("seed", [5, 300])

@@ -24,7 +24,7 @@ def test_python_blocks_run(tmp_path, monkeypatch, capsys):
     names = {}
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), names)
-    written = {"mesh.vtu", "quality.png", "polyMesh", "layers.png", "torus.vtu"}
+    written = {"mesh.vtu", "mesh.nc", "quality.png", "polyMesh", "layers.png", "torus.vtu"}
     assert {p.name for p in tmp_path.iterdir()} == written
     assert re.search(r"\d+ cells, \d+ inner faces, area 3\.750000", capsys.readouterr().out)
 

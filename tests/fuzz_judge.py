@@ -1,0 +1,74 @@
+"""Whether what an input led to is right: a mesh, or an error that is true."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy.spatial import KDTree
+
+import clvoro
+from clvoro.errors import InputError
+from tests.reference_polygon import faults
+
+CLOSE = 64
+"""Roundings of positions: generators that are given nearer to each other may come too near to be told apart."""
+NARROW = 8
+"""Roundings of positions: where parts of a polygon are no further from each other than that, it may be refused."""
+_adapters: dict[str, clvoro.Adapter] = {}
+
+
+class Wrong(Exception):  # noqa: N818
+    """An input led to something other than a right mesh or a clear error."""
+
+
+def adapter(dtype: str) -> clvoro.Adapter:
+    if dtype not in _adapters:
+        _adapters[dtype] = clvoro.Adapter(dtype=dtype)
+    return _adapters[dtype]
+
+
+def some_real(rng: np.random.Generator) -> str:
+    return str(rng.choice(["float64", "float64", "float32"]))
+
+
+def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
+    """Raise unless `mesh` is right."""
+    report = mesh.check()
+    if not report:
+        raise Wrong(str(report))
+    diagram = mesh.diagram if isinstance(mesh, clvoro.Result) else mesh
+    if isinstance(diagram.domain, clvoro.Polygon):
+        found, outside = faults(diagram, real), ~diagram.domain.contains(mesh.points)
+        if found or outside.any():
+            raise Wrong("; ".join([*found, f"{outside.sum()} outside"]))
+
+
+def run_by(made_by: clvoro.Adapter, domain: Any, *arguments: Any, **options: Any) -> clvoro.Result:
+    """Run; what comes too close to each other by itself is not the caller's fault."""
+    try:
+        return made_by.run(domain, *arguments, **options)
+    except InputError as error:
+        demand_truth(error, domain, made_by.dtype.name, options.get("points"))
+        raise
+
+
+def demand_truth(error: InputError, domain: Any, real: str, points: Any) -> None:
+    """Raise if `error` says of generators or edges that they are too close to each other, and they are not."""
+    if not any(said in str(error) for said in ("too close to each other", "coincide in")):
+        return
+    if isinstance(domain, clvoro.Polygon) and clearance(domain, real) <= NARROW:
+        return
+    if points is not None:
+        placed = domain.place(np.asarray(points, float), np.dtype(float))
+        apart = KDTree(placed).query(placed, k=2)[0][:, 1] if len(placed) > 1 else np.array([1.0])
+        if apart.min() <= CLOSE * np.finfo(real).eps:
+            return
+    raise Wrong(f"this is not so: {error}") from error
+
+
+def clearance(domain: clvoro.Polygon, real: str) -> float:
+    """How near to each other edges are that have no corner in common, in roundings of positions."""
+    unit = domain.frame[1] * np.finfo(real).eps
+    return float(shapely.minimum_clearance(domain.geometry)) / unit
