@@ -1,4 +1,6 @@
 #include "common/corner.h"
+
+#include "common/around.h"
 #include "common/measures.h"
 #include "common/widening.h"
 #if IN_LANES
@@ -205,7 +207,8 @@ kernel void measure_faces(const int size, global const int *starts, global const
 /* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has
    them, if one of the two is doubtful? Where rounding has let two cells see different neighbours, what they disagree
    about must be as little as rounding makes of the box, and no more than a share of the cell; else generators are too
-   close to tell apart, which is flagged. */
+   close to tell apart, which is flagged, as are faces that cross others: those are short beside their corners'
+   distance from the generators, which is what rounds. */
 kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
                            global const int *starts, global const int *neighbours, global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
@@ -241,6 +244,9 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         }
         if (j >= size)
             continue;
+        const REAL2 e = v - u;
+        if (dot(e, e) < R(1e-4) * fmax(dot(u, u), dot(v, v)) && is_loop(size, starts, neighbours, i, starts[i] + k))
+            atomic_or(flags, FLAG_LOOPED);
         global const int *other = neighbours + starts[j];
         const int m = starts[j + 1] - starts[j];
         const int q = place_in_row(other, m, i);
@@ -258,5 +264,29 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             right = false;
     }
     if (!right)
+        atomic_or(flags, FLAG_COLLAPSED);
+}
+
+/* Per generator i, all of whose rows are new: leave out of keep[its first slot ...] the faces that cross others. Where
+   two do, both go, and the four cells meet in a point. counts[i] is how many stay. */
+kernel void drop_loops(const int size, global const int *places, global const int *slot_counts,
+                       global const int *starts, global const int *neighbours, global uint *keep, global int *counts,
+                       global int *flags)
+{
+    WORK_ITEM(i);
+    const int place = places[i], listed = abs(slot_counts[place]);
+    int face = starts[i], count = 0;
+    for (int k = 0; k < listed; ++k) {
+        const uint bit = 1u << (k % 32);
+        if (!(keep[place + k / 32] & bit))
+            continue;
+        if (neighbours[face] >= 0 && is_loop(size, starts, neighbours, i, face))
+            keep[place + k / 32] &= ~bit;
+        else
+            ++count;
+        ++face;
+    }
+    counts[i] = count;
+    if (count < 3)
         atomic_or(flags, FLAG_COLLAPSED);
 }

@@ -1,6 +1,10 @@
 #include "common/join.h"
 #include "common/noise.h"
 
+#ifndef MOST_DOUBLINGS
+#error "build with -DMOST_DOUBLINGS=times that a tolerance may double"
+#endif
+
 /* Loops of faces in 3D, from each cell's view of its own faces (corners.cl). Where many cells meet, or a face is as
    narrow as vertices round, cells see different corners. A cell's own view is closed whatever is done to it by
 
@@ -10,8 +14,8 @@
 
    So views of a face that differ are brought together by these, within a tolerance: corners of either view that are
    near each other are joined, and corners near an edge are put into it, as in snap rounding. Where nothing is near
-   enough, the tolerance of the face is doubled. In the end both cells of every face see the same loop, or both see
-   none.
+   enough, the tolerance of the face is doubled, MOST_DOUBLINGS times at most: rounding explains no more, and nothing
+   that is done makes the views agree. Else both cells of every face see the same loop in the end, or both see none.
 
    twins (v,)                  the same face in the neighbour's row; itself for a wall, -1 where the graph has no face
    turn_starts, turns          of each view: its loop with what was put into it, corners; labels[u] is the vertex of u
@@ -245,10 +249,12 @@ kernel void snap_views(const int size, global const REAL *points, global const R
                 any = true;
             }
         }
-    if (any)
+    if (any) {
         atomic_or(done, 2);
-    else
+    } else if (levels[k] < MOST_DOUBLINGS) {
         ++levels[k];
+        atomic_or(done, 4);
+    }
 }
 
 /* What is put into the edge that leaves turn t, or -1: what one of its faces has proposed. */

@@ -194,7 +194,10 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
    of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
    If it is wider than rounding explains, generators are too close to tell apart (from far away, two an ulp apart have
    the same bisector), and that is flagged. So it is where both see a face, but of areas that differ by more than a
-   share of the cell. What borders on a generator without a row is not looked at, nor are two cells that are certain. */
+   share of the cell. What borders on a generator without a row is not looked at, nor are two cells that are certain.
+
+   A bisector of generators d apart rounds by eps R / d of the distance R from them, along all of its face: by
+   eps R³ / d, where that is little beside the cell. The area of all faces stands for R². */
 kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
                         global const int *labels, global const REAL *measures, global const REAL *volumes,
                         global const REAL *points, const REAL share, const int some_doubtful, global uchar *kept,
@@ -207,6 +210,9 @@ kernel void match_faces(const int size, global const int *row_places, global con
     if (!some_doubtful)
         return;
     int count = 0;
+    REAL surface = 0;
+    for (int k = row_places[i]; k < row_places[i] + n; ++k)
+        surface += measures[k];
     REAL apart = 0; /* the volume of the cones to what faces differ by */
     for (int k = row_places[i]; k < row_places[i] + n; ++k) {
         const int j = labels[k];
@@ -224,7 +230,8 @@ kernel void match_faces(const int size, global const int *row_places, global con
             const REAL distance = sqrt(dx * dx + dy * dy + dz * dz);
             const REAL other = mutual ? measures[row_places[j] + q] : 0;
             apart += fabs(measures[k] - other) * distance / 6;
-            if (!mutual && !(measures[k] < 2048 * REAL_EPS * distance))
+            const REAL rounded = fmin(64 * REAL_EPS * surface * sqrt(surface) / distance, sqrt(REAL_EPS) * surface);
+            if (!mutual && !(measures[k] < fmax(2048 * REAL_EPS * distance, rounded)))
                 atomic_or(report, FLAG_COLLAPSED);
         }
         kept[k] = mutual;

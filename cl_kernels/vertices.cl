@@ -1,56 +1,31 @@
 #include "common/corner.h"
 
+#include "common/around.h"
+
 /* Corners of cells and the vertices that they share. Corner k of cell i, at place c = starts[i] + k, lies between its
    faces k - 1 and k. Walking from cell to cell around the point visits all corners that are one vertex; the least of
    them owns it. The walk uses the graph alone, so it needs no tolerance and holds for any number of cells at a
    point. */
-
-/* Place of the face of `cell` with `neighbour`; a graph is symmetric, but the walk must not leave the row of one that
-   is not. */
-inline int find_face(global const int *starts, global const int *neighbours, int cell, int neighbour)
-{
-    int k = starts[cell];
-    const int last = starts[cell + 1] - 1;
-    while (k < last && neighbours[k] != neighbour)
-        ++k;
-    return k;
-}
 
 /* Per generator i: owners[c] of each of its corners. */
 kernel void find_owners(const int size, global const int *starts, global const int *neighbours, global int *owners,
                         global int *is_owner)
 {
     WORK_ITEM(i);
-    const int begin = starts[i], end = starts[i + 1];
+    const int begin = starts[i], end = starts[i + 1], most = starts[size];
     for (int c = begin; c < end; ++c) {
         int owner = c;
-        /* Clockwise around the point, over face k, whose far side starts where this corner is. */
+        /* In a symmetric graph a walk ends at a wall or where it began. */
         int cell = i, at = c, steps = 0;
-        bool wall = false;
+        bool open = false;
         do {
-            const int next = neighbours[at];
-            if (next < 0) {
-                wall = true;
-                break;
-            }
-            at = find_face(starts, neighbours, next, cell) + 1;
-            if (at == starts[next + 1])
-                at = starts[next];
-            cell = next;
+            open = !walk_clockwise(size, starts, neighbours, &cell, &at);
             owner = min(owner, at);
-        } while (at != c && ++steps < MAX_CELLS_AT_VERTEX);
-        /* At a wall the walk is open: the other way, over face k - 1. */
+        } while (!open && at != c && ++steps < most);
         cell = i;
         at = c;
-        for (steps = 0; wall && steps < MAX_CELLS_AT_VERTEX; ++steps) {
-            const int face = at == starts[cell] ? starts[cell + 1] - 1 : at - 1;
-            const int next = neighbours[face];
-            if (next < 0)
-                break;
-            at = find_face(starts, neighbours, next, cell);
-            cell = next;
+        while (open && ++steps < most && walk_back(size, starts, neighbours, &cell, &at))
             owner = min(owner, at);
-        }
         owners[c] = owner;
         is_owner[c] = owner == c;
     }

@@ -22,6 +22,7 @@ from .tessellation import (
     DOUBT,
     EXACT_SHARE,
     FULL,
+    LOOPED,
     ROUGH_SHARE,
     CloseError,
     Tessellation,
@@ -268,11 +269,15 @@ class Cells:
             np.int32(fits is not None), self._share(exact), rows.places if fits is None else fits,
             rows.keep, starts, rows.flags,
         )  # fmt: skip
-        self._scan.exclusive(starts, starts, n)
+        return self._count(rows, starts, n)
+
+    def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> tuple[int, int]:
+        """Set `rows.starts` by the faces of each of `n` rows; return the flags and the number of faces."""
+        self._scan.exclusive(counts, rows.starts, n)
         # The host reads all at once.
-        word = starts.dtype.itemsize
+        word = rows.starts.dtype.itemsize
         cl.enqueue_copy(
-            engine.queue, buffer_of(rows.flags), buffer_of(starts), byte_count=word, src_offset=n * word,
+            self.engine.queue, buffer_of(rows.flags), buffer_of(rows.starts), byte_count=word, src_offset=n * word,
             dst_offset=2 * word,
         )  # fmt: skip
         return self._read_flags()
@@ -308,7 +313,10 @@ class Cells:
                 self._kernels.check_doubtful, n, rows.places, rows.counts, starts, neighbours,
                 new["volumes"], points, *corners, self._share(exact), rows.flags,
             )  # fmt: skip
-            if self._read_flags()[0] & ~DOUBT:
+            wrong = self._read_flags()[0] & ~DOUBT
+            if wrong & LOOPED and old_starts is rows.places:
+                return self._measure_without_loops(rows, box, points, n, neighbours, exact)
+            if wrong:
                 return None
         copied = [(starts, new["starts"])]
         if not direct:
@@ -320,6 +328,27 @@ class Cells:
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
             offsets=new["offsets"], covariances=new["covariances"],
         )  # fmt: skip
+
+    def _measure_without_loops(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        neighbours: cla.Array,
+        exact: bool,
+    ) -> Tessellation | None:
+        """Measure anew without the faces that cross others, in the graph by `rows.starts` and `neighbours`."""
+        counts = self.engine.scratch(n + 1, np.int32)
+        self._reset_flags(n, len(rows.counts), byte_count=4)
+        self.engine.run_each(
+            self._kernels.drop_loops, n, rows.places, rows.counts, rows.starts, neighbours, rows.keep, counts,
+            rows.flags,
+        )  # fmt: skip
+        flags, m = self._count(rows, counts, n)
+        if flags & ~DOUBT:
+            return None
+        return self._measure(rows, box, points, n, rows.places, rows.places, m, flags, exact)
 
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)

@@ -20,6 +20,9 @@ from .tessellation import Tessellation
 MOST_ROUNDS = 200
 """Steps in which cells may come to agree; spheres of a hundred generators take some thirty."""
 JOINED, PUT = 1, 2
+MOST_DOUBLINGS = 6
+"""How often the tolerance may double within which a face's views are brought together: in degenerate sets that come out
+right it is three times as a rule, five at most; after eight, vertices lie elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class FaceLoops:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._kernels = engine.kernels("loops")
+        self._kernels = engine.kernels("loops", {"MOST_DOUBLINGS": MOST_DOUBLINGS})
 
     def walk(self, box: ClipBox, t: Tessellation) -> Loops:
         """Return the loops of `t`, vertices numbered in the order of the first cell they belong to.
@@ -116,6 +119,8 @@ class FaceLoops:
                 views.turn_starts, views.turns, chains, differs, levels, joined, proposals, done,
             )  # fmt: skip
             what = int(done[0].get())
+            if not what:
+                break
             if what & JOINED:
                 corners.name_vertices(views, joined)
                 chosen = self._chosen(k, views)
@@ -123,9 +128,10 @@ class FaceLoops:
                 del reduced
                 snapping = levels, joined, *self._put(k, views, opposites, chains, proposals)
                 reduced = engine.empty(len(views.turns), np.int32)
+        other = "" if engine.real == np.float64 else ", or use dtype='float64'"
         raise ClvoroError(
-            "the cells' views of their common faces do not come together; perturb generators that are "
-            "cospherical, or use dtype='float64'"
+            "the cells' views of their common faces do not come together; perturb generators that are cospherical, "
+            f"or on a common circle{other}"
         )
 
     def _chosen(self, k: SimpleNamespace, views: Views) -> cla.Array:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
 # Bits of common/face_rows.h; its others mean generators that coincide, and cells that collapsed.
-FULL, DOUBT, NARROW = 1, 8, 16
+FULL, DOUBT, NARROW, LOOPED = 1, 8, 16, 32
 
 
 class CloseError(InputError):
@@ -52,8 +52,8 @@ class CloseError(InputError):
         what = "coincide" if gap == 0 else "are too close to each other"
         other = "" if self.real == np.float64 else ", or use dtype='float64'"
         return (
-            f"generators at {place}, {gap:.3g} apart, {what} in {self.real}, expected some roundings between them; "
-            f"remove one or move it{other}"
+            f"generators at {place}, {gap:.3g} apart, {what} in {self.real}, which leaves too much of a cell to "
+            f"rounding; remove one or move it{other}"
         )
 
     def within(self, domain: Domain) -> InputError:

@@ -12,8 +12,6 @@ from ._program import Engine
 from .domain import ClipBox
 from .tessellation import Tessellation
 
-MAX_CELLS_AT_VERTEX = 1024
-
 
 @dataclass(frozen=True)
 class Vertices:
@@ -33,7 +31,7 @@ class VertexNumbering:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._kernels = engine.kernels("vertices", {"MAX_CELLS_AT_VERTEX": MAX_CELLS_AT_VERTEX})
+        self._kernels = engine.kernels("vertices")
 
     def number(self, box: ClipBox, t: Tessellation) -> Vertices:
         """Return the vertices of `t`, numbered in the order of their least corner."""

@@ -8,7 +8,7 @@ import clvoro
 from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.corners import Corners
-from clvoro.loops import FaceLoops
+from clvoro.loops import MOST_DOUBLINGS, FaceLoops
 from clvoro.polyhedra import Polyhedra
 
 
@@ -20,7 +20,7 @@ def engine(ctx):
 
 @pytest.fixture(scope="module")
 def kernels(engine):
-    return engine.kernels("loops")
+    return engine.kernels("loops", {"MOST_DOUBLINGS": MOST_DOUBLINGS})
 
 
 def rows(engine, loops, behind=None):

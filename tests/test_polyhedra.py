@@ -94,6 +94,7 @@ def point_sets():
     }  # fmt: skip
 
 
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 POINTS = point_sets()
 FINE = [name for name in POINTS if name not in ("walls, edges and corners", "lattice on walls")]
 
@@ -218,6 +219,34 @@ def test_cells_of_points_on_spheres(adapter, n):
         diagram = adapter.diagram(BOX, points)
         check_invariants(diagram, eps, 8)
         check_loops(diagram, eps, 8)
+
+
+@pytest.mark.parametrize("n", [80, 100, 300])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_cells_of_points_around_an_axis(adapter, n, layers):
+    """As in a mesh of a pipe: all of them meet along a line, where faces are slits as long as the cells."""
+    turn = 2 * np.pi * np.arange(n) / n + 0.1
+    ring = 0.5 + 0.4 * np.column_stack([np.cos(turn), np.sin(turn)])
+    heights = np.repeat((np.arange(layers) + 0.5) / layers, n)
+    diagram = adapter.diagram(CUBE, np.column_stack([np.tile(ring, (layers, 1)), heights]))
+    assert diagram.check()
+    assert diagram.volumes.sum() == pytest.approx(1, rel=1e-6)
+
+
+@pytest.mark.parametrize("n", [300, 1000, 2000])
+def test_very_many_points_on_a_sphere_are_right_or_refused(adapter, n):
+    """Vertices are not brought together over a share of the cells."""
+    u = np.random.default_rng(61301).standard_normal((n, 3))
+    diagram = adapter.diagram(CUBE, 0.5 + 0.4 * u / np.linalg.norm(u, axis=1)[:, None])
+    try:
+        assert diagram.check()
+        said = ""
+    except clvoro.ClvoroError as error:
+        said = str(error)
+    if said:
+        assert n > 300, said
+        assert "do not come together" in said
+        assert ("float64" in said) == (adapter.dtype == np.float32)
 
 
 @pytest.mark.parametrize("name", FINE)

@@ -15,6 +15,7 @@
 #define FLAG_FULL 1     /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than spare slots are left for */
 #define FLAG_COINCIDE 2 /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
+#define FLAG_LOOPED 32   /* faces cross */
 
 #define ELSEWHERE INT_MAX
 

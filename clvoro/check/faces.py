@@ -46,6 +46,14 @@ def check_corners(check: Check) -> None:
         "vertices once", wrong,
         lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
     )  # fmt: skip
+    if d.domain.dim == 2 and not any(d.domain.periodic):
+        # Of what covers a rectangle; across seams vertices have several numbers.
+        v, e = len(d.vertices), len(d.neighbours) - len(inner) // 2
+        check.note(
+            "Euler's formula", np.array([v - e + len(d) != 1]),
+            lambda _: f"{v} vertices - {e} faces + {len(d)} cells is {v - e + len(d)}, expected 1: faces cross, or "
+            "two vertices have one number",
+        )  # fmt: skip
 
 
 def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:

@@ -1,0 +1,58 @@
+/* Walks around a vertex of a graph in the plane, from the corner of one cell to that of the next, by the graph alone.
+   Corner k of a cell lies between its faces k - 1 and k. */
+
+/* Move from the corner before face *at of *cell to the same one of the cell beyond that face: clockwise around the
+   vertex. False, and nowhere, where the face is a wall or leads to a cell without a row: one of `size` or more, or, in
+   a graph that is not symmetric, one that does not list this one. */
+inline bool walk_clockwise(const int size, global const int *starts, global const int *neighbours, int *cell, int *at)
+{
+    const int next = neighbours[*at];
+    if (next < 0 || next >= size)
+        return false;
+    const int begin = starts[next], n = starts[next + 1] - begin;
+    const int q = place_in_row(neighbours + begin, n, *cell);
+    if (q == n)
+        return false;
+    *at = begin + (q + 1 < n ? q + 1 : 0);
+    *cell = next;
+    return true;
+}
+
+/* The other way, over the face before *at. */
+inline bool walk_back(const int size, global const int *starts, global const int *neighbours, int *cell, int *at)
+{
+    const int first = starts[*cell];
+    const int next = neighbours[*at == first ? starts[*cell + 1] - 1 : *at - 1];
+    if (next < 0 || next >= size)
+        return false;
+    const int begin = starts[next], n = starts[next + 1] - begin;
+    const int q = place_in_row(neighbours + begin, n, *cell);
+    if (q == n)
+        return false;
+    *at = begin + q;
+    *cell = next;
+    return true;
+}
+
+/* Do the walks around one end of face k of cell i come by its other end? No face of a diagram does that. Two that cross
+   do: each is seen from both sides, where rounding has let one pair of four nearly cocircular generators decide
+   otherwise than the other pair. */
+inline bool is_loop(const int size, global const int *starts, global const int *neighbours, int i, int k)
+{
+    const int other = k + 1 < starts[i + 1] ? k + 1 : starts[i];
+    /* In a symmetric graph a walk ends at a wall or where it began. */
+    const int most = starts[size];
+    int cell = i, at = k, steps = 0;
+    while (steps++ < most && walk_clockwise(size, starts, neighbours, &cell, &at)) {
+        if (at == other)
+            return true;
+        if (at == k)
+            return false;
+    }
+    cell = i;
+    at = k;
+    while (steps++ < most && walk_back(size, starts, neighbours, &cell, &at))
+        if (at == other)
+            return true;
+    return false;
+}
