@@ -1,9 +1,9 @@
 """Throw everything at clvoro: `python -m tests.fuzz --minutes 10`.
 
-Each input is made from one seed: generators in the plane and in space (clusters down to one ulp, lattices, circles,
-lines, walls, corners, one to three points, scales 1e-300 to 1e300), periodic boxes, polygons, rings of which some make
-one, layers, size fields of all kinds, options, runs that are interrupted and go on, meshes that follow a field, cases,
-and files with bits changed.
+Each input is made from one seed: generators in the plane and in space (clusters down to one ulp, lattices, circles and
+spheres, lines, walls, corners, one to three points, scales 1e-300 to 1e300), periodic boxes, polygons, rings of which
+some make one, layers, size fields of all kinds, options, runs that are interrupted and go on, meshes that follow a
+field, cases, and files with bits changed.
 It must end in a mesh that passes `check`, or in a ClvoroError (a ValueError, TypeError or MemoryError that says what
 is wrong), and without a warning of NumPy's or Python's. Whatever else happens is printed with its seed and saved;
 `python -m tests.fuzz --repeat SEED` does it again. In the end a table says how many inputs of each kind ended in a
@@ -34,6 +34,7 @@ from tests.fuzz_sizes import OwnError
 
 WORK = {
     "diagram": (partial(work.try_diagram, work.in_plane), 0.3),
+    "around": (work.try_around, 0.08),
     "solid": (partial(work.try_diagram, work.in_space), 0.12),
     "polygon": (boundaries.try_polygon, 0.15),
     "periodic": (partial(work.try_diagram, work.with_seams), 0.12),

@@ -135,6 +135,32 @@ KINDS = {
 }
 
 
+def around(rng: np.random.Generator, dim: int) -> np.ndarray:
+    """Generators in the unit box around a point or an axis: rings, stacks of them, shells; alone or among others."""
+    count = int(2 ** rng.uniform(1, 11 if dim == 2 else 8.5))
+    copies = int(rng.choice([1, 1, 2, 5]))
+    radii = 10.0 ** rng.uniform(-3, np.log10(0.5), copies)
+    shells = []
+    for radius in radii:
+        turn = 2 * np.pi * np.arange(count) / count + rng.random() * (rng.random() < 0.5)
+        unit = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        if dim == 3 and rng.random() < 0.5:
+            unit = np.pad(unit, ((0, 0), (0, 1)))
+        elif dim == 3:
+            unit = rng.standard_normal((count, 3))
+            unit /= np.linalg.norm(unit, axis=1)[:, None]
+        shells.append(0.5 + radius * unit)
+    x = np.concatenate(shells)
+    if dim == 3 and rng.random() < 0.5:
+        layers = int(rng.integers(1, 4))
+        x = np.concatenate([x * [1, 1, 0.5 / layers] + [0, 0, k / layers] for k in range(layers)])
+    if rng.random() < 0.3:
+        x = np.vstack([x, np.full(dim, 0.5)])
+    if rng.random() < 0.3:
+        x = np.vstack([x, rng.random((30, dim))])
+    return x
+
+
 def placed(
     rng: np.random.Generator, box: clvoro.Box, real: str = "float64", wild: bool = True
 ) -> np.ndarray:

@@ -149,12 +149,15 @@ class Rebuilt:
         normals = self.areas / np.maximum(self.measures, 1e-300)[:, None]
         self.directions[self.adopted] = normals[self.adopted]
 
-    def are_slits(self, places: np.ndarray, width: float) -> np.ndarray:
-        """Tell which edges of faces' loops (3D), open ones of their cells, border slits no wider than `width`.
+    def are_slits(self, places: np.ndarray, slack: float) -> np.ndarray:
+        """Tell which edges of faces' loops (3D), open ones of their cells, border slits as narrow as rounding.
 
         Where faces meet in the middle of an edge, give or take a rounding, one may have a vertex there that the other
-        lacks. Such an edge's middle lies on another open edge of the cell; that of a missing face does not.
+        lacks. Such an edge's middle lies on another open edge of the cell; that of a missing face does not. A face is
+        off as its bisector is (see `doubts`), where a position may be off by `slack`.
         """
+        spacings = self.spacings[self.edges[0][places]]
+        width = slack * (1 + np.linalg.norm(self._tails[places], axis=1) / spacings)
         result = np.zeros(len(places), bool)
         ends, cells = self._tails[places] + self._edge[places], self.cells[places]
         order = np.argsort(cells, kind="stable")
@@ -166,7 +169,7 @@ class Rebuilt:
                 t = np.clip(((middle - a) * edge).sum(axis=1) / square, 0, 1)
                 off = np.linalg.norm(a + t[:, None] * edge - middle, axis=1)
                 off[rows == row] = np.sqrt(square[rows == row]) / 2
-                result[row] = off.min() <= width
+                result[row] = (off <= np.maximum(width[row], width[rows])).any()
         return result
 
     def doubts(self, slack: float | np.ndarray) -> Doubts:
