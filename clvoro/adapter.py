@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
@@ -16,7 +17,7 @@ from ._arrays import Naming, check_callable, check_number, check_points
 from ._probe import check_process
 from ._program import Engine
 from .domain import Domain
-from .errors import InputError, InputTypeError, MemoryLimitError
+from .errors import InputError, InputTypeError, MemoryLimitError, UnusedOptionWarning
 from .fetch import fetch_diagram
 from .layers import Layers
 from .memory import check_memory, memory_needed
@@ -27,6 +28,8 @@ from .results import Diagram, Result
 from .run import Files, carry_out
 from .stages import Stages
 from .tessellator import Tessellator
+
+CHECKPOINT_EVERY = 60.0
 
 
 class Adapter:
@@ -229,7 +232,7 @@ class Adapter:
         error_target: float | None = None,
         layers: Layers | Sequence[Layers] = (),
         checkpoint: str | PathLike[str] | None = None,
-        checkpoint_every: float = 60.0,
+        checkpoint_every: float = CHECKPOINT_EVERY,
         resume: str | PathLike[str] | None = None,
     ) -> Result:
         """Adapt generators until their cells have the target size and a good shape.
@@ -315,7 +318,7 @@ class Adapter:
         SizeErrorWarning
             If the sizes of a mesh that "adaptive" or "exact" has finished are far from those asked for.
         UnusedOptionWarning
-            If an option is given that the method does not use.
+            If an option is given that the method does not use, or `checkpoint_every` without a `checkpoint`.
         """
         options = Options(
             method=method, start=start, effort=effort, levels=levels, seed=seed, tol=tol, k=k, alpha=alpha,
@@ -337,6 +340,12 @@ class Adapter:
                 "run(domain, size)"
             )
         every = check_number("checkpoint_every", checkpoint_every, least=0)
+        if checkpoint is None and every != CHECKPOINT_EVERY:
+            warnings.warn(
+                f"checkpoint_every is {every:g}, and no file to write to is given: say checkpoint=path",
+                UnusedOptionWarning,
+                stacklevel=2,
+            )
         with self._alone():
             for kept in self._stages.values():
                 kept.release()  # a diagram's buffers, or a failed run's, are not part of what this one takes

@@ -370,7 +370,7 @@ class Result(_Sealed):
         return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
 
     def save(self, path: str | PathLike[str], **options: Any) -> None:
-        """Write the mesh to `path`: `.npz` (reload with `clvoro.load`), `.vtu`, OpenFOAM's `polyMesh`, ...
+        """Write the mesh to `path`: `.npz` (for `clvoro.load`), `.vtu`, netCDF (`.nc`), OpenFOAM's `polyMesh`, ...
 
         See `clvoro.io.save` for all formats and their options.
         """

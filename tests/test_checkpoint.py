@@ -14,7 +14,7 @@ import pytest
 
 import clvoro
 from clvoro import checkpoint, cli, poisson
-from clvoro.errors import InputError
+from clvoro.errors import InputError, UnusedOptionWarning
 from clvoro.loop import STALLED
 from clvoro.made_by import identity
 from clvoro.resume import Saved
@@ -226,6 +226,8 @@ def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
         clvoro.Adapter(ctx).run(BOX, 1.0001 * SIZE, resume=path, **options)
     with pytest.raises(InputError, match="checkpoint_every is -1"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=-1, **options)
+    with pytest.warns(UnusedOptionWarning, match="checkpoint_every is 5, and no file"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint_every=5, **options)
     with pytest.raises(InputError, match=r"checkpoint is .*, a folder"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path.parent, **options)
     with pytest.raises(InputError, match="no folder"):
