@@ -12,6 +12,7 @@ import numpy as np
 
 from .domain import Domain
 from .margins import block_counts
+from .plans import MOST_SURPLUS
 from .polygon import Polygon
 from .quadrature import DensityTree
 
@@ -27,15 +28,10 @@ IMAGE_SAMPLE = 16384
 """Cells that are looked at for images."""
 STEEP_FROM, STEEP_TO = 1.4, 2.4
 """Ratios of sizes, within reach of a cell, from which on it is near something steep, and up to which more so."""
-MOST_SURPLUS, SURPLUS_RATE = 0.7, 2.0
-"""Generators, over those that a size field asks for, that a run takes at most where cells are near something steep, and
-by how much more quickly than the mean of that it comes to as many. Measured on jumps of 1 : 5 to 1 : 20, kinks, stripes
-and chequers, 4000 to 30,000 cells: 0.02 to 0.6, nowhere more than 0.05 over what is told here."""
-STEEP_SHARE, STEEPEST, BEYOND_RATE = 0.25, 2.9, 3.2
-"""Where all but this share of the cells are near what is steeper still, as in a kink of few cells, up to which ratio
-that counts, and by how much: a coarse level there takes up to 2.5 times the generators that it is asked for."""
-NEARER = 4
-"""How many times nearer that is looked at, too."""
+SURPLUS_RATE = 8.0
+"""How quickly what a run takes comes to the most that it may (`plans.MOST_SURPLUS`), by the mean of that over cells.
+Measured on jumps of 1 : 5 to 1 : 40, strips, rings, chequers and kinks, 1500 to 20,000 cells: 0.83 to 1.05 of what is
+told here, cells that are asked for included."""
 SAMPLE = 1024
 """Places where that is looked at."""
 SHORE_SAMPLE = 4096
@@ -82,7 +78,8 @@ def images_expected(
     def scaled(points: np.ndarray) -> np.ndarray:
         return factor * np.asarray(size(points))
 
-    depths = _margins_expected(domain, scaled, count, _share_of_jumps(domain, scaled, tree))
+    jumps = _steepness(domain, scaled, sample_cells(domain, tree, SAMPLE), RIGHT_BESIDE)
+    depths = _margins_expected(domain, scaled, count, jumps)
     x = (sample_cells(domain, tree, IMAGE_SAMPLE) - domain.lower) / domain.extent
     images = 0
     for code in product((-1, 0, 1), repeat=d):
@@ -143,24 +140,11 @@ def _margins_expected(
     return depths
 
 
-def _share_of_jumps(
-    domain: Domain, size: Callable[[np.ndarray], np.ndarray], tree: DensityTree
-) -> float:
-    """Return the share of cells that sizes several times larger lie right beside."""
-    places = sample_cells(domain, tree, SAMPLE)
-    if not len(places):
-        return 0.0
-    ratios = _growth_around(domain, size, places, np.asarray(size(places)), RIGHT_BESIDE)
-    return float((ratios.clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean())
-
-
 def surplus_expected(
     domain: Domain,
     size: Callable[[np.ndarray], np.ndarray],
     tree: DensityTree,
     reach: float,
-    *,
-    coarse: bool = True,
 ) -> float:
     """Return how many generators more than the integral of h^-d a run takes at times, per generator.
 
@@ -175,33 +159,18 @@ def surplus_expected(
         Of it, or of what is in proportion.
     reach : float
         How far cells are looked around, in their sizes.
-    coarse : bool
-        Whether a coarser level hands its generators on.
     """
-    places = sample_cells(domain, tree, SAMPLE)
+    steep = _steepness(domain, size, sample_cells(domain, tree, SAMPLE), reach)
+    return float(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * steep)))
+
+
+def _steepness(
+    domain: Domain, size: Callable[[np.ndarray], np.ndarray], places: np.ndarray, reach: float
+) -> float:
+    """Return how steep sizes are around `places` (k, d): the mean of 0 (not) to 1 (`STEEP_TO`), `reach` sizes away."""
     if not len(places):
         return 0.0
-    h = np.asarray(size(places))
-    ratios = _growth_around(domain, size, places, h, reach)
-    steep = (ratios.clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean()
-    surplus = float(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * steep)))
-    if not coarse:
-        return surplus
-    # In a kink sizes grow from the cell itself on; a jump may be a cell or two away from most.
-    growing = 1 + (_growth_around(domain, size, places, h, reach / NEARER) - 1) * NEARER
-    beyond = np.quantile(np.minimum(ratios, growing), STEEP_SHARE).clip(STEEP_TO, STEEPEST)
-    return surplus + BEYOND_RATE * float(beyond - STEEP_TO)
-
-
-def _growth_around(
-    domain: Domain,
-    size: Callable[[np.ndarray], np.ndarray],
-    places: np.ndarray,
-    h: np.ndarray,
-    reach: float,
-) -> np.ndarray:
-    """Return by how much sizes are larger at most, `reach` sizes along an axis from places (k, d) of size h; (k,)."""
-    d = domain.dim
+    d, h = domain.dim, np.asarray(size(places))
     ways = np.concatenate([np.eye(d), -np.eye(d)])
     beside = (places[:, None] + reach * h[:, None, None] * ways).reshape(-1, d)
     for a in np.flatnonzero(domain.periodic):
@@ -209,7 +178,8 @@ def _growth_around(
     known, sizes = domain.contains(beside), np.repeat(h, 2 * d)
     if known.any():
         sizes[known] = size(beside[known])
-    return np.asarray(sizes.reshape(-1, 2 * d).max(axis=1) / h)
+    ratios = sizes.reshape(-1, 2 * d).max(axis=1) / h
+    return float((ratios.clip(STEEP_FROM, STEEP_TO) - STEEP_FROM).mean())
 
 
 def shore_expected(domain: Polygon, size: Callable[[np.ndarray], np.ndarray]) -> float:

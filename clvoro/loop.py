@@ -14,7 +14,7 @@ from .checkpoint import Checkpointer
 from .errors import InputTypeError
 from .krylov import Solution
 from .mesh import Mesh
-from .plans import Action, Mend, Refine, Reorganise, Rest, Settle, Step, work_of
+from .plans import MOST_SURPLUS, Action, Mend, Refine, Reorganise, Rest, Settle, Step, work_of
 from .results import HISTORY_DTYPE, Displacements, Result
 
 SAMPLING_GAIN = 0.36
@@ -161,7 +161,8 @@ class Loop:
         # What the solver holds is of no use for other generators, and the largest of what is not needed here.
         self.mesh.stages.clear("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
-        self.mesh.reorganise(nuclei, self.held, theta=action.theta)
+        most = math.inf if self.held is not None else self.most()
+        self.mesh.reorganise(nuclei, self.held, theta=action.theta, most=most)
 
     def mend(self, action: Mend) -> None:
         """Delete or split the worst cells."""
@@ -170,7 +171,18 @@ class Loop:
 
     def missing(self) -> float:
         """Cells that are missing: to the count that is held, or to what the size field asks for."""
-        return self.mesh.missing() if self.held is None else float(self.held - self.mesh.n)
+        if self.held is not None:
+            return float(self.held - self.mesh.n)
+        return min(self.mesh.missing(), self.most() - self.mesh.n)
+
+    def most(self) -> float:
+        """Cells of this level, at most, where no count is held.
+
+        A size counts where a generator is: one beside a jump owns a part of what is to be coarse, and asks for others
+        there, which ask for more. Where cells can follow their sizes, they ask for little more than the integral.
+        """
+        factor = 2.0 ** (self.mesh.engine.dim * self.level)
+        return self.mesh.fixed + (1 + MOST_SURPLUS) * self.asked / factor
 
     def missing_ahead(self) -> float:
         """Cells that are missing for refinement to make the count of the next finer level.
@@ -183,7 +195,7 @@ class Loop:
         factor = 2.0**mesh.engine.dim
         # What this level would ask for with exact sampling.
         exact = self.asked / factor**self.level
-        bias = (mesh.n + mesh.missing()) / exact - 1
+        bias = min((mesh.n + mesh.missing()) / exact - 1, MOST_SURPLUS)
         lack = factor * mesh.n / mesh.refined_count() - 1
         wanted = exact * (1 + SAMPLING_GAIN * bias)
         for level in range(self.level):
@@ -212,7 +224,8 @@ class Loop:
             if swings == MOST_SWINGS:
                 break
             target = self.mesh.n + round(missing) if ahead else self.held
-            inserted, deleted = self.mesh.reorganise(0, target, climb=False)
+            most = math.inf if target is not None else self.most()
+            inserted, deleted = self.mesh.reorganise(0, target, climb=False, most=most)
             if inserted == deleted:
                 break
         if self.held is not None:

@@ -306,16 +306,18 @@ class Mesh:
         n_cells: int | None = None,
         climb: bool = True,
         theta: float = THETA,
+        most: float = math.inf,
     ) -> tuple[int, int]:
         """Insert and delete generators (see `PopulationControl.reorganise`); return how many of each.
 
-        The count goes to `n_cells` or, with None, to what the size field asks for.
+        The count goes to `n_cells` or, with None, to what the size field asks for, but not above `most`.
         """
         # This takes more than a step does.
         self.engine.workspace.clear()
         with self.engine.workspace.frame():
             w = self.stages.density.weigh(self.t, self.h)
             total = self.missing(w) if n_cells is None else float(n_cells - self.n)
+            total = min(total, most - self.n)
             new = self.stages.population.reorganise(
                 self.free, self.t, self.h, self.reach, w.excess, self._rows(), total, self.next_label,
                 nuclei, climb, theta, self.fixed,

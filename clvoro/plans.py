@@ -132,6 +132,9 @@ SINGLE_LENIENCE = 0.15
 """-log Q from which on a cell may be off its size for its shape, there, at least. Measured on F1 (600 cells), thirty
 starts: the largest error is 0.010 (median; of twenty others in three more than 0.02, 0.030 at most) in the place of
 0.013 (0.031), for 0.01 of the least Q."""
+MOST_SURPLUS = 0.4
+"""Cells that a run takes at most, over the integral of h^-d, as a share of that. Steep slopes ask for up to 0.35 more
+for a while, and for 0.15 in the end; jumps for any number, and meshes are no better for it."""
 COUNT_SHARE = 0.03
 """Share of the generators by which the count may be off before the climb takes care of it."""
 COUNT_LEAST = 1e-3

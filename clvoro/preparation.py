@@ -129,8 +129,7 @@ class Preparation:
             # A coarser level has steeper sizes, and hands its generators on to the next; in the plane, where there is
             # none, as many come on the finest.
             reach = self.factor * (2 if self.levels or d == 2 else 1)
-            coarse = self.levels > 0
-            surplus = surplus_expected(domain, self.sizing, self._tree, reach, coarse=coarse)
+            surplus = surplus_expected(domain, self.sizing, self._tree, reach)
         if any(domain.periodic) and self._tree is not None:
             free = most * self._tree.integral / asked
             images = images_expected(domain, self.sizing, free, self._tree)

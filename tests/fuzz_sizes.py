@@ -146,6 +146,8 @@ def jump(rng, domain, h, depth):
     if rng.random() < 0.5:
         return sizing.Expression(f"x < {middle!r} ? {h!r} : {h / ratio(rng, domain)!r}")
     fine = h / 10 ** rng.uniform(0.5, 2 if domain.dim == 2 else 0.8)
+    if depth:  # what is made of it may be as fine everywhere: of a million cells it would be a benchmark, not a test
+        fine = max(fine, h / 5)
     place = float(rng.choice([middle, domain.lower[0], domain.upper[0]]))
     return sizing.Expression(
         f"fabs(x - {place!r}) < {fine * rng.uniform(0.2, 4)!r} ? {float(fine)!r} : {h!r}"
