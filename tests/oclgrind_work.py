@@ -11,6 +11,7 @@ import collections
 import json
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from unittest import mock
 
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.spatial import ConvexHull
 import clvoro
 from clvoro import _program
 from clvoro._primitives import Scan
+from clvoro.face_rows import SLOT
 from clvoro.population import Population, PopulationControl
 from clvoro.sizing import (
     Circle,
@@ -68,6 +70,7 @@ def diagrams(adapter: clvoro.Adapter) -> None:
         diagram = adapter.diagram(square, each)
         assert abs(diagram.volumes.sum() - 1) < 1e-4
         assert len(diagram.vertices) > 3
+    drop_loops(adapter)
 
 
 def hulls(adapter: clvoro.Adapter) -> None:
@@ -165,6 +168,56 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
             engine.empty((left, dim), engine.face), ints[2],
         )  # fmt: skip
         assert (ints[2].get() == np.flatnonzero(kept)).all()
+
+
+def drop_loops(adapter: clvoro.Adapter) -> None:
+    """Leave out faces that cross, which takes a circle of a thousand generators; one from corner to corner stays.
+
+    In a lattice of squares, four of which meet in each point.
+    """
+    square, across = clvoro.Box((0, 0), (1, 1)), 8
+    stages = adapter._stages_for(square)
+    engine, where = stages.engine, lattice(across, 2)
+    n, x = len(where), engine.upload(where)
+    t = Tessellator(stages, square).tessellate(x, n)
+    starts, neighbours = t.starts.get(), t.neighbours.get()
+    expected = [list(neighbours[a:b]) for a, b in pairwise(starts)]
+    rows = [list(row) for row in expected]
+
+    def join(i: int, j: int, before_i: int, before_j: int) -> None:
+        """Let i and j see each other, after the neighbours that are named, counter-clockwise."""
+        for cell, other, before in ((i, j, before_i), (j, i, before_j)):
+            rows[cell].insert(rows[cell].index(before) + 1, other)
+
+    for column, row, crossed in (
+        (1, 1, True),
+        (5, 2, True),
+        (3, 5, False),
+        (6, 6, True),
+        (1, 6, False),
+    ):
+        i = column + across * row  # lower left of the four
+        right, above, opposite = i + 1, i + across, i + across + 1
+        join(i, opposite, right, above)
+        if crossed:
+            join(right, above, opposite, i)
+        else:
+            expected[i], expected[opposite] = list(rows[i]), list(rows[opposite])
+    made = stages.cells.take_rows(n)
+    slots = np.zeros((n, SLOT), np.int32)
+    for i, labels in enumerate(rows):
+        slots[i, : len(labels)] = labels
+    counts = np.array([len(labels) for labels in rows], np.int32)
+    made.slots.set(slots.ravel())
+    made.places.set(np.arange(n, dtype=np.int32))
+    made.counts.set(-counts)
+    made.keep.set((1 << counts.astype(np.uint32)) - 1)
+    made.starts.set(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
+    graph = engine.upload(np.concatenate(rows), np.int32)
+    t = stages.cells._measure_without_loops(made, square, x, n, graph, exact=True)
+    assert t is not None
+    starts, neighbours = t.starts.get(), t.neighbours.get()
+    assert [list(neighbours[a:b]) for a, b in pairwise(starts)] == expected
 
 
 def gradation(adapter: clvoro.Adapter) -> None:

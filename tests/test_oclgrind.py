@@ -49,7 +49,7 @@ NOT_IN = {
 """Kernels that have no place in a variant; all others run in it."""
 ALIKE = {
     "coarsening", "copy", "gradation", "krylov", "multigrid", "primitives", "transfer", "bins.count_children",
-    "bins.make_grids", "poisson.apply", "poisson.apply_full", "projection.iterate",
+    "bins.make_grids", "cells.drop_loops", "poisson.apply", "poisson.apply_full", "projection.iterate",
 }  # fmt: skip
 """Files, and kernels of others, that work alike whatever the domain: that they run in any is enough."""
 IN_PLANE = {
