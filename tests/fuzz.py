@@ -29,7 +29,7 @@ import clvoro
 from tests import fuzz_boundaries as boundaries
 from tests import fuzz_commands as commands
 from tests import fuzz_work as work
-from tests.fuzz_judge import Wrong
+from tests.fuzz_judge import TooLarge, Wrong
 from tests.fuzz_sizes import OwnError
 
 WORK = {
@@ -71,6 +71,8 @@ def attempt(kind: str, seed: int) -> tuple[str, str]:
         warnings.simplefilter("always")
         try:
             end, error = WORK[kind][0](np.random.default_rng((seed, 1))), ""
+        except TooLarge:
+            end, error = "too large", ""
         except (clvoro.ClvoroError, OwnError) as refused:
             end, error = "error", f"{type(refused).__name__}: {refused}"
     # Those of clvoro are UserWarnings.
