@@ -373,8 +373,8 @@ class Adapter:
         """Return how many bytes `run` takes on the device with these arguments, as it is told before it begins.
 
         A run does not exceed it by more than a tenth. Where sizes change several-fold from one cell to the next it may
-        take a fifth less, at seams of periodic boxes up to three fifths. Reading all arrays of the diagram afterwards is
-        allowed for: in 3D it takes more than the run.
+        take a fifth less, at seams of periodic boxes up to three fifths. Reading all arrays of the diagram afterwards
+        is allowed for: in 3D it takes more than the run.
 
         Parameters
         ----------
