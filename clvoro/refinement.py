@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl.array as cla
+from scipy.spatial import KDTree
 
 from ._primitives import Scan
 from ._program import Engine
 from .domain import Domain
+from .polygon import Polygon
 from .tessellation import Tessellation
 
 SHORT_FACE = 0.02
 """Share of a cell's length (squared in 3D) under which a face is an accident that deserves no new generator."""
+CLOSE, MOST_LOOKED_AT = 256, 5000
+"""Roundings of positions within which new generators of polygons count as the same; how many may be looked at on the
+host for that: cells of larger meshes are smaller than that could happen to."""
 
 
 class Refinement:
@@ -49,7 +54,18 @@ class Refinement:
             np.int32(n), *domain.device_args(engine), firsts, finer,
             t.face_centroids, *t.outlines,
         )  # fmt: skip
+        # Where cells are much larger than what their boundary is made of, several may bring one at the same corner.
+        if isinstance(domain, Polygon) and len(finer) <= MOST_LOOKED_AT:
+            return self._apart(finer, n)
         return finer
+
+    def _apart(self, finer: cla.Array, n: int) -> cla.Array:
+        """Return the generators without new ones, from row `n` on, that all but coincide with others."""
+        host = finer.get()
+        pairs = KDTree(host).query_pairs(CLOSE * np.finfo(host.dtype).eps, output_type="ndarray")
+        close = np.unique(pairs.max(axis=1))
+        close = close[close >= n]
+        return self.engine.upload(np.delete(host, close, axis=0)) if len(close) else finer
 
     def count(self, t: Tessellation) -> int:
         """Return how many generators `refine` would make of `t`."""

@@ -54,10 +54,13 @@ def test_refusals_have_to_be_true():
         ("polygon-run", 50000082),
         ("hard-polygon", 70000154),
         ("hard-polygon", 70000338),
+        ("hard-polygon", 71000383),
+        ("hard-polygon", 120000326),
     ],
 )
 def test_polygons_that_failed_once(kind, seed):
-    """Generators as near as a slit is wide; a face across its tip; edges along faces where three cells meet; spits."""
+    """Generators as near as a slit is wide; a face across its tip; edges along faces where three cells meet; spits;
+    new generators of few cells at the same corner."""
     assert fuzz.attempt(kind, seed)[0] == "mesh"
 
 
