@@ -30,6 +30,7 @@ from .stages import Stages
 from .tessellator import Tessellator
 
 CHECKPOINT_EVERY = 60.0
+"""Seconds from one checkpoint to the next, unless the caller says otherwise."""
 
 
 class Adapter:

@@ -119,7 +119,7 @@ class FaceLoops:
                 views.turn_starts, views.turns, chains, differs, levels, joined, proposals, done,
             )  # fmt: skip
             what = int(done[0].get())
-            if not what:
+            if not what:  # nothing is near enough, and no tolerance may grow
                 break
             if what & JOINED:
                 corners.name_vertices(views, joined)
