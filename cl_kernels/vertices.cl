@@ -19,12 +19,12 @@ kernel void find_owners(const int size, global const int *starts, global const i
         int cell = i, at = c, steps = 0;
         bool open = false;
         do {
-            open = !walk_clockwise(size, starts, neighbours, &cell, &at);
+            open = !walk(size, starts, neighbours, &cell, &at, false);
             owner = min(owner, at);
         } while (!open && at != c && ++steps < most);
         cell = i;
         at = c;
-        while (open && ++steps < most && walk_back(size, starts, neighbours, &cell, &at))
+        while (open && ++steps < most && walk(size, starts, neighbours, &cell, &at, true))
             owner = min(owner, at);
         owners[c] = owner;
         is_owner[c] = owner == c;

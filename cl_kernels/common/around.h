@@ -1,35 +1,20 @@
 /* Walks around a vertex of a graph in the plane, from the corner of one cell to that of the next, by the graph alone.
    Corner k of a cell lies between its faces k - 1 and k. */
 
-/* Move from the corner before face *at of *cell to the same one of the cell beyond that face: clockwise around the
-   vertex. False, and nowhere, where the face is a wall or leads to a cell without a row: one of `size` or more, or, in
-   a graph that is not symmetric, one that does not list this one. */
-inline bool walk_clockwise(const int size, global const int *starts, global const int *neighbours, int *cell, int *at)
+/* Move from the corner before face *at of *cell to the same one of the next cell around the vertex: clockwise, beyond
+   that face, or `back`, beyond the face before it. False, and nowhere, where that is a wall or leads to a cell without
+   a row: one of `size` or more, or, in a graph that is not symmetric, one that does not list this one. */
+inline bool walk(const int size, global const int *starts, global const int *neighbours, int *cell, int *at, bool back)
 {
-    const int next = neighbours[*at];
+    const int first = starts[*cell], last = starts[*cell + 1] - 1;
+    const int next = neighbours[!back ? *at : *at == first ? last : *at - 1];
     if (next < 0 || next >= size)
         return false;
     const int begin = starts[next], n = starts[next + 1] - begin;
     const int q = place_in_row(neighbours + begin, n, *cell);
     if (q == n)
         return false;
-    *at = begin + (q + 1 < n ? q + 1 : 0);
-    *cell = next;
-    return true;
-}
-
-/* The other way, over the face before *at. */
-inline bool walk_back(const int size, global const int *starts, global const int *neighbours, int *cell, int *at)
-{
-    const int first = starts[*cell];
-    const int next = neighbours[*at == first ? starts[*cell + 1] - 1 : *at - 1];
-    if (next < 0 || next >= size)
-        return false;
-    const int begin = starts[next], n = starts[next + 1] - begin;
-    const int q = place_in_row(neighbours + begin, n, *cell);
-    if (q == n)
-        return false;
-    *at = begin + q;
+    *at = begin + (back ? q : q + 1 < n ? q + 1 : 0);
     *cell = next;
     return true;
 }
@@ -43,7 +28,7 @@ inline bool is_loop(const int size, global const int *starts, global const int *
     /* In a symmetric graph a walk ends at a wall or where it began. */
     const int most = starts[size];
     int cell = i, at = k, steps = 0;
-    while (steps++ < most && walk_clockwise(size, starts, neighbours, &cell, &at)) {
+    while (steps++ < most && walk(size, starts, neighbours, &cell, &at, false)) {
         if (at == other)
             return true;
         if (at == k)
@@ -51,7 +36,7 @@ inline bool is_loop(const int size, global const int *starts, global const int *
     }
     cell = i;
     at = k;
-    while (steps++ < most && walk_back(size, starts, neighbours, &cell, &at))
+    while (steps++ < most && walk(size, starts, neighbours, &cell, &at, true))
         if (at == other)
             return true;
     return false;
