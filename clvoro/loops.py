@@ -20,9 +20,11 @@ from .tessellation import Tessellation
 MOST_ROUNDS = 200
 """Steps in which cells may come to agree; spheres of a hundred generators take some thirty."""
 JOINED, PUT = 1, 2
-MOST_DOUBLINGS = 6
-"""How often the tolerance may double within which a face's views are brought together: in degenerate sets that come out
-right it is three times as a rule, five at most; after eight, vertices lie elsewhere."""
+MOST_DOUBLINGS, SURE_DOUBLINGS = 6, 3
+"""How often the tolerance may double within which a face's views are brought together, and up to when vertices surely
+are where they should be: in degenerate sets it doubles three times as a rule. Beyond that they are looked at."""
+ROUNDINGS = 256
+"""By how many roundings of positions the distances from a vertex to its generators may differ: as in `check`."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class FaceLoops:
         views = corners.list(box, t)
         twins = engine.empty(len(views.view_labels), np.int32)
         engine.run_each(k.find_twins, n, t.starts, views.starts, views.view_labels, twins)
-        reduced, counts, chosen = self._agree(k, corners, t, views, twins)
+        reduced, counts, chosen, widest = self._agree(k, corners, t, views, twins)
         c = len(views.owners)
         loop_starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
         engine.run_each(
@@ -83,15 +85,29 @@ class FaceLoops:
             k.place_vertices, c, t.points, *box.device_corners(engine.real), views.owners,
             views.corners, views.labels, chosen, ids, positions,
         )  # fmt: skip
-        return Loops(positions, loop_starts, loops)
+        result = Loops(positions, loop_starts, loops)
+        if widest > SURE_DOUBLINGS and not self._are_right(t, result):
+            raise self._apart()
+        return result
+
+    def _are_right(self, t: Tessellation, loops: Loops) -> bool:
+        """Tell whether every vertex is as far from both generators of each of its faces, but for rounding."""
+        starts, m = t.starts.get()[: t.n + 1], len(loops.starts) - 1
+        face = np.repeat(np.arange(m), np.diff(loops.starts.get()))
+        i = np.repeat(np.arange(t.n), np.diff(starts))[face]
+        j = t.neighbours.get()[:m][face]
+        x, inner = t.points.get().astype(float), j >= 0
+        at = loops.positions.get().astype(float)[loops.vertices.get()[inner]]
+        apart = np.linalg.norm(at - x[i[inner]], axis=1) - np.linalg.norm(at - x[j[inner]], axis=1)
+        return bool(np.abs(apart).max(initial=0) <= ROUNDINGS * np.finfo(self.engine.real).eps)
 
     def _agree(
         self, k: SimpleNamespace, corners: Corners, t: Tessellation, views: Views, twins: cla.Array
-    ) -> tuple[cla.Array, cla.Array, cla.Array]:
+    ) -> tuple[cla.Array, cla.Array, cla.Array, int]:
         """Change `views` until both cells of every face see the same loop.
 
-        Returns the loops (in the places of the turns), their lengths, and for each label the corner that lies where its
-        vertex does.
+        Returns the loops (in the places of the turns), their lengths, for each label the corner that lies where its
+        vertex does, and how often tolerances have doubled at most.
         """
         engine, v, c = self.engine, len(twins), len(views.owners)
         counts, differs = engine.empty(v, np.int32), engine.empty(v, np.uint8)
@@ -107,7 +123,8 @@ class FaceLoops:
                 k.compare_views, v, twins, views.turn_starts, reduced, counts, differs, any_
             )
             if not int(any_[0].get()):
-                return reduced, counts, chosen
+                widest = 0 if snapping is None else int(snapping[0].get().max())
+                return reduced, counts, chosen, widest
             if snapping is None:
                 snapping = self._begin_snapping(k, views, v, c)
             levels, joined, opposites, chains = snapping
@@ -128,8 +145,11 @@ class FaceLoops:
                 del reduced
                 snapping = levels, joined, *self._put(k, views, opposites, chains, proposals)
                 reduced = engine.empty(len(views.turns), np.int32)
-        other = "" if engine.real == np.float64 else ", or use dtype='float64'"
-        raise ClvoroError(
+        raise self._apart()
+
+    def _apart(self) -> ClvoroError:
+        other = "" if self.engine.real == np.float64 else ", or use dtype='float64'"
+        return ClvoroError(
             "the cells' views of their common faces do not come together; perturb generators that are cospherical, "
             f"or on a common circle{other}"
         )

@@ -27,6 +27,9 @@ inline REAL leaves_over(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
     const int bottom = clamp((int)floor((least.s1 - edge_frame.s1) * edge_frame.s2), 0, edge_shape.s1 - 1);
     const int top = clamp((int)floor((most.s1 - edge_frame.s1) * edge_frame.s2), 0, edge_shape.s1 - 1);
     REAL first = 2;
+    /* Of a corner at x: the edges that end and begin there, and whether y lies beyond them. */
+    REAL2 before = 0, after = 0;
+    bool past_before = false, past_after = false;
     for (int row = bottom; row <= top; ++row) {
         /* The bins of a row are one run of edges. */
         const int begin = edge_starts[row * edge_shape.s0 + left], end = edge_starts[row * edge_shape.s0 + right + 1];
@@ -43,8 +46,21 @@ inline REAL leaves_over(const REAL *x, const REAL *y, int *edge, DOMAIN_ARGS)
                     *edge = k;
                 }
             }
+            if (fmin(dot(a, a), dot(b, b)) <= BEHIND * BEHIND) {
+                const bool ends = dot(b, b) <= dot(a, a), past = there <= 0 && there < here;
+                before = ends ? e : before;
+                after = ends ? after : e;
+                past_before = ends ? past : past_before;
+                past_after = ends ? past_after : past;
+                if (past && first > 1)
+                    *edge = k;
+            }
         }
     }
+    /* A generator in the tip of a spit may lie beyond both edges, but for rounding: no way from there crosses them. */
+    const REAL turn = before.s0 * after.s1 - before.s1 * after.s0;
+    if (first > 1 && (turn > 0 ? past_before || past_after : turn < 0 && past_before && past_after))
+        first = 0;
     return first;
 }
 
