@@ -75,9 +75,12 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     loose = np.zeros(len(g.owner), bool)
     if isinstance(d.domain, Polygon):
         # Parts that were cut off from their generators have faces anywhere: these are where their corners are. Such a
-        # part lies at the boundary, and so does the cell that has it now.
+        # part lies at the boundary, and so does the cell that has it now, on one side of the face or the other.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
-        at_wall = np.bincount(g.owner[walls], minlength=n)[g.owner] > 0
+        at_boundary = np.bincount(g.owner[walls], minlength=n) > 0
+        at_wall = (
+            at_boundary[g.owner] | at_boundary[np.where(d.neighbours < 0, g.owner, d.neighbours)]
+        )
         off = np.linalg.norm(there - normals, axis=1) * g.measures
         adopted = off > np.where(at_wall, doubts.measures, positions.measures)
         adopted &= (d.neighbours >= 0) & (g.measures > 0)

@@ -240,7 +240,12 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
         )  # fmt: skip
     gap = np.stack([np.bincount(g.owner, g.areas[:, k], minlength=n) for k in range(dim)], axis=1)
     gap = np.linalg.norm(gap, axis=1)
-    bound = slack * (1 if dim == 2 else 2 * g.reach)
+    bound = np.full(n, slack)
+    if dim == 3:
+        # Between the corners of neighbouring faces slits may be left, as wide as their bisectors round.
+        near = np.full(n, np.inf)
+        np.minimum.at(near, g.owner, g.spacings)
+        bound *= 2 * g.reach * (1 + g.reach / near)
     check.note(
         "faces closed", np.maximum(gap - bound, 0), lambda i: f"the faces of cell {i} do not close"
     )
