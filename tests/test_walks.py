@@ -70,7 +70,14 @@ def point_sets():
         "few and a cluster": np.concatenate(
             [random[:20], 0.5 + 0.05 * directions(rng, 3000) * rng.random((3000, 1))]
         ),
+        # Of some there walls were the nearest at first, and what a cell was walked from once more lay outside of it.
+        **{f"clump {seed}": clump(seed) for seed in (165, 2459, 7147)},
     }  # fmt: skip
+
+
+def clump(seed):
+    rng = np.random.default_rng(seed)
+    return np.concatenate([0.5 + 0.016 * rng.random((100, 3)), rng.random((30, 3))])
 
 
 POINTS = point_sets()

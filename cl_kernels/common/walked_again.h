@@ -175,19 +175,22 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
         later->counts[lane] = 0;
     const long8 some = convert_long8(vload8(0, later->counts) > 0);
     const int length = pad_lists(list, later->counts);
+    /* Not the first face for sure: that is a wall's where no generator had been seen. */
+    list->nearest = 0;
+    list->nearest2 = some ? (double8)INFINITY : 1;
     for (int k = 0; k < length; ++k) {
         planes_t *plane = &list->planes[k];
         const long8 spare = plane->x == INFINITY;
         plane->x = spare ? 0 : plane->x;
         plane->d2 = spare ? INFINITY : plane->d2;
+        const long8 nearer = some & (plane->d2 < list->nearest2);
+        list->nearest2 = nearer ? plane->d2 : list->nearest2;
+        list->nearest = nearer ? (long8)k : list->nearest;
     }
     for (int shell = 0; shell < SHELLS; ++shell) {
         list->ends[shell] = length;
         list->radii2[shell] = INFINITY;
     }
-    /* The first face of a cell is that of the nearest. */
-    list->nearest = 0;
-    list->nearest2 = some ? list->planes[0].d2 : 1;
     walk_cells(cells, &later->walk, list, some);
     const long8 closed = some & ~vload8(0, cells->lost) & ~vload8(0, cells->doubt);
     const moments_t m = finish_cells(cells, &later->walk, closed);
