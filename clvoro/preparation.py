@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
@@ -147,9 +148,9 @@ class Preparation:
         if levels == "auto":
             if points is None:
                 return auto_levels(self.target, d)
-            return max(0, round(np.log2(self.target / len(points)) / d))
+            return max(0, round(math.log2(self.target / len(points)) / d))
         count = int(levels)
-        most = int(np.log2(max(self.target, 1)) / d)
+        most = int(math.log2(max(self.target, 1)) / d)
         if points is None and count > most:
             raise InputError(
                 f"levels is {levels}, expected at most {most} for {self.target} cells, or 'auto': each "

@@ -92,6 +92,9 @@ def test_levels(adapter, tmp_path, capsys):
         adapter.run(BOX, 0.1, levels="2")
     with pytest.raises(InputError, match="levels is -1, expected at least 0"):
         adapter.run(BOX, 0.1, levels=-1)
+    # Sizes may ask for more cells than 64 bits can count.
+    with pytest.raises(InputError, match=r"levels is 50, expected at most 36 for \d{22} cells"):
+        adapter.run(BOX, 1e-11, levels=50)
     (tmp_path / "c.toml").write_text(CASE)
     for text in ("two", "-1"):
         assert cli.main(["run", str(tmp_path / "c.toml"), f"--levels={text}"]) == cli.BAD_INPUT
