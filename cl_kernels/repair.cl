@@ -44,8 +44,16 @@ inline bool fits_neighbour(int i, int j, int before, int after, REAL2 u, REAL2 v
     }
     const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
     /* Where four or more cells meet in a point, cells may leave out different faces of no length. */
-    return (p == after || is_rounding(corner_gap2(v, i, j, p, i, points, lower, upper), d2)) &&
-           (s == before || is_rounding(corner_gap2(u, i, j, i, s, points, lower, upper), d2));
+    bool fits = true;
+    if (p != after) {
+        const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
+        fits = is_rounding(dot(gap, gap), d2);
+    }
+    if (fits && s != before) {
+        const REAL2 gap = corner_gap(u, i, j, i, s, points, lower, upper);
+        fits = is_rounding(dot(gap, gap), d2);
+    }
+    return fits;
 }
 
 /* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from

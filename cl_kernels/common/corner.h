@@ -68,15 +68,13 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 }
 
-/* Squared distance between a corner of cell i, relative to x_i, and what cell j takes for the same corner, between its
-   faces p and q. */
-inline REAL corner_gap2(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
+/* From what cell j takes for a corner, between its faces p and q, to that corner of cell i, relative to x_i. */
+inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
                         const REAL *upper)
 {
     const REAL x[2] = {points[2 * j], points[2 * j + 1]};
     const REAL2 from = direction_of(x, i, points);
-    const REAL2 gap = mine + from - corner(j, x, p, q, points, lower, upper);
-    return dot(gap, gap);
+    return mine + from - corner(j, x, p, q, points, lower, upper);
 }
 
 /* Where j stands in a row of n; n if it does not. */

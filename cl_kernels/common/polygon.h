@@ -8,6 +8,20 @@
 #error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
 #endif
 
+/* A cut shallower than this is none, so that cocircular generators do not shred a corner: depth times d, as a share of
+   d.d. */
+#define LEAST_DEPTH (4 * REAL_EPS)
+/* Distances from a bisector that rounding may turn, as shares of d or of the corners' distance. */
+#define IN_DOUBT (64 * REAL_EPS)
+/* Largest square of the distance of generators that are near each other, as a share of that to them. */
+#define NEAR_EACH_OTHER R(1e-2)
+/* Least side that is believed, as a share of the neighbour's distances from both, one times the other: of four on a
+   circle it is 0, of three on a line a half. */
+#define LEAST_SIDE R(5e-3)
+
+/* What is hardly ever called is kept out of the way of what is. */
+#define OUT_OF_LINE __attribute__((noinline))
+
 /* Face k runs counter-clockwise from corner k to corner k + 1 and belongs to faces[k]: a generator, or -1 - wall. */
 typedef struct {
     int n;
@@ -58,10 +72,74 @@ inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out
     return a + ab * (s / (s - s_out));
 }
 
-/* Signed distance, times |d|, of corner k from the bisector with the neighbour at x + d; level = d.d / 2. */
-inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL level)
+/* The same as `beyond`, of a corner between the faces of generators a and b, from the places of all: the product of d
+   and the corner loses the digits in which the neighbour differs from a or b, if it is near one of them and far from
+   the generator. As seen from that one it does not. NAN if it is not so near, or all are on a circle but for little. */
+inline REAL beyond_from_near(const cell_t *cell, int a, int b, const REAL *d, REAL d2, int neighbour,
+                             global const REAL *points)
 {
-    return cell->x[k] * d[0] + cell->y[k] * d[1] - level;
+    const REAL2 to_a = direction_of(cell->position, a, points), to_b = direction_of(cell->position, b, points);
+    const REAL2 to_j = (REAL2)(d[0], d[1]);
+    if (!(fmin(dot(to_j - to_a, to_j - to_a), dot(to_j - to_b, to_j - to_b)) < NEAR_EACH_OTHER * d2))
+        return NAN;
+    const REAL2 from_a = (REAL2)(APART(0, to_a.s0, d[0], points[2 * a], points[2 * neighbour]),
+                                 APART(1, to_a.s1, d[1], points[2 * a + 1], points[2 * neighbour + 1]));
+    const REAL2 from_b = (REAL2)(APART(0, to_b.s0, d[0], points[2 * b], points[2 * neighbour]),
+                                 APART(1, to_b.s1, d[1], points[2 * b + 1], points[2 * neighbour + 1]));
+    const REAL2 ab = (REAL2)(APART(0, to_a.s0, to_b.s0, points[2 * a], points[2 * b]),
+                             APART(1, to_a.s1, to_b.s1, points[2 * a + 1], points[2 * b + 1]));
+    const REAL a2 = dot(from_a, from_a), b2 = dot(from_b, from_b);
+    /* From the nearer of the two: to the other, the neighbour, and the generator. */
+    const bool is_a = a2 <= b2;
+    const REAL2 u = is_a ? ab : -ab, v = is_a ? from_a : from_b, w = is_a ? -to_a : -to_b;
+    const REAL u2 = dot(u, u), v2 = fmin(a2, b2), w2 = dot(w, w);
+    /* The neighbour is inside of the circle through the three if this has the sign of u x w. */
+    const REAL uw = difference_of_products(u.s0, w.s1, u.s1, w.s0);
+    const REAL uv = w2 * difference_of_products(u.s0, v.s1, u.s1, v.s0);
+    const REAL vw = u2 * difference_of_products(v.s0, w.s1, v.s1, w.s0);
+    const REAL sum = uv + vw - v2 * uw, rounding = 8 * REAL_EPS * (fabs(uv) + fabs(vw) + fabs(v2 * uw));
+    const REAL side = sum / (2 * uw);
+    const bool sure = fabs(sum) > rounding && side * side > LEAST_SIDE * LEAST_SIDE * a2 * b2;
+    return sure && (is_a ? uw > 0 : uw < 0) ? side : NAN;
+}
+
+/* Might the bisector with the neighbour at x + d be nearly parallel to the face from corner k to the next? Only then is
+   it near the face's generator. */
+inline bool is_nearly_parallel(const cell_t *cell, int k, const REAL *d, REAL d2)
+{
+    const int next = k == cell->n - 1 ? 0 : k + 1;
+    const REAL2 e = (REAL2)(cell->x[next] - cell->x[k], cell->y[next] - cell->y[k]);
+    const REAL along = e.s0 * d[0] + e.s1 * d[1];
+    return !(along * along > 2 * NEAR_EACH_OTHER * dot(e, e) * d2);
+}
+
+/* What `beyond` is for corner k, where it is found to be `s`, which rounding may turn. */
+OUT_OF_LINE REAL beyond_in_doubt(const cell_t *cell, int k, REAL s, const REAL *d, REAL d2, int neighbour,
+                                 global const REAL *points)
+{
+    const int before = k == 0 ? cell->n - 1 : k - 1, a = cell->faces[before], b = cell->faces[k];
+    if (a < 0 || b < 0 || !(is_nearly_parallel(cell, before, d, d2) || is_nearly_parallel(cell, k, d, d2)))
+        return s;
+    const REAL sure = beyond_from_near(cell, a, b, d, d2, neighbour, points);
+    return sure > 0 ? fmax(sure, 2 * LEAST_DEPTH * d2) : (sure < 0 ? fmin(s, R(0)) : s);
+}
+
+/* Signed distance, times |d|, of corner k from the bisector with the neighbour at x + d. */
+inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt, int neighbour,
+                   global const REAL *points)
+{
+    const REAL s = cell->x[k] * d[0] + cell->y[k] * d[1] - d2 / 2;
+    return fabs(s) > doubt ? s : beyond_in_doubt(cell, k, s, d, d2, neighbour, points);
+}
+
+/* The first corner that is beyond the bisector by more than `depth`, where some are in doubt; n if there is none. */
+OUT_OF_LINE int first_beyond(const cell_t *cell, const REAL *d, REAL d2, REAL depth, REAL doubt, int neighbour,
+                             global const REAL *points)
+{
+    int k = 0;
+    while (k < cell->n && !(beyond(cell, k, d, d2, doubt, neighbour, points) > depth))
+        ++k;
+    return k;
 }
 
 inline void copy_corner(cell_t *cell, int to, int from)
@@ -71,21 +149,23 @@ inline void copy_corner(cell_t *cell, int to, int from)
     cell->faces[to] = cell->faces[from];
 }
 
-/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2. False if the cell is full.
-   A cut shallower than rounding is none, so that cocircular generators do not shred a corner. */
+/* Cut off what is nearer to the neighbour at x + d: the points y with y.d > d.d / 2. False if the cell is full. */
 inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool seen_before, global const REAL *points)
 {
     const int n = cell->n;
-    const REAL level = d2 / 2;
-    const REAL depth = 4 * REAL_EPS * d2;
-    /* The first corner that is cut off, and the one before it. */
+    const REAL depth = LEAST_DEPTH * d2, doubt = IN_DOUBT * sqrt(d2 * fmax(d2, cell->reach2));
+    /* A corner that is cut off, if there is one: as a rule all are far from doubt. */
     int first = 0;
-    REAL s_before = 0, s_first = 0;
+    REAL s_first = 0, far = -REAL_MAX;
     for (; first < n; ++first) {
-        s_first = beyond(cell, first, d, level);
+        s_first = cell->x[first] * d[0] + cell->y[first] * d[1] - d2 / 2;
         if (s_first > depth)
             break;
-        s_before = s_first;
+        far = fmax(far, s_first);
+    }
+    if (first == n ? far >= -doubt : s_first <= doubt) {
+        first = first_beyond(cell, d, d2, depth, doubt, neighbour, points);
+        s_first = first < n ? beyond(cell, first, d, d2, doubt, neighbour, points) : 0;
     }
     if (first == n)
         return true;
@@ -95,25 +175,21 @@ inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbour, bool 
                 return true;
 
     /* The corners cut off are first..last, cyclically. */
-    int last = first, before = first - 1;
-    REAL s_last = s_first;
-    if (first == 0) {
-        before = n - 1;
-        s_before = beyond(cell, before, d, level);
-        while (s_before > depth && before > 0) {
-            first = before;
-            s_first = s_before;
-            --before;
-            s_before = beyond(cell, before, d, level);
-        }
+    int last = first, before = first == 0 ? n - 1 : first - 1;
+    REAL s_last = s_first, s_before = beyond(cell, before, d, d2, doubt, neighbour, points);
+    while (s_before > depth && before != last) {
+        first = before;
+        s_first = s_before;
+        before = first == 0 ? n - 1 : first - 1;
+        s_before = beyond(cell, before, d, d2, doubt, neighbour, points);
     }
     int after = last == n - 1 ? 0 : last + 1;
-    REAL s_after = beyond(cell, after, d, level);
+    REAL s_after = beyond(cell, after, d, d2, doubt, neighbour, points);
     while (s_after > depth && after != before) {
         last = after;
         s_last = s_after;
         after = last == n - 1 ? 0 : last + 1;
-        s_after = beyond(cell, after, d, level);
+        s_after = beyond(cell, after, d, d2, doubt, neighbour, points);
     }
     /* Where the bisector meets the faces before -> first and last -> after. */
     const int last_face = cell->faces[last];
