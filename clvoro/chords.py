@@ -18,6 +18,16 @@ UNTOUCHED = 0x7FFFFFFF
 _ROUNDINGS = 4  # by which vertices lie off a face for sure; ON_FACE in chords.cl
 
 
+class BoundaryError(InputError):
+    """Rounding lets the boundary not be followed through the cells, or leaves cells along it open."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the boundary of the polygon cannot be followed through the cells: edges of it are too close to each "
+            "other, or generators are, for the precision; use dtype='float64', or a polygon without such slits"
+        )
+
+
 @dataclass(frozen=True)
 class Chords:
     """Chords, edge by edge, and the cells that they lie in, on the device; see common/boundary.h.
@@ -38,6 +48,8 @@ class Chords:
         Unit vectors along the edges.
     turns : tuple of arrays
         The edge before each and how far the boundary turns there; see common/sides.h.
+    shift : (2,) float
+        By how much the boundary was put aside.
     """
 
     count: int
@@ -49,6 +61,7 @@ class Chords:
     listed: cla.Array
     tangents: cla.Array
     turns: tuple[cla.Array, ...]
+    shift: np.ndarray
 
 
 def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
@@ -87,12 +100,13 @@ class Boundary:
         self._kernels = engine.kernels("chords")
         origin, scale = domain.frame
         self.edges = len(domain.vertices)
-        self.vertices = engine.upload((domain.vertices - origin) / scale)
-        self.next_vertex = engine.upload(domain.next_vertex, np.int32)
-        inner = (domain.vertices - origin) / scale + inward(domain, engine.real)
+        self._exact = (domain.vertices - origin) / scale
+        inner = self._exact + inward(domain, engine.real)
         # Rings that touch in a vertex have it in the same cell.
         same = np.unique(domain.vertices, axis=0, return_index=True, return_inverse=True)
-        self.inner = engine.upload(inner[same[1]][same[2].ravel()])
+        self._exact_inner = inner[same[1]][same[2].ravel()]
+        self.put()
+        self.next_vertex = engine.upload(domain.next_vertex, np.int32)
         self.shells = engine.upload(shells(domain), np.int32)
         along = domain.vertices[domain.next_vertex] - domain.vertices
         self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
@@ -104,6 +118,13 @@ class Boundary:
         self._known = 0  # cells that owners are among
         self._flags = engine.empty(1, np.int32)
 
+    def put(self, shift: tuple[float, float] = (0, 0)) -> None:
+        """Let the boundary lie off where it is by `shift`, in the device's coordinates."""
+        self._shift = np.array(shift, float)
+        # In arrays of their own: chords from before go on with theirs.
+        self.vertices = self.engine.upload(self._exact + self._shift)
+        self.inner = self.engine.upload(self._exact_inner + self._shift)
+
     def cut(self, t: Tessellation, generators: int) -> Chords | np.ndarray:
         """Walk along all edges through the cells of `t`.
 
@@ -112,7 +133,7 @@ class Boundary:
 
         Raises
         ------
-        InputError
+        BoundaryError
             If rounding lets a walk find no way.
         """
         engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
@@ -133,10 +154,7 @@ class Boundary:
         if flags & OUTSIDE:
             return np.flatnonzero(intruders.get())
         if flags & LOST:
-            raise InputError(
-                "the boundary of the polygon cannot be followed through the cells: edges of it are too close to each "
-                "other, or generators are, for the precision; use dtype='float64', or a polygon without such slits"
-            )
+            raise BoundaryError
         cells, of_edges = (room(name, size=count, dtype=np.int32) for name in ("cells", "of_edges"))
         ends = room("ends", size=count)
         engine.run_each(
@@ -175,5 +193,6 @@ class Boundary:
         engine.run_each(k.place_chords, count, cells, slots, ranks, starts, listed)
         engine.run_each(k.sort_chords, touched_count, starts, listed)
         return Chords(
-            count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns
-        )
+            count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns,
+            self._shift,
+        )  # fmt: skip

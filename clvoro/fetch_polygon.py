@@ -35,6 +35,7 @@ class _FetchedPolygon(_Fetched):
         # Little beside the faces: only what the boundary passes through.
         self.slots_of_cells = made.chords.slots.get()[: t.n]
         self.touched = made.chords.touched.get()[: made.chords.touched_count]
+        self.shift = made.chords.shift * domain.frame[1]
         arrays = [a.get() for a in made.chords.arrays]
         self.owners_of_vertices, self.firsts, self.chord_cells, self.chord_edges = arrays[2:6]
         self.chord_ends = arrays[6][: made.chords.count]
@@ -49,7 +50,7 @@ class _FetchedPolygon(_Fetched):
     def points(self) -> np.ndarray:
         positions = super().points()
         # A rounding may not carry a generator on the boundary out of the domain.
-        near = self.ranks[self.touched]
+        near = np.arange(len(positions)) if self.shift.any() else self.ranks[self.touched]
         positions[near] = self.domain.nearest(positions[near])
         return positions
 
@@ -65,7 +66,8 @@ class _FetchedPolygon(_Fetched):
         Those are the same that are the same on the device, where segments between them are left out.
         """
         found = []
-        for vertices in (self.device_vertices, self.domain.vertices):
+        # Measures are those of where the boundary was.
+        for vertices in (self.device_vertices, self.domain.vertices + self.shift):
             a = vertices[self.chord_edges]
             b = vertices[self.domain.next_vertex[self.chord_edges]]
             t = self.chord_ends[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,14 +11,17 @@ import pyopencl.array as cla
 
 from ._device_array import buffer_of
 from .bins import BinnedPoints
-from .chords import Boundary
+from .chords import Boundary, BoundaryError, Chords
 from .polygon import Polygon
 from .sentinels import place_sentinels
 from .stages import Stages, tessellate_box
-from .tessellation import Tessellation
+from .tessellation import CloseError, Tessellation
 
 PATIENCE = 3
 """Times that sentinels are taken away one by one, before all are."""
+SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
+"""Roundings by which the boundary is put aside, each time another way, where it cannot be followed: no more than
+vertices may be off, so that meshes stay as exact as any."""
 
 
 class PolygonTessellator:
@@ -71,13 +75,46 @@ class PolygonTessellator:
             )
             if total > n:
                 binned = None  # sentinels are not among these
-            convex = tessellate_box(stages, domain, self._all, total, convex, exact, binned)
-            # The vertices of the boundary are found from the cells that held them before, or from the least.
-            chords = self._boundary.cut(convex, n)
-            if not isinstance(chords, np.ndarray):
-                return stages.trim.trim(domain, points, convex, chords, n)
+            try:
+                convex = tessellate_box(stages, domain, self._all, total, convex, exact, binned)
+            except CloseError:
+                if total == n:
+                    raise
+                # From far away generators may look too close to each other, which without sentinels nobody sees.
+                self._sentinels = self._sentinels[:0]
+                continue
+            found = self._cut_out(points, convex, n)
+            if isinstance(found, Tessellation):
+                return found
             self._taken_away += 1
             keep = np.ones(len(self._sentinels), bool)
-            keep[chords] = False
+            keep[found] = False
             self._sentinels = self._sentinels[keep & (self._taken_away < PATIENCE)]
             convex = None
+
+    def _cut_out(
+        self, points: cla.Array, convex: Tessellation, n: int
+    ) -> Tessellation | np.ndarray:
+        """Return the diagram of `points` (n, 2) that the boundary leaves of `convex`, or sentinels that are in its way.
+
+        Where very many cells meet at one vertex of the boundary, their faces there are as rounding has it, and no edge
+        may find its way through them. A little aside there are one or two of them.
+        """
+        eps = float(np.finfo(self.engine.real).eps)
+        lost = BoundaryError()
+        for attempt, far in enumerate((0, *SHIFTS)):
+            if attempt:
+                angle, length = 2 * attempt, far * eps
+                self._boundary.put((length * math.cos(angle), length * math.sin(angle)))
+            try:
+                # The vertices of the boundary are found from the cells that held them before, or from the least.
+                chords = self._boundary.cut(convex, n)
+                if not isinstance(chords, Chords):
+                    return chords
+                return self.stages.trim.trim(self.domain, points, convex, chords, n)
+            except BoundaryError as error:
+                lost = error
+            finally:
+                if attempt:
+                    self._boundary.put()
+        raise lost

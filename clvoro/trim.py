@@ -9,12 +9,11 @@ import pyopencl.array as cla
 
 from ._primitives import Room, Scan
 from ._program import Engine
-from .chords import Chords
-from .errors import InputError
+from .chords import LOST, BoundaryError, Chords
 from .polygon import Polygon
 from .tessellation import Tessellation
 
-LOST, ORPHANS = 1, 4  # of the bits in trim.cl
+ORPHANS = 4  # of the bits in trim.cl
 ROUNDS = 6
 """How many cells away the one may be that takes a piece without a generator."""
 
@@ -61,7 +60,7 @@ class Trim:
 
         Raises
         ------
-        InputError
+        BoundaryError
             If rounding leaves loops of faces open.
         """
         engine, k, room = self.engine, self._kernels, self._room
@@ -103,10 +102,7 @@ class Trim:
     @staticmethod
     def _demand(flags: int) -> int:
         if flags & LOST:
-            raise InputError(
-                "cells cannot be trimmed by the boundary of the polygon: edges of it are too close to each other, or "
-                "generators are, for the precision; use dtype='float64', or a polygon without such slits"
-            )
+            raise BoundaryError
         return flags
 
     def _adopt(

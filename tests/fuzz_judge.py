@@ -12,8 +12,10 @@ import clvoro
 from clvoro.errors import InputError
 from tests.reference_polygon import faults
 
-CLOSE = 64
-"""Roundings of positions: generators that are given nearer to each other may come too near to be told apart."""
+CLOSE = {"float32": np.finfo("float32").eps ** 0.5, "float64": 64 * np.finfo(float).eps}
+"""Generators that are given nearer to each other than this, in domains of size 1, may come too near to be told apart.
+In single precision that is far: the bisectors of such are so nearly parallel that corners at the other end of the
+domain are off by as much as the generators are apart. Double precision is to do better than that."""
 NARROW = 8
 """Roundings of positions: where parts of a polygon are no further from each other than that, it may be refused."""
 LARGEST = 150e6
@@ -76,7 +78,7 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any) -> None
     if points is not None:
         placed = domain.place(np.asarray(points, float), np.dtype(float))
         apart = KDTree(placed).query(placed, k=2)[0][:, 1] if len(placed) > 1 else np.array([1.0])
-        if apart.min() <= CLOSE * np.finfo(real).eps:
+        if apart.min() <= CLOSE[real]:
             return
     raise Wrong(f"this is not so: {error}") from error
 

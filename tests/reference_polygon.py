@@ -208,7 +208,8 @@ def faults(diagram, real: str = "float64") -> list[str]:
     eps = float(np.finfo(real).eps)
     size, n = float(domain.extent.max()), len(d.points)
     far = max(map(abs, (*domain.lower, *domain.upper)))
-    slack = 64 * (eps * size + 2.3e-16 * far)
+    # What corners of cells that are repaired may be off by (is_rounding in repair.cl), in units of the device.
+    slack = 64 * (eps * domain.frame[1] + 2.3e-16 * far)
     found = []
 
     def demand(holds, text: str) -> None:
@@ -247,7 +248,7 @@ def faults(diagram, real: str = "float64") -> list[str]:
     if same:
         off = np.abs(d.face_measures[inner][here] - d.face_measures[inner][there])
         demand(
-            (off <= loose[inner][here]).all(),
+            (off <= 2 * loose[inner][here]).all(),  # both ends may be off
             f"faces differ from both sides by {off.max(initial=0):.3g}",
         )
     # Edges are covered once.
@@ -259,7 +260,8 @@ def faults(diagram, real: str = "float64") -> list[str]:
     # Faces run from vertex to vertex, in loops, the cell on their left.
     off = np.abs(np.hypot(*(b - a).T) - d.face_measures)
     demand(
-        (off <= loose).all(), f"face measures are not the distance of their ends: {off.max():.3g}"
+        (off <= 2 * loose).all(),
+        f"face measures are not the distance of their ends: {off.max():.3g}",
     )
     off = np.abs((a + b) / 2 - d.face_centroids).max(axis=1)
     demand((off <= loose).all(), f"face centroids: {off.max():.3g}")

@@ -57,11 +57,22 @@ def test_refusals_have_to_be_true():
         ("hard-polygon", 71000383),
         ("hard-polygon", 120000326),
         ("hard-polygon", 210000134),
+        ("hard-polygon", 210001839),
+        ("polygon", 210001878),
+        ("polygon-run", 410000584),
+        ("polygon", 757286782),
+        ("hard-polygon", 483733786),
+        ("hard-polygon", 483733990),
+        ("hard-polygon", 483738857),
+        ("hard-polygon", 530437850),
+        ("hard-polygon", 530440997),
     ],
 )
 def test_polygons_that_failed_once(kind, seed):
     """Generators as near as a slit is wide; a face across its tip; edges along faces where three cells meet; spits;
-    new generators of few cells at the same corner; one in the tip of a spit that leaves it."""
+    new generators of few cells at the same corner; one in the tip of a spit that leaves it; sentinels that see too
+    little; crowds around a corner; generators at the corners of a hole of some roundings; parts of two regions that
+    change places; generators on both sides of a slit of some roundings, or near each other and far from all others."""
     assert fuzz.attempt(kind, seed)[0] == "mesh"
 
 

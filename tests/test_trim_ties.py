@@ -10,6 +10,8 @@ from reference_polygon import faults
 from shores import blocks, slit, spit
 
 import clvoro
+from clvoro import polygonal
+from clvoro.chords import Boundary, BoundaryError
 
 RING = [(x, y) for x in range(-25, 26) for y in range(-25, 26) if x * x + y * y == 625]
 """On a circle exactly, in whole numbers: all faces between neighbours on it meet in its centre."""
@@ -101,3 +103,67 @@ def test_faces_across_the_tip_of_a_wedge(adapters, real, make):
         points = np.concatenate([rng.random((20, 2)), tip + rng.normal(0, 0.05, (20, 2))])
         diagram = adapter.diagram(domain, points[domain.contains(points)])
         assert faults(diagram, adapter.dtype.name) == []
+
+
+PAIR = clvoro.Polygon.from_shapely(shapely.union(shapely.box(0, 0, 1, 1), shapely.box(1, 1, 2, 2)))
+"""Two squares that have a corner in common."""
+
+
+def crowd(seed: int, n: int) -> np.ndarray:
+    """Generators on a circle about that corner, on which their faces meet but for rounding."""
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0, 7) + 2 * np.pi * np.arange(n) / n
+    points = 1 + rng.uniform(0.05, 0.3) * np.column_stack([np.cos(angles), np.sin(angles)])
+    return points[PAIR.contains(points)]
+
+
+@pytest.mark.parametrize("real", [0, 1])
+@pytest.mark.parametrize("n", [8, 60, 200])
+def test_crowds_around_a_corner(adapters, real, n):
+    """Edges found no way from the corner through cells that are cut off there as rounding has it."""
+    for seed in range(10):
+        diagram = adapters[real].diagram(PAIR, crowd(seed, n))
+        assert faults(diagram, adapters[real].dtype.name) == []
+        report = diagram.check()
+        assert report, report
+
+
+def test_edges_may_find_no_way(adapters, monkeypatch):
+    """The boundary is put aside where it must be, and an error says so where that does not help."""
+    monkeypatch.setattr(polygonal, "SHIFTS", ())
+    with pytest.raises(BoundaryError, match="cannot be followed"):
+        adapters[0].diagram(PAIR, crowd(0, 200))
+    # Nothing of it is left.
+    diagram = adapters[0].diagram(PAIR, crowd(0, 8))
+    assert faults(diagram, "float64") == []
+
+
+@pytest.mark.parametrize("real", [0, 1])
+def test_a_boundary_that_is_put_aside(adapters, monkeypatch, real):
+    """By as much as a hole is wide, in single precision: generators at its corners stay in the domain."""
+    cut, shifts = Boundary.cut, []
+
+    def cut_aside(boundary, *arguments):
+        shifts.append(boundary._shift)
+        if not boundary._shift.any():
+            raise BoundaryError
+        return cut(boundary, *arguments)
+
+    monkeypatch.setattr(Boundary, "cut", cut_aside)
+    adapter = adapters[real]
+    eps = float(np.finfo(adapter.dtype).eps)
+    rng = np.random.default_rng(5)
+    angles = np.arange(8) * 0.8
+    radius = max(20 * eps, 4e-12)  # edges are not shorter than 1e-12
+    hole = shapely.Polygon(0.4 + radius * np.column_stack([np.cos(angles), np.sin(angles)]))
+    domain = clvoro.Polygon.from_shapely(shapely.box(0, 0, 1, 1).difference(hole))
+    points = np.concatenate([domain.vertices[4::2], rng.random((30, 2))])
+    diagram = adapter.diagram(domain, points)
+    assert domain.contains(diagram.points).all()
+    assert faults(diagram, adapter.dtype.name) == []
+    report = diagram.check()
+    assert report, report
+    # Measures are those of the boundary where it was, which is off by some roundings.
+    off = domain.boundary_distance(diagram.vertices[~domain.contains(diagram.vertices)])
+    assert 0 < off.max() <= (polygonal.SHIFTS[0] + 4) * eps * domain.frame[1]
+    assert [s.any() for s in shifts] == [False, True]

@@ -9,12 +9,17 @@ import shapely
 from scipy.spatial import KDTree
 
 from ..outlines import face_ends, next_faces
+from ..polygonal import SHIFTS
 
 if TYPE_CHECKING:
     from ..polygon import Polygon
     from ..results import Diagram
     from .findings import Check
     from .rebuilt import Rebuilt
+
+ASIDE = 16 + 2 * max(SHIFTS)
+"""How many roundings of a position corners may be off the domain: where it could not be followed, the boundary was put
+aside (in units of the device, which are up to twice the domain's size)."""
 
 
 def check_outlines(check: Check) -> None:
@@ -126,8 +131,8 @@ def hidden(
     place = np.repeat(np.arange(len(places)), [len(some) for some in nearest])
     goal = d.points[np.array([j for some in nearest for j in some], int)]
     way = goal - at[place]
-    # The corner itself may be off the domain by a few roundings.
-    part = np.minimum(16 * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
+    # The corner itself may be off the domain.
+    part = np.minimum(ASIDE * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
     ends = np.stack([at[place] + part[:, None] * way, goal], axis=1)
     lines = np.asarray(shapely.linestrings(ends))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
@@ -139,8 +144,9 @@ def hidden(
         along /= np.linalg.norm(along, axis=1)[:, None]
         right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
         away[place[(right > 4 * unit) & (d.neighbours[faces] < 0)[place]]] = True
-    # In those of a few roundings nobody can tell what is on this side.
-    away |= domain.is_slit(at, 16 * unit)
+    # In those of a few roundings nobody can tell what is on this side, nor on which side a generator is.
+    away |= domain.is_slit(at, ASIDE * unit)
+    away[place[domain.is_slit(goal, ASIDE * unit)]] = True
     away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
     # Nor is anything seen through a point, or from one.
     away[place[near_shared_corners(domain, lines, slack)]] = True

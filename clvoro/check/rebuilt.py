@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
+from scipy.spatial import KDTree
 
 from ..faces import neighbour_points
 from ..outlines import face_ends, next_faces
@@ -146,6 +148,19 @@ class Rebuilt:
         least = np.maximum(1e-200 * far, np.finfo(float).tiny)
         noise = ADOPTED * self.unit * (1 + far / np.maximum(across, least))
         self.adopted = inner & (off > noise) & (self.measures > 0)
+        # On its bisector as well, by chance or where either generator has a part of the other's region: then another is
+        # nearer there, or neither sees it.
+        inward = np.flatnonzero(
+            inner & ~self.adopted & ((self.areas * self.directions).sum(axis=1) < 0)
+        )
+        if inward.size:
+            own = d.points[self.owner[inward]]
+            places = own + self.middles[inward]
+            away = np.linalg.norm(self.middles[inward], axis=1)
+            nearest = KDTree(d.points).query(places)[0]
+            ways = shapely.linestrings(np.stack([own, places], axis=1))
+            hidden = ~shapely.covers(d.domain.geometry, ways)
+            self.adopted[inward[hidden | (nearest < away - noise[inward] / 16)]] = True
         normals = self.areas / np.maximum(self.measures, 1e-300)[:, None]
         self.directions[self.adopted] = normals[self.adopted]
 
