@@ -110,6 +110,9 @@ def _margins_expected(
     unlike each other: what such a ball may move along the seam takes it over fine ones.
     """
     d, depths = domain.dim, {}
+    # In units of the longest edge, as squares in single precision are to be numbers.
+    unit_length = float(domain.extent.max())
+    extent = domain.extent / unit_length
     share = min(jumps / FULL_JUMPS, 1.0)
     reach, aside = IMAGE_REACH[d] * (1 + LARGER * share), SIDEWAYS_REACH * share
     places = (np.arange(count) + 0.5) / count
@@ -121,7 +124,7 @@ def _margins_expected(
             away = np.abs(places[:, None] - places)
             if domain.periodic[a]:
                 away = np.minimum(away, 1 - away)
-            away2.append(((away * domain.extent[a]) ** 2).astype(np.float32))
+            away2.append(((away * extent[a]) ** 2).astype(np.float32))
         apart2 = away2[0] if d == 2 else away2[0][:, None, :, None] + away2[1][:, None, :]
         apart2 = apart2.reshape(len(unit), len(unit))
         apart = np.sqrt(apart2)
@@ -129,13 +132,14 @@ def _margins_expected(
             at, deep, limit = np.insert(unit, axis, (end + 1) / 2, axis=1), 0.0, 0.0
             for back in (0.0, *BACK) if share else (0.0,):
                 at[:, axis] = back if end < 0 else 1 - back
-                h = np.asarray(size(at * domain.extent + domain.lower)).astype(np.float32)
+                h = np.asarray(size(at * domain.extent + domain.lower)) / unit_length
+                h = np.minimum(h, 1e9).astype(np.float32)
                 if back == 0:
                     limit = (reach * h + apart).min(axis=1)
-                t = back * domain.extent[axis]
+                t = back * extent[axis]
                 radius = np.minimum(limit + t + aside * h, reach * h)
                 deep = np.maximum(deep, np.sqrt((radius**2 - apart2).max(axis=1).clip(0)) - t)
-            deep = np.minimum(deep, domain.extent[axis])
+            deep = unit_length * np.minimum(deep, extent[axis])
             depths[int(axis), end] = deep.reshape((count,) * (d - 1))
     return depths
 

@@ -304,6 +304,17 @@ def test_strips_hold_what_is_told(bench, name, real):
     assert (0.4 if name == "corner of seams" else LEAST_HELD) <= held / told <= 1.1
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_is_told_does_not_depend_on_the_unit_of_length():
+    """Squares of lengths leave the range of single precision long before domains are too large."""
+    found = []
+    for scale in (1.0, 2.0**80, 2.0**-80):
+        box = clvoro.Box((0, 0), (scale, 0.5 * scale), periodic=True)
+        tree = density_tree(sizing.Constant(scale), box)
+        found.append(images_expected(box, sizing.Constant(scale), 20000, tree))
+    assert found == [found[0]] * 3
+
+
 def test_what_is_told_does_not_depend_on_where_seams_are():
     """Images by balls alone where cells are alike; of a strip all cells wherever it meets a seam."""
     for box in (TORUS, clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)):
