@@ -100,12 +100,12 @@ class Boundary:
         self._kernels = engine.kernels("chords")
         origin, scale = domain.frame
         self.edges = len(domain.vertices)
-        self._exact = (domain.vertices - origin) / scale
-        inner = self._exact + inward(domain, engine.real)
+        vertices = (domain.vertices - origin) / scale
+        inner = vertices + inward(domain, engine.real)
         # Rings that touch in a vertex have it in the same cell.
         same = np.unique(domain.vertices, axis=0, return_index=True, return_inverse=True)
-        self._exact_inner = inner[same[1]][same[2].ravel()]
-        self.put()
+        self._places = vertices, inner[same[1]][same[2].ravel()]
+        self.vertices, self.inner = (engine.upload(places) for places in self._places)
         self.next_vertex = engine.upload(domain.next_vertex, np.int32)
         self.shells = engine.upload(shells(domain), np.int32)
         along = domain.vertices[domain.next_vertex] - domain.vertices
@@ -118,15 +118,10 @@ class Boundary:
         self._known = 0  # cells that owners are among
         self._flags = engine.empty(1, np.int32)
 
-    def put(self, shift: tuple[float, float] = (0, 0)) -> None:
-        """Let the boundary lie off where it is by `shift`, in the device's coordinates."""
-        self._shift = np.array(shift, float)
-        # In arrays of their own: chords from before go on with theirs.
-        self.vertices = self.engine.upload(self._exact + self._shift)
-        self.inner = self.engine.upload(self._exact_inner + self._shift)
-
-    def cut(self, t: Tessellation, generators: int) -> Chords | np.ndarray:
-        """Walk along all edges through the cells of `t`.
+    def cut(
+        self, t: Tessellation, generators: int, shift: tuple[float, float] = (0, 0)
+    ) -> Chords | np.ndarray:
+        """Walk along all edges, put aside by `shift` in the device's coordinates, through the cells of `t`.
 
         Only the first `generators` of its generators lie in the domain. If the boundary passes through cells of others,
         those are returned, (i,) int, counted from `generators` on.
@@ -137,16 +132,19 @@ class Boundary:
             If rounding lets a walk find no way.
         """
         engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
+        vertices, inner = self.vertices, self.inner
+        if any(shift):
+            vertices, inner = (engine.upload(places + shift) for places in self._places)
         graph = (t.starts, t.neighbours, t.points)
         if t.n < self._known:
             self.owners.fill(0)
         self._known = t.n
-        engine.run_each(k.find_owners, edges, self.inner, *graph, self.owners)
+        engine.run_each(k.find_owners, edges, inner, *graph, self.owners)
         firsts = room("firsts", size=edges + 1, dtype=np.int32)
         intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
         self._flags.fill(0)
-        none = np.int32(0), firsts, firsts, firsts, self.vertices
-        walk = (np.int32(generators), self.vertices, self.next_vertex, self.owners, *graph)
+        none = np.int32(0), firsts, firsts, firsts, vertices
+        walk = (np.int32(generators), vertices, self.next_vertex, self.owners, *graph)
         engine.run_each(k.walk_edges, edges, *walk, *none, intruders, self._flags)
         self._scan.exclusive(firsts, firsts, edges)
         count = int(firsts[edges].get())
@@ -170,11 +168,13 @@ class Boundary:
             self._flags,
         )
         arrays = (
-            self.vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells
+            vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells
         )  # fmt: skip
-        return self._sort(count, arrays, cells, t.n)
+        return self._sort(count, arrays, cells, t.n, np.array(shift, float))
 
-    def _sort(self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int) -> Chords:
+    def _sort(
+        self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int, shift: np.ndarray
+    ) -> Chords:
         """List the cells, and the chords of each."""
         engine, k, room = self.engine, self._kernels, self._room
         slots = room("slots", size=n, dtype=np.int32).fill(UNTOUCHED)
@@ -194,5 +194,5 @@ class Boundary:
         engine.run_each(k.sort_chords, touched_count, starts, listed)
         return Chords(
             count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns,
-            self._shift,
+            shift,
         )  # fmt: skip

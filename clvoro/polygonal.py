@@ -103,18 +103,14 @@ class PolygonTessellator:
         eps = float(np.finfo(self.engine.real).eps)
         lost = BoundaryError()
         for attempt, far in enumerate((0, *SHIFTS)):
-            if attempt:
-                angle, length = 2 * attempt, far * eps
-                self._boundary.put((length * math.cos(angle), length * math.sin(angle)))
+            angle, length = 2 * attempt, far * eps
+            shift = (length * math.cos(angle), length * math.sin(angle))
             try:
                 # The vertices of the boundary are found from the cells that held them before, or from the least.
-                chords = self._boundary.cut(convex, n)
+                chords = self._boundary.cut(convex, n, shift)
                 if not isinstance(chords, Chords):
                     return chords
                 return self.stages.trim.trim(self.domain, points, convex, chords, n)
             except BoundaryError as error:
                 lost = error
-            finally:
-                if attempt:
-                    self._boundary.put()
         raise lost
