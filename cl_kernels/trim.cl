@@ -11,6 +11,21 @@
 
 #define FLAG_ORPHANS 4 /* a cell is in several pieces */
 
+/* By which a corner may lie outside of the domain, as `check` allows. */
+#define MOST_OUTSIDE (256 * REAL_EPS)
+
+/* Does a segment on a face, from a corner of the cell to a chord's end or from there to a corner, leave the domain by
+   that chord's edge? Edges miss the tips of needles that are narrower than rounding. */
+inline bool leads_out(const segment_t *s, const chords_t *c)
+{
+    if ((s->from < 0) == (s->to < 0))
+        return false;
+    const int edge = c->edges[max(s->from, s->to)];
+    const REAL2 e = c->vertices[c->next_vertex[edge]] - c->vertices[edge];
+    const REAL2 inwards = s->from < 0 ? s->p - s->q : s->q - s->p;
+    return difference_of_products(e.s0, inwards.s1, e.s1, inwards.s0) < -MOST_OUTSIDE * sqrt(dot(e, e));
+}
+
 /* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
 
    loop_chords   a chord with which each loop begins; -1: around the whole cell
@@ -25,7 +40,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     const convex_t cell = convex_cell(u, CONVEX);
     const int first = list_starts[u] + u;
     int loops = 0, outer = 0, main = -1, total = 0;
-    bool crossed = false, rim = false, main_winds = false;
+    bool crossed = false, rim = false, main_winds = false, astray = false;
     REAL nearest = REAL_MAX;
     for (int k = 0; k < cell.chord_count; ++k)
         chord_loops[cell.chords[k]] = -1;
@@ -48,6 +63,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
             around += winding(s, 0);
             near = fmin(near, squared_distance_to(s, 0));
             open |= !on_chord;
+            astray |= !on_chord && leads_out(&s, &c);
             lost |= !on_chord && s.label < 0; /* at a wall of the box, which is far outside */
         } while (!is_complete(&cursor, begin) && ++count < most);
         if (lost || count == most) {
@@ -79,6 +95,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         outer += is_outer;
         ++loops;
     }
+    if (astray)
+        atomic_or(flags, FLAG_LOST);
     if (!crossed && rim) {
         const int place = first + loops++;
         loop_chords[place] = -1;

@@ -19,6 +19,7 @@ from .domain import ClipBox
 from .errors import ClvoroError, MemoryLimitError
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 from .tessellation import (
+    COINCIDE,
     DOUBT,
     EXACT_SHARE,
     FULL,
@@ -55,8 +56,8 @@ class Cells:
         self.engine = engine
         self._scan = Scan(engine)
         self._capacity = self._room = self._n = self._enlarged_for = 0
-        self._flags = engine.empty(5, np.int32)
-        self._no_flags: dict[tuple[int, int], cla.Array] = {}
+        self._flags = engine.empty(6, np.int32)
+        self._no_flags: dict[tuple[int, int, bool], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
 
     def _build(self, cell_capacity: int, row_capacity: int) -> None:
@@ -159,21 +160,25 @@ class Cells:
             # One mesh had a cell of very many faces; a larger one need not pay for that.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
         self._reserve(n)
-        spare = spare_slots(n)
+        spare, whole = spare_slots(n), False
         while True:
             with engine.workspace.frame():
-                rows = self.take_rows(n, spare=spare)
+                rows = self.take_rows(n, spare=spare, whole=whole)
                 flags, m = self._clip(rows, box, points, total, n, binned, exact)
-                if not flags & CROWDED:
-                    if flags & ~DOUBT:
-                        raise CloseError(points, total)
+                if flags & CROWDED:
+                    # All anew: as many as have been asked for by now, and more by those that were not yet.
+                    spare = 2 * (int(rows.flags.get()[3]) - n)
+                    continue
+                t = None
+                if not flags & ~DOUBT:
                     old = rows.places, rows.places
                     t = self._measure(rows, box, points, n, *old, m, flags, exact)
-                    if t is None:
-                        raise CloseError(points, total)
+                if t is not None:
                     return t
-                # All anew: as many as have been asked for by now, and more by those that were not yet.
-                spare = 2 * (int(rows.flags.get()[3]) - n)
+                if whole or flags & COINCIDE:
+                    raise CloseError(points, total)
+                # Faces that were left out one by one may have been too many together.
+                whole = True
 
     def _clip(
         self,
@@ -246,7 +251,7 @@ class Cells:
 
         With `DOUBT` where any cell is doubtful, and `CROWDED` where there were too few spare slots.
         """
-        wrong, doubtful, m, spare, slots = (int(v) for v in self._flags.get())
+        wrong, doubtful, m, spare, slots, _ = (int(v) for v in self._flags.get())
         wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
         return wrong, m
 
@@ -353,10 +358,13 @@ class Cells:
     def _share(self, exact: bool) -> np.floating:
         return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
 
-    def take_rows(self, n: int, slots: int | None = None, spare: int = 0) -> FaceRows:
+    def take_rows(
+        self, n: int, slots: int | None = None, spare: int = 0, whole: bool = False
+    ) -> FaceRows:
         """Return `n` rows of faces, of which as many as `slots` (by default all) may be new; no flags.
 
-        `spare` are the slots, behind these, for rows that are longer than one.
+        `spare` are the slots, behind these, for rows that are longer than one. If they are to be `whole`, faces that
+        are no longer than rounding stay.
         """
         engine, slots = self.engine, n if slots is None else slots
         first, slots = slots, slots + spare
@@ -365,22 +373,22 @@ class Cells:
                 f"the faces of {n} cells need {slots * SLOT:.3g} entries, expected fewer than 2^31, which "
                 "32-bit indices can tell apart; use fewer cells, or perturb generators that lie on a common circle"
             )
-        self._reset_flags(first, slots)
+        self._reset_flags(first, slots, whole)
         return FaceRows(
             engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32),
             engine.scratch(slots, np.uint32), engine.scratch(n, np.int32), engine.scratch(n + 1, np.int32),
             self._flags,
         )  # fmt: skip
 
-    def _reset_flags(self, first: int, slots: int, **part: Any) -> None:
+    def _reset_flags(self, first: int, slots: int, whole: bool = False, **part: Any) -> None:
         """Take the flags back, or a part of them, where `slots` from the `first` on are to spare."""
-        if (first, slots) not in self._no_flags:
+        if (first, slots, whole) not in self._no_flags:
             if len(self._no_flags) >= 4:
                 self._no_flags.clear()
             # To be copied on the device: the host would have to wait for a transfer.
-            start = self.engine.upload([0, 0, 0, first, slots], np.int32)
-            self._no_flags[first, slots] = start
-        start = self._no_flags[first, slots]
+            start = self.engine.upload([0, 0, 0, first, slots, whole], np.int32)
+            self._no_flags[first, slots, whole] = start
+        start = self._no_flags[first, slots, whole]
         cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
 
     def _enlarge(self, n: int) -> None:

@@ -29,9 +29,9 @@ class FaceRows:
         First slot of each row, or -1 if it is as before.
     starts : (n + 1,) int32
         Where rows begin in the graph to be.
-    flags : (5,) int32
-        What went wrong, whether any cell is doubtful, the faces of all rows, the next spare slot and the number of
-        slots.
+    flags : (6,) int32
+        What went wrong, whether any cell is doubtful, the faces of all rows, the next spare slot, the number of slots,
+        and whether faces of no length stay.
     """
 
     slots: cla.Array

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
-# Bits of common/face_rows.h; its others mean generators that coincide, and cells that collapsed.
-FULL, DOUBT, NARROW, LOOPED = 1, 8, 16, 32
+# Bits of common/face_rows.h; its other means cells that collapsed.
+FULL, COINCIDE, DOUBT, NARROW, LOOPED = 1, 2, 8, 16, 32
 
 
 class CloseError(InputError):

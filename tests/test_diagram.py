@@ -331,7 +331,7 @@ def test_what_has_two_faces_is_no_cell(ctx, doubtful):
         # A doubt has all rows compared, and none is found wanting.
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
-        rows.flags.set(np.array([0, doubtful, 0, n, n], np.int32))
+        rows.flags.set(np.array([0, doubtful, 0, n, n, 0], np.int32))
         old = rows.places, rows.places
         flags, m = cells._match(rows, BOX, points, n, *old, exact=True)
         assert m == 9 - two

@@ -33,7 +33,7 @@ def test_diagram_that_is_made_anew_at_the_end(ctx, dtype):
     others = 0
     for seed in range(4):
         rows = []
-        points = middles + 10 * eps * np.random.default_rng(seed).standard_normal((144, 2))
+        points = middles + 3 * eps * np.random.default_rng(seed).standard_normal((144, 2))
         result = adapter.run(
             clvoro.Box((0, 0), (1, 1), periodic=True), 1 / 12, points, method="lloyd", max_steps=3,
             tol=0, callback=lambda row, rows=rows: rows.append(row),

@@ -94,8 +94,8 @@ def test_rows_are_those_of_clipping(engine, name):
     for wrap in (True, False):
         cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
         taken, take = [], cells.take_rows
-        cells.take_rows = lambda n, spare, taken=taken, take=take: (
-            taken.append(take(n, spare=spare)) or taken[-1]
+        cells.take_rows = lambda n, taken=taken, take=take, **options: (
+            taken.append(take(n, **options)) or taken[-1]
         )
         if not wrap:
             cells._wrap = None

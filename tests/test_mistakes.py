@@ -397,12 +397,11 @@ def test_no_method(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
-@pytest.mark.parametrize("dim", [2, 3])
-def test_generators_that_are_too_close_are_named_by_their_place(ctx, dim, periodic, real):
-    """In the domain's units; two roundings apart they have the same bisector with those far away. In the plane some
-    such are told apart, but not these, a lattice of 25."""
-    box = clvoro.Box((0,) * dim, (4,) * dim, periodic=periodic)
-    points = np.random.default_rng(4).random((300, dim)) * 4
+def test_generators_that_are_too_close_are_named_by_their_place(ctx, periodic, real):
+    """In the domain's units; two roundings apart they have the same bisector with those far away. In the plane they are
+    told apart all the same."""
+    box = clvoro.Box((0,) * 3, (4,) * 3, periodic=periodic)
+    points = np.random.default_rng(4).random((300, 3)) * 4
     step = 2 * float(np.spacing(np.asarray(2.75, real)))
     points[100:125] = 2.75
     points[100:125, :2] += step * np.stack(np.meshgrid(range(5), range(5)), axis=-1).reshape(-1, 2)
@@ -413,7 +412,7 @@ def test_generators_that_are_too_close_are_named_by_their_place(ctx, dim, period
     assert place, said
     # Printed with eight digits after the point.
     assert np.array(place[1].split(), float) == pytest.approx(
-        np.full(dim, 2.75), abs=4 * step + 1e-8
+        np.full(3, 2.75), abs=4 * step + 1e-8
     )
     assert place[2] == f"{step:.3g}"
     assert ("or use dtype='float64'" in said) == (real == "float32")

@@ -412,7 +412,9 @@ def test_face_that_one_side_does_not_see_ends_in_one_vertex(adapter, box, monkey
             noise = np.random.default_rng(seed).standard_normal((n * n, 2))
             x = np.array(box.lower) + (middles + 10 * eps * noise) * box.extent
             adapter.diagram(box, x).check().demand()
-    assert 0 < sum(dropped) < len(dropped)
+    assert sum(dropped) < len(dropped)
+    # Single ones of the channel's, if any.
+    assert box is CHANNEL or sum(dropped)
 
 
 def test_coarse_levels_with_too_few_cells_are_left_out(double):

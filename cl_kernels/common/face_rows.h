@@ -1,7 +1,7 @@
 /* Rows of faces while a diagram is made: those that stay as they were lie in the previous graph, the others in slots of
    SLOT. A row that is longer takes several which follow each other, from spare ones: few cells are, and all would need
    as much room. */
-#include "common/polygon.h"
+#include "common/short_faces.h"
 
 #ifndef ROW_CAPACITY
 #error "build with -DROW_CAPACITY=faces that a cell may have in the end"
@@ -11,7 +11,7 @@
 #endif
 
 /* Bits of flags[0], in which kernels report what went wrong; flags[1] is not 0 where there are doubtful cells. The next
-   spare slot is flags[3], and flags[4] how many slots there are. */
+   spare slot is flags[3], flags[4] how many slots there are; flags[5]: faces that are nothing but rounding stay. */
 #define FLAG_FULL 1     /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than spare slots are left for */
 #define FLAG_COINCIDE 2 /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
@@ -63,8 +63,8 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
     int to = place;
     if (flag == 0) {
         doubtful = is_doubtful(cell, x, points);
-        if (doubtful)
-            drop_short_faces(cell, x, points);
+        if (doubtful && !flags[5])
+            drop_short_faces(cell, points);
         if (cell->n > ROW_CAPACITY)
             flag = FLAG_FULL;
     }
