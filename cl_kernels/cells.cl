@@ -204,35 +204,11 @@ kernel void measure_faces(const int size, global const int *starts, global const
     }
 }
 
-/* What a corner may be off by that rounding has put elsewhere, and by how much nearer another generator may be then, as
-   `check` allows: of bisectors that are nearly parallel by more. */
-#define MOST_GAP (16 * REAL_EPS)
-#define MOST_NEARER (256 * REAL_EPS)
-
-/* The cell of x has a corner at v, between others at `before` and `after`, which its neighbour has off by `gap`. Is
-   less than `least` of area between the two, and rounding alone what it is off by? */
-inline bool is_sliver(REAL2 gap, REAL2 before, REAL2 after, REAL least)
-{
-    const REAL2 chord = after - before;
-    return dot(gap, gap) <= MOST_GAP * MOST_GAP &&
-           fabs(difference_of_products(gap.s0, chord.s1, gap.s1, chord.s0)) <= 2 * least;
-}
-
-/* Is a corner of the cell of x, at v, one of its neighbour j with p as well: is p no nearer, but for rounding? */
-inline bool is_common(REAL2 v, int j, int p, const REAL *x, global const REAL *points)
-{
-    if (p < 0)
-        return true;
-    const REAL2 to_j = direction_of(x, j, points), to_p = direction_of(x, p, points);
-    const REAL far = sqrt(dot(v, v)), near = sqrt(fmin(dot(to_j, to_j), dot(to_p, to_p)));
-    return dot(v - to_p / 2, to_p) <= MOST_NEARER * far * (1 + far / near);
-}
-
 /* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has
-   them, if one of the two is doubtful? Where rounding has let two cells see different neighbours, what they disagree
-   about must be as little as rounding makes of the box, and no more than a share of the cell (of less than a tenth:
-   corners must be right, too); else generators are too close to tell apart, which is flagged, as are faces that cross
-   others: those are short beside their corners' distance from the generators, which is what rounds. */
+   them, if one of the two is doubtful? Where two cells see different neighbours, having left out different faces, what
+   they disagree about must be as little as rounding makes of the box, and no more than a share of the cell; else too
+   many were left out, which is flagged, as are faces that cross others: those are short beside their corners' distance
+   from the generators, which is what rounds. */
 kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
                            global const int *starts, global const int *neighbours, global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
@@ -247,7 +223,6 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     global const int *row = neighbours + starts[i];
     const int n = starts[i + 1] - starts[i];
     const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
-    const bool exact = share < R(0.1);
     bool right = volumes[i] > 0;
     const bool doubtful = slot_counts[places[i]] < 0;
     bool any = doubtful;
@@ -280,24 +255,16 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             continue;
         }
         const int p = other[q == 0 ? m - 1 : q - 1], s = other[q == m - 1 ? 0 : q + 1];
-        const int last = row[k < 2 ? n + k - 2 : k - 2], next = row[k < n - 2 ? k + 2 : k + 2 - n];
-        /* The area is no more than the gap times the distance of the farther corner; of long and thin cells it is
-           less. */
+        /* The area is no more than the gap times the distance of the farther corner. */
         const REAL reach2 = fmax(dot(u, u), dot(v, v));
         if (p != after) {
             const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
-            if (!(dot(gap, gap) * reach2 <= least * least) &&
-                !is_sliver(gap, u, corner(i, x, after, next, points, lower, upper), least))
-                right = false;
-            if (exact && !is_common(v, j, p, x, points))
+            if (!(dot(gap, gap) * reach2 <= least * least))
                 right = false;
         }
         if (s != before) {
             const REAL2 gap = corner_gap(u, i, j, i, s, points, lower, upper);
-            if (!(dot(gap, gap) * reach2 <= least * least) &&
-                !is_sliver(gap, corner(i, x, last, before, points, lower, upper), v, least))
-                right = false;
-            if (exact && !is_common(u, j, s, x, points))
+            if (!(dot(gap, gap) * reach2 <= least * least))
                 right = false;
         }
     }

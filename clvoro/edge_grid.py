@@ -17,7 +17,7 @@ def bin_edges(
     Returns
     -------
     frame : (4,) float
-        Origin (2), one over the edge of a bin, 0.
+        Origin (2), one over the edge of a bin, 0 for the caller to fill in.
     shape : (4,) int32
         Bins along x and y, 0, 0.
     starts : (bins + 1,) int32

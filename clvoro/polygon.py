@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ._workspace import Workspace
 
 _MARGIN = 1 / 64  # of the clip box around the domain, of the bounding box's longest edge
+_BEHIND = 16
+"""Roundings on the device by which generators that were put on an edge may be beyond it."""
 
 
 class Polygon(Region):
@@ -298,6 +300,8 @@ class Polygon(Region):
             begins = (self.vertices - origin) / scale
             ends = begins[self.next_vertex]
             frame, shape, starts, listed = bin_edges(begins, ends)
+            # Where what is put on an edge may be: by the rounding of device and domain.
+            frame[3] = _BEHIND * float(np.finfo(engine.real).eps) + self._rounding / scale
             there[engine.real] = (
                 frame.astype(engine.real), shape, engine.upload(starts, np.int32),
                 engine.upload(np.concatenate([begins, ends], axis=1)[listed].ravel()),

@@ -168,3 +168,17 @@ def test_runs_stay_inside(ctx, method, real):
     assert result.diagram.volumes.sum() == pytest.approx(
         domain.measure, rel=64 * float(np.finfo(real).eps)
     )
+
+
+def test_refinement_from_generators_on_a_slanted_edge_far_from_0(ctx):
+    """There they lie off it by more than the device's rounding, on either side; middles of edges between them are
+    outside."""
+    vee = np.array([(0, 0), (1, 0.37), (2, 0), (2, 1), (1, 1.37), (0, 1)]) - (6168.3, 244326.7)
+    domain, adapter = clvoro.Polygon(vee), clvoro.Adapter(ctx)
+    for seed in range(10):
+        t = np.random.default_rng(seed).random((3, 1))
+        points = np.concatenate(
+            [vee[0] + t * (vee[1] - vee[0]), vee[1] + (1 - t) * (vee[2] - vee[1])]
+        )
+        result = adapter.run(domain, 0.25, points=points, levels=1, max_steps=0, method="exact")
+        result.check().demand()

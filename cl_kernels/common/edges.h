@@ -1,6 +1,6 @@
 /* The edges of a polygonal domain in uniform bins, for all that moves: which edge does a generator's way cross first?
 
-   edge_frame   origin (2), 1 / edge of a bin
+   edge_frame   origin (2), 1 / edge of a bin, how far beyond an edge a generator may be that was put on it
    edge_shape   bins along x, y
    edge_starts  (bins + 1) first of the edges that pass through each bin, row by row
    edge_ends    both ends of each edge, the domain on the left */
@@ -14,7 +14,7 @@
 /* Generators come no nearer to the boundary than this, so that no rounding carries them out. Those that the caller has
    put on it, or on it but for rounding, may leave it inwards. */
 #define OFF_EDGE (2 * REAL_EPS)
-#define BEHIND (16 * REAL_EPS)
+#define BEHIND edge_frame.s3
 
 /* Where the way from x to y, t = 0 to 1, leaves the domain first, and over which edge (a place in edge_ends); 2 if it
    does not. Corners are seen by both their edges with the same numbers, so that no way slips through between them. */
