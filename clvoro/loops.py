@@ -24,7 +24,8 @@ MOST_DOUBLINGS, SURE_DOUBLINGS = 6, 3
 """How often the tolerance may double within which a face's views are brought together, and up to when vertices surely
 are where they should be: in degenerate sets it doubles three times as a rule. Beyond that they are looked at."""
 ROUNDINGS = 256
-"""By how many roundings of positions the distances from a vertex to its generators may differ: as in `check`."""
+"""By how many roundings of positions a vertex may be farther from one of its generators than from another: as in
+`check`."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +92,17 @@ class FaceLoops:
         return result
 
     def _are_right(self, t: Tessellation, loops: Loops) -> bool:
-        """Tell whether every vertex is as far from both generators of each of its faces, but for rounding."""
-        starts, m = t.starts.get()[: t.n + 1], len(loops.starts) - 1
-        face = np.repeat(np.arange(m), np.diff(loops.starts.get()))
-        i = np.repeat(np.arange(t.n), np.diff(starts))[face]
-        j = t.neighbours.get()[:m][face]
-        x, inner = t.points.get().astype(float), j >= 0
-        at = loops.positions.get().astype(float)[loops.vertices.get()[inner]]
-        apart = np.linalg.norm(at - x[i[inner]], axis=1) - np.linalg.norm(at - x[j[inner]], axis=1)
-        return bool(np.abs(apart).max(initial=0) <= ROUNDINGS * np.finfo(self.engine.real).eps)
+        """Tell whether every vertex is as far from all generators whose cells meet there, but for rounding."""
+        starts = t.starts.get()[: t.n + 1]
+        cell = np.repeat(np.arange(t.n), np.diff(starts))
+        own = np.repeat(cell, np.diff(loops.starts.get()))
+        vertex = loops.vertices.get()
+        at = loops.positions.get().astype(float)[vertex]
+        far = np.linalg.norm(at - t.points.get().astype(float)[own], axis=1)
+        nearest = np.full(len(loops.positions), np.inf)
+        np.minimum.at(nearest, vertex, far)
+        excess = far - nearest[vertex]
+        return bool(excess.max(initial=0) <= ROUNDINGS * np.finfo(self.engine.real).eps)
 
     def _agree(
         self, k: SimpleNamespace, corners: Corners, t: Tessellation, views: Views, twins: cla.Array

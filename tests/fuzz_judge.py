@@ -71,6 +71,7 @@ def refuse_large(needed: float) -> None:
 
 def demand_truth(error: InputError, domain: Any, real: str, points: Any) -> None:
     """Raise if `error` says of generators or edges that they are too close to each other, and they are not."""
+    demand_telling_apart(error, domain)
     if not any(said in str(error) for said in ("too close to each other", "coincide in")):
         return
     if isinstance(domain, clvoro.Polygon) and clearance(domain, real) <= NARROW:
@@ -81,6 +82,23 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any) -> None
         if apart.min() <= CLOSE[real]:
             return
     raise Wrong(f"this is not so: {error}") from error
+
+
+def demand_telling_apart(error: InputError, domain: Any) -> None:
+    """Raise if `error` says of generators in the plane that they are too close to each other: their places differ."""
+    if domain.dim == 2 and "apart, are too close" in str(error):
+        raise Wrong(f"this is not so in the plane: {error}") from error
+
+
+def diagram_by(made_by: clvoro.Adapter, box: clvoro.Box, points: Any) -> clvoro.Diagram:
+    """Return the diagram of a box, if it is right."""
+    try:
+        diagram = made_by.diagram(box, points)
+    except InputError as error:
+        demand_telling_apart(error, box)
+        raise
+    demand(diagram, made_by.dtype.name)
+    return diagram
 
 
 def clearance(domain: clvoro.Polygon, real: str) -> float:

@@ -16,7 +16,7 @@ from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
 from clvoro.layers import count_rows, free_domain, place_layers
 from tests.fuzz_inputs import around, placed, some_box, some_layers, some_periodic_box, some_polygon
-from tests.fuzz_judge import Wrong, adapter, demand, run_by, some_real
+from tests.fuzz_judge import Wrong, adapter, demand, diagram_by, run_by, some_real
 from tests.fuzz_options import some_options
 from tests.fuzz_sizes import fine_size, some_size
 
@@ -48,8 +48,7 @@ def with_seams(rng: np.random.Generator, wild: bool) -> clvoro.Box:
 def try_diagram(boxes: Boxes, rng: np.random.Generator) -> str:
     wild, real = rng.random() < 2 * WILD, some_real(rng)
     box = boxes(rng, wild)
-    diagram = adapter(real).diagram(box, placed(rng, box, real, wild))
-    demand(diagram, real)
+    diagram = diagram_by(adapter(real), box, placed(rng, box, real, wild))
     if rng.random() < 0.1 and len(adapter(real).diagram(box, diagram.points)) != len(diagram):
         raise Wrong("another number of cells")
     return "mesh"
@@ -59,7 +58,7 @@ def try_around(rng: np.random.Generator) -> str:
     """Very many cells at a point, or along a line."""
     dim, real = int(rng.choice([2, 2, 3])), some_real(rng)
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=tuple((rng.random(dim) < 0.1).tolist()))
-    demand(adapter(real).diagram(box, around(rng, dim)), real)
+    diagram_by(adapter(real), box, around(rng, dim))
     return "mesh"
 
 

@@ -45,6 +45,9 @@ def test_refusals_have_to_be_true():
     with pytest.raises(Wrong):
         demand_truth(error, clvoro.Polygon(shores.UNIT), "float64", near)
     demand_truth(InputError("n is 3, expected at least 4"), domain, "float32", None)
+    generators = InputError("generators at [0 0], 1e-300 apart, are too close to each other")
+    with pytest.raises(Wrong, match="not so in the plane"):
+        demand_truth(generators, domain, "float32", near)
 
 
 @pytest.mark.parametrize(
@@ -66,14 +69,26 @@ def test_refusals_have_to_be_true():
         ("hard-polygon", 483738857),
         ("hard-polygon", 530437850),
         ("hard-polygon", 530440997),
+        ("hard-polygon", 95364880),
+        ("polygon-run", 220638134),
     ],
 )
 def test_polygons_that_failed_once(kind, seed):
     """Generators as near as a slit is wide; a face across its tip; edges along faces where three cells meet; spits;
     new generators of few cells at the same corner; one in the tip of a spit that leaves it; sentinels that see too
     little; crowds around a corner; generators at the corners of a hole of some roundings; parts of two regions that
-    change places; generators on both sides of a slit of some roundings, or near each other and far from all others."""
+    change places; generators on both sides of a slit of some roundings, or near each other and far from all others, or
+    on a slanted edge far from 0."""
     assert fuzz.attempt(kind, seed)[0] == "mesh"
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("around", 822841374), ("around", 220865677), ("hard-polygon", 95364499)]
+)
+def test_vertices_that_were_elsewhere_once(kind, seed):
+    """Near a corner of the box; where very many cells meet in space; at the tip of a needle that sticks out of the
+    domain. A mesh that is right or an error: else this raises."""
+    fuzz.attempt(kind, seed)
 
 
 @pytest.mark.parametrize("seed", [5, 300])

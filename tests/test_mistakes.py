@@ -411,9 +411,7 @@ def test_generators_that_are_too_close_are_named_by_their_place(ctx, periodic, r
     place = re.search(r"generators at \[(.*)\], (\S+) apart, are too close", said)
     assert place, said
     # Printed with eight digits after the point.
-    assert np.array(place[1].split(), float) == pytest.approx(
-        np.full(3, 2.75), abs=4 * step + 1e-8
-    )
+    assert np.array(place[1].split(), float) == pytest.approx(np.full(3, 2.75), abs=4 * step + 1e-8)
     assert place[2] == f"{step:.3g}"
     assert ("or use dtype='float64'" in said) == (real == "float32")
 
