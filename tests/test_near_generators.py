@@ -180,3 +180,20 @@ def test_the_side_of_a_corner(ctx, kind, real):
         assert abs(Fraction(side) - truth) <= Fraction(0.01) * abs(truth)
     assert zeros < n
     assert zeros > 0 or kind != "lattice"
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_a_cell_of_a_thousand_faces(ctx, real):
+    """The middle of a circle; without it a thousand cells meet there, but for rounding."""
+    t = np.arange(1000) * 2 * np.pi / 1000
+    circle = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t)])
+    adapter = clvoro.Adapter(ctx, real)
+    adapter.diagram(UNIT, circle).check().demand()
+    points = np.vstack([circle, [[0.5, 0.5]]])
+    if not ctx.devices[0].type & cl.device_type.CPU:
+        with pytest.raises(clvoro.ClvoroError, match="more than 640 faces"):
+            adapter.diagram(UNIT, points)
+        return
+    diagram = adapter.diagram(UNIT, points)
+    diagram.check().demand()
+    assert np.diff(diagram.neighbour_starts).max() == 1000
