@@ -1,4 +1,5 @@
 #include "common/boundary.h"
+#include "common/half_planes.h"
 #include "common/sort.h"
 
 /* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex
@@ -92,12 +93,19 @@ typedef struct {
     REAL at, rank, doubt;
 } exit_t;
 
-/* Does an edge leave by `a` before `b`? Where rounding may have it either way, the nearer of the two generators behind
-   is the first. They may be so close to each other that the cell's faces with them lie alike but for rounding, while
-   the edge is clearly on one side of the face between them, which is at right angles to those. */
-inline bool leaves_before(exit_t a, exit_t b, REAL2 start, REAL2 e, global const REAL *points)
+/* Does an edge leave the cell of x by `a` before `b`? Where rounding may have it either way, double words tell; if
+   these cannot, the nearer of the two generators behind is the first. */
+inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2 e, global const REAL *points)
 {
     if (fabs(a.at - b.at) <= a.doubt + b.doubt) {
+        if (a.rank == 0 && b.rank == 0) {
+            const REAL from[2] = {x.s0, x.s1};
+            const REAL later = leaves_later(half_plane_of(from, a.behind, points, from, from),
+                                            half_plane_of(from, b.behind, points, from, from),
+                                            wide_sum(start.s0, -x.s0), wide_sum(start.s1, -x.s1), e);
+            if (later != 0)
+                return later < 0;
+        }
         const REAL2 y = start + (a.doubt < b.doubt ? a.at : b.at) * e;
         const REAL nearer = beyond_bisector(y, b.behind, a.behind, points);
         const int i = 2 * a.behind, j = 2 * b.behind;
@@ -160,7 +168,7 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
             }
         }
         const bool past = !(way.at < 1 || (way.at == 1 && way.rank < 0));
-        if (!past && (first.behind < 0 || leaves_before(way, first, a, e, points)))
+        if (!past && (first.behind < 0 || leaves_before(way, first, x, a, e, points)))
             first = way;
     }
     *t = first.behind < 0 ? 1 : fmax(*t, first.at);

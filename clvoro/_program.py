@@ -259,8 +259,13 @@ class Engine:
         generators: it halves what is most of a diagram in the plane. Trimmed cells and polyhedra are measured where
         they are cut, and only there, so that theirs is full.
         """
-        whole = self.dim == 3 or any(name == "POLYGON" for name, _ in self.domain_defines)
+        whole = self.dim == 3 or self.trims
         return self.real if whole else np.dtype(np.float32)
+
+    @property
+    def trims(self) -> bool:
+        """Whether cells are trimmed by the edges of a polygon."""
+        return any(name == "POLYGON" for name, _ in self.domain_defines)
 
     @staticmethod
     def name_of(real: np.dtype) -> str:

@@ -34,8 +34,9 @@ CELL_CAPACITY = 24
 """Faces that a cell may have while it is clipped."""
 ROW_CAPACITY = SLOT
 """Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
-LARGEST_ROW, LARGEST_ON_GPUS = 4096, 512
-"""Faces that a cell may have, or a few more. On GPUs each of very many work-items has room of its own for so many."""
+LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
+"""Faces that a cell may have, or a few more: on CPUs in boxes. On GPUs each of very many work-items has room of its own
+for so many; to trim such a cell by as many edges takes minutes."""
 LANES, EIGHTS = 8, 16
 """Cells that a CPU's work-item makes at a time, in lanes of vectors, and how many times `hulls.cl` does so."""
 FIRST_REACH = 1.9
@@ -154,7 +155,7 @@ class Cells:
         MemoryLimitError
             If the rows of faces are too many for 32-bit indices.
         ClvoroError
-            If a cell has more than `LARGEST_ROW` faces, on GPUs `LARGEST_ON_GPUS`, or a little more.
+            If a cell has more than `LARGEST_ROW` faces, or `LARGEST_ELSEWHERE`, or a little more.
         """
         engine, total, n = self.engine, n, n if wanted is None else wanted
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
@@ -394,7 +395,8 @@ class Cells:
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for `n` cells."""
-        if self.row_capacity >= (LARGEST_ROW if self.engine.group_size == 1 else LARGEST_ON_GPUS):
+        many = self.engine.group_size == 1 and not self.engine.trims
+        if self.row_capacity >= (LARGEST_ROW if many else LARGEST_ELSEWHERE):
             raise ClvoroError(
                 f"a cell has more than {self.row_capacity} faces, and so many are not supported: remove or perturb "
                 "cocircular generators, or give thin layers a spacing nearer to the size of the cells beside them"

@@ -90,3 +90,19 @@ OUT_OF_LINE REAL beyond_corner(const REAL *x, int a, int b, int j, global const 
     const bool sure = fabs(sum) > WIDE_NOISE * (fabs(first.s0) + fabs(second.s0) + fabs(third.s0));
     return sure && turn > 0 ? sum / turn : 0;
 }
+
+/* Which of two half-planes does the line a + t e leave first? Negative: u; 0 if double words cannot tell, or the line
+   does not lead out of both. All is relative to one place. */
+inline REAL leaves_later(wide_half_plane_t u, wide_half_plane_t v, wide_t a_x, wide_t a_y, REAL2 e)
+{
+    const wide_t e_x = (wide_t)(e.s0, 0), e_y = (wide_t)(e.s1, 0);
+    const wide_t u_x = wide_product(u.x, a_x), u_y = wide_product(u.y, a_y);
+    const wide_t v_x = wide_product(v.x, a_x), v_y = wide_product(v.y, a_y);
+    const wide_t u_along = wide_add(wide_product(u.x, e_x), wide_product(u.y, e_y));
+    const wide_t v_along = wide_add(wide_product(v.x, e_x), wide_product(v.y, e_y));
+    const wide_t u_left = wide_add(u.level, -wide_add(u_x, u_y)), v_left = wide_add(v.level, -wide_add(v_x, v_y));
+    const REAL later = wide_add(wide_product(u_left, v_along), -wide_product(v_left, u_along)).s0;
+    const REAL terms = (fabs(u.level.s0) + fabs(u_x.s0) + fabs(u_y.s0)) * v_along.s0 +
+                       (fabs(v.level.s0) + fabs(v_x.s0) + fabs(v_y.s0)) * u_along.s0;
+    return u_along.s0 > 0 && v_along.s0 > 0 && fabs(later) > WIDE_NOISE * terms ? later : 0;
+}

@@ -11,7 +11,7 @@
 /* A turn is certain if it is more than this share of the largest p^2: hundreds of times the rounding of p and of the
    turn. */
 #define TURN_ROUNDING 1e-13
-/* A cell is certain if it is far from what `is_doubtful` (common/polygon.h) calls doubtful: least square of a face's
+/* A cell is certain if it is far from what `is_doubtful` (common/short_faces.h) calls doubtful: least square of a face's
    length over that of its generator's distance; largest square of the reach over that of the least distance; least
    square of that. */
 #define CERTAIN_FACE2 1e-9
