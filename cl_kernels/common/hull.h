@@ -11,9 +11,9 @@
 /* A turn is certain if it is more than this share of the largest p^2: hundreds of times the rounding of p and of the
    turn. */
 #define TURN_ROUNDING 1e-13
-/* A cell is certain if it is far from what `is_doubtful` (common/short_faces.h) calls doubtful: least square of a face's
-   length over that of its generator's distance; largest square of the reach over that of the least distance; least
-   square of that. */
+/* A cell is certain if it is far from what `is_doubtful` (common/short_faces.h) calls doubtful: least square of a
+   face's length over that of its generator's distance; largest square of the reach over that of the least distance;
+   least square of that. */
 #define CERTAIN_FACE2 1e-9
 #define CERTAIN_RATIO2 3e7
 #define CERTAIN_DISTANCE2 1e-16
