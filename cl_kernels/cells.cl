@@ -34,7 +34,7 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
     cell_t cell;
     start_cell(&cell, i, x, lower, upper);
     int flag = 0;
-    REAL w = reach[p], inner = -1;
+    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     while (flag == 0) {
         flag = clip_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
@@ -43,8 +43,7 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
         inner = w;
         w = fmin(need, 2 * w);
     }
-    /* A search that is to be repeated begins with a guess as before: from 0 it would never widen. */
-    if (flag == 0 && cell.reach2 > 0)
+    if (flag == 0)
         reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }

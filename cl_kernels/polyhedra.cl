@@ -67,7 +67,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
     cell_t cell;
     start_cell(&cell, x, box_lower, box_upper);
     int flag = 0;
-    REAL w = reach[p], inner = -1;
+    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     if (warm) {
         flag = flag_of(clip_by_row(&cell, i, x, old_starts, old_neighbours, points));
         w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
@@ -86,9 +86,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
         return;
     }
 
-    /* A search that is to be repeated begins with a guess as before: from 0 it would never widen. */
-    if (flag == 0 && cell.reach2 > 0)
-        reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
 #ifdef SEAMS
     SEAMS_GIVEN;
     if (i < seams.own)

@@ -29,27 +29,32 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbours
                   (face_measures[m] == face_measures[k] && m > k);
     return longest;
 }
+#else
+#define is_wall_side(k, begin, end, neighbours, face_measures, volume) (neighbours[k] < 0)
+#endif
 
-/* How far cell i reaches from a wall with the direction t at the distance `gap` from its generator, up to `most`: in a
-   strip that is far thinner than h, generators beyond it are there that it has brought on coarser levels. */
-inline REAL room_inwards(int i, REAL most, REAL gap, REAL2 t, global const int *starts, global const int *neighbours,
-                         global const REAL *points)
+/* How far cell i reaches from a wall with the normal n, inwards, at the distance `gap` from its generator, up to
+   `most`: in a strip that is far thinner than h, generators beyond it are there that it has brought on coarser levels.
+ */
+inline REAL room_inwards(int i, REAL most, REAL gap, const REAL *n, global const int *starts,
+                         global const int *neighbours, global const REAL *points)
 {
     REAL room = most;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbours[k];
         if (j < 0)
             continue;
-        const REAL2 d = (REAL2)(points[2 * j] - points[2 * i], points[2 * j + 1] - points[2 * i + 1]);
-        const REAL inwards = d.s1 * t.s0 - d.s0 * t.s1;
+        REAL inwards = 0, d2 = 0;
+        for (int a = 0; a < DIM; ++a) {
+            const REAL d = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
+            inwards += d * n[a];
+            d2 += d * d;
+        }
         if (inwards > 0)
-            room = fmin(room, fmax(gap, R(0)) + dot(d, d) / (2 * inwards));
+            room = fmin(room, fmax(gap, R(0)) + d2 / (2 * inwards));
     }
     return room;
 }
-#else
-#define is_wall_side(k, begin, end, neighbours, face_measures, volume) (neighbours[k] < 0)
-#endif
 
 /* Per generator i: how many new generators it brings. */
 kernel void count_children(const int size, global const int *starts, global const int *neighbours,
@@ -90,7 +95,8 @@ kernel void place_children(const int size, global const int *starts, global cons
 #ifdef POLYGON
             const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]), t = BOUNDARY_TANGENT(j);
             const REAL gap = m.s0 * t.s1 - m.s1 * t.s0;
-            const REAL room = room_inwards(i, h[i] / 2, gap, t, starts, neighbours, points);
+            const REAL normal[2] = {-t.s1, t.s0};
+            const REAL room = room_inwards(i, h[i] / 2, gap, normal, starts, neighbours, points);
             const REAL way = gap > h[i] / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {x[0] + m.s0 - way * t.s1, x[1] + m.s1 + way * t.s0};
@@ -100,11 +106,15 @@ kernel void place_children(const int size, global const int *starts, global cons
 #else
             const int wall = -1 - j, axis = wall / 2;
             const REAL level = wall % 2 ? upper[axis] : lower[axis];
-            for (int a = 0; a < DIM; ++a)
+            REAL normal[DIM];
+            for (int a = 0; a < DIM; ++a) {
                 child[a] = points[DIM * i + a];
+                normal[a] = a != axis ? 0 : wall % 2 ? -1 : 1;
+            }
             /* In a box that is thinner than the cell, too: short of what comes from its other wall. */
             const REAL gap = fabs(points[DIM * i + axis] - level);
-            const REAL room = fmin(h[i], (upper[axis] - lower[axis]) / 2);
+            const REAL most = fmin(h[i], (upper[axis] - lower[axis]) / 2);
+            const REAL room = room_inwards(i, most, gap, normal, starts, neighbours, points);
             const REAL way = gap > room / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
             child[axis] = level + (wall % 2 ? -way : way);
 #endif

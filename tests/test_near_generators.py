@@ -4,6 +4,7 @@ A cell at the other end of the domain and those near each other have to see the 
 not, such sets were refused, or a corner was wrong.
 """
 
+import re
 from fractions import Fraction
 
 import numpy as np
@@ -79,6 +80,24 @@ def test_one_rounding_apart(ctx, periodic, real):
         few = square[rng.permutation(81)[: [3, 10, 40, 81][seed % 4]]]
         diagram = adapter.diagram(box, np.vstack([rng.random((300, 2)), 0.6875 + step * few]))
         report = diagram.check()
+        assert report, report
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("size", [1e-44, 1e-60, 1e-160, 1e-300])
+def test_nearer_than_the_domain_rounds(ctx, dim, size, real):
+    """Beside 0 places may be as near as that: a mesh or an error; the search for neighbours went on for ever once."""
+    rng = np.random.default_rng(dim)
+    points = np.vstack([size * rng.random((10, dim)), rng.random((100, dim))])
+    points[0] = 0
+    try:
+        report = (
+            clvoro.Adapter(ctx, real).diagram(clvoro.Box((0,) * dim, (1,) * dim), points).check()
+        )
+    except clvoro.errors.InputError as error:
+        assert re.search("too close|coincide|distinct", str(error))
+    else:
         assert report, report
 
 

@@ -19,6 +19,15 @@ def refine(engine, points, h):
     return patch.fetch(t), Refinement(engine).refine(BOX, t, engine.upload(h)).get()
 
 
+def room_inwards(host, i, inwards, gap, most):
+    """How far cell i reaches from a wall at the distance `gap`, up to `most`."""
+    neighbours = host.neighbours[host.owners == i]
+    d = host.points[neighbours[neighbours >= 0]] - host.points[i]
+    ahead = d @ inwards > 0
+    reach = (d**2).sum(axis=1)[ahead] / (2 * (d @ inwards)[ahead])
+    return (max(gap, 0) + reach).min(initial=most)
+
+
 def expected_children(host, h):
     """Middles of all edges across faces of some length, and one point between each wall and its cells."""
     children = []
@@ -26,7 +35,9 @@ def expected_children(host, h):
         if j < 0:
             axis, upper = divmod(-1 - j, 2)
             wall = (BOX.lower, BOX.upper)[upper][axis]
-            gap, room = abs(host.points[i, axis] - wall), min(h[i], BOX.extent[axis] / 2)
+            inwards = (1 - 2 * upper) * np.eye(2)[axis]
+            gap, most = abs(host.points[i, axis] - wall), min(h[i], BOX.extent[axis] / 2)
+            room = room_inwards(host, i, inwards, gap, most)
             way = min(gap / 2, h[i] / 4) if gap > room / 8 else room / 2
             child = host.points[i].copy()
             child[axis] = wall - way if upper else wall + way
@@ -97,10 +108,7 @@ def children_in(shape, tangents, host, h, labels, fixed):
         elif longest:
             inwards = np.array([-tangents[-1 - j, 1], tangents[-1 - j, 0]])
             gap = -m @ inwards
-            d = host.points[host.neighbours[row][host.neighbours[row] >= 0]] - x
-            ahead = d @ inwards > 0
-            reach = (d**2).sum(axis=1)[ahead] / (2 * (d @ inwards)[ahead])
-            room = (max(gap, 0) + reach).min(initial=h[i] / 2)
+            room = room_inwards(host, i, inwards, gap, h[i] / 2)
             way = min(gap / 2, h[i] / 4) if gap > h[i] / 8 else room / 2
             goal = x + m + way * inwards
             children.append(apart(x, goal, kept(x + m, goal), h[i] / 16))
@@ -191,6 +199,20 @@ def test_no_child_is_close_to_a_generator_at_a_wall(ctx, real, share):
         assert box.contains(finer).all()
         apart, _ = cKDTree(finer).query(finer, k=2)
         assert apart[:, 1].min() > 0.06 * room  # half of the gap where there is enough: a sixteenth
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("count", [4, 15, 40])
+def test_no_child_beyond_a_cell(ctx, real, count):
+    """Cells much flatter than h, stacked in a thin strip: what comes from a wall stays in the cell there."""
+    box = patch.Box((0, 0), (0.125, 1))
+    engine = patch.make_engine(ctx, real, box=box)
+    step = 0.125 / (count + 1)
+    points = np.column_stack([step * np.arange(1, count + 1), np.full(count, 0.25)]).astype(real)
+    t = patch.tessellate(engine, points, box)
+    finer = Refinement(engine).refine(box, t, engine.upload(np.full(count, 0.1))).get()
+    apart, _ = cKDTree(finer).query(finer, k=2)
+    assert apart[:, 1].min() > 0.2 * step  # half a gap, or half of that beyond it
 
 
 def test_repeats_bit_by_bit(ctx):

@@ -1,0 +1,121 @@
+"""Generators near each other, or cocircular: how many sets become meshes that `check` passes.
+
+    python bench/clusters.py [--sets 60] [--kinds circles,one-rounding] [--device NAME] [--json]
+
+In the unit square, in both precisions. `clusters`: 3 to 40 generators within 1e-13 to 1e-3 of each
+other (1e-5 in float32), at random, on lines or circles, beside fewer anywhere. `circles` and
+`arcs`: 400 at random on one. `lines`: 20 to 150 on a line 1e-4 to 5e-4 apart, beside 40.
+`one rounding`: 3 to 81 places next to each other, beside 300; `across seams`: the same in a
+periodic box. Places are rounded to the precision beforehand, and those that fall together are one.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from datetime import date
+
+import numpy as np
+from _common import Report, device_name, make_adapter, names, parser
+
+import clvoro
+
+PLACE = 0.6875
+
+
+def on_circle(rng: np.random.Generator, angle: float) -> np.ndarray:
+    """Return 400 places on an arc of `angle` of a circle in the unit square."""
+    radius, middle = 10 ** rng.uniform(-3, -0.5), 0.5 + 0.3 * rng.uniform(-1, 1, 2)
+    t = rng.uniform(0, angle, 400)
+    return middle + radius * np.column_stack([np.cos(t), np.sin(t)])
+
+
+def clusters(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
+    """Return a few generators near each other, and fewer anywhere."""
+    count, size = int(rng.integers(3, 40)), 10 ** rng.uniform(-13 if real == np.float64 else -5, -3)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    near = [
+        rng.standard_normal((count, 2)),
+        10 * rng.uniform(-1, 1, (count, 1)) * [np.cos(angle[0]), np.sin(angle[0])],
+        np.column_stack([np.cos(angle), np.sin(angle)]),
+    ][rng.integers(3)]
+    return np.vstack([rng.random(2) + size * near, rng.random((int(rng.integers(1, 10)), 2))])
+
+
+def circles(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
+    """Return a circle of generators."""
+    return on_circle(rng, 2 * np.pi)
+
+
+def arcs(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
+    """Return an arc of generators."""
+    return on_circle(rng, rng.uniform(0.1, 3))
+
+
+def lines(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
+    """Return a line of generators, and 40 anywhere."""
+    count, way = int(rng.integers(20, 150)), rng.uniform(0, 2 * np.pi)
+    along = (np.arange(count) - count / 2) * rng.choice([1e-4, 2.5e-4, 5e-4])
+    middle = 0.5 + 0.2 * rng.uniform(-1, 1, 2)
+    line = middle + np.outer(along, [np.cos(way), np.sin(way)])
+    return np.vstack([line, rng.random((40, 2))])
+
+
+def one_rounding(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
+    """Return generators a rounding apart, and 300 anywhere; places of a periodic box are those beside 1."""
+    step = 2 * float(np.spacing(np.asarray(PLACE, real)))
+    square = np.stack(np.meshgrid(range(9), range(9)), axis=-1).reshape(-1, 2)
+    chosen = square[rng.permutation(81)[: int(rng.integers(3, 82))]]
+    return np.vstack([PLACE + step * chosen, rng.random((300, 2))])
+
+
+KINDS = {
+    "clusters": clusters,
+    "circles": circles,
+    "arcs": arcs,
+    "lines": lines,
+    "one-rounding": one_rounding,
+    "across-seams": one_rounding,
+}
+
+
+def sets_of(kind: str, count: int, real: np.dtype) -> Iterator[np.ndarray]:
+    """Yield the sets of generators of a kind."""
+    for seed in range(count):
+        points = np.clip(KINDS[kind](np.random.default_rng(seed), real), 0, 1).astype(real)
+        yield np.unique(points, axis=0).astype(float)
+
+
+def main() -> int:
+    options_of = parser(__doc__)
+    options_of.add_argument("--sets", type=int, default=60)
+    options_of.add_argument("--kinds", type=names, default=list(KINDS))
+    options = options_of.parse_args()
+    columns = {
+        name: lambda r, name=name: r[name]
+        for name in ("generators", "dtype", "sets", "meshes", "refused", "wrong")
+    }
+    report, refusals = Report(options.json, columns), []
+    for options.dtype in ("float64", "float32"):
+        adapter = make_adapter(options)
+        for kind in options.kinds:
+            box = clvoro.Box((0, 0), (1, 1), periodic=kind == "across-seams")
+            found = {"meshes": 0, "refused": 0, "wrong": 0}
+            for points in sets_of(kind, options.sets, np.dtype(options.dtype)):
+                try:
+                    right = bool(adapter.diagram(box, points).check())
+                    found["meshes" if right else "wrong"] += 1
+                except clvoro.ClvoroError as error:
+                    found["refused"] += 1
+                    refusals.append(f"{kind}, {options.dtype}: {error}")
+            report.add(
+                {"generators": kind, "dtype": options.dtype, "sets": options.sets, **found}, kind
+            )
+    title = f"{options.sets} sets each. {date.today()}, {device_name(adapter)}."
+    report.finish(title)
+    print(*refusals, sep="\n", end="", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
