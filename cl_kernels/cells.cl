@@ -203,6 +203,40 @@ kernel void measure_faces(const int size, global const int *starts, global const
     }
 }
 
+/* Cells around a vertex from which on faces that are nothing may have been left out one after the other, and how far
+   off each other the places may be that they take for it. */
+#define MANY_AROUND 8
+#define MOST_SPREAD (64 * REAL_EPS)
+
+/* Do cells around corner c of cell i, which is at v, take places for it that are too far off, if they are many? The one
+   with the least angle there asks, if not more do: no more than 45 degrees. */
+inline bool is_spread(const int size, global const int *starts, global const int *neighbours, int i, int c, REAL2 v,
+                      const REAL *x, global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    const int last = starts[i + 1] - 1, most = starts[size];
+    const REAL2 one = face_direction(neighbours[c], x, points);
+    const REAL2 other = face_direction(neighbours[c > starts[i] ? c - 1 : last], x, points);
+    const REAL turn = dot(one, other);
+    if (turn > 0 || turn * turn < R(0.49) * dot(one, one) * dot(other, other))
+        return false;
+    int cell = i, at = c, count = 1;
+    bool back = false;
+    while (count < most && walk_on(size, starts, neighbours, i, c, &cell, &at, &back))
+        ++count;
+    if (count < MANY_AROUND)
+        return false;
+    cell = i;
+    at = c;
+    back = false;
+    for (int steps = 0; steps < count && walk_on(size, starts, neighbours, i, c, &cell, &at, &back); ++steps) {
+        const int before = neighbours[at > starts[cell] ? at - 1 : starts[cell + 1] - 1];
+        const REAL2 gap = corner_gap(v, i, cell, before, neighbours[at], points, lower, upper);
+        if (!(dot(gap, gap) <= MOST_SPREAD * MOST_SPREAD))
+            return true;
+    }
+    return false;
+}
+
 /* Per new cell, where some are doubtful: is its area positive, and do neighbours have their common faces where it has
    them, if one of the two is doubtful? Where two cells see different neighbours, having left out different faces, what
    they disagree about must be as little as rounding makes of the box, and no more than a share of the cell; else too
@@ -243,6 +277,9 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         }
         if (j >= size)
             continue;
+        /* Corner k. With all faces there is nothing to be put right. */
+        if (doubtful && !flags[5] && is_spread(size, starts, neighbours, i, starts[i] + k, u, x, points, lower, upper))
+            right = false;
         const REAL2 e = v - u;
         if (dot(e, e) < R(1e-4) * fmax(dot(u, u), dot(v, v)) && is_loop(size, starts, neighbours, i, starts[i] + k))
             atomic_or(flags, FLAG_LOOPED);

@@ -14,17 +14,9 @@ kernel void find_owners(const int size, global const int *starts, global const i
     WORK_ITEM(i);
     const int begin = starts[i], end = starts[i + 1], most = starts[size];
     for (int c = begin; c < end; ++c) {
-        int owner = c;
-        /* In a symmetric graph a walk ends at a wall or where it began. */
-        int cell = i, at = c, steps = 0;
-        bool open = false;
-        do {
-            open = !walk(size, starts, neighbours, &cell, &at, false);
-            owner = min(owner, at);
-        } while (!open && at != c && ++steps < most);
-        cell = i;
-        at = c;
-        while (open && ++steps < most && walk(size, starts, neighbours, &cell, &at, true))
+        int owner = c, cell = i, at = c, steps = 0;
+        bool back = false;
+        while (++steps < most && walk_on(size, starts, neighbours, i, c, &cell, &at, &back))
             owner = min(owner, at);
         owners[c] = owner;
         is_owner[c] = owner == c;

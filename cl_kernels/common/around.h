@@ -19,24 +19,31 @@ inline bool walk(const int size, global const int *starts, global const int *nei
     return true;
 }
 
-/* Do the walks around one end of face k of cell i come by its other end? No face of a diagram does that. Two that cross
-   do: each is seen from both sides, where rounding has let one pair of four nearly cocircular generators decide
+/* The next corner of a walk from corner c of cell i around their vertex: clockwise and, where a wall ends that, from c
+   on the other way. False at its end: at a wall or, in a symmetric graph, where it began. */
+inline bool walk_on(const int size, global const int *starts, global const int *neighbours, int i, int c, int *cell,
+                    int *at, bool *back)
+{
+    if (!*back) {
+        if (walk(size, starts, neighbours, cell, at, false))
+            return *at != c;
+        *back = true;
+        *cell = i;
+        *at = c;
+    }
+    return walk(size, starts, neighbours, cell, at, true);
+}
+
+/* Does the walk around one end of face k of cell i come by its other end? No face of a diagram does that. Two that
+   cross do: each is seen from both sides, where rounding has let one pair of four nearly cocircular generators decide
    otherwise than the other pair. */
 inline bool is_loop(const int size, global const int *starts, global const int *neighbours, int i, int k)
 {
     const int other = k + 1 < starts[i + 1] ? k + 1 : starts[i];
-    /* In a symmetric graph a walk ends at a wall or where it began. */
-    const int most = starts[size];
+    const int most = starts[size]; /* steps: rounding may leave a graph that is not symmetric */
     int cell = i, at = k, steps = 0;
-    while (steps++ < most && walk(size, starts, neighbours, &cell, &at, false)) {
-        if (at == other)
-            return true;
-        if (at == k)
-            return false;
-    }
-    cell = i;
-    at = k;
-    while (steps++ < most && walk(size, starts, neighbours, &cell, &at, true))
+    bool back = false;
+    while (steps++ < most && walk_on(size, starts, neighbours, i, k, &cell, &at, &back))
         if (at == other)
             return true;
     return false;
