@@ -57,6 +57,12 @@ def test_restart():
     assert all(r["mass"] < 1e-12 for r in moved)
 
 
+def test_clusters():
+    rows = records("clusters.py", "--sets", "3")
+    assert len(rows) == 12
+    assert all(r["meshes"] == r["sets"] == 3 for r in rows)
+
+
 def test_transfer():
     rows = records("transfer.py", "--sizes", "500,4000", "--dims", "2", "--repeat", "1")
     first, second, free = (r for r in rows if r["rate"] is not None)
