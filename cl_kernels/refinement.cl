@@ -111,11 +111,11 @@ kernel void place_children(const int size, global const int *starts, global cons
                 child[a] = points[DIM * i + a];
                 normal[a] = a != axis ? 0 : wall % 2 ? -1 : 1;
             }
-            /* In a box that is thinner than the cell, too: short of what comes from its other wall. */
+            /* In a box that is thinner than the cell, too: short of what comes from its other wall; in the cell. */
             const REAL gap = fabs(points[DIM * i + axis] - level);
             const REAL most = fmin(h[i], (upper[axis] - lower[axis]) / 2);
             const REAL room = room_inwards(i, most, gap, normal, starts, neighbours, points);
-            const REAL way = gap > room / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
+            const REAL way = gap > most / 8 || room < 3 * gap ? fmin(gap / 2, h[i] / 4) : room / 2;
             child[axis] = level + (wall % 2 ? -way : way);
 #endif
         } else if (has_middle(i, j, face_measures[k], volumes[i])) {

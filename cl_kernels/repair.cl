@@ -179,7 +179,7 @@ inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n
             continue;
         const REAL d[2] = {BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1])};
         const REAL d2 = d[0] * d[0] + d[1] * d[1];
-        if (d2 >= 4 * cell->reach2)
+        if (d2 >= cutting_distance2(cell))
             continue;
         if (d2 == 0)
             return FLAG_COINCIDE;

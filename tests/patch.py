@@ -11,6 +11,7 @@ from clvoro._program import Engine
 from clvoro.bins import Bins
 from clvoro.cells import Cells
 from clvoro.domain import Box
+from clvoro.refinement import SHORT_FACE
 from clvoro.stages import Stages
 from clvoro.tessellator import Tessellator
 
@@ -62,10 +63,46 @@ def fetch(t):
 
 def ways(host, box):
     """Return the way from each face's generator to the nearest image of its neighbour, (m, d); of walls nothing."""
-    across = host.points[host.neighbours].astype(float) - host.points[host.owners]
+    across = host.points[np.maximum(host.neighbours, 0)].astype(float) - host.points[host.owners]
     across[host.neighbours < 0] = 0
     periods = np.where(box.periodic, box.extent, 1)
     return across - np.rint(across / periods) * np.where(box.periodic, periods, 0)
+
+
+def room_inwards(ways, inwards, gap, most):
+    """How far a cell reaches from a wall, by the `ways` to its neighbours (k, d), up to `most`; see refinement.cl."""
+    ahead = ways @ inwards > 0
+    reach = (ways**2).sum(axis=1)[ahead] / (2 * (ways @ inwards)[ahead])
+    return (max(gap, 0) + reach).min(initial=most)
+
+
+def children(host, box, h, held=None):
+    """Middles of all edges across faces of some size, and one point between each wall and its cells; see refinement.cl.
+
+    Nothing of cells that are `held` (n,), or across their faces.
+    """
+    made, across = [], ways(host, box)
+    held = np.zeros(len(host.points), bool) if held is None else held
+    for k, (i, j) in enumerate(zip(host.owners, host.neighbours, strict=True)):
+        if held[i] or (j >= 0 and held[j]):
+            continue
+        child = host.points[i].astype(float)
+        if j < 0:
+            axis, upper = divmod(-1 - j, 2)
+            wall = (box.lower, box.upper)[upper][axis]
+            gap, most = abs(child[axis] - wall), min(h[i], box.extent[axis] / 2)
+            inwards = (1 - 2 * upper) * np.eye(box.dim)[axis]
+            room = room_inwards(across[host.owners == i], inwards, gap, most)
+            between = gap > most / 8 or room < 3 * gap
+            way = min(gap / 2, h[i] / 4) if between else room / 2
+            child[axis] = wall - way if upper else wall + way
+        elif j > i and host.face_measures[k] > SHORT_FACE * host.volumes[i] ** (1 - 1 / box.dim):
+            child = child + across[k] / 2
+            child = np.where(box.periodic, child % box.extent, child)
+        else:
+            continue
+        made.append(child)
+    return np.array(made)
 
 
 def hexagons(a, box=BOX):

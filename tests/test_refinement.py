@@ -19,34 +19,6 @@ def refine(engine, points, h):
     return patch.fetch(t), Refinement(engine).refine(BOX, t, engine.upload(h)).get()
 
 
-def room_inwards(host, i, inwards, gap, most):
-    """How far cell i reaches from a wall at the distance `gap`, up to `most`."""
-    neighbours = host.neighbours[host.owners == i]
-    d = host.points[neighbours[neighbours >= 0]] - host.points[i]
-    ahead = d @ inwards > 0
-    reach = (d**2).sum(axis=1)[ahead] / (2 * (d @ inwards)[ahead])
-    return (max(gap, 0) + reach).min(initial=most)
-
-
-def expected_children(host, h):
-    """Middles of all edges across faces of some length, and one point between each wall and its cells."""
-    children = []
-    for i, j, length in zip(host.owners, host.neighbours, host.face_measures, strict=True):
-        if j < 0:
-            axis, upper = divmod(-1 - j, 2)
-            wall = (BOX.lower, BOX.upper)[upper][axis]
-            inwards = (1 - 2 * upper) * np.eye(2)[axis]
-            gap, most = abs(host.points[i, axis] - wall), min(h[i], BOX.extent[axis] / 2)
-            room = room_inwards(host, i, inwards, gap, most)
-            way = min(gap / 2, h[i] / 4) if gap > room / 8 else room / 2
-            child = host.points[i].copy()
-            child[axis] = wall - way if upper else wall + way
-            children.append(child)
-        elif j > i and length > SHORT_FACE * np.sqrt(host.volumes[i]):
-            children.append((host.points[i] + host.points[j]) / 2)
-    return np.array(children)
-
-
 def as_sorted(points):
     return points[np.lexsort(points.T)]
 
@@ -60,7 +32,7 @@ def test_children(ctx, real, n):
     h = np.random.default_rng(n).uniform(0.5, 1, n).astype(real) * np.sqrt(0.75 / n / 4)
     host, finer = refine(engine, points, h)
     assert np.array_equal(finer[:n], points), "the parents come first, in their order"
-    expected = expected_children(host, h)
+    expected = patch.children(host, BOX, h)
     assert len(finer) == n + len(expected)
     eps = float(np.finfo(real).eps)
     assert as_sorted(finer[n:]) == pytest.approx(as_sorted(expected), abs=2 * eps)
@@ -108,7 +80,8 @@ def children_in(shape, tangents, host, h, labels, fixed):
         elif longest:
             inwards = np.array([-tangents[-1 - j, 1], tangents[-1 - j, 0]])
             gap = -m @ inwards
-            room = room_inwards(host, i, inwards, gap, h[i] / 2)
+            ways = host.points[host.neighbours[row][host.neighbours[row] >= 0]] - x
+            room = patch.room_inwards(ways, inwards, gap, h[i] / 2)
             way = min(gap / 2, h[i] / 4) if gap > h[i] / 8 else room / 2
             goal = x + m + way * inwards
             children.append(apart(x, goal, kept(x + m, goal), h[i] / 16))

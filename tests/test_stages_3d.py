@@ -14,7 +14,7 @@ from clvoro.poisson import Poisson
 from clvoro.polyhedra import Polyhedra
 from clvoro.population import LARGEST_CHANGE, Population, PopulationControl
 from clvoro.projection import Projection
-from clvoro.refinement import SHORT_FACE, Refinement
+from clvoro.refinement import Refinement
 
 BOX = Box((0, 0, 0), (1, 0.75, 0.9))
 """Its frame is the unit cube's: normalised coordinates are physical ones."""
@@ -199,23 +199,6 @@ def test_projection_knows_the_derivative_of_the_volumes(double):
 # Refinement.
 
 
-def expected_children(host, h):
-    """Middles of all edges across faces of some size, and one point between each wall and its cells."""
-    children = []
-    for i, j, area in zip(host.owners, host.neighbours, host.face_measures, strict=True):
-        if j < 0:
-            axis, upper = divmod(-1 - j, 2)
-            wall = (BOX.lower, BOX.upper)[upper][axis]
-            gap, room = abs(host.points[i, axis] - wall), min(h[i], BOX.extent[axis] / 2)
-            way = min(gap / 2, h[i] / 4) if gap > room / 8 else room / 2
-            child = host.points[i].copy()
-            child[axis] = wall - way if upper else wall + way
-            children.append(child)
-        elif j > i and area > SHORT_FACE * np.cbrt(host.volumes[i]) ** 2:
-            children.append((host.points[i] + host.points[j]) / 2)
-    return np.array(children)
-
-
 @pytest.mark.parametrize("n", [1, 2, 3, 200])
 def test_children(engine, n):
     points = random_points(n, n + 41, engine.real)
@@ -224,7 +207,7 @@ def test_children(engine, n):
     finer = refinement.refine(BOX, t, engine.upload(h)).get()
     assert refinement.count(t) == len(finer)
     assert np.array_equal(finer[:n], points.astype(engine.real)), "the parents come first"
-    expected = expected_children(patch.fetch(t), h)
+    expected = patch.children(patch.fetch(t), BOX, h)
     assert len(finer) == n + len(expected)
     new = finer[n:]
     off = np.abs(new[np.lexsort(new.T)] - expected[np.lexsort(expected.T)])

@@ -53,7 +53,8 @@ inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
     y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
 }
 
-/* The same, but a generator that would leave comes back: so no two meet on a wall. */
+/* The same, but a generator that would leave comes back: so no two meet on a wall. Where h is larger than the domain,
+   it goes no further than from one wall to the other, which leaves it inside. */
 inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
@@ -61,6 +62,8 @@ inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
     {
         if (PERIOD(a) > 0)
             continue;
+        const REAL most = upper[a] - lower[a];
+        y[a] = clamp(y[a], x[a] - most, x[a] + most);
         if (y[a] < lower[a])
             y[a] = 2 * lower[a] - y[a];
         if (y[a] > upper[a])

@@ -23,6 +23,13 @@ typedef struct {
     REAL position[2], lower[2], upper[2];
 } cell_t;
 
+/* Square of the distance from which on no generator cuts the cell: rounding of its reach must not hide one that is
+   beside one that does. */
+inline REAL cutting_distance2(const cell_t *cell)
+{
+    return 4 * cell->reach2 * (1 + 8 * REAL_EPS);
+}
+
 /* The whole box around generator x. */
 inline void start_cell(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
 {

@@ -67,7 +67,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
         while (turn <= last_turn) {
             const int row = turn & 1 ? middle + (turn + 1) / 2 : middle - turn / 2;
             const REAL away = row_distance(x[1], frame.s1, edge, row);
-            if (row < bottom || row > top || away * away >= 4 * cell->reach2) {
+            if (row < bottom || row > top || away * away >= cutting_distance2(cell)) {
                 ++turn;
                 part = 0;
                 ix = -1;
@@ -110,7 +110,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
                 for (int q = first.s0; q < end.s0; ++q) {
                     const REAL d[2] = {binned[2 * q] - x[0], binned[2 * q + 1] - x[1]};
                     const REAL d2 = d[0] * d[0] + d[1] * d[1];
-                    if (d2 >= 4 * cell->reach2 || q == own)
+                    if (d2 >= cutting_distance2(cell) || q == own)
                         continue;
                     if (d2 == 0)
                         return FLAG_COINCIDE;
