@@ -256,6 +256,7 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     global const int *row = neighbours + starts[i];
     const int n = starts[i + 1] - starts[i];
     const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
+    const REAL noise2 = flags[5] ? 16 * REAL_EPS * REAL_EPS : 0;
     bool right = volumes[i] > 0;
     const bool doubtful = slot_counts[places[i]] < 0;
     bool any = doubtful;
@@ -291,16 +292,17 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             continue;
         }
         const int p = other[q == 0 ? m - 1 : q - 1], s = other[q == m - 1 ? 0 : q + 1];
-        /* The area is no more than the gap times the distance of the farther corner. */
+        /* The area is no more than the gap times the distance of the farther corner. With all faces a gap that places
+           of corners have by rounding is none. */
         const REAL reach2 = fmax(dot(u, u), dot(v, v));
         if (p != after) {
             const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
-            if (!(dot(gap, gap) * reach2 <= least * least))
+            if (!(dot(gap, gap) <= fmax(least * least / reach2, noise2 * reach2)))
                 right = false;
         }
         if (s != before) {
             const REAL2 gap = corner_gap(u, i, j, i, s, points, lower, upper);
-            if (!(dot(gap, gap) * reach2 <= least * least))
+            if (!(dot(gap, gap) <= fmax(least * least / reach2, noise2 * reach2)))
                 right = false;
         }
     }
