@@ -37,14 +37,14 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     while (flag == 0) {
         flag = clip_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
-        const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
+        const REAL need = sqrt(cutting_distance2(&cell));
         if (!(need > w)) /* ends with a NaN, too */
             break;
         inner = w;
         w = fmin(need, 2 * w);
     }
     if (flag == 0)
-        reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+        reach[p] = (float)sqrt(cutting_distance2(&cell));
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 
