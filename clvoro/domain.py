@@ -217,7 +217,8 @@ class Box(Domain):
         """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
         points, lower, extent = np.asarray(points, float), np.array(self.lower), self.extent
         inside = (points >= lower) & (points < self.upper)
-        moved = lower + np.mod(points - lower, extent)
+        with np.errstate(invalid="ignore"):  # who is given infinite ones says so
+            moved = lower + np.mod(points - lower, extent)
         last = np.nextafter(np.array(self.upper), lower)  # where rounding has put one on the seam
         moved = np.clip(moved, lower, last)
         return np.where(inside | ~np.array(self.periodic), points, moved)

@@ -58,7 +58,14 @@ class CloseError(InputError):
 
     def within(self, domain: Domain) -> InputError:
         """Return what to tell the caller, in his units."""
-        return InputError(self._text(whereabouts(domain, self.place), self.gap * domain.frame[1]))
+        gap, thin = self.gap * domain.frame[1], float(domain.extent.min())
+        if 0 < thin < gap:
+            wider = "" if self.real == np.float64 else "use dtype='float64', or "
+            return InputError(
+                f"{domain} is {thin:.3g} thin where generators are {gap:.3g} apart, which leaves too much of a cell to "
+                f"rounding in {self.real}; {wider}give it a thickness nearer to the size of cells"
+            )
+        return InputError(self._text(whereabouts(domain, self.place), gap))
 
 
 def whereabouts(domain: Domain, place: np.ndarray) -> np.ndarray:

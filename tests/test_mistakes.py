@@ -425,3 +425,14 @@ def test_the_closest_generators_are_named_whichever_cell_shows_it(ctx):
     with pytest.raises(InputError, match="too close") as refused:
         clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), points)
     assert f", {least:.3g} apart" in str(refused.value)
+
+
+def test_slab_too_thin_for_the_precision_is_said_to_be_thin(ctx):
+    """Its generators are far from each other, seen from outside: they were told to be too close."""
+    slab = clvoro.Box((0, 0, 0), (1e-6, 1, 1))
+    points = np.random.default_rng(1).random((200, 3)) * slab.extent
+    with pytest.raises(
+        InputError, match=r"1e-06 thin.*use dtype='float64', or give it a thickness"
+    ):
+        clvoro.Adapter(ctx, "float32").diagram(slab, points)
+    assert clvoro.Adapter(ctx).diagram(slab, points).check()

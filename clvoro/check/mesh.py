@@ -270,7 +270,9 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
     if isinstance(d.domain, Polygon):
         # A part that is cut off from its generator goes to the cell beyond a face, and its faces lie otherwise: some of
         # those between the same two cells may look back.
-        pair = np.unique(g.owner * (len(d) + 1) + np.maximum(d.neighbours, -1) + 1, return_inverse=True)[1]
+        pair = np.unique(
+            g.owner * (len(d) + 1) + np.maximum(d.neighbours, -1) + 1, return_inverse=True
+        )[1]
         together = np.bincount(pair, inward)[pair]
         inward = np.where(d.neighbours >= 0, np.minimum(inward, together), inward)
     check.note(
