@@ -44,7 +44,7 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
         w = fmin(need, 2 * w);
     }
     if (flag == 0)
-        reach[p] = (float)sqrt(cutting_distance2(&cell));
+        reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 
