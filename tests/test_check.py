@@ -36,12 +36,13 @@ def arrays_of(diagram):
 
 
 def spoilt(result, **changes):
-    """The result with functions applied to arrays of its diagram."""
-    arrays = arrays_of(result.diagram)
+    """The diagram, of a result or by itself, with functions applied to its arrays."""
+    diagram = result if isinstance(result, Diagram) else result.diagram
+    arrays = arrays_of(diagram)
     for name, change in changes.items():
         changed = change(arrays[name])
         arrays[name] = arrays[name] if changed is None else changed
-    return Diagram(result.diagram.domain, arrays)
+    return Diagram(diagram.domain, arrays)
 
 
 def put(index, value):
@@ -294,6 +295,17 @@ def test_clockwise_cell_is_found(flat):
 
     names = {f.name for f in spoilt(flat, cell_vertices=turn).check().findings}
     assert {"orientation", "faces outward"} <= names
+
+
+def test_cells_of_a_polygon_that_look_back_are_found(ctx):
+    """Of faces between the same two cells some may do so there, but not all together."""
+    square = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)])
+    points = np.random.default_rng(7).uniform(0.02, 0.98, (60, 2))
+    diagram = clvoro.Adapter(ctx).diagram(square, points)
+    assert diagram.check()
+    beside = next(int(j) for j in diagram.neighbours[diagram.neighbour_starts[5] :] if j >= 0)
+    names = {f.name for f in spoilt(diagram, points=swap(5, beside)).check().findings}
+    assert "faces outward" in names
 
 
 def test_inward_and_open_faces_are_found(solid):
