@@ -1,10 +1,11 @@
 """Generators near each other, or cocircular: how many sets become meshes that `check` passes.
 
-    python bench/clusters.py [--sets 60] [--kinds circles,one-rounding] [--device NAME] [--json]
+    python bench/clusters.py [--sets 60] [--kinds circles,arcs] [--dtype float32] [--device NAME]
+        [--json]
 
-In the unit square, in both precisions. `clusters`: 3 to 40 generators within 1e-13 to 1e-3 of each
-other (1e-5 in float32), at random, on lines or circles, beside fewer anywhere. `circles` and
-`arcs`: 400 at random on one. `lines`: 20 to 150 on a line 1e-4 to 5e-4 apart, beside 40.
+In the unit square, in both precisions if none is named. `clusters`: 3 to 40 generators within 1e-13
+to 1e-3 of each other (1e-5 in float32), at random, on lines or circles, beside fewer anywhere.
+`circles` and `arcs`: 400 at random on one. `lines`: 20 to 150 on a line 1e-4 to 5e-4 apart, beside 40.
 `one rounding`: 3 to 81 places next to each other, beside 300; `across seams`: the same in a
 periodic box. Places are rounded to the precision beforehand, and those that fall together are one.
 """
@@ -90,13 +91,15 @@ def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--sets", type=int, default=60)
     options_of.add_argument("--kinds", type=names, default=list(KINDS))
+    options_of.set_defaults(dtype=None)
     options = options_of.parse_args()
     columns = {
         name: lambda r, name=name: r[name]
         for name in ("generators", "dtype", "sets", "meshes", "refused", "wrong")
     }
     report, refusals = Report(options.json, columns), []
-    for options.dtype in ("float64", "float32"):
+    precisions = [options.dtype] if options.dtype else ["float64", "float32"]
+    for options.dtype in precisions:
         adapter = make_adapter(options)
         for kind in options.kinds:
             box = clvoro.Box((0, 0), (1, 1), periodic=kind == "across-seams")
