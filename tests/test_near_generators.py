@@ -203,6 +203,77 @@ def test_the_side_of_a_corner(ctx, kind, real):
     assert zeros > 0 or kind != "lattice"
 
 
+def exactly_later(x, a, b, begin, way):
+    """What `leaves_later` is, by fractions, and the sum of its terms; 0 if the line does not lead out of both."""
+    x, begin, way = ([Fraction(float(v)) for v in pair] for pair in (x, begin, way))
+    found = []
+    for label in (a, b):
+        n = [Fraction(float(q)) - p for q, p in zip(label, x, strict=True)]
+        level = (n[0] ** 2 + n[1] ** 2) / 2
+        ahead = [m * (q - p) for m, q, p in zip(n, begin, x, strict=True)]
+        along = n[0] * way[0] + n[1] * way[1]
+        found.append((level - sum(ahead), along, level + sum(map(abs, ahead))))
+    (u_left, u_along, u_terms), (v_left, v_along, v_terms) = found
+    if u_along <= 0 or v_along <= 0:
+        return 0, 0
+    return u_left * v_along - v_left * u_along, u_terms * v_along + v_terms * u_along
+
+
+LATER = """
+kernel void probe(const int size, global const REAL *points, global REAL *found)
+{
+    WORK_ITEM(k);
+    const REAL lower[2] = {0, 0}, upper[2] = {1, 1};
+    global const REAL *own = points + 10 * k;
+    const REAL x[2] = {own[0], own[1]};
+    found[k] = leaves_later(half_plane_of(x, 5 * k + 1, points, lower, upper),
+                            half_plane_of(x, 5 * k + 2, points, lower, upper), wide_sum(own[6], -x[0]),
+                            wide_sum(own[7], -x[1]), (REAL2)(own[8], own[9]));
+}
+"""
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("kind", ["far", "near", "tie", "lattice"])
+def test_the_face_that_a_line_leaves_by(ctx, kind, real):
+    """By fractions: of places x, a, b, where a line begins and its way, which may be off by half its last digit."""
+    rng, n = np.random.default_rng(6), 500
+    step = float(np.spacing(np.asarray(0.5, real)))
+    x = rng.random((n, 5, 2))
+    if kind == "near":  # some within roundings of each other
+        x = np.where(rng.random((n, 5, 1)) < 0.6, 0.625 + step * rng.integers(-9, 9, x.shape), x)
+    elif kind == "lattice":
+        x = rng.integers(0, 5, x.shape) / 8 + 0.25
+    if kind == "tie":  # a and b are mirror images of each other, or nearly so, by a line through x
+        angle, length = rng.uniform(0, 1.5, n), rng.uniform(0.01, 0.3, n)
+        ends = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * length[:, None]
+        x[:, 0] = x[:, 3] = 0.5
+        x[:, 1], x[:, 2] = 0.5 + ends, 0.5 + ends * [1, -1]
+        x[:, 1] += step * rng.integers(-2, 3, (n, 2))
+        x[:, 4] = rng.uniform(0.1, 1, (n, 1)) * [1, 0]
+    else:
+        x[:, 4] -= x[:, 3]
+    x = x.astype(real)
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real))
+    program = cl.Program(ctx, source_text("common/half_planes.h") + LATER).build(
+        ["-DDIM=2", f"-DREAL={'double' if real == 'float64' else 'float'}"]
+    )
+    places, found = engine.upload(x), engine.empty(n)
+    kernel = cl.Kernel(program, "probe")
+    kernel(engine.queue, (n,), None, np.int32(n), places.data, found.data)
+    eps2 = Fraction(float(np.finfo(real).eps)) ** 2
+    signs = []
+    for places, later in zip(x, found.get().tolist(), strict=True):
+        truth, terms = exactly_later(*places)
+        if later == 0:  # below what is taken for noise, and what that may be off by
+            assert abs(truth) <= 80 * eps2 * terms
+        else:  # a few eps^2 for each of eight operations, and one rounding of the sum
+            assert abs(Fraction(later) - truth) <= 16 * eps2 * terms + abs(truth) / 2**20
+            assert (later > 0) == (truth > 0)
+        signs.append(np.sign(later))
+    assert {-1, 0, 1} == set(signs)
+
+
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_a_cell_of_a_thousand_faces(ctx, real):
     """The middle of a circle; without it a thousand cells meet there, but for rounding."""
