@@ -63,7 +63,7 @@ inline void weight_offset(const int i, const REAL *gradient, global const REAL *
    over kinks of h at the scale of the cells. */
 kernel void fit_gradient(const int size, global const int *starts, global const int *neighbours,
                          global const REAL *points, global const REAL *log_h, global const REAL *offsets,
-                         global const REAL *covariances, global REAL *gradient, global REAL *lloyd)
+                         global const REAL *covariances, global REAL *gradient, global REAL *lloyd PERIOD_ARGS)
 {
     WORK_ITEM(i);
     MANY(REAL) sums[DIM][DIM], rises[DIM];

@@ -6,7 +6,7 @@
 kernel void follow_potential(const int size, global const int *starts, global const int *neighbours,
                              global const FACE *face_measures, global const FACE *face_centroids,
                              global const REAL *volumes, global const REAL *points, global const REAL *psi,
-                             global REAL *u)
+                             global REAL *u PERIOD_ARGS)
 {
     WORK_ITEM(i);
     REAL sum[DIM] = {0};

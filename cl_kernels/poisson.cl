@@ -55,7 +55,7 @@ inline REAL measure_from(int k, int end, global const int *neighbours, global co
    rho at the face where log rho is smooth. */
 kernel void assemble(int n, int weighted, global const int *starts, global const int *neighbours,
                      global const FACE *face_measures, global const REAL *points, global const REAL *density,
-                     global STORE *weights)
+                     global STORE *weights PERIOD_ARGS)
 {
     const int i = get_global_id(0);
     if (i >= n)

@@ -17,7 +17,7 @@
 #endif
 
 #if DIM == 2
-inline REAL2 difference(global const REAL *points, int from, int to)
+inline REAL2 difference(global const REAL *points, int from, int to PERIOD_ARGS)
 {
     return (REAL2)(DIFFERENCE(0, points[2 * from], points[2 * to]),
                    DIFFERENCE(1, points[2 * from + 1], points[2 * to + 1]));
@@ -30,7 +30,7 @@ inline REAL2 difference(global const REAL *points, int from, int to)
    unstrained lattice, in single precision: it is compared with thresholds. Only six-sided inner cells have weight. */
 kernel void measure_strain(const int size, global const int *starts, global const int *neighbours,
                            global const REAL *points, global const REAL *h, global int2 *kinds,
-                           global float4 *strain OUTLINE_ARGS)
+                           global float4 *strain OUTLINE_ARGS PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const int n = starts[i + 1] - starts[i];
@@ -42,7 +42,7 @@ kernel void measure_strain(const int size, global const int *starts, global cons
             ++walls;
             continue;
         }
-        const REAL2 d = difference(points, i, j);
+        const REAL2 d = difference(points, i, j PERIODS);
         s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(d.s0 * d.s0, d.s0 * d.s1, d.s1 * d.s1, 0);
     }
 #ifdef POLYGON
@@ -83,7 +83,7 @@ kernel void average_strain(const int size, global const int *starts, global cons
    are. */
 kernel void score_pairs(const int size, global const int *starts, global const int *neighbours,
                         global const REAL *points, global const int2 *kinds, global const float4 *strain,
-                        const int at_walls, global int *partners, global REAL *pull, global ulong *keys)
+                        const int at_walls, global int *partners, global REAL *pull, global ulong *keys PERIOD_ARGS)
 {
     WORK_ITEM(i);
     REAL best = 0, rank = 0;
@@ -97,7 +97,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
             const bool one_wall = (kind.s1 > 0) != (kinds[j].s1 > 0);
             if ((kind.s1 > 0 && kinds[j].s1 > 0) || (one_wall && !at_walls))
                 continue;
-            const REAL2 d = difference(points, i, j);
+            const REAL2 d = difference(points, i, j PERIODS);
             const float4 s = (strain[i] + strain[j]) / 2;
             const REAL along = s.s0 * d.s0 * d.s0 + 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s1 * d.s1;
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
@@ -154,7 +154,7 @@ kernel void tally_pairs(const int size, global const ulong *chosen, global const
 kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
                        global const int *partners, const REAL theta, const REAL shift, global const REAL *points,
                        global const REAL *reach, global int *kept, global REAL2 *shifts, global int *born,
-                       global REAL2 *births, global ulong *busy)
+                       global REAL2 *births, global ulong *busy PERIOD_ARGS)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -168,7 +168,7 @@ kernel void mark_pairs(const int size, global const ulong *chosen, global const 
         kept[i] = 0;
         return;
     }
-    const REAL2 d = difference(points, i, j);
+    const REAL2 d = difference(points, i, j PERIODS);
     const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
     born[j] = 1;
     shifts[j] = R(SPLIT_DISTANCE) * reach[j] * across;
@@ -194,7 +194,7 @@ kernel void score_strain(const int size, global const int *starts, global const 
    neighbour merged. */
 kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, global const int *starts,
                         global const int *neighbours, global const REAL *points, global int *kept, global REAL2 *shifts,
-                        global int *born, global REAL2 *births, global ulong *busy)
+                        global int *born, global REAL2 *births, global ulong *busy PERIOD_ARGS)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -203,14 +203,14 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
     REAL best = 0;
     int partner = -1;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const REAL2 d = difference(points, i, neighbours[k]);
+        const REAL2 d = difference(points, i, neighbours[k] PERIODS);
         const REAL d2 = dot(d, d);
         if (partner < 0 || (insert ? d2 > best : d2 < best)) {
             best = d2;
             partner = neighbours[k];
         }
     }
-    const REAL2 half_way = difference(points, i, partner) / 2;
+    const REAL2 half_way = difference(points, i, partner PERIODS) / 2;
     if (insert) {
         born[i] = 1;
         births[i] = half_way;

@@ -68,7 +68,7 @@ kernel void assemble(int n, const int room, global const int *starts, global con
                      const REAL penalty, const REAL lenience, const REAL bound, global float *rows,
                      global float *columns, global STORE *own, global STORE *eps, global STORE *inverse_diagonal,
                      global STORE *r, global STORE *z, global REAL *partial, global const int *labels, const int fixed,
-                     const int warm, global const float *start)
+                     const int warm, global const float *start PERIOD_ARGS)
 {
     local REAL scratch[GROUP_SIZE];
     Sum norm = SUM_ZERO, gamma = SUM_ZERO;

@@ -37,7 +37,7 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbours
    `most`: in a strip that is far thinner than h, generators beyond it are there that it has brought on coarser levels.
  */
 inline REAL room_inwards(int i, REAL most, REAL gap, const REAL *n, global const int *starts,
-                         global const int *neighbours, global const REAL *points)
+                         global const int *neighbours, global const REAL *points PERIOD_ARGS)
 {
     REAL room = most;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -96,7 +96,7 @@ kernel void place_children(const int size, global const int *starts, global cons
             const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]), t = BOUNDARY_TANGENT(j);
             const REAL gap = m.s0 * t.s1 - m.s1 * t.s0;
             const REAL normal[2] = {-t.s1, t.s0};
-            const REAL room = room_inwards(i, h[i] / 2, gap, normal, starts, neighbours, points);
+            const REAL room = room_inwards(i, h[i] / 2, gap, normal, starts, neighbours, points PERIODS);
             const REAL way = gap > h[i] / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {x[0] + m.s0 - way * t.s1, x[1] + m.s1 + way * t.s0};
@@ -114,7 +114,7 @@ kernel void place_children(const int size, global const int *starts, global cons
             /* In a box that is thinner than the cell, too: short of what comes from its other wall; in the cell. */
             const REAL gap = fabs(points[DIM * i + axis] - level);
             const REAL most = fmin(h[i], (upper[axis] - lower[axis]) / 2);
-            const REAL room = room_inwards(i, most, gap, normal, starts, neighbours, points);
+            const REAL room = room_inwards(i, most, gap, normal, starts, neighbours, points PERIODS);
             const REAL way = gap > most / 8 || room < 3 * gap ? fmin(gap / 2, h[i] / 4) : room / 2;
             child[axis] = level + (wall % 2 ? -way : way);
 #endif

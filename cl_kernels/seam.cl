@@ -17,7 +17,7 @@
    points lies within [-P, 2 P]. */
 
 #ifndef PERIODIC
-#error "build with -DPERIODIC -DPERIOD_0=... -DPERIOD_1=... -DPERIOD_2=..."
+#error "build with -DPERIODIC"
 #endif
 #define CODES (DIM == 2 ? 9 : 27) /* sum over the axes of (c + 1) 3^a */
 #define CENTRE (CODES / 2)
@@ -32,14 +32,12 @@ inline int step_of(int code, int a)
     return (a == 0 ? code : a == 1 ? code / 3 : code / 9) % 3 - 1;
 }
 
-#define PERIOD_ALONG(a) ((a) == 0 ? PERIOD(0) : (a) == 1 ? PERIOD(1) : PERIOD(2))
-
 /* The codes, as bits, whose step along axis a is -1; those of the next step are shifted by the weight of the axis. */
 #define WEIGHT(a) ((a) == 0 ? 1 : (a) == 1 ? 3 : 9)
 #define BACK(a) ((a) == 0 ? 0x1249249 : (a) == 1 ? 0x1c0e07 : 0x1ff)
 
 /* The codes, as bits, of those images of x that are within the largest margin along each axis: none, as a rule. */
-inline int codes_near(const REAL *x, global const int *extremes)
+inline int codes_near(const REAL *x, global const int *extremes PERIOD_ARGS)
 {
     int codes = (1 << CODES) - 1;
     EACH_AXIS(a)
@@ -60,7 +58,8 @@ inline int take_code(int *codes)
 }
 
 /* The image y of x that has the code; is it within the margins? */
-inline bool make_image(const REAL *x, int code, global const float *margins, const blocks_t *blocks, REAL *y)
+inline bool make_image(const REAL *x, int code, global const float *margins, const blocks_t *blocks,
+                       REAL *y PERIOD_ARGS)
 {
     EACH_AXIS(a)
     y[a] = x[a] + step_of(code, a) * PERIOD(a);
@@ -92,7 +91,7 @@ inline float block_spacing(int k, int j, int count, int was, REAL length)
    extremes are collected (common/seams.h). Wishes begin anew. */
 kernel void next_margins(const int size, global const float *needed, const int4 was, const float factor,
                          const int spread, const int grow, BLOCK_ARGS, global float *margins, global int *extremes,
-                         global int *wishes)
+                         global int *wishes PERIOD_ARGS)
 {
     WORK_ITEM(k);
     BLOCKS_GIVEN;
@@ -101,7 +100,7 @@ kernel void next_margins(const int size, global const float *needed, const int4 
     const int first = DIM == 2 ? along : along / BLOCKS, second = DIM == 2 ? 0 : along % BLOCKS;
     const int b = FIRST_ALONG(a), c = DIM == 2 ? b : SECOND_ALONG(a), earlier[4] = {was.s0, was.s1, was.s2, was.s3};
     const int count_b = count_along(&blocks, b), count_c = count_along(&blocks, c);
-    const REAL period = PERIOD_ALONG(a);
+    const REAL period = PERIOD(a);
     wishes[k] = 0;
     if ((first >= count_b) | (second >= count_c) | !(period > 0)) {
         margins[k] = 0;
@@ -131,7 +130,7 @@ kernel void next_margins(const int size, global const float *needed, const int4 
 
 /* Per generator i: how many images it has. */
 kernel void count_images(const int size, global const REAL *points, global const float *margins,
-                         global const int *extremes, BLOCK_ARGS, global int *counts)
+                         global const int *extremes, BLOCK_ARGS, global int *counts PERIOD_ARGS)
 {
     WORK_ITEM(i);
     BLOCKS_GIVEN;
@@ -139,8 +138,8 @@ kernel void count_images(const int size, global const REAL *points, global const
     EACH_AXIS(a)
     x[a] = points[DIM * i + a];
     int count = 0;
-    for (int codes = codes_near(x, extremes); codes != 0;)
-        count += make_image(x, take_code(&codes), margins, &blocks, y);
+    for (int codes = codes_near(x, extremes PERIODS); codes != 0;)
+        count += make_image(x, take_code(&codes), margins, &blocks, y PERIODS);
     counts[i] = count;
 }
 
@@ -148,7 +147,7 @@ kernel void count_images(const int size, global const REAL *points, global const
    whatever the margins; firsts are the prefix sums of the counts. */
 kernel void place_images(const int size, global const REAL *points, global const float *margins,
                          global const int *extremes, BLOCK_ARGS, global const int *firsts, global REAL *extended,
-                         global int *owners, global int *codes)
+                         global int *owners, global int *codes PERIOD_ARGS)
 {
     WORK_ITEM(i);
     BLOCKS_GIVEN;
@@ -156,9 +155,9 @@ kernel void place_images(const int size, global const REAL *points, global const
     EACH_AXIS(a)
     extended[DIM * i + a] = x[a] = points[DIM * i + a];
     int g = firsts[i];
-    for (int near = codes_near(x, extremes); near != 0;) {
+    for (int near = codes_near(x, extremes PERIODS); near != 0;) {
         const int code = take_code(&near);
-        if (!make_image(x, code, margins, &blocks, y))
+        if (!make_image(x, code, margins, &blocks, y PERIODS))
             continue;
         EACH_AXIS(a)
         extended[DIM * (size + g) + a] = y[a];
@@ -177,6 +176,7 @@ kernel void measure_margins(const int size, global const int *items, global cons
 {
     WORK_ITEM(p);
     SEAMS_GIVEN;
+    const REAL4 periods = seams.period;
     const int i = items[p];
     if (i >= seams.own)
         return;
@@ -215,11 +215,11 @@ kernel void measure_margins(const int size, global const int *items, global cons
 /* Per block: what is needed, as is wished, or else the share `kept` of its margin: cells that move to and fro do not
    make it too narrow in turn. */
 kernel void note_margins(const int size, global const float *margins, const float kept, global const int *wishes,
-                         global float *needed)
+                         global float *needed PERIOD_ARGS)
 {
     WORK_ITEM(k);
     const int a = k / (2 * (DIM == 2 ? BLOCKS : BLOCKS * BLOCKS));
-    needed[k] = fmax(as_float(wishes[k]), kept * fmin(margins[k], (float)PERIOD_ALONG(a)));
+    needed[k] = fmax(as_float(wishes[k]), kept * fmin(margins[k], (float)PERIOD(a)));
 }
 
 /* The row of generator j's image with this code among those of `size` generators and their images, or -1. */
@@ -239,7 +239,7 @@ kernel void fold_rows(const int size, global const int *starts, global const int
                       global const FACE *face_measures, global const REAL *volumes, global const REAL *points,
                       global const int *firsts, global const int *owners, global const int *codes, const REAL share,
                       const int nearest, global int *folded, global int *face_codes, global uchar *kept,
-                      global int *counts, global int *report)
+                      global int *counts, global int *report PERIOD_ARGS)
 {
     WORK_ITEM(i);
     int count = 0;
@@ -308,7 +308,7 @@ kernel void close_rows(const int size, global const int *starts, global const uc
    on. */
 kernel void unfold_rows(const int size, global const int *starts, global const int *neighbours,
                         global const REAL *points, global const int *firsts, global const int *codes,
-                        global int *unfolded)
+                        global int *unfolded PERIOD_ARGS)
 {
     WORK_ITEM(i);
     REAL x[DIM];
@@ -318,7 +318,7 @@ kernel void unfold_rows(const int size, global const int *starts, global const i
         const int j = neighbours[k];
         int label = j < 0 ? -1 : j, wanted = CENTRE, weight = 1;
         for (int a = 0; a < DIM && j >= 0; ++a, weight *= 3) {
-            const REAL d = points[DIM * j + a] - x[a], half_period = PERIOD_ALONG(a) / 2;
+            const REAL d = points[DIM * j + a] - x[a], half_period = PERIOD(a) / 2;
             if (half_period > 0 && fabs(d) > half_period)
                 wanted += d < 0 ? weight : -weight;
         }

@@ -40,7 +40,8 @@ typedef struct {
     REAL tension;  /* the neighbour's */
 } Face;
 
-inline Face look_at_face(int label, REAL2 x, global const REAL *points, global const REAL *tension OUTLINE_ARGS)
+inline Face look_at_face(int label, REAL2 x, global const REAL *points,
+                         global const REAL *tension OUTLINE_ARGS PERIOD_ARGS)
 {
     Face f;
     f.label = label;
@@ -77,16 +78,17 @@ inline bool ends_at(REAL2 r, int k, REAL2 tangent, global const FACE *face_measu
 kernel void descend_shape(const int size, global const int *starts, global const int *neighbours,
                           global const FACE *face_measures, global const FACE *face_centroids,
                           global const REAL *points, global const REAL *tension, global const REAL *pressure,
-                          global const REAL *h, const REAL rate, const REAL longest, global REAL *lloyd OUTLINE_ARGS)
+                          global const REAL *h, const REAL rate, const REAL longest,
+                          global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const REAL2 x = (REAL2)(points[2 * i], points[2 * i + 1]);
     const int begin = starts[i], end = starts[i + 1];
     const REAL wi = tension[i];
     REAL2 g = 0;
-    Face before = look_at_face(neighbours[end - 1], x, points, tension OUTLINE);
+    Face before = look_at_face(neighbours[end - 1], x, points, tension OUTLINE PERIODS);
     for (int k = begin; k < end; ++k) {
-        const Face face = look_at_face(neighbours[k], x, points, tension OUTLINE);
+        const Face face = look_at_face(neighbours[k], x, points, tension OUTLINE PERIODS);
         const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
         const REAL2 r = m - face_measures[k] / 2 * face.tangent; /* corner k */
         REAL s = 0;
@@ -97,7 +99,7 @@ kernel void descend_shape(const int size, global const int *starts, global const
         const int last = k == begin ? end - 1 : k - 1;
         apart = !ends_at(r, last, before.tangent, face_measures, face_centroids);
         for (int other = begin; other < end && apart; ++other) {
-            const Face ending = look_at_face(neighbours[other], x, points, tension OUTLINE);
+            const Face ending = look_at_face(neighbours[other], x, points, tension OUTLINE PERIODS);
             if (ends_at(r, other, ending.tangent, face_measures, face_centroids)) {
                 before = ending;
                 apart = false;

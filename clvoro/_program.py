@@ -205,6 +205,16 @@ def build_seconds() -> float:
     return _building
 
 
+def _period_args(defines: Mapping[str, object], real: np.dtype) -> tuple[np.ndarray, ...]:
+    """Return the periods that the defines of a domain tell, as one vector."""
+    if "PERIODIC" not in defines:
+        return ()
+    periods = [float.fromhex(str(defines[f"PERIOD_{a}"])) for a in range(3)]
+    vector = np.array([*periods, 0], real)
+    vector.setflags(write=False)
+    return (vector,)
+
+
 @dataclass(frozen=True)
 class Engine:
     """One device, ready to work: context, in-order queue, dimension and precision.
@@ -230,6 +240,8 @@ class Engine:
 
     item_group: int = field(init=False)
     """Work-items per group of a kernel that does one item each."""
+    period_args: tuple[np.ndarray, ...] = field(init=False, repr=False, compare=False)
+    """What kernels take as PERIOD_ARGS: the periods in the device's coordinates, padded to four, or nothing."""
     workspace: Workspace = field(init=False, repr=False, compare=False)
     """Memory that stages use in turn; see `scratch`."""
     pool: KernelPool = field(init=False, repr=False, compare=False, default_factory=KernelPool)
@@ -242,6 +254,7 @@ class Engine:
         object.__setattr__(self, "groups", CPU_GROUPS if cpu else min(512, units * 8))
         object.__setattr__(self, "group_size", 1 if cpu else 128)
         object.__setattr__(self, "item_group", 64)
+        object.__setattr__(self, "period_args", _period_args(dict(self.domain_defines), self.real))
         object.__setattr__(self, "workspace", Workspace(self.queue))
 
     def single(self) -> Engine:

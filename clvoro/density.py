@@ -88,7 +88,7 @@ class Density:
             log_h = self._weigh(t, h, w)
             engine.run_each(
                 k.fit_gradient, t.n, t.starts, t.neighbours, t.points, log_h, t.offsets, t.covariances,
-                gradient, lloyd,
+                gradient, lloyd, *engine.period_args,
             )  # fmt: skip
         return w
 

@@ -123,7 +123,7 @@ class Domain(ABC):
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return what kernels take as DOMAIN_ARGS; see common/domain.h."""
-        return self.device_corners(engine.real)
+        return *self.device_corners(engine.real), *engine.period_args
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class Box(Domain):
         return lower, upper
 
     def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Say how long the periods are, if there are any; see common/domain.h."""
+        """Say how long the periods are, if there are any: kernels that do not name them take them as PERIOD_ARGS."""
         if not any(self.periodic):
             return ()
         lengths = np.zeros(3)

@@ -1,4 +1,7 @@
-"""Cells of a folded diagram (see `seam.py`) in 2D, whose neighbours are the nearest images of their generators."""
+"""Cells of a folded diagram (see `seam.py`) in 2D, whose neighbours are the nearest images of their generators.
+
+Their kernels have the periods built in: all that is said of corners takes differences of positions.
+"""
 
 from __future__ import annotations
 

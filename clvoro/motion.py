@@ -22,7 +22,7 @@ class Motion:
         """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d)."""
         self.engine.run_each(
             self._kernels.follow_potential, t.n, t.starts, t.neighbours, t.face_measures,
-            t.face_centroids, t.volumes, t.points, psi, u,
+            t.face_centroids, t.volumes, t.points, psi, u, *self.engine.period_args,
         )  # fmt: skip
 
     def relax_globally(

@@ -147,7 +147,7 @@ class Poisson:
         engine.run(
             self._kernels_in(store, face_measures.dtype).assemble, n, np.int32(n),
             np.int32(density is not None), starts, neighbours, face_measures, points,
-            points if density is None else density, weights,
+            points if density is None else density, weights, *self.engine.period_args,
         )  # fmt: skip
         return Laplacian(starts, neighbours, weights)
 

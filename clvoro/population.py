@@ -194,8 +194,9 @@ class PopulationControl:
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
         raw, once = (self._room("strain", turn, size=4 * n, dtype=np.float32) for turn in range(2))
         engine.run_each(
-            k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines
-        )
+            k.measure_strain, n, t.starts, t.neighbours, t.points, h, kinds, raw, *t.outlines,
+            *engine.period_args,
+        )  # fmt: skip
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, raw, once)
         engine.run_each(k.average_strain, n, t.starts, t.neighbours, once, raw)
         return kinds, once, raw
@@ -218,7 +219,7 @@ class PopulationControl:
         self._scan.exclusive(ranks, ranks, n)
         engine.run_each(
             k.mark_nuclei, n, chosen, ranks, t.starts, t.neighbours, t.points, *marks.arrays,
-            marks.busy,
+            marks.busy, *engine.period_args,
         )  # fmt: skip
 
     def _climb(
@@ -243,7 +244,7 @@ class PopulationControl:
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
             k.score_pairs, n, t.starts, t.neighbours, t.points, kinds, strain,
-            np.int32(theta <= THETA), partners, pull, keys,
+            np.int32(theta <= THETA), partners, pull, keys, *engine.period_args,
         )  # fmt: skip
         self._exempt(t, keys, around=True)
         if nucleated:
@@ -258,7 +259,7 @@ class PopulationControl:
         best = order[np.argmin(np.abs(changes[order] - need))]
         engine.run_each(
             k.mark_pairs, n, chosen, pull, kinds, partners, real(theta), real(shifts[best]),
-            t.points, reach, *marks.arrays, marks.busy,
+            t.points, reach, *marks.arrays, marks.busy, *engine.period_args,
         )  # fmt: skip
         return int(changes[best])
 

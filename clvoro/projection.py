@@ -132,7 +132,7 @@ class Projection:
             t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
             real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, partial,
             t.starts if labels is None else labels, np.int32(fixed), np.int32(warm), start,
-            groups=groups,
+            *engine.period_args, groups=groups,
         )()  # fmt: skip
         iteration = (
             *sizes, np.int32(warm), real(tolerance), *faces, v.rows, v.columns, v.own, v.eps, v.inverse,

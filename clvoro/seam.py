@@ -153,12 +153,14 @@ class Seam:
         engine.run_each(
             k.next_margins, block_count(d), margins.needed, was, np.float32(factor),
             np.int32(others), np.int32(grow), *blocks, margins.widths, margins.extremes, margins.wishes,
+            *engine.period_args,
         )  # fmt: skip
         self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
         engine.run_each(
-            k.count_images, n, points, margins.widths, margins.extremes, *blocks, firsts
-        )
+            k.count_images, n, points, margins.widths, margins.extremes, *blocks, firsts,
+            *engine.period_args,
+        )  # fmt: skip
         self._scan.exclusive(firsts, firsts, n)
         ghosts = int(firsts[n].get())
         count = n + ghosts
@@ -167,7 +169,7 @@ class Seam:
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
             k.place_images, n, points, margins.widths, margins.extremes, *blocks, firsts, extended,
-            owners, codes,
+            owners, codes, *engine.period_args,
         )  # fmt: skip
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
         # On a coarse grid, so that the corners of the extended box are exact.
@@ -187,7 +189,7 @@ class Seam:
         neighbours = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
             self._kernels.unfold_rows, images.n, previous.starts, previous.neighbours,
-            images.points, images.firsts, images.codes, neighbours,
+            images.points, images.firsts, images.codes, neighbours, *self.engine.period_args,
         )  # fmt: skip
         return Rows(images.n, previous.starts, neighbours)
 
@@ -228,7 +230,7 @@ class Seam:
             )  # fmt: skip
         engine.run_each(
             k.note_margins, block_count(engine.dim), margins.widths, images.kept, margins.wishes,
-            margins.needed,
+            margins.needed, *engine.period_args,
         )  # fmt: skip
         margins.cells, margins.guessed = n, False
         m = int(t.starts[n].get())
@@ -241,7 +243,7 @@ class Seam:
         engine.run_each(
             k.fold_rows, n, t.starts, t.neighbours, t.face_measures, t.volumes, t.points,
             images.firsts, images.owners, images.codes, engine.real.type(share), np.int32(nearest),
-            *graph, kept, starts, self._report,
+            *graph, kept, starts, self._report, *engine.period_args,
         )  # fmt: skip
         words = self._report.get()
         flags, places = int(words[1]), None

@@ -47,4 +47,5 @@ class Shape:
             engine.run_each(
                 k.descend_shape, t.n, t.starts, t.neighbours, t.face_measures, t.face_centroids,
                 t.points, tension, pressure, h, real(rate), real(longest), lloyd, *t.outlines,
+                *engine.period_args,
             )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import Voronoi, cKDTree
 
 import clvoro
-from clvoro import sizing
+from clvoro import _program, sizing
 from clvoro.errors import InputError, InputTypeError
 from clvoro.faces import face_owners
 from clvoro.io.vtu_read import load_vtu
@@ -653,3 +653,17 @@ def test_each_attempt_begins_with_the_graph_from_before(adapter, monkeypatch, re
     stages.release()
     off = np.abs(volumes - adapter.diagram(SLAB, points).volumes)
     assert off.max() < ROUNDING[adapter.dtype.name] * volumes.mean()
+
+
+@pytest.mark.parametrize(("dim", "size"), [(2, "0.15"), (3, "0.3")])
+def test_boxes_of_other_lengths_share_their_kernels(double, dim, size):
+    """Those that work on folded rows in 2D have the periods built in; what is built for each takes a second or so."""
+    size, periodic = sizing.Expression(size), (True, False, True)[:dim]
+    built = []
+    for length in (1.53, 1.71):
+        before = set(_program._programs)
+        box = clvoro.Box((0,) * dim, (length, 1.5, 1.5)[:dim], periodic=periodic)
+        double.run(box, size, method="adaptive", max_steps=3)
+        built.append(set(_program._programs) - before)
+    assert all(any(option.startswith("-DFOLD_0") for option in options) for *_, options in built[1])
+    assert bool(built[1]) == (dim == 2)

@@ -1,12 +1,21 @@
 /* What a kernel that places generators has to know of the domain: DOMAIN_ARGS in its signature, DOMAIN to hand them
-   on. */
+   on. One that only wants differences of positions has PERIOD_ARGS at the end of its signature, and hands PERIODS on:
+   as arguments, so that kernels are built once for all periodic boxes. */
 #include "common/real.h"
+
+#ifdef PERIODIC
+#define PERIOD_ARGS , const REAL4 periods
+#define PERIODS , periods
+#else
+#define PERIOD_ARGS
+#define PERIODS
+#endif
 
 #ifdef POLYGON
 #include "common/edges.h"
 #else
-#define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper
-#define DOMAIN box_lower, box_upper
+#define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper PERIOD_ARGS
+#define DOMAIN box_lower, box_upper PERIODS
 #endif
 
 /* Corners of the box as arrays. */
@@ -17,7 +26,7 @@
 #ifdef PERIODIC
 /* Length of the period along axis a, in which positions lie in [0, period); 0 where there are walls. Positions and
    periods are multiples of eps in the unit box, so that differences are exact, whatever the image. */
-#define PERIOD(a) ((a) == 0 ? R(PERIOD_0) : (a) == 1 ? R(PERIOD_1) : R(PERIOD_2))
+#define PERIOD(a) ((a) == 0 ? periods.s0 : (a) == 1 ? periods.s1 : periods.s2)
 
 inline REAL nearest_image(REAL d, REAL period)
 {
