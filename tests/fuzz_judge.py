@@ -62,7 +62,8 @@ def run_by(made_by: clvoro.Adapter, domain: Any, *arguments: Any, **options: Any
     try:
         return made_by.run(domain, *arguments, **options)
     except InputError as error:
-        demand_truth(error, domain, made_by.dtype.name, options.get("points"))
+        levels = options.get("levels") or 0
+        demand_truth(error, domain, made_by.dtype.name, options.get("points"), levels)
         raise
 
 
@@ -72,8 +73,11 @@ def refuse_large(needed: float) -> None:
         raise TooLarge
 
 
-def demand_truth(error: InputError, domain: Any, real: str, points: Any) -> None:
-    """Raise if `error` says of generators or edges that they are too close to each other, and they are not."""
+def demand_truth(error: InputError, domain: Any, real: str, points: Any, levels: int = 0) -> None:
+    """Raise if `error` says of generators or edges that they are too close to each other, and they are not.
+
+    New generators of finer levels, between those that are there, are half as far apart, and somewhat less.
+    """
     demand_telling_apart(error, domain, real)
     if not any(said in str(error) for said in ("too close to each other", "coincide in")):
         return
@@ -83,7 +87,8 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any) -> None
         placed = domain.place(np.asarray(points, float), np.dtype(float))
         apart = KDTree(placed).query(placed, k=2)[0][:, 1] if len(placed) > 1 else np.array([1.0])
         in_space = domain.dim == 3 and real == "float32"
-        if apart.min() <= (CLOSE_IN_SPACE if in_space else CLOSE * np.finfo(real).eps):
+        least = CLOSE_IN_SPACE if in_space else CLOSE * np.finfo(real).eps
+        if apart.min() <= least * (3**levels if domain.dim == 3 else 1):
             return
     raise Wrong(f"this is not so: {error}") from error
 
