@@ -1,13 +1,17 @@
 """Generators near each other, or cocircular: how many sets become meshes that `check` passes.
 
-    python bench/clusters.py [--sets 60] [--kinds circles,arcs] [--dtype float32] [--device NAME]
-        [--json]
+    python bench/clusters.py [--dim 3] [--sets 60] [--kinds circles,arcs] [--dtype float32]
+        [--device NAME] [--json]
 
 In the unit square, in both precisions if none is named. `clusters`: 3 to 40 generators within 1e-13
 to 1e-3 of each other (1e-5 in float32), at random, on lines or circles, beside fewer anywhere.
 `circles` and `arcs`: 400 at random on one. `lines`: 20 to 150 on a line 1e-4 to 5e-4 apart, beside 40.
 `one rounding`: 3 to 81 places next to each other, beside 300; `across seams`: the same in a
 periodic box. Places are rounded to the precision beforehand, and those that fall together are one.
+
+In the unit cube: `clusters` and `lines` likewise; `spheres`: 100 at random on one; `rings`: 60 on a
+circle; `few roundings`: two groups of 2 to 16, each within 40 roundings of a place, beside 60;
+`lattices`: 3 to 60 places of one of five each way, a rounding apart, beside 200.
 """
 
 from __future__ import annotations
@@ -70,27 +74,91 @@ def one_rounding(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
     return np.vstack([PLACE + step * chosen, rng.random((300, 2))])
 
 
+def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return unit vectors in space."""
+    v = rng.standard_normal((count, 3))
+    return v / np.linalg.norm(v, axis=1)[:, None]
+
+
+def clusters_in_space(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
+    """Return a few generators near each other, and fewer anywhere."""
+    count, size = int(rng.integers(3, 40)), 10 ** rng.uniform(-13 if real == np.float64 else -5, -3)
+    ways = directions(rng, count)
+    line = 10 * rng.uniform(-1, 1, (count, 1)) * ways[0]
+    near = [rng.standard_normal((count, 3)), line, ways][rng.integers(3)]
+    return np.vstack([rng.random(3) + size * near, rng.random((int(rng.integers(1, 10)), 3))])
+
+
+def spheres(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
+    """Return a sphere of generators."""
+    return 0.5 + 0.3 * rng.uniform(-1, 1, 3) + 10 ** rng.uniform(-3, -0.5) * directions(rng, 100)
+
+
+def rings(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
+    """Return a circle of generators in space, turned anyhow."""
+    radius, t = 10 ** rng.uniform(-3, -0.5), rng.uniform(0, 2 * np.pi, 60)
+    plane = np.linalg.qr(rng.standard_normal((3, 3)))[0][:2]
+    circle = np.column_stack([np.cos(t), np.sin(t)]) @ plane
+    return 0.5 + 0.3 * rng.uniform(-1, 1, 3) + radius * circle
+
+
+def lines_in_space(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
+    """Return a line of generators, and 40 anywhere."""
+    count = int(rng.integers(20, 150))
+    along = (np.arange(count) - count / 2) * rng.choice([1e-4, 2.5e-4, 5e-4])
+    line = 0.5 + 0.2 * rng.uniform(-1, 1, 3) + np.outer(along, directions(rng, 1)[0])
+    return np.vstack([line, rng.random((40, 3))])
+
+
+def few_roundings(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
+    """Return two groups of generators within a few roundings of each other, and 60 anywhere."""
+    step = 2 * float(np.spacing(np.asarray(PLACE, real)))
+    groups = [
+        at + step * rng.integers(0, 40, (int(rng.integers(2, 17)), 3)) for at in (PLACE, 0.25)
+    ]
+    return np.vstack([*groups, rng.random((60, 3))])
+
+
+def lattices(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
+    """Return places of a lattice a rounding apart, and 200 anywhere."""
+    step = 2 * float(np.spacing(np.asarray(PLACE, real)))
+    lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
+    chosen = lattice[rng.permutation(125)[: int(rng.integers(3, 61))]]
+    return np.vstack([PLACE + step * chosen, rng.random((200, 3))])
+
+
 KINDS = {
-    "clusters": clusters,
-    "circles": circles,
-    "arcs": arcs,
-    "lines": lines,
-    "one-rounding": one_rounding,
-    "across-seams": one_rounding,
+    2: {
+        "clusters": clusters,
+        "circles": circles,
+        "arcs": arcs,
+        "lines": lines,
+        "one-rounding": one_rounding,
+        "across-seams": one_rounding,
+    },
+    3: {
+        "clusters": clusters_in_space,
+        "spheres": spheres,
+        "rings": rings,
+        "lines": lines_in_space,
+        "few-roundings": few_roundings,
+        "lattices": lattices,
+    },
 }
 
 
-def sets_of(kind: str, count: int, real: np.dtype) -> Iterator[np.ndarray]:
+def sets_of(dim: int, kind: str, count: int, real: np.dtype) -> Iterator[np.ndarray]:
     """Yield the sets of generators of a kind."""
     for seed in range(count):
-        points = np.clip(KINDS[kind](np.random.default_rng(seed), real), 0, 1).astype(real)
-        yield np.unique(points, axis=0).astype(float)
+        points = KINDS[dim][kind](np.random.default_rng(seed), real)
+        yield np.unique(np.clip(points, 0, 1).astype(real), axis=0).astype(float)
 
 
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--sets", type=int, default=60)
-    options_of.add_argument("--kinds", type=names, default=list(KINDS))
+    options_of.add_argument("--dim", type=int, choices=list(KINDS), default=2)
+    options_of.add_argument("--kinds", type=names)
     options_of.set_defaults(dtype=None)
     options = options_of.parse_args()
     columns = {
@@ -101,10 +169,11 @@ def main() -> int:
     precisions = [options.dtype] if options.dtype else ["float64", "float32"]
     for options.dtype in precisions:
         adapter = make_adapter(options)
-        for kind in options.kinds:
-            box = clvoro.Box((0, 0), (1, 1), periodic=kind == "across-seams")
+        for kind in options.kinds or KINDS[options.dim]:
+            ends = (0,) * options.dim, (1,) * options.dim
+            box = clvoro.Box(*ends, periodic=kind == "across-seams")
             found = {"meshes": 0, "refused": 0, "wrong": 0}
-            for points in sets_of(kind, options.sets, np.dtype(options.dtype)):
+            for points in sets_of(options.dim, kind, options.sets, np.dtype(options.dtype)):
                 try:
                     right = bool(adapter.diagram(box, points).check())
                     found["meshes" if right else "wrong"] += 1

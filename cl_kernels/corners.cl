@@ -18,7 +18,7 @@ inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lowe
                       global const int *starts, global const int *neighbours)
 {
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
-    start_cell(cell, x, lower, upper);
+    start_cell(cell, x, lower, upper, true);
     return clip_by_row(cell, i, x, starts, neighbours, points) != CLIP_FULL;
 }
 

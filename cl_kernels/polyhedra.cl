@@ -53,10 +53,10 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
                        global float *reach, global const int2 *bins, global const FRAME *grid_frames,
                        global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
                        const REAL4 box_upper, const int warm, global const int *old_starts,
-                       global const int *old_neighbours, const int again, const int room, const REAL share,
-                       global int *row_places, global int *row_counts, global int *labels, global REAL *measures,
-                       global REAL *centroids, global REAL *volumes, global REAL *offsets, global REAL *covariances,
-                       global int *report SEAM_ARGS)
+                       global const int *old_neighbours, const int again, const int from_near, const int room,
+                       const REAL share, global int *row_places, global int *row_counts, global int *labels,
+                       global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
+                       global REAL *covariances, global int *report SEAM_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -65,7 +65,7 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
     const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
     cell_t cell;
-    start_cell(&cell, x, box_lower, box_upper);
+    start_cell(&cell, x, box_lower, box_upper, from_near);
     int flag = 0;
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     if (warm) {

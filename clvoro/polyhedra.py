@@ -182,11 +182,28 @@ class Polyhedra:
         ClvoroError
             If a cell has more than `MOST_FACES` faces.
         """
-        rows = n if rows is None else rows
+        engine, rows = self.engine, n if rows is None else rows
         self._reserve_cells(rows)
-        share = self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
-        cut = self._cut(box, points, n, binned, previous, rows, share, seams)
-        return self._match(cut, points, n, share)
+        share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
+        first = engine.scratch(n, np.float32)
+        cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
+        # Where cells differ about a face, what generators near each other cut off is seen from there: it takes longer.
+        for from_near in (False, True):
+            with engine.workspace.frame():
+                cut = self._cut(
+                    box, points, n, binned, first, previous, rows, share, seams, from_near
+                )
+                t = None if cut is None else self._match(cut, points, share)
+            if t is not None:
+                return t
+            self._begin_anew(binned, first, n)
+        raise CloseError(points, n)
+
+    def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
+        """Have the radii from before: the last bits depend on them, and should not on what has been tried."""
+        cl.enqueue_copy(
+            self.engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
+        )
 
     def _cut(
         self,
@@ -194,12 +211,17 @@ class Polyhedra:
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
+        first: cla.Array,
         previous: Tessellation | None,
         rows: int,
         share: np.floating,
         seams: tuple[object, ...],
-    ) -> _CutCells:
-        """Cut the first `rows` cells, again with more room for as long as any needs it."""
+        from_near: bool,
+    ) -> _CutCells | None:
+        """Cut the first `rows` cells, again with more room for as long as any needs it; None if one collapses.
+
+        `first` (n,) float32 is what `binned.reach` has been to begin with; `from_near`: see common/clip.h.
+        """
         engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
         faces = self._take_faces(most if rows != self._n else max(most, self._room))
@@ -214,37 +236,33 @@ class Polyhedra:
             if previous is not None and warm
             else (counts, counts)
         )
-        capacity, again = FACE_CAPACITY, False
-        first_reach, first = engine.real.type(FIRST_REACH), engine.scratch(n, np.float32)
-        cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
+        capacity, again, walk = FACE_CAPACITY, False, None if from_near else self._wrap
+        first_reach = engine.real.type(FIRST_REACH)
         self._report.set(np.zeros(2, np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         while True:
             room, written = np.int32(self._room), (places, counts, *faces, *of_cells)
-            if self._wrap is not None and not again:
+            if walk is not None and not again:
                 with engine.workspace.frame():
                     order = self._ordered(binned, rows)
                     engine.run_each(
-                        self._wrap, -(-rows // STRETCH), np.int32(rows), order, binned.points,
+                        walk, -(-rows // STRETCH), np.int32(rows), order, binned.points,
                         binned.items, binned.spacing, *search, lower, upper, first_reach, room,
                         *written, *seams, group=1,
                     )  # fmt: skip
-            some = np.int32(again or self._wrap is not None)
+            how = np.int32(again or walk is not None), np.int32(from_near)
             engine.run_each(
                 self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items,
-                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *seams,
+                *search, points, lower, upper, np.int32(warm), *old, *how, room, share, *written, *seams,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
             flags, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | DOUBT | NARROW):
-                raise CloseError(points, n)
+                return None
             if m > self._room:
-                # All anew: what did not fit was not kept. With the radii from before, as the last bits depend on them,
-                # and should not on how much room there was.
-                cl.enqueue_copy(
-                    engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
-                )
+                # All anew: what did not fit was not kept.
+                self._begin_anew(binned, first, n)
                 faces = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.zeros(2, np.int32))
@@ -260,8 +278,8 @@ class Polyhedra:
             else:
                 return _CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
 
-    def _match(self, cut: _CutCells, points: cla.Array, n: int, share: np.floating) -> Tessellation:
-        """Keep the faces that both cells see, and bring them into the order of rows."""
+    def _match(self, cut: _CutCells, points: cla.Array, share: np.floating) -> Tessellation | None:
+        """Keep the faces that both cells see, and bring them into the order of rows; None if they differ by much."""
         engine, k, m = self.engine, self._kernels(FACE_CAPACITY), cut.m
         rows, cells, doubt = len(cut.counts), cut.cells, np.int32(cut.doubtful)
         # The previous graph stays until all is done.
@@ -273,7 +291,7 @@ class Polyhedra:
         )  # fmt: skip
         flags = int(self._report.get()[0])
         if flags & ~(DOUBT | NARROW):
-            raise CloseError(points, n)
+            return None
         self._scan.exclusive(starts, starts, rows)
         faces, of_rows = self._faces(m), self._of_cells["starts"][: rows + 1]
         engine.run_each(

@@ -16,9 +16,6 @@ from tests.reference_polygon import faults
 CLOSE = 64
 """Roundings: generators that are given nearer to each other than that, in domains of size 1, may come too near to be
 told apart in space, or for the boundary of a polygon to find its way between them."""
-CLOSE_IN_SPACE = float(np.finfo("float32").eps) ** 0.5
-"""The same in space in single precision: bisectors of such generators are so nearly parallel that corners at the other
-end of the domain are off by as much as the generators are apart. Double precision is to do better than that."""
 NARROW = 8
 """Roundings of positions: where parts of a polygon are no further from each other than that, it may be refused."""
 LARGEST = 150e6
@@ -86,9 +83,7 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any, levels:
     if points is not None:
         placed = domain.place(np.asarray(points, float), np.dtype(float))
         apart = KDTree(placed).query(placed, k=2)[0][:, 1] if len(placed) > 1 else np.array([1.0])
-        in_space = domain.dim == 3 and real == "float32"
-        least = CLOSE_IN_SPACE if in_space else CLOSE * np.finfo(real).eps
-        if apart.min() <= least * (3**levels if domain.dim == 3 else 1):
+        if apart.min() <= CLOSE * np.finfo(real).eps * (3**levels if domain.dim == 3 else 1):
             return
     raise Wrong(f"this is not so: {error}") from error
 

@@ -91,10 +91,9 @@ def test_nearer_than_the_domain_rounds(ctx, dim, size, real):
     rng = np.random.default_rng(dim)
     points = np.vstack([size * rng.random((10, dim)), rng.random((100, dim))])
     points[0] = 0
-    diagram = None
-    with suppress(clvoro.errors.InputError):
+    with suppress(clvoro.ClvoroError):
         diagram = clvoro.Adapter(ctx, real).diagram(clvoro.Box((0,) * dim, (1,) * dim), points)
-    assert diagram is None or diagram.check()
+        assert diagram.check()
 
 
 def arc(seed, n, real):
@@ -129,6 +128,54 @@ def test_cells_around_a_vertex_take_one_place_for_it(ctx):
     """Faces of no length left out one after the other had moved it by 600 roundings."""
     report = clvoro.Adapter(ctx).diagram(UNIT, arc(305, 400, float)).check()
     assert report, report
+
+
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
+
+
+def few_roundings_apart(seed, real):
+    """Two groups of a few places, each within 40 roundings of another, and others anywhere in space."""
+    rng = np.random.default_rng(seed)
+    step = 2 * float(np.spacing(np.asarray(0.6875, real)))
+    groups = [
+        at + step * rng.integers(0, 40, (int(rng.integers(2, 9)), 3)) for at in (0.6875, 0.25)
+    ]
+    points = np.vstack([*groups, rng.random((int(rng.choice([0, 5, 60])), 3))])
+    return np.unique(points.astype(real), axis=0).astype(float)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_few_roundings_apart_in_space(ctx, real):
+    """Cells at the other end of the domain see their bisectors as one plane; all but one in a hundred were refused."""
+    adapter = clvoro.Adapter(ctx, real)
+    for seed in range(12):
+        report = adapter.diagram(CUBE, few_roundings_apart(seed, real)).check()
+        assert report, report
+
+
+def test_the_same_in_both_precisions(ctx):
+    """In double precision generators a rounding of single precision apart are far from each other."""
+    for seed in range(6):
+        points = few_roundings_apart(seed, "float32")
+        single, double = (
+            clvoro.Adapter(ctx, r).diagram(CUBE, points) for r in ("float32", "float64")
+        )
+        assert np.allclose(single.volumes, double.volumes, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_few_roundings_apart_beyond_seams(ctx, real):
+    """Some on either side of a seam."""
+    box, adapter = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), clvoro.Adapter(ctx, real)
+    others = np.random.default_rng(7).random((150, 3))
+    to_seam = np.array([0, 0.3125 - 40 * float(np.spacing(np.asarray(0.6875, real))), 0])
+    for seed in range(4):
+        near = (few_roundings_apart(seed, real) + to_seam) % 1
+        assert near[:, 1].min() < 1e-3
+        assert near[:, 1].max() > 1 - 1e-3
+        points = np.unique(np.vstack([near, others]).astype(real), axis=0).astype(float)
+        report = adapter.diagram(box, points).check()
+        assert report, report
 
 
 def exactly_beyond(x, a, b, j):
