@@ -12,7 +12,7 @@ from .domain import Box, Domain
 from .loops import FaceLoops, Loops
 from .polygon import Polygon
 from .results import Diagram
-from .tessellation import Tessellation
+from .tessellation import CloseError, Tessellation
 from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
 
@@ -29,6 +29,13 @@ def fetch_diagram(
 
     Without `copy`, nobody may use the buffers of `t` any more. `unfolded` is what `t` was folded from, in a periodic
     box.
+
+    Raises
+    ------
+    InputError
+        If rounding has made cells of generators near each other wrong.
+    ClvoroError
+        If the faces of such cells do not come together.
     """
     from .fetch_polygon import _FetchedPolygon
     from .fetch_torus import _FetchedTorus
@@ -44,7 +51,12 @@ def fetch_diagram(
     else:
         fetched = _Fetched(engine, domain, t, labels, copy)
     names = (name for name in Diagram._NAMES if not name.startswith(tuple(others)))
-    return Diagram(domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names})
+    diagram = Diagram(
+        domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names}
+    )
+    if t.near and not diagram.check():
+        raise CloseError(t.points, t.n).within(domain)
+    return diagram
 
 
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
@@ -64,6 +76,7 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
         offsets=kept(t.offsets),
         covariances=t.covariances,
         narrow=t.narrow,
+        near=t.near,
     )
 
 

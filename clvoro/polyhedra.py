@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -195,7 +195,7 @@ class Polyhedra:
                 )
                 t = None if cut is None else self._match(cut, points, share)
             if t is not None:
-                return t
+                return replace(t, near=True) if from_near else t
             self._begin_anew(binned, first, n)
         raise CloseError(points, n)
 

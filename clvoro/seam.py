@@ -261,8 +261,9 @@ class Seam:
             )
             graph, measures = list(closed[:2]), closed[2:]
         folded = Tessellation(
-            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n]
-        )
+            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n],
+            near=t.near,
+        )  # fmt: skip
         enough = not words[0]
         if not enough:
             # The next attempt takes the place of this one: the graph from before is where that begins, too.

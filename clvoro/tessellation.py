@@ -100,6 +100,9 @@ class Tessellation:
         How such a diagram came to be.
     narrow : bool
         Whether faces (in 3D) may be as narrow as their vertices round: of those, what has no loop in `Loops` is none.
+    near : bool
+        Whether generators (in 3D) are so near each other that rounding may have made cells wrong: what the caller gets
+        of such a diagram is checked.
     """
 
     n: int
@@ -114,6 +117,7 @@ class Tessellation:
     outlines: tuple[cla.Array, ...] = ()
     trimmed: Trimmed | None = None
     narrow: bool = False
+    near: bool = False
 
 
 def restored(
