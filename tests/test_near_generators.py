@@ -153,6 +153,19 @@ def test_few_roundings_apart_in_space(ctx, real):
         assert report, report
 
 
+@pytest.mark.parametrize(("real", "seed"), [("float64", 3), ("float32", 3), ("float32", 44)])
+def test_lattices_of_roundings_in_space(ctx, real, seed):
+    """A mesh or an error: that of the last one had cells whose faces did not close, without a word."""
+    rng = np.random.default_rng(seed)
+    step = 2 * float(np.spacing(np.asarray(0.6875, real)))
+    lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
+    chosen = lattice[rng.permutation(125)[: int(rng.integers(3, 61))]]
+    points = np.vstack([0.6875 + step * chosen, rng.random((200, 3))]).astype(real)
+    with suppress(clvoro.ClvoroError):
+        report = clvoro.Adapter(ctx, real).diagram(CUBE, np.unique(points, axis=0)).check()
+        assert report, report
+
+
 def test_the_same_in_both_precisions(ctx):
     """In double precision generators a rounding of single precision apart are far from each other."""
     for seed in range(6):
