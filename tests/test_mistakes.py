@@ -417,10 +417,10 @@ def test_generators_that_are_too_close_are_named_by_their_place(ctx, periodic, r
 
 
 def test_the_closest_generators_are_named_whichever_cell_shows_it(ctx):
-    """In space a cell far from a cluster of some roundings' width may be the first that cannot be cut by it."""
-    rng = np.random.default_rng(4)
-    cluster = 0.6 + 1e-15 * rng.standard_normal((120, 3))
-    points = np.unique(np.concatenate([cluster, rng.random((40, 3))]), axis=0)
+    """In space a cell far from a lattice of some roundings' width may be the first that cannot be cut by it."""
+    lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
+    cluster = 0.6875 + 2.0**-52 * lattice
+    points = np.concatenate([cluster, np.random.default_rng(4).random((40, 3))])
     least = KDTree(points).query(points, k=2)[0][:, 1].min()
     with pytest.raises(InputError, match="too close") as refused:
         clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), points)
