@@ -190,10 +190,10 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
 
 /* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, rounding may let one
    of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
-   If it is wider than rounding explains, generators are too close to tell apart so (from far away, two an ulp apart have
-   the same bisector), and that is flagged: cells are clipped once more, with `from_near` (common/clip.h). So it is where
-   both see a face, but of areas that differ by more than a share of the cell. What borders on a generator without a row
-   is not looked at, nor are two cells that are certain.
+   If it is wider than rounding explains, generators are too close to tell apart so (from far away, two an ulp apart
+   have the same bisector), and that is flagged: cells are clipped once more, with `from_near` (common/clip.h). So it is
+   where both see a face, but of areas that differ by more than a share of the cell. What borders on a generator without
+   a row is not looked at, nor are two cells that are certain.
 
    A bisector of generators d apart rounds by eps R / d of the distance R from them, along all of its face: by
    eps R³ / d, where that is little beside the cell. The area of all faces stands for R². */
