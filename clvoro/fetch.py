@@ -16,6 +16,9 @@ from .tessellation import CloseError, Tessellation
 from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
 
+LEFT_OUT = 1e-3
+"""Share of a cell's volume that faces may make up which are left out as they are no polygons."""
+
 
 def fetch_diagram(
     engine: Engine,
@@ -102,8 +105,30 @@ class _Fetched:
         """Which of the device's faces are in the result, (m,) bool; None if all are.
 
         A face in 3D that is no polygon, as narrow as its vertices round, is none.
+
+        Raises
+        ------
+        InputError
+            If that leaves out more than `LEFT_OUT` of a cell.
         """
-        return np.diff(self.loop_starts) > 0 if self.t.narrow else None
+        if not self.t.narrow:
+            return None
+        kept = np.diff(self.loop_starts) > 0
+        self._refuse_gaps(~kept)
+        return kept
+
+    def _refuse_gaps(self, left_out: np.ndarray) -> None:
+        """Raise if cones of the faces (m,) bool make up too much of a cell."""
+        t, faces = self.t, np.flatnonzero(left_out)
+        if not len(faces):
+            return
+        cell = np.searchsorted(t.starts.get(), faces, side="right") - 1
+        other, points = t.neighbours.get()[faces], t.points.get().astype(float)
+        inner = other >= 0  # in 3D walls are wide
+        way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
+        cones = np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
+        if (cones > LEFT_OUT * t.volumes.get()[: t.n]).any():
+            raise CloseError(t.points, t.n).within(self.domain)
 
     @cached_property
     def starts(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from .krylov import Solution
 from .mesh import Mesh
 from .plans import MOST_SURPLUS, Action, Mend, Refine, Reorganise, Rest, Settle, Step, work_of
 from .results import HISTORY_DTYPE, Displacements, Result
+from .tessellation import CloseError
 
 SAMPLING_GAIN = 0.36
 """Error in counting by sizes at generators over that on the next coarser level: measured on a kinked field."""
@@ -323,7 +324,13 @@ class Loop:
         )
 
     def result(self, converged: bool, reason: str, settings: dict[str, Any]) -> Result:
-        """Fetch what the run has come to."""
+        """Fetch what the run has come to.
+
+        Raises
+        ------
+        InputError
+            If rounding has made cells of generators near each other wrong.
+        """
         mesh, final = self.mesh, self.final
         if self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
             # No step was known to be the last, or generators have been inserted or deleted since.
@@ -336,8 +343,9 @@ class Loop:
         labels = np.sort(mesh.labels.get())
         size = mesh.values(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)
+        close = CloseError(mesh.t.points, mesh.t.n).within(mesh.domain) if mesh.t.near else None
         diagram = mesh.finish()
-        return Result(
+        result = Result(
             points=diagram.points,
             diagram=diagram,
             size=size,
@@ -353,3 +361,6 @@ class Loop:
             settings=settings,
             origin=np.where(labels < self.n_start, labels, -1).astype(np.int32),
         )
+        if close is not None and not result.check():
+            raise close
+        return result

@@ -30,6 +30,8 @@ from .tessellation import (
     restored,
 )
 
+FINE_SHARE = 1e-3
+"""Share of a cell's volume that it may differ by from others about their common faces, before more is done about it."""
 FACE_CAPACITY = 64
 """Faces that a cell may have while it is clipped; doubled for those cells that have more."""
 MOST_FACES = 512
@@ -184,16 +186,18 @@ class Polyhedra:
         """
         engine, rows = self.engine, n if rows is None else rows
         self._reserve_cells(rows)
-        share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
+        share = EXACT_SHARE if exact else ROUGH_SHARE
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         # Where cells differ about a face, what generators near each other cut off is seen from there: it takes longer.
         for from_near in (False, True):
+            # What is made once more is checked in the end.
+            most = engine.real.type(FINE_SHARE if exact and not from_near else share)
             with engine.workspace.frame():
                 cut = self._cut(
-                    box, points, n, binned, first, previous, rows, share, seams, from_near
+                    box, points, n, binned, first, previous, rows, most, seams, from_near
                 )
-                t = None if cut is None else self._match(cut, points, share)
+                t = None if cut is None else self._match(cut, points, most)
             if t is not None:
                 return replace(t, near=True) if from_near else t
             self._begin_anew(binned, first, n)

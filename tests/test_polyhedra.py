@@ -237,9 +237,9 @@ def test_cells_of_points_around_an_axis(adapter, n, layers):
 def test_very_many_points_on_a_sphere_are_right_or_refused(adapter, n):
     """Vertices are not brought together over a share of the cells."""
     u = np.random.default_rng(61301).standard_normal((n, 3))
-    diagram = adapter.diagram(CUBE, 0.5 + 0.4 * u / np.linalg.norm(u, axis=1)[:, None])
+    points = 0.5 + 0.4 * u / np.linalg.norm(u, axis=1)[:, None]
     try:
-        assert diagram.check()
+        assert adapter.diagram(CUBE, points).check()
         said = ""
     except clvoro.ClvoroError as error:
         said = str(error)
