@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy as shallow_copy
 from functools import cached_property
 
 import numpy as np
@@ -16,8 +17,8 @@ from .tessellation import CloseError, Tessellation
 from .torus import Unfolded
 from .vertices import VertexNumbering, Vertices
 
-LEFT_OUT = 1e-3
-"""Share of a cell's volume that faces may make up which are left out as they are no polygons."""
+LEFT_OUT = 1e-5
+"""Share of a cell: if faces that are left out, as they are no polygons, make up more, the diagram is checked."""
 
 
 def fetch_diagram(
@@ -53,12 +54,10 @@ def fetch_diagram(
         fetched = _FetchedTorus(engine, domain, t, labels, copy, unfolded)
     else:
         fetched = _Fetched(engine, domain, t, labels, copy)
-    names = (name for name in Diagram._NAMES if not name.startswith(tuple(others)))
-    diagram = Diagram(
-        domain, {name: (lambda name=name: getattr(fetched, name)()) for name in names}
-    )
-    if t.near and not diagram.check():
-        raise CloseError(t.points, t.n).within(domain)
+    fetched.names = [name for name in Diagram._NAMES if not name.startswith(tuple(others))]
+    diagram = fetched.diagram()
+    if t.near:
+        fetched.refuse_if_wrong(diagram)
     return diagram
 
 
@@ -92,13 +91,30 @@ class _Fetched:
         self.engine, self.domain, self.n = engine, domain, t.n
         self.origin, self.scale = domain.frame
         self.labels = labels.get()[: t.n]
+        self.names: list[str] = []
         m = int(t.starts[t.n].get())
-        self.t = kept_faces(t, m, copy)
+        self.t = self.whole = kept_faces(t, m, copy)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Place in `whole` of each of the device's faces, (m,)."""
+        return np.arange(len(self.t.neighbours))
 
     @cached_property
     def order(self) -> np.ndarray:
         """Device row of each row of the result, (n,)."""
         return np.argsort(self.labels, kind="stable")
+
+    def diagram(self) -> Diagram:
+        """Return the result, of which `names` say what it has."""
+        return Diagram(
+            self.domain, {name: (lambda name=name: getattr(self, name)()) for name in self.names}
+        )
+
+    def refuse_if_wrong(self, diagram: Diagram) -> None:
+        """Check the result, and raise InputError if something is wrong."""
+        if not diagram.check():
+            raise CloseError(self.t.points, self.n).within(self.domain)
 
     @cached_property
     def kept(self) -> np.ndarray | None:
@@ -109,26 +125,29 @@ class _Fetched:
         Raises
         ------
         InputError
-            If that leaves out more than `LEFT_OUT` of a cell.
+            If what that leaves out makes a cell wrong.
         """
-        if not self.t.narrow:
+        if not self.whole.narrow:
             return None
-        kept = np.diff(self.loop_starts) > 0
-        self._refuse_gaps(~kept)
+        kept = self.polygons()
+        if (self._gaps(kept) > LEFT_OUT * self.whole.volumes.get()).any():
+            trial = shallow_copy(self)
+            trial.kept = kept
+            trial.refuse_if_wrong(trial.diagram())
         return kept
 
-    def _refuse_gaps(self, left_out: np.ndarray) -> None:
-        """Raise if cones of the faces (m,) bool make up too much of a cell."""
-        t, faces = self.t, np.flatnonzero(left_out)
-        if not len(faces):
-            return
+    def polygons(self) -> np.ndarray:
+        """Which of the device's faces are polygons, (m,) bool."""
+        return np.diff(self.loop_starts) > 0
+
+    def _gaps(self, kept: np.ndarray) -> np.ndarray:
+        """Volumes that cones of the faces make up which are not `kept`, of each cell of `whole`."""
+        t, faces = self.whole, self.places[~kept]
         cell = np.searchsorted(t.starts.get(), faces, side="right") - 1
         other, points = t.neighbours.get()[faces], t.points.get().astype(float)
         inner = other >= 0  # in 3D walls are wide
         way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
-        cones = np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
-        if (cones > LEFT_OUT * t.volumes.get()[: t.n]).any():
-            raise CloseError(t.points, t.n).within(self.domain)
+        return np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
 
     @cached_property
     def starts(self) -> np.ndarray:

@@ -51,11 +51,8 @@ class _FetchedTorus(_Fetched):
         """Vertices and loops of the extended diagram, in 3D."""
         return FaceLoops(self.engine).walk(self.box, self.whole)
 
-    @cached_property
-    def kept(self) -> np.ndarray | None:
-        """Which of the folded faces are in the result; see `_Fetched.kept`."""
-        if not self.whole.narrow:
-            return None
+    def polygons(self) -> np.ndarray:
+        """Which of the folded faces are polygons, (m,) bool."""
         # Of both sides of a seam each has a loop of its own.
         seen = np.diff(self.loop_starts)[self.places] > 0
         i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbours.get()

@@ -166,6 +166,16 @@ def test_lattices_of_roundings_in_space(ctx, real, seed):
         assert report, report
 
 
+@pytest.mark.parametrize("seed", [18, 26, 29, 35, 37])
+def test_faces_that_are_left_out_are_next_to_nothing(ctx, seed):
+    """A mesh or an error: a cell of each lacked some 1e-3 of its volume."""
+    rng = np.random.default_rng(seed)
+    points = (0.39 + 5e-7 * rng.standard_normal((200, 3))).astype(np.float32)
+    with suppress(clvoro.ClvoroError):
+        report = clvoro.Adapter(ctx, "float32").diagram(CUBE, np.unique(points, axis=0)).check()
+        assert report, report
+
+
 def test_the_same_in_both_precisions(ctx):
     """In double precision generators a rounding of single precision apart are far from each other."""
     for seed in range(6):
