@@ -131,10 +131,14 @@ class _Fetched:
             return None
         kept = self.polygons()
         if (self._gaps(kept) > LEFT_OUT * self.whole.volumes.get()).any():
-            trial = shallow_copy(self)
-            trial.kept = kept
-            trial.refuse_if_wrong(trial.diagram())
+            self._try(kept=kept)
         return kept
+
+    def _try(self, **made: object) -> None:
+        """Raise InputError if with what has been `made`, which is not ours before that returns, the result is wrong."""
+        trial = shallow_copy(self)
+        vars(trial).update(made)
+        trial.refuse_if_wrong(trial.diagram())
 
     def polygons(self) -> np.ndarray:
         """Which of the device's faces are polygons, (m,) bool."""
@@ -187,7 +191,19 @@ class _Fetched:
 
     @cached_property
     def loops(self) -> Loops:
-        """Vertices, each once, in 3D, and the loops of faces in the device's order."""
+        """Vertices, each once, in 3D, and the loops of faces in the device's order.
+
+        Raises
+        ------
+        InputError
+            If vertices had to be placed anew, and that makes the result wrong.
+        """
+        loops = self._walked()
+        if loops.doubtful:
+            self._try(loops=loops)
+        return loops
+
+    def _walked(self) -> Loops:
         return FaceLoops(self.engine).walk(self.domain, self.t)
 
     @cached_property

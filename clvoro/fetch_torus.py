@@ -46,8 +46,7 @@ class _FetchedTorus(_Fetched):
         """Vertices of the extended diagram, in 2D."""
         return VertexNumbering(self.engine).number(self.box, self.whole)
 
-    @cached_property
-    def loops(self) -> Loops:
+    def _walked(self) -> Loops:
         """Vertices and loops of the extended diagram, in 3D."""
         return FaceLoops(self.engine).walk(self.box, self.whole)
 

@@ -26,7 +26,8 @@ OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[
 PARTS = {
     "poisson": {"krylov", "multigrid"},
     "multigrid": {"coarsening"},
-    "loops": {"corners"},
+    "loops": {"agreement"},
+    "agreement": {"corners"},
     "repair": {"cells"},
 }
 """Stages that are made of others."""

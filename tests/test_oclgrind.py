@@ -57,7 +57,7 @@ IN_PLANE = {
     "population.mark_flaws", "population.mark_nuclei", "population.mark_pairs", "population.measure_strain",
     "population.score_flaws", "population.score_pairs", "population.score_strain", "population.tally_pairs",
 }  # fmt: skip
-IN_SPACE = {"corners", "loops", "polyhedra", "walks"}
+IN_SPACE = {"agreement", "corners", "loops", "polyhedra", "walks"}
 AT_POLYGONS = {"chords", "trim"}
 AT_LAYERS = {"metric.hold_sizes", "motion.hold_generators", "population.exempt_fixed"}
 NOT_FOR = {

@@ -1,4 +1,4 @@
-"""Loops of faces in 3D, step by step, against plain ones in Python."""
+"""How cells come to see the same faces in 3D, step by step, against plain ones in Python."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ from test_polyhedra import BOX, tessellation
 
 import clvoro
 from clvoro._program import Engine
+from clvoro.agreement import MOST_DOUBLINGS, Agreement
 from clvoro.bins import Bins
-from clvoro.corners import Corners
-from clvoro.loops import MOST_DOUBLINGS, FaceLoops
+from clvoro.meetings import Meetings
 from clvoro.polyhedra import Polyhedra
 
 
@@ -20,7 +20,7 @@ def engine(ctx):
 
 @pytest.fixture(scope="module")
 def kernels(engine):
-    return engine.kernels("loops", {"MOST_DOUBLINGS": MOST_DOUBLINGS})
+    return engine.kernels("agreement", {"MOST_DOUBLINGS": MOST_DOUBLINGS})
 
 
 def rows(engine, loops, behind=None):
@@ -125,11 +125,12 @@ def test_views_that_differ(engine, kernels):
     starts, turns = rows(engine, loops, behind)
     counts = engine.upload([len(loop) for loop in loops], np.int32)
     v, any_ = len(loops), engine.zeros(1, np.int32)
-    differs = engine.empty(v, np.uint8)
+    differs = engine.zeros(v, np.uint8)
     engine.run_each(
         kernels.compare_views, v, engine.upload(twins, np.int32), starts, turns, counts, differs, any_
     )  # fmt: skip
-    assert differs.get().astype(bool).tolist() == expected
+    # It stays known that they have.
+    assert differs.get().tolist() == [3 if d else 0 for d in expected]
     assert int(any_[0].get()) == 1
     same = [k for k in range(v) if not expected[k]]
     place = {k: s for s, k in enumerate(same)}
@@ -157,18 +158,18 @@ def test_the_first_of_the_sharpest_corners(engine, kernels):
         assert chosen[label] == expected
 
 
-def test_vertices_put_into_edges(engine, kernels):
+def test_vertices_put_into_edges(engine):
     """In both faces of an edge, once, whoever proposes it; halves know their other sides."""
     rng, cells = np.random.default_rng(61203), Polyhedra(engine)
     t = tessellation(engine, Bins(engine), cells, rng.random((12, 3)) * BOX.extent)
-    views, stage = Corners(engine).list(BOX, t), FaceLoops(engine)
-    v = len(views.view_labels)
+    stage = Agreement(engine, BOX, t)
+    views, v = stage.views, len(stage.views.view_labels)
     owners, faces = views.owners.get(), views.corner_faces.get()
     labels = np.repeat(views.view_labels.get(), np.diff(views.turn_starts.get()))
-    _, _, opposites, chains = stage._begin_snapping(kernels, views, v, len(owners))
+    assert not stage._begin_snapping().get().any()
     for _ in range(3):
         starts, turns = views.turn_starts.get(), views.turns.get()
-        before, of_chain = opposites.get()[: len(turns)], chains.get()[: len(turns)]
+        before, of_chain = (a.get()[: len(turns)] for a in (stage._opposites, stage._chains))
         following = np.arange(len(turns)) + 1
         following[starts[1:] - 1] = starts[:-1]
         # The other side begins where an edge ends, in the same cell's face across, and goes back.
@@ -193,9 +194,63 @@ def test_vertices_put_into_edges(engine, kernels):
                 expected += [turns[s], *more]
                 expected_chains += [of_chain[s]] * (1 + len(more))
             new_starts.append(len(expected))
-        opposites, chains = stage._put(
-            kernels, views, opposites, chains, engine.upload(proposals, np.int32)
-        )
+        stage._put(engine.upload(proposals, np.int32))
         assert views.turn_starts.get().tolist() == new_starts
         assert views.turns.get().tolist() == expected
-        assert chains.get().tolist() == expected_chains
+        assert stage._chains.get().tolist() == expected_chains
+
+
+def test_what_is_no_wider_than_vertices_round(engine, kernels):
+    """Of walls: all vertices of a loop lie within the tolerance of a line, and a neighbour of it differed."""
+    rng, level = np.random.default_rng(61205), 3
+    points = engine.upload(rng.random((1, 3)))
+    eps = float(np.finfo(float).eps)
+    loops, narrow = [], []
+    for wide in rng.choice([0.3, 3], 200):
+        n, way, any_way = int(rng.integers(4, 7)), *rng.standard_normal((2, 3))
+        way *= 0.3 / np.linalg.norm(way)
+        side = np.cross(way, any_way)
+        off = rng.uniform(-1, 1, n)
+        off[:2], off[2] = 0, 1  # its ends, and what is farthest from the line
+        # 16 roundings of a vertex's distance and of positions, as far as these are from the generator.
+        off *= wide * 2**level * 16 * eps * (0.3 + 1) / np.linalg.norm(side)
+        along = np.array([0, 1, *rng.random(n - 2)])
+        loops.append(np.outer(along, way) + np.outer(off, side))
+        narrow.append(wide < 1)
+    v, c = len(loops), sum(map(len, loops))
+    starts = np.cumsum([0] + [len(loop) for loop in loops])
+    own, each = engine.upload(np.arange(c), np.int32), engine.upload(np.arange(v), np.int32)
+    state = rng.choice([2, 4, 6], v)
+    differs, any_ = engine.upload(state, np.uint8), engine.zeros(1, np.int32)
+    engine.run_each(
+        kernels.find_slits, v, points, engine.upload(np.concatenate(loops)), engine.zeros(c, np.int32), own, own,
+        each, engine.upload(starts, np.int32), own, own, engine.upload(np.diff(starts), np.int32),
+        engine.upload(np.full(v, level), np.uint8), differs, any_,
+    )  # fmt: skip
+    expected = [s | (slit and s & 4 > 0) for slit, s in zip(narrow, state.tolist(), strict=True)]
+    assert differs.get().tolist() == expected
+    assert int(any_[0].get()) == 1
+    assert 20 < np.count_nonzero(differs.get() & 1) < v - 20
+
+
+def test_vertices_as_far_from_all_their_generators():
+    """On circles and on spheres, on a wall, and where hardly anything tells: it stays there."""
+    rng = np.random.default_rng(61206)
+    t, u = rng.uniform(0, 2 * np.pi, 40), rng.standard_normal((30, 3))
+    circle = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t), 0 * t])
+    sphere = np.array([0.2, 0.4, 0.6]) + 0.1 * u / np.linalg.norm(u, axis=1)[:, None]
+    points = np.vstack([circle, sphere])
+    vertices = np.repeat([0, 1, 2], [40, 40, 30])
+    cells = np.concatenate([np.arange(40), np.arange(40), np.arange(40, 70)])
+    fixed = np.zeros((3, 3), bool)
+    fixed[0, 2] = True
+    order = rng.permutation(110)
+    meetings = Meetings(points, fixed, vertices[order], cells[order])
+    begun = np.array([[0.51, 0.48, 0.0], [0.5 + 1e-9, 0.5, 0.7], [0.2 + 1e-3, 0.4, 0.6]])
+    placed, eps = meetings.place(begun), float(np.finfo(float).eps)
+    assert np.abs(placed - [[0.5, 0.5, 0], [0.5, 0.5, 0.7], [0.2, 0.4, 0.6]]).max() < 8 * eps
+    far = [np.linalg.norm(begun[k] - points[cells[vertices == k]], axis=1) for k in (0, 2)]
+    found = meetings.excess(np.array([0, 2]), begun[[0, 2]])
+    assert found == pytest.approx([np.ptp(f) for f in far], rel=1e-12)
+    assert meetings.excess(np.arange(3), placed).max() < 8 * eps
+    assert meetings.excess(np.zeros(0, int), np.zeros((0, 3))).shape == (0,)
