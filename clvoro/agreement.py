@@ -72,6 +72,7 @@ class Agreement:
         self.differs = engine.zeros(self.v, np.uint8)
         self.reduced = engine.empty(len(views.turns), np.int32)
         self.chosen = self._choose()
+        self._corner_faces: np.ndarray | None = None
         self._most = ROUNDINGS * float(np.finfo(engine.real).eps)
 
     def reach(self, sliding: bool) -> Agreed | None:
@@ -88,7 +89,9 @@ class Agreement:
                 )
                 if levels is None or not widened:
                     return self._agreed(doubtful=False)
-                excess, labels = self._place_anew()
+                if not (sliding or placed) and self._are_right():
+                    return self._agreed(doubtful=False)
+                labels = self._place_anew()
                 if labels is not None:
                     self._rename(self.engine.upload(labels, np.int32))
                     continue
@@ -96,9 +99,9 @@ class Agreement:
                     levels.fill(SURE_DOUBLINGS)
                 placed = True
                 if not self._are_slits(levels):
-                    return self._agreed(doubtful=True) if excess <= self._most else None
+                    return self._agreed(doubtful=True)
             if levels is None:
-                levels = self._begin_snapping()
+                levels = self._begin_snapping(sliding)
             what, joined, proposals = self._snap(levels, sliding)
             if not what or len(self.views.turns) > most_turns:
                 break  # nothing is near enough, and no tolerance may grow, or it would not end
@@ -122,6 +125,19 @@ class Agreement:
             k.compare_views, self.v, self.twins, views.turn_starts, self.reduced, self.counts, self.differs, any_
         )  # fmt: skip
         return bool(any_[0].get())
+
+    def _are_right(self) -> bool:
+        """Tell whether vertices are as far from all generators whose cells have them, but for rounding."""
+        views, n, points = self.views, self.t.n, self.t.points.get().astype(float)
+        lengths = self.counts.get().astype(np.int64)
+        vertices = self.reduced.get()[_places(views.turn_starts.get()[:-1], lengths)]
+        cells = np.repeat(np.repeat(np.arange(n), np.diff(views.starts.get()[: n + 1])), lengths)
+        at = self.chosen.get()[vertices]
+        places = points[views.owners.get()[at]] + views.corners.get()[at]
+        far = np.linalg.norm(places - points[cells], axis=1)
+        nearest = np.full(self.c, np.inf)
+        np.minimum.at(nearest, vertices, far)
+        return bool((far - nearest[vertices]).max(initial=0) <= self._most)
 
     def _are_slits(self, levels: cla.Array) -> bool:
         """Tell whether any faces are, which differ from now on."""
@@ -158,7 +174,7 @@ class Agreement:
         engine.run_each(k.choose_corners, self.c, views.labels, views.sharpness, best, chosen)
         return chosen
 
-    def _begin_snapping(self) -> cla.Array:
+    def _begin_snapping(self, sliding: bool = False) -> cla.Array:
         """Find the opposites and the chains of turns; return the levels of views."""
         engine, views = self.engine, self.views
         self._opposites, self._chains = (engine.empty(len(views.turns), np.int32) for _ in range(2))
@@ -166,7 +182,14 @@ class Agreement:
             self._kernels.find_opposites, self.v, views.owners, views.corner_faces, views.starts, views.view_labels,
             views.turn_starts, views.turns, self._opposites, self._chains,
         )  # fmt: skip
+        if not sliding:  # the largest of what has served but for vertices in doubt
+            self._corner_faces = views.corner_faces.get()
+            views.corner_faces = engine.empty(1, np.int32)
         return engine.zeros(self.v, np.uint8)
+
+    def _faces(self) -> np.ndarray:
+        faces = self._corner_faces
+        return self.views.corner_faces.get() if faces is None else faces
 
     def _put(self, proposals: cla.Array) -> None:
         """Put the vertices proposed into edges."""
@@ -186,17 +209,17 @@ class Agreement:
         self._opposites, self._chains = opposites, chains
         self.reduced = engine.empty(len(turns), np.int32)
 
-    def _place_anew(self) -> tuple[float, np.ndarray | None]:
+    def _place_anew(self) -> np.ndarray | None:
         """Move vertices of views that have differed to where they are as far from all their generators.
 
-        Returns how far from that they are at most, and labels to be if some cannot be told from each other.
+        Returns labels to be, if some cannot be told from each other.
         """
         views = self.views
         names, ends = self._edges_in_doubt()
         labels, at = views.labels.get(), self.chosen.get()[names]
         here = np.flatnonzero(np.isin(labels, names))
         vertices = np.searchsorted(names, labels[here])
-        cells = np.column_stack([views.owners.get()[here], views.corner_faces.get()[here]])
+        cells = np.column_stack([views.owners.get()[here], self._faces()[here]])
         fixed = np.zeros((len(names), 3), bool)
         row, column = np.nonzero(cells < 0)
         fixed[vertices[row], (-1 - cells[row, column]) // 2] = True
@@ -214,10 +237,10 @@ class Agreement:
         a, b = a[near], b[near]
         alike = meetings.excess(a, places[b]) < self._most
         if not alike.any():
-            return float(meetings.excess(np.arange(len(names)), places).max(initial=0)), None
+            return None
         pairs = np.sort(np.stack([names[a], names[b]])[:, alike], axis=0)
         np.minimum.at(labels, pairs[1], pairs[0])
-        return 0.0, labels
+        return labels
 
     def _edges_in_doubt(self) -> tuple[np.ndarray, np.ndarray]:
         """Mark the views that have a vertex of one that has differed.

@@ -10,7 +10,7 @@ import pyopencl.array as cla
 
 from ._program import Engine
 from .domain import Box, Domain
-from .loops import FaceLoops, Loops
+from .loops import FaceLoops, Loops, apart
 from .polygon import Polygon
 from .results import Diagram
 from .tessellation import CloseError, Tessellation
@@ -131,14 +131,15 @@ class _Fetched:
             return None
         kept = self.polygons()
         if (self._gaps(kept) > LEFT_OUT * self.whole.volumes.get()).any():
-            self._try(kept=kept)
+            trial = self._with(kept=kept)
+            trial.refuse_if_wrong(trial.diagram())
         return kept
 
-    def _try(self, **made: object) -> None:
-        """Raise InputError if with what has been `made`, which is not ours before that returns, the result is wrong."""
+    def _with(self, **made: object) -> _Fetched:
+        """Return a copy for which this is `made`, which is not ours before it has proved right."""
         trial = shallow_copy(self)
         vars(trial).update(made)
-        trial.refuse_if_wrong(trial.diagram())
+        return trial
 
     def polygons(self) -> np.ndarray:
         """Which of the device's faces are polygons, (m,) bool."""
@@ -195,12 +196,12 @@ class _Fetched:
 
         Raises
         ------
-        InputError
-            If vertices had to be placed anew, and that makes the result wrong.
+        ClvoroError
+            If cells do not come to see the same, or only what is wrong.
         """
         loops = self._walked()
-        if loops.doubtful:
-            self._try(loops=loops)
+        if loops.doubtful and not self._with(loops=loops).diagram().check():
+            raise apart(self.engine.real)
         return loops
 
     def _walked(self) -> Loops:

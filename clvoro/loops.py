@@ -37,6 +37,15 @@ class Loops:
     doubtful: bool = False
 
 
+def apart(real: np.dtype) -> ClvoroError:
+    """Return what to tell the caller if cells do not come to see the same, or only what is wrong."""
+    other = "" if real == np.float64 else ", or use dtype='float64'"
+    return ClvoroError(
+        "the cells' views of their common faces do not come together; perturb generators that are cospherical, "
+        f"or on a common circle{other}"
+    )
+
+
 class FaceLoops:
     """Number the vertices of a tessellation in 3D, and walk around its faces."""
 
@@ -60,7 +69,7 @@ class FaceLoops:
         agreed = Agreement(engine, box, t).reach(sliding=False)
         agreed = agreed or Agreement(engine, box, t).reach(sliding=True)
         if agreed is None:
-            raise self._apart()
+            raise apart(engine.real)
         views, reduced = agreed.views, agreed.reduced
         c = len(views.owners)
         loop_starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
@@ -79,10 +88,3 @@ class FaceLoops:
             views.corners, views.labels, agreed.chosen, ids, positions,
         )  # fmt: skip
         return Loops(positions, loop_starts, loops, agreed.doubtful)
-
-    def _apart(self) -> ClvoroError:
-        other = "" if self.engine.real == np.float64 else ", or use dtype='float64'"
-        return ClvoroError(
-            "the cells' views of their common faces do not come together; perturb generators that are cospherical, "
-            f"or on a common circle{other}"
-        )

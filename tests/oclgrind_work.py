@@ -102,6 +102,14 @@ def almost_cubes(adapter: clvoro.Adapter) -> np.ndarray:
     return lattice(2, 3) + (1e-14 if adapter.dtype == np.float64 else 3e-6) * noise
 
 
+def ring() -> np.ndarray:
+    """Return places on a circle in space, of which vertices slide along the line where all cells meet."""
+    rng = np.random.default_rng(7)
+    turn = rng.uniform(0, 2 * np.pi, 30)
+    plane = np.linalg.qr(rng.standard_normal((3, 3)))[0][:2]
+    return 0.5 + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)]) @ plane
+
+
 def solid(adapter: clvoro.Adapter) -> None:
     """Three dimensions: the same kinds of sets, and almost a lattice."""
     near = almost_cubes(adapter)
@@ -109,7 +117,7 @@ def solid(adapter: clvoro.Adapter) -> None:
     ball = points(40, 3) - 0.5
     ball *= 0.4 / np.linalg.norm(ball, axis=1)[:, None]
     few = points(1, 3), points(2, 3), points(20, 3)
-    for each in (*few, lattice(3, 3), near, cluster, np.vstack([0.5 + ball, [[0.5] * 3]])):
+    for each in (*few, lattice(3, 3), near, ring(), cluster, np.vstack([0.5 + ball, [[0.5] * 3]])):
         diagram = adapter.diagram(CUBE, each)
         assert abs(diagram.volumes.sum() - 1) < 1e-4
         assert len(diagram.vertices) > 3
@@ -277,6 +285,7 @@ def periodic(adapter: clvoro.Adapter) -> None:
         (lattice(4, 2), (True, True)),
         (near, (True, False, False)),
         (almost_cubes(adapter), (True, False, False)),
+        (ring(), (True, False, False)),
     ):
         dim = len(which)
         diagram = adapter.diagram(clvoro.Box((0,) * dim, (1,) * dim, periodic=which), x)
