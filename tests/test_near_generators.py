@@ -83,6 +83,18 @@ def test_one_rounding_apart(ctx, periodic, real):
         assert report, report
 
 
+def test_a_cluster_alone_in_a_periodic_box(ctx):
+    """Bins about its images are as far off as neighbours are away: rows of them that have some were left out once."""
+    eps = float(np.finfo(np.float32).eps)
+    rng = np.random.default_rng((68, 7))
+    size = 10 ** rng.uniform(-6.3, -1)
+    cluster = rng.random(2) + size * rng.standard_normal((int(rng.integers(20, 400)), 2))
+    places = np.unique(np.rint(cluster.astype(np.float32) / eps) * eps, axis=0)
+    box = clvoro.Box((0, 0), (1, 1), periodic=True)
+    report = clvoro.Adapter(ctx, "float32").diagram(box, places).check()
+    assert report, report
+
+
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("size", [1e-44, 1e-60, 1e-160, 1e-300])

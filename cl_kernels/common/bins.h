@@ -20,6 +20,22 @@ inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
     return t > 0 ? (t >= (REAL)side ? side - 1 : (int)t) : 0;
 }
 
+/* By how much what is in a bin may lie outside of it, along an axis, where x is near it and the first grid begins at
+   `start`: positions are put into bins with rounding, and a grid begins where the bin was that it divides, give or take
+   a rounding at each level. They add up to 10. */
+inline REAL bin_noise(REAL x, REAL start)
+{
+    return 16 * REAL_EPS * (fabs(x) + fabs(start));
+}
+
+/* How far a row of bins is from y, give or take `slack`: no more than it is. */
+inline REAL row_distance(REAL y, REAL origin, REAL edge, int row, REAL slack)
+{
+    const REAL below = origin + row * edge - y;
+    const REAL distance = (below > 0 ? below : -below - edge) - slack;
+    return distance > 0 ? distance : 0;
+}
+
 /* Bin of generator x in one grid. */
 inline int bin_in_grid(global const REAL *x, FRAME frame, int4 shape)
 {

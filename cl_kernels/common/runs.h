@@ -53,14 +53,14 @@ inline double8 gap_to_rows(double8 begin, double8 end, double y)
 
 /* Of eight rows of a grid's bins, of the bins in the box [least, most], the first and the last bin that may have
    something in common with the balls: number `pair` on, counted layer by layer, `across` of them in a layer from rows
-   low_y and low_z on. */
+   low_y and low_z on. `noise` is by how much positions may be out of their bins. */
 inline void span_rows(int *nexts, int *rights, int *offsets, int pair, int pairs, int across, int low_y, int low_z,
                       FRAME frame, int4 shape, const double *xs, const double *ys, const double *zs, const double *rs,
-                      double4 least, double4 most)
+                      double4 least, double4 most, double noise)
 {
     const double inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
-    /* Positions are put into bins with rounding, and below a root is taken in single precision. */
-    const double slack = edge * 1e-6;
+    /* Below a root is taken in single precision. */
+    const double slack = edge * 1e-6 + noise;
     const int8 pair8 = pair + (int8)(0, 1, 2, 3, 4, 5, 6, 7);
     const int8 layer = convert_int8((convert_float8(pair8) + 0.5f) / across), row = pair8 - layer * across + low_y;
     const double8 begin_y = frame.s1 + convert_double8(row) * edge - slack;
@@ -100,6 +100,9 @@ inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, doub
     vstore8(r > 0 ? r : 0, 0, rs);
     least = fmax(least, (double4)(least_of(balls->x - r), least_of(balls->y - r), least_of(balls->z - r), 0));
     most = fmin(most, -(double4)(least_of(-balls->x - r), least_of(-balls->y - r), least_of(-balls->z - r), 0));
+    const FRAME root = grid_frames[0];
+    const double4 far = fmax(fabs(least), fabs(most));
+    const double noise = fmax(fmax(bin_noise(far.s0, root.s0), bin_noise(far.s1, root.s1)), bin_noise(far.s2, root.s2));
     runs->n = runs->total = 0;
     descent_t way; /* through rows and bins */
     begin_descent(&way, (int4)(0));
@@ -117,7 +120,7 @@ inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, doub
             int nexts[8], rights[8], offsets[8];
             const int first_pair = pair & ~7, end_pair = min(pairs, first_pair + 8);
             span_rows(nexts, rights, offsets, first_pair, pairs, across, low_y, low_z, frame, shape, xs, ys, zs, rs,
-                      least, most);
+                      least, most, noise);
             for (; pair < end_pair; ++pair, next = 0) {
                 const int right = rights[pair - first_pair];
                 next = max(next, nexts[pair - first_pair]);

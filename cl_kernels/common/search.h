@@ -77,14 +77,6 @@ inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, 
     return 0;
 }
 
-/* How far a row of bins is from y; a little less, as positions are put into bins with rounding. */
-inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
-{
-    const REAL below = origin + row * edge - y;
-    const REAL distance = (below > 0 ? below : -below - edge) - edge * (64 * REAL_EPS + R(1e-6));
-    return distance > 0 ? distance : 0;
-}
-
 /* Bins along one axis that [x - w, x + w] touches. */
 inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
 {
@@ -135,6 +127,8 @@ inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool
 {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
     const REAL per_shell = SHELLS / (6 * w * w);
+    const FRAME root = in->grid_frames[0];
+    const REAL noise_y = bin_noise(x.s1, root.s1), noise_z = bin_noise(x.s2, root.s2);
     batch_t batch;
     batch.n = 0;
     int depth = 0;
@@ -159,10 +153,10 @@ inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool
         open_grid_t next = here; /* where to go on */
         int iy = here.iy, part = here.part, at = here.bin;
         for (int iz = max(here.iz, zs.s0); iz <= zs.s1 && child < 0; ++iz, iy = -1) {
-            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz);
+            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz, edge * R(1e-6) + noise_z);
             const bool layer_done = iz >= done_z.s0 && iz <= done_z.s1;
             for (iy = max(iy, ys.s0); iy <= ys.s1; ++iy, part = 0, at = -1) {
-                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy);
+                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy, edge * R(1e-6) + noise_y);
                 const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
                 if (!(left2 > 0))
                     continue;

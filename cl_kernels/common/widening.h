@@ -5,14 +5,6 @@
 /* A search over more than WIDE bins to each side is worth a look at where it may end in each row. */
 #define WIDE 4
 
-/* How far a row of bins is from y; a little less, as positions are put into bins with rounding. */
-inline REAL row_distance(REAL y, REAL origin, REAL edge, int row)
-{
-    const REAL below = origin + row * edge - y;
-    const REAL distance = (below > 0 ? below : -below - edge) - edge * (64 * REAL_EPS + R(1e-6));
-    return distance > 0 ? distance : 0;
-}
-
 /* The x, relative to the generator, between which a row of bins may hold what cuts the cell: within the circle about a
    corner through the generator. Wider by a little, as all rounds. */
 inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
@@ -40,6 +32,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
 {
     /* Through rows in outward order, parts of rows, bins; and whether the grid's own bin was opened for the inner
        square. */
+    const REAL noise = bin_noise(x[1], grid_frames[0].s1);
     descent_t way;
     begin_descent(&way, (int4)(0, 0, -1, inner >= 0));
     while (way.depth >= 0) {
@@ -47,7 +40,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
         const int4 place = way.places[way.depth];
         const FRAME frame = grid_frames[grid];
         const int4 shape = grid_shapes[grid];
-        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
+        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse, slack = edge * R(1e-6) + noise;
         const int left = axis_bin(x[0] - w, frame.s0, inverse, shape.s1);
         const int right = axis_bin(x[0] + w, frame.s0, inverse, shape.s1);
         const int bottom = axis_bin(x[1] - w, frame.s1, inverse, shape.s2);
@@ -66,7 +59,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
         bool inside = false; /* is that in a bin which was opened? */
         while (turn <= last_turn) {
             const int row = turn & 1 ? middle + (turn + 1) / 2 : middle - turn / 2;
-            const REAL away = row_distance(x[1], frame.s1, edge, row);
+            const REAL away = row_distance(x[1], frame.s1, edge, row, slack);
             if (row < bottom || row > top || away * away >= cutting_distance2(cell)) {
                 ++turn;
                 part = 0;
@@ -78,8 +71,8 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
             global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
             int least = left, most = right;
             if (w > WIDE * edge) {
-                const REAL below = frame.s1 + row * edge - x[1], slack = R(0.01) * edge;
-                const REAL2 extent = row_extent(cell, below - slack, below + edge + slack);
+                const REAL below = frame.s1 + row * edge - x[1], wider = R(0.01) * edge + noise;
+                const REAL2 extent = row_extent(cell, below - wider, below + edge + wider);
                 least = max(least, axis_bin(x[0] + extent.s0, frame.s0, inverse, shape.s1));
                 most = min(most, axis_bin(x[0] + extent.s1, frame.s0, inverse, shape.s1));
             }
