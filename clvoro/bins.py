@@ -29,6 +29,25 @@ MAX_LEVELS = 8
 """Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
 
 
+def root_edge(extent: np.ndarray, n: int) -> float:
+    """Return the edge of bins that cover a box and hold `OCCUPANCY` of `n` generators each, if these are anywhere.
+
+    Across an axis that is thinner there is one bin, and the others say how long it is: a needle of squares as thin as
+    it is would take any number of them.
+
+    Parameters
+    ----------
+    extent : (d,) float
+    n : int
+    """
+    wide = np.sort(extent)[::-1]
+    for axes in range(len(wide), 1, -1):
+        edge = float(np.prod(wide[:axes]) * OCCUPANCY / n) ** (1 / axes)
+        if edge <= wide[axes - 1]:
+            return edge
+    return float(wide[0] * OCCUPANCY / n)
+
+
 @dataclass(frozen=True)
 class BinnedPoints:
     """Generators in bins, on the device; see `common/bins.h` for the layout.
@@ -133,7 +152,7 @@ class Bins:
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
-        edge = float(np.prod(upper - lower) * OCCUPANCY / n) ** (1 / d)
+        edge = root_edge(upper - lower, n)
         sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
         root_bins = int(np.prod(sides)) + 1
         if not self._capacity[0]:

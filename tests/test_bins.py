@@ -6,6 +6,7 @@ import pytest
 
 from clvoro.bins import MAX_CHILD_SIDE, MAX_LEVELS, OCCUPANCY, SPACING_COUNT, SPLIT_COUNT, Bins
 from clvoro.domain import Box
+from clvoro.seam import ExtendedBox
 
 
 def child_side(count, dim):
@@ -70,7 +71,8 @@ def check(binned, points, dim, eps):
     reach = binned.reach.get()[:n]
     covered = np.zeros(n, int)
     spacings = binned.spacing.get()[:n]
-    for start, count, origin, edge, level, index, sides, spacing in leaves:
+    first = binned.grid_frames.get()[:dim].astype(float)
+    for start, count, origin, edge, level, _, _, spacing in leaves:
         place = slice(start, start + count)
         covered[place] += 1
         assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
@@ -78,23 +80,23 @@ def check(binned, points, dim, eps):
         assert np.allclose(reach[place], edge, rtol=1e-6)
         # float32, and the grid's 1 / edge rounds
         assert np.allclose(spacings[place], spacing, rtol=1e-6)
-        # A generator lies in its bin but for the rounding of the bin's corner; outermost bins take what rounds out.
-        inside = points[items[place]]
-        for a in range(dim):
-            if index[a] > 0:
-                assert (inside[:, a] >= origin[a] - 8 * eps).all()
-            if index[a] < sides[a] - 1:
-                assert (inside[:, a] <= origin[a] + edge + 8 * eps).all()
+        # A generator lies in its bin, but for what the search takes into account: bin_noise of bins.h.
+        inside = points[items[place]].astype(float)
+        noise = 16 * eps * (np.abs(inside) + np.abs(first))
+        below, above = origin - inside, inside - (origin + edge)
+        assert (np.maximum(below, above) <= noise).all()
     assert (covered == 1).all(), "leaves overlap or leave a gap"
+    sides = binned.grid_shapes.get()[1 : 1 + dim]
+    assert np.prod(sides) <= 2**dim * max(n / OCCUPANCY, 1), "far more bins than generators"
     return leaves
 
 
 def sets(dim, box):
     rng = np.random.default_rng(8111)
-    lower, extent = np.array(box.lower), box.extent
+    lower, extent = np.array(box.lower), np.array(box.upper) - box.lower
     square = lower + rng.random((700, dim)) * extent
     corners = np.array(list(np.ndindex(*(2,) * dim))) * extent + lower
-    tight = lower + 0.3 * extent
+    tight = lower + 0.95 * extent
     return {
         "one": square[:1],
         "two": square[:2],
@@ -102,7 +104,7 @@ def sets(dim, box):
         "graded": lower + rng.random((900, dim)) ** 5 * extent,
         "corners": np.concatenate([corners, square[:50]]),
         "clusters": np.concatenate(
-            [tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-8, 1e-12)]
+            [tight * (1 + s * rng.random((120, dim))) for s in (1e-2, 1e-5, 1e-6, 1e-8, 1e-12)]
         ),
         "one place": np.repeat(square[:1], 400, axis=0),
         "few places": np.repeat(square[:5], [1, 90, 11, 3000, 10], axis=0)[rng.permutation(3112)],
@@ -114,7 +116,11 @@ def sets(dim, box):
 BOXES = {
     "box": Box((0, 0), (1, 0.75)),
     "needle": Box((0, 0), (1, 1e-4)),
+    "thread": Box((0, 0), (1, 1e-9)),
     "cube": Box((0, 0, 0), (1, 0.5, 0.75)),
+    "sheet": Box((0, 0, 0), (1, 1, 1e-9)),
+    # Beyond seams: the grid begins below 0, and positions beyond 1 round twice as much.
+    "beyond": ExtendedBox(np.array([-0.507, -0.512]), np.array([1.507, 1.512])),
 }
 
 
@@ -126,14 +132,15 @@ def real(request):
 @pytest.mark.parametrize("box", BOXES)
 def test_every_generator_in_one_leaf(ctx, real, box):
     box = BOXES[box]
-    engine = patch.make_engine(ctx, real, box.dim)
+    dim = len(box.lower)
+    engine = patch.make_engine(ctx, real, dim)
     bins = Bins(engine)  # one object for all sets: its buffers are used again, and grow
     corner = np.array(box.upper).astype(real)
-    for name, points in sets(box.dim, box).items():
+    for name, points in sets(dim, box).items():
         points = np.minimum(points.astype(real), corner)
         binned = bins.build(box, engine.upload(points), len(points))
         try:
-            leaves = check(binned, points, box.dim, float(np.finfo(real).eps))
+            leaves = check(binned, points, dim, float(np.finfo(real).eps))
         except AssertionError as error:
             raise AssertionError(f"{name}: {error}") from error
         levels = max(leaf[4] for leaf in leaves)
@@ -173,8 +180,9 @@ def test_repeats_bit_by_bit_whatever_came_before(ctx, real):
 def test_renumbered_bins_are_those_of_the_sorted_generators(ctx, real, box):
     """Bit by bit: a diagram of generators in any order bins them once, to sort them and to search among them."""
     box = BOXES[box]
-    engine = patch.make_engine(ctx, real, box.dim)
-    for name, points in sets(box.dim, box).items():
+    dim = len(box.lower)
+    engine = patch.make_engine(ctx, real, dim)
+    for name, points in sets(dim, box).items():
         points, n = np.minimum(points, box.upper).astype(real), len(points)
         once, anew = Bins(engine), Bins(engine)
         binned = once.build(box, engine.upload(points), n)
