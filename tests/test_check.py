@@ -264,6 +264,16 @@ def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
         assert "quality" in names_of(dataclasses.replace(result, quality=quality).check())
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_periods_round_on_the_device(ctx, dtype):
+    """By half a step, which is much of a thin box: faces across its seams do not close their cells any better."""
+    adapter, step = clvoro.Adapter(ctx, dtype), float(np.finfo(dtype).eps)
+    for seed in (9, 14, 17):
+        box = clvoro.Box((0, 0), (0.7, (2000.5 + 100 * seed) * step), periodic=True)
+        points = np.random.default_rng(seed).random((2000, 2)) * box.extent
+        adapter.diagram(box, points).check().demand()
+
+
 def test_only_where_faces_may_have_been_left_out_quality_may_be_off(ctx):
     box = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, False, False))
     points = np.random.default_rng(5).random((300, 3))

@@ -88,7 +88,10 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         # Edges meet their corners to rounding.
         loose = adopted | (d.neighbours < 0)
     rounding = np.where(loose, 2 * positions.measures, 0.0)
-    width = np.bincount(g.owner, doubts.measures + rounding, n)
+    # Across seams neighbours are off by what the device's periods are.
+    across = np.where(d.shifts.any(axis=1), g.period_off, 0.0) * d.face_measures
+    turned = across / g.spacings
+    width = np.bincount(g.owner, doubts.measures + rounding + turned, n)
     gap = np.stack(
         [np.bincount(g.owner, d.face_measures * normals[:, k], n) for k in range(dim)], axis=1
     )
@@ -100,8 +103,9 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     if isinstance(d.domain, Polygon):  # how far off a part's faces are only corners tell
         return
     volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
-    off = np.abs(d.volumes - volumes)
+    gap = np.abs(d.volumes - volumes)
+    width = doubts.volumes + np.bincount(g.owner, across, n) / (2 * dim)
     check.note(
-        "volumes", np.maximum(off - doubts.volumes, 0),
+        "volumes", np.maximum(gap - width, 0),
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
     )  # fmt: skip

@@ -57,6 +57,8 @@ class Rebuilt:
         The rounding of a position.
     unit_of_cell : (n,) float
         The rounding of a corner's place relative to its generator.
+    period_off : float
+        By how much a periodic box's periods round, together: see `Box`.
     remade : bool
         Whether the diagram's own measures of faces were made from its corners, too: they round as positions do.
     """
@@ -128,6 +130,7 @@ class Rebuilt:
         np.maximum.at(self.reach, self.cells, self._distances)
         self._vertex_count = len(x)
         self.unit_of_cell = float(np.finfo(self.real).eps) * self.reach + np.finfo(float).eps * far
+        self.period_off = float(np.finfo(self.real).eps) * d.domain.frame[1] * dim**0.5 / 2
         told = getattr(d, "face_measures", None)
         self.remade = told is not None and np.array_equal(told, self.measures)
 
