@@ -15,6 +15,7 @@ from matplotlib.quiver import Quiver
 import clvoro
 from clvoro.errors import InputError
 from clvoro.report import (
+    page,
     plot_cells,
     plot_displacements,
     plot_history,
@@ -329,6 +330,22 @@ def test_same_run_gives_the_same_page(result, tmp_path):
         write_report(result, tmp_path / folder, size=size)
     one, two = ((tmp_path / folder / "report.html").read_bytes() for folder in ("a", "b"))
     assert one == two
+
+
+def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
+    drawn = pictures_of({"coupled": result})
+
+    def fail():
+        raise MemoryError("no room for it")
+
+    broken = [
+        (name, caption, fail if k == 1 else draw) for k, (name, caption, draw) in enumerate(drawn)
+    ]
+    monkeypatch.setattr(page, "pictures_of", lambda *_: broken)
+    with pytest.raises(MemoryError, match="no room"):
+        write_report(result, tmp_path)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert text.count("src=") == len(list(tmp_path.glob("pictures/*.png"))) == len(drawn) - 1
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

@@ -75,6 +75,11 @@ def write_report(
     -------
     list of Path
         The files written, the page first.
+
+    Raises
+    ------
+    OutputError, MemoryError, or whatever Matplotlib raises
+        The first of what went wrong, after all that can be written is.
     """
     if isinstance(results, Result):
         method = results.settings.get("method") or "result"
@@ -82,17 +87,22 @@ def write_report(
     target = Path(folder)
     with writing(target / "pictures"):
         (target / "pictures").mkdir(parents=True, exist_ok=True)
-    written, figures = [], []
+    written, figures, failed = [], [], None
     for name, caption, draw in pictures_of(results, initial, size):
-        figure = draw()
-        png = render(figure, "png", dpi)
-        for kind in formats:
-            path = target / "pictures" / f"{name}.{kind}"
-            _write(path, png if kind == "png" else render(figure, kind, dpi))
-            written.append(path)
-        figures.append((caption, png))
+        try:
+            figure = draw()
+            png = render(figure, "png", dpi)
+            figures.append((caption, png))
+            for kind in formats:
+                path = target / "pictures" / f"{name}.{kind}"
+                _write(path, png if kind == "png" else render(figure, kind, dpi))
+                written.append(path)
+        except Exception as error:  # raised below: the other pictures are drawn all the same
+            failed = failed or error
     page = target / "report.html"
     _write(page, _page(results, title, case, facts or {}, figures).encode())
+    if failed is not None:
+        raise failed
     return [page, *written]
 
 
