@@ -7,7 +7,8 @@ In the unit square, in both precisions if none is named. `clusters`: 3 to 40 gen
 to 1e-3 of each other (1e-5 in float32), at random, on lines or circles, beside fewer anywhere.
 `circles` and `arcs`: 400 at random on one. `lines`: 20 to 150 on a line 1e-4 to 5e-4 apart, beside 40.
 `one rounding`: 3 to 81 places next to each other, beside 300; `across seams`: the same in a
-periodic box. Places are rounded to the precision beforehand, and those that fall together are one.
+periodic box. `alone`: 50 to 300 places within 15 to 60 roundings, without others, in a periodic
+box. Places are rounded to the precision beforehand, and those that fall together are one.
 
 In the unit cube: `clusters` and `lines` likewise; `spheres`: 100 at random on one; `rings`: 60 on a
 circle; `few roundings`: two groups of 2 to 16, each within 40 roundings of a place, beside 60;
@@ -26,6 +27,8 @@ from _common import Report, device_name, make_adapter, names, parser
 import clvoro
 
 PLACE = 0.6875
+SHOWN = 3
+"""Refusals of a kind of set that are printed."""
 
 
 def on_circle(rng: np.random.Generator, angle: float) -> np.ndarray:
@@ -72,6 +75,13 @@ def one_rounding(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
     square = np.stack(np.meshgrid(range(9), range(9)), axis=-1).reshape(-1, 2)
     chosen = square[rng.permutation(81)[: int(rng.integers(3, 82))]]
     return np.vstack([PLACE + step * chosen, rng.random((300, 2))])
+
+
+def alone(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
+    """Return generators within a few roundings of each other."""
+    step, count, across = float(np.finfo(real).eps), rng.integers(50, 300), rng.integers(15, 60)
+    first = np.floor(rng.uniform(0, 0.99, 2) / step) * step
+    return first + step * rng.integers(0, across, (count, 2))
 
 
 def directions(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -135,6 +145,7 @@ KINDS = {
         "lines": lines,
         "one-rounding": one_rounding,
         "across-seams": one_rounding,
+        "alone": alone,
     },
     3: {
         "clusters": clusters_in_space,
@@ -145,6 +156,10 @@ KINDS = {
         "lattices": lattices,
     },
 }
+
+
+PERIODIC = ("across-seams", "alone")
+"""Kinds that lie in a periodic box."""
 
 
 def sets_of(dim: int, kind: str, count: int, real: np.dtype) -> Iterator[np.ndarray]:
@@ -165,13 +180,13 @@ def main() -> int:
         name: lambda r, name=name: r[name]
         for name in ("generators", "dtype", "sets", "meshes", "refused", "wrong")
     }
-    report, refusals = Report(options.json, columns), []
+    report, refusals = Report(options.json, columns), {}
     precisions = [options.dtype] if options.dtype else ["float64", "float32"]
     for options.dtype in precisions:
         adapter = make_adapter(options)
         for kind in options.kinds or KINDS[options.dim]:
             ends = (0,) * options.dim, (1,) * options.dim
-            box = clvoro.Box(*ends, periodic=kind == "across-seams")
+            box = clvoro.Box(*ends, periodic=kind in PERIODIC)
             found = {"meshes": 0, "refused": 0, "wrong": 0}
             for points in sets_of(options.dim, kind, options.sets, np.dtype(options.dtype)):
                 try:
@@ -179,13 +194,17 @@ def main() -> int:
                     found["meshes" if right else "wrong"] += 1
                 except clvoro.ClvoroError as error:
                     found["refused"] += 1
-                    refusals.append(f"{kind}, {options.dtype}: {error}")
+                    refusals.setdefault(f"{kind}, {options.dtype}", []).append(error)
             report.add(
                 {"generators": kind, "dtype": options.dtype, "sets": options.sets, **found}, kind
             )
     title = f"{options.sets} sets each. {date.today()}, {device_name(adapter)}."
     report.finish(title)
-    print(*refusals, sep="\n", end="", file=sys.stderr)
+    for which, errors in refusals.items():
+        for error in errors[:SHOWN]:
+            print(f"{which}: {error}", file=sys.stderr)
+        if len(errors) > SHOWN:
+            print(f"{which}: and {len(errors) - SHOWN} more", file=sys.stderr)
     return 0
 
 

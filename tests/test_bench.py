@@ -60,7 +60,7 @@ def test_restart():
 def test_clusters():
     rows = records("clusters.py", "--sets", "3")
     rows += records("clusters.py", "--sets", "3", "--dim", "3", "--kinds", "spheres,few-roundings")
-    assert len(rows) == 16
+    assert len(rows) == 18
     assert all(r["meshes"] == r["sets"] == 3 for r in rows)
 
 
