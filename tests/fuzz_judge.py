@@ -91,11 +91,8 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any, levels:
 def demand_telling_apart(error: InputError, domain: Any, real: str) -> None:
     """Raise if `error` says of generators in the plane that they are too close to each other, and they are not.
 
-    Their places differ. Near 0 floating-point numbers may be closer than the domain's size rounds. In float32 cells of
-    a cluster that is alone in a periodic box may be one rounding wide, of which 1 % is asked for.
+    Their places differ. Near 0 floating-point numbers may be closer than the domain's size rounds.
     """
-    if any(domain.periodic) and real == "float32":
-        return
     said = re.search(r"(\S+) apart, are too close", str(error))
     if domain.dim == 2 and said and float(said[1]) > domain.frame[1] * np.finfo(real).eps / 2:
         raise Wrong(f"this is not so in the plane: {error}") from error
