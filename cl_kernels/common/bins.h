@@ -28,6 +28,9 @@ inline REAL bin_noise(REAL x, REAL start)
     return 16 * REAL_EPS * (fabs(x) + fabs(start));
 }
 
+/* Share of a bin's edge by which it may be off, too, where it is not near x. */
+#define BIN_SHARE (64 * REAL_EPS + R(1e-6))
+
 /* How far a row of bins is from y, give or take `slack`: no more than it is. */
 inline REAL row_distance(REAL y, REAL origin, REAL edge, int row, REAL slack)
 {

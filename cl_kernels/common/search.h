@@ -153,10 +153,10 @@ inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool
         open_grid_t next = here; /* where to go on */
         int iy = here.iy, part = here.part, at = here.bin;
         for (int iz = max(here.iz, zs.s0); iz <= zs.s1 && child < 0; ++iz, iy = -1) {
-            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz, edge * R(1e-6) + noise_z);
+            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz, edge * BIN_SHARE + noise_z);
             const bool layer_done = iz >= done_z.s0 && iz <= done_z.s1;
             for (iy = max(iy, ys.s0); iy <= ys.s1; ++iy, part = 0, at = -1) {
-                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy, edge * R(1e-6) + noise_y);
+                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy, edge * BIN_SHARE + noise_y);
                 const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
                 if (!(left2 > 0))
                     continue;

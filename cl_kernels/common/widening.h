@@ -40,7 +40,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
         const int4 place = way.places[way.depth];
         const FRAME frame = grid_frames[grid];
         const int4 shape = grid_shapes[grid];
-        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse, slack = edge * R(1e-6) + noise;
+        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse, slack = edge * BIN_SHARE + noise;
         const int left = axis_bin(x[0] - w, frame.s0, inverse, shape.s1);
         const int right = axis_bin(x[0] + w, frame.s0, inverse, shape.s1);
         const int bottom = axis_bin(x[1] - w, frame.s1, inverse, shape.s2);
