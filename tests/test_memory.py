@@ -95,6 +95,20 @@ def test_steep_sizes_are_allowed_for(bench, name, real):
     assert LEAST_HELD <= found["held"] <= 1.1, found
 
 
+@needs_bench
+@pytest.mark.parametrize("extent", [(1, 1e-5), (1, 1, 1e-5)], ids=["thread", "sheet"])
+def test_thin_boxes_take_no_more(bench, extent):
+    """Bins of a sheet were squares as thin as it is, once: a quarter more than was told."""
+    box = clvoro.Box((0,) * len(extent), extent)
+    size = (box.measure / 5000) ** (1 / box.dim)
+    options = Namespace(device=None, dtype="float64")
+    with pytest.warns(SizeErrorWarning):  # across it there is one cell, larger than it is thin
+        _, run, output = bench.peaks(
+            options, lambda a: a.run(box, size, effort="fast", seed=1).diagram
+        )
+    assert max(sum(run.values()), output) <= 1.1 * clvoro.Adapter().memory_needed(box, size)
+
+
 def lake():
     turn = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     radius = 0.4 + 0.08 * np.sin(5 * turn)
