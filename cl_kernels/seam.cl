@@ -268,9 +268,9 @@ kernel void fold_rows(const int size, global const int *starts, global const int
             }
             const REAL measure = face_measures[k], way = sqrt(d2), cone = measure * way / (2 * DIM);
             /* Of cells as narrow as a rounding what their corners round by is much. */
-            const bool tiny = (cone <= share * volumes[i] && cone <= share * volumes[j] &&
-                               measure < 2048 * REAL_EPS * (DIM == 2 ? R(1) : way)) ||
-                              (DIM == 2 && measure <= 2 * REAL_EPS * way);
+            const REAL rounding = DIM == 2 ? 2 * REAL_EPS * way : R(0);
+            const bool tiny = measure <= rounding || (measure < 2048 * REAL_EPS * (DIM == 2 ? R(1) : way) &&
+                                                      cone <= share * volumes[i] && cone <= share * volumes[j]);
             const int flag = mutual ? 0 : (tiny ? FLAG_DROPPED : FLAG_COLLAPSED);
             if (flag || (nearest && far)) {
                 atomic_or(report + 1, flag | (nearest && far ? FLAG_FAR : 0));
