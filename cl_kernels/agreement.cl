@@ -158,6 +158,15 @@ typedef struct {
     REAL4 x;
 } places_t;
 
+/* The same, from generator i. */
+inline places_t places_from(int i, global const REAL *points, global const REAL *corners, global const int *owners,
+                            global const int *labels, global const int *chosen, global const int *turns)
+{
+    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    const places_t places = {points, corners, owners, labels, chosen, turns, x};
+    return places;
+}
+
 inline REAL4 place_of(int label, const places_t *in)
 {
     const int u = in->chosen[label], i = in->owners[u];
@@ -241,14 +250,7 @@ kernel void snap_views(const int size, const int sliding, global const REAL *poi
         return;
     const int2 ranges[2] = {turns_of(k, turn_starts), turns_of(twin > k ? twin : -1, turn_starts)};
     const int own = ranges[0].s0 < ranges[0].s1 ? ranges[0].s0 : ranges[1].s0;
-    const int i = owners[turns[own]];
-    const places_t in = {points,
-                         corners,
-                         owners,
-                         labels,
-                         chosen,
-                         turns,
-                         (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0)};
+    const places_t in = places_from(owners[turns[own]], points, corners, owners, labels, chosen, turns);
     REAL far2 = 0;
     for (int r = 0; r < 2; ++r)
         for (int t = ranges[r].s0; t < ranges[r].s1; ++t) {
@@ -341,13 +343,7 @@ kernel void find_slits(const int size, global const REAL *points, global const R
         return;
     global const int *loop = reduced + turn_starts[k];
     const int i = owners[turns[turn_starts[k]]];
-    const places_t in = {points,
-                         corners,
-                         owners,
-                         labels,
-                         chosen,
-                         turns,
-                         (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0)};
+    const places_t in = places_from(i, points, corners, owners, labels, chosen, turns);
     /* Its two ends: what is farthest from any vertex, and what is farthest from that. */
     REAL4 ends[2];
     ends[1] = place_of(loop[0], &in);

@@ -72,13 +72,13 @@ class Agreement:
         self.differs = engine.zeros(self.v, np.uint8)
         self.reduced = engine.empty(len(views.turns), np.int32)
         self.chosen = self._choose()
-        self._corner_faces: np.ndarray | None = None
         self._most = ROUNDINGS * float(np.finfo(engine.real).eps)
 
     def reach(self, sliding: bool) -> Agreed | None:
         """Change the views until both cells of every face see the same loop; return None if they do not come to.
 
-        If `sliding`, vertices may be joined that are far from each other, where all their planes meet in one line.
+        If `sliding`, vertices may be joined that are far from each other, where all their planes meet in one line, and
+        placed anew; else it is None as well where vertices come to lie where they should not.
         """
         levels, widened, placed = None, False, False
         most_turns = np.inf if sliding else MOST_GROWTH * len(self.views.turns)
@@ -89,8 +89,8 @@ class Agreement:
                 )
                 if levels is None or not widened:
                     return self._agreed(doubtful=False)
-                if not (sliding or placed) and self._are_right():
-                    return self._agreed(doubtful=False)
+                if not sliding:
+                    return self._agreed(doubtful=False) if self._are_right() else None
                 labels = self._place_anew()
                 if labels is not None:
                     self._rename(self.engine.upload(labels, np.int32))
@@ -182,14 +182,9 @@ class Agreement:
             self._kernels.find_opposites, self.v, views.owners, views.corner_faces, views.starts, views.view_labels,
             views.turn_starts, views.turns, self._opposites, self._chains,
         )  # fmt: skip
-        if not sliding:  # the largest of what has served but for vertices in doubt
-            self._corner_faces = views.corner_faces.get()
+        if not sliding:  # the largest of what has served
             views.corner_faces = engine.empty(1, np.int32)
         return engine.zeros(self.v, np.uint8)
-
-    def _faces(self) -> np.ndarray:
-        faces = self._corner_faces
-        return self.views.corner_faces.get() if faces is None else faces
 
     def _put(self, proposals: cla.Array) -> None:
         """Put the vertices proposed into edges."""
@@ -219,7 +214,7 @@ class Agreement:
         labels, at = views.labels.get(), self.chosen.get()[names]
         here = np.flatnonzero(np.isin(labels, names))
         vertices = np.searchsorted(names, labels[here])
-        cells = np.column_stack([views.owners.get()[here], self._faces()[here]])
+        cells = np.column_stack([views.owners.get()[here], views.corner_faces.get()[here]])
         fixed = np.zeros((len(names), 3), bool)
         row, column = np.nonzero(cells < 0)
         fixed[vertices[row], (-1 - cells[row, column]) // 2] = True

@@ -19,7 +19,7 @@ def child_side(count, dim):
 
 
 def walk(binned, n, dim, eps):
-    """Return the leaves as (first, count, origin, edge, level, place in its grid, bins of the grid, spacing)."""
+    """Return the leaves as (first, count, origin, edge, level, spacing)."""
     bins = binned.bins.get().reshape(-1, 2)
     frames = binned.grid_frames.get().reshape(-1, 4).astype(float)
     shapes = binned.grid_shapes.get().reshape(-1, 4)
@@ -47,7 +47,7 @@ def walk(binned, n, dim, eps):
                     if block.sum() >= SPACING_COUNT:
                         break
                 spacing = edge * (OCCUPANCY * block.size / max(block.sum(), 1)) ** (1 / dim)
-                leaves.append((start, count, origin, edge, level, index, sides, spacing))
+                leaves.append((start, count, origin, edge, level, spacing))
             else:
                 assert frames[grid, :dim] == pytest.approx(origin, abs=8 * eps)
                 assert shapes[grid][1] / frames[grid, 3] == pytest.approx(edge, rel=8 * eps)
@@ -72,7 +72,7 @@ def check(binned, points, dim, eps):
     covered = np.zeros(n, int)
     spacings = binned.spacing.get()[:n]
     first = binned.grid_frames.get()[:dim].astype(float)
-    for start, count, origin, edge, level, _, _, spacing in leaves:
+    for start, count, origin, edge, level, spacing in leaves:
         place = slice(start, start + count)
         covered[place] += 1
         assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
