@@ -6,7 +6,7 @@
 Boxes, polygons, periodic boxes, layers, each method, effort and precision, several kinds of size
 fields, given generators, transfers and resumed runs, with fixed seeds. A hash is the first 16 hex
 digits of SHA-256 over type, shape and bytes of an array. `--save` writes the hashes, and `--arrays`
-the arrays themselves to FILE.npz beside FILE.json. `--compare` prints which arrays differ from those
+the arrays themselves to FILE.npz beside FILE.json. `--compare` prints only which arrays differ from those
 of the file, by how much if FILE.npz is there, and returns 1 if any does. Hashes hold for one device
 and its driver: `--compare` says if the file comes from another one. `--only` takes the runs whose
 names contain the text, `--dtype` those of one precision.
@@ -513,12 +513,14 @@ def main(arguments: list[str] | None = None) -> int:
             record = {"error": type(error).__name__}
             print(f"{case.label}: {error}", file=sys.stderr)
         runs[case.label] = record
-        report.add({"run": case.label, **record}, case.label)
-        if comparison is not None:
+        if comparison is None:
+            report.add({"run": case.label, **record}, case.label)
+        else:
             comparison.add(case.label, record, arrays)
         if options.arrays:
             kept |= {f"{case.label}/{name}": array for name, array in arrays.items()}
-    report.finish(heading(adapters["float64"], "Hashes of meshes"))
+    if comparison is None:
+        report.finish(heading(adapters["float64"], "Hashes of meshes"))
     if options.save:
         text = json.dumps({"device": device, "runs": runs}, indent=1)
         options.save.write_text(text + "\n", encoding="utf-8")
