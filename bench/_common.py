@@ -132,7 +132,7 @@ def heading(adapter: clvoro.Adapter, what: str) -> str:
 
 def off_walls(diagram: clvoro.Diagram) -> np.ndarray:
     """Tell for each cell whether it has no face on a wall, (n,) bool."""
-    on_wall = np.logical_or.reduceat(diagram.neighbours < 0, diagram.neighbour_starts[:-1])
+    on_wall = np.logical_or.reduceat(diagram.neighbors < 0, diagram.neighbor_starts[:-1])
     return ~on_wall
 
 
@@ -149,7 +149,7 @@ def figures(diagram: clvoro.Diagram, h: np.ndarray, quality: np.ndarray) -> dict
     inner = off_walls(diagram)
     if not inner.any():
         inner[:] = True
-    sides = np.diff(diagram.neighbour_starts)
+    sides = np.diff(diagram.neighbor_starts)
     return {
         "cells": len(diagram),
         "mean_error": float(error.mean()),
@@ -170,7 +170,7 @@ def figures(diagram: clvoro.Diagram, h: np.ndarray, quality: np.ndarray) -> dict
 
 def cell_quality(diagram: clvoro.Diagram) -> np.ndarray:
     """Return the paper's (4.1) for each cell of a 2D diagram, on the host."""
-    starts = diagram.neighbour_starts
+    starts = diagram.neighbor_starts
     sides = np.diff(starts)
     perimeter = np.add.reduceat(diagram.face_measures, starts[:-1])
     return 4 * diagram.volumes * sides * np.tan(math.pi / sides) / perimeter**2

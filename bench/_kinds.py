@@ -9,7 +9,7 @@ import numpy as np
 
 import clvoro
 from clvoro import sizing
-from clvoro.start import count_cells
+from clvoro.adaptation.sampling.start import count_cells
 
 Kind = tuple[clvoro.Box | clvoro.Polygon, Any, dict[str, Any]]
 

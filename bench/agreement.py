@@ -30,7 +30,7 @@ from _common import (
 )
 
 import clvoro
-from clvoro.start import count_cells
+from clvoro.adaptation.sampling.start import count_cells
 
 STEPS = 3
 ROUNDINGS = 1e4
@@ -59,7 +59,7 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
     same = {"dim": box.dim, "dtype": options.dtype}
 
     a, b = (adapter.diagram(box, points) for adapter in (one, other))
-    graph = bool(np.array_equal(a.neighbours, b.neighbours))
+    graph = bool(np.array_equal(a.neighbors, b.neighbors))
     off = float(np.abs(a.volumes - b.volumes).max() / a.volumes.mean())
     records = [
         {**same, "what": "diagram", "cells": n, "graph": graph, "off": off, "in_eps": off / eps}
@@ -70,7 +70,7 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
         for adapter in (one, other)
     )
     off = float((np.linalg.norm(a.points - b.points, axis=1) / a.size).max())
-    graph = bool(np.array_equal(a.diagram.neighbours, b.diagram.neighbours))
+    graph = bool(np.array_equal(a.diagram.neighbors, b.diagram.neighbors))
     records.append({**same, "what": f"{STEPS} steps", "cells": len(a.points), "graph": graph, "off": off,
                     "in_eps": off / eps})  # fmt: skip
 

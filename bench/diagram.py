@@ -5,13 +5,13 @@
                             [--dtype float32] [--json]
 
 With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000 around an empty
-ball, "core", the same with the ball filled, and "bcc", the body-centred cubic lattice, jittered
-likewise. Cells at the empty ball are cones to its centre, each near hundreds of others; "core" is
+ball, "core", the same with the ball filled, and "bcc", the body-centerd cubic lattice, jittered
+likewise. Cells at the empty ball are cones to its center, each near hundreds of others; "core" is
 what grading alone costs. Areas and moments are then part of "clip", and a
-warm row bins the moved generators and clips by the neighbours of the diagram before first.
+warm row bins the moved generators and clips by the neighbors of the diagram before first.
 
 Point sets in the unit square, random with a fixed seed: "uniform"; "cubed", uniform with x -> x^3
-in both coordinates; "radial", spacing in proportion to the distance from the centre, sizes
+in both coordinates; "radial", spacing in proportion to the distance from the center, sizes
 1 : 10 000; "hexagonal", a lattice jittered by a tenth of its spacing, as a finished mesh is.
 
 Times are medians of `--repeat` after a first call, from an idle queue to an idle queue, in
@@ -21,7 +21,7 @@ milliseconds:
   diagram  clipping, matching, scan, areas, centroids, faces, graph
 "clip", "match" and "measure" are the device's own times of the kernels in "diagram", by its
 events. Warm rows: the generators moved by up to a tenth of the distance to the nearest other, and
-the diagram before is repaired ("clip": checking which neighbours stay, clipping the others);
+the diagram before is repaired ("clip": checking which neighbors stay, clipping the others);
 there is no binning. Rates are millions of cells per second: of clipping alone; from binning to
 graph; and from "order" to graph, which is a diagram of points in any order: these need no further
 binning. With `--scipy`
@@ -46,13 +46,13 @@ import numpy as np
 from _common import Report, best, clock_of, counts, heading, make_adapter, markdown, names, parser
 
 import clvoro
-from clvoro._hooks import watching
-from clvoro._program import Engine
-from clvoro.bins import Bins
-from clvoro.cells import Cells
-from clvoro.polyhedra import Polyhedra
-from clvoro.profile import Profile, profiled_queue
-from clvoro.repair import Repair
+from clvoro.opencl.hooks import watching
+from clvoro.opencl.profile import Profile, profiled_queue
+from clvoro.opencl.program import Engine
+from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.incremental import Repair
+from clvoro.tessellation.polyhedra import Polyhedra
 
 BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
 CUBE = clvoro.Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
@@ -125,7 +125,7 @@ def core_3d(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Jittered body-centred cubic lattice in random order, of about n points."""
+    """Jittered body-centerd cubic lattice in random order, of about n points."""
     k = max(1, round((n / 2) ** (1 / 3)))
     p = np.stack(np.meshgrid(*[np.arange(k, dtype=float)] * 3), axis=-1).reshape(-1, 3)
     p = np.concatenate([p + 0.25, p + 0.75]) / k
@@ -202,9 +202,9 @@ class Tessellator:
         self.bin()
         t, host = self.diagram(), self.points.get()
         starts = t.starts.get()
-        neighbours = t.neighbours.get()[: starts[-1]]
-        d = host[neighbours] - np.repeat(host, np.diff(starts), axis=0)
-        d = np.where(neighbours >= 0, np.linalg.norm(d, axis=1), np.inf)
+        neighbors = t.neighbors.get()[: starts[-1]]
+        d = host[neighbors] - np.repeat(host, np.diff(starts), axis=0)
+        d = np.where(neighbors >= 0, np.linalg.norm(d, axis=1), np.inf)
         nearest = np.minimum.reduceat(d, starts[:-1])
         moved = host + WARM_MOVE * nearest[:, None] * (rng.random(host.shape) - 0.5) * math.sqrt(2)
         moved = np.clip(moved, 0, 1)

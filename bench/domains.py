@@ -20,10 +20,10 @@ from polygon import lake
 
 import clvoro
 from clvoro import sizing
-from clvoro.cases.naca import naca4
+from clvoro.cli.cases.naca import naca4
 
 LIMITS = (0.008, 0.12)
-"""Ends of the scale of colours; the lower one leaves room under the smallest cells, for faces to show on them."""
+"""Ends of the scale of colors; the lower one leaves room under the smallest cells, for faces to show on them."""
 
 
 @dataclass
@@ -63,8 +63,8 @@ def spots() -> Example:
 
     def size(points: np.ndarray) -> np.ndarray:
         h = np.full(len(points), 0.05)
-        for centre in ((0.02, 0.4), (0.55, 0.97)):
-            away = (points - centre + 0.5) % 1 - 0.5  # to the nearest image
+        for center in ((0.02, 0.4), (0.55, 0.97)):
+            away = (points - center + 0.5) % 1 - 0.5  # to the nearest image
             h = np.minimum(h, 0.01 + 0.18 * np.hypot(*away.T))
         return h
 
@@ -72,8 +72,8 @@ def spots() -> Example:
 
 
 def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
-    from clvoro.report.cells import plot_cells
-    from clvoro.report.style import new_figure, styled
+    from clvoro.plotting.cells import plot_cells
+    from clvoro.plotting.style import new_figure, styled
 
     with styled():
         figure = new_figure(11.5, 3.35)

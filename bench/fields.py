@@ -3,7 +3,7 @@
     python bench/fields.py [--effort default] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
 Writes `fields.png` into `bench/pictures` or `--out`, and prints what each mesh came to. Six fields on one
-box, one scale of colours: the distance to a polygon with a law of growth, a raster with gaps, a jump that
+box, one scale of colors: the distance to a polygon with a law of growth, a raster with gaps, a jump that
 `Graded` makes a ramp, sizes from the second derivatives and from the gradient of a solution, and a
 composition. Lines show what a field was made from; dashed ones are the gaps, the jump, the layer, the wake.
 """
@@ -19,11 +19,11 @@ from _common import FIRST_SEED, PICTURES, Report, figures, heading, make_adapter
 
 import clvoro
 from clvoro import sizing
-from clvoro.cases.naca import naca4
+from clvoro.cli.cases.naca import naca4
 
 BOX = clvoro.Box((0, 0), (1.5, 1))
 LIMITS = (0.008, 0.12)
-"""Ends of the scale of colours; the lower one leaves room under the smallest cells, for faces to show on them."""
+"""Ends of the scale of colors; the lower one leaves room under the smallest cells, for faces to show on them."""
 LINE = "#D55E00"
 
 
@@ -38,9 +38,9 @@ class Example:
     dashed: list[np.ndarray] = field(default_factory=list)
 
 
-def circle_line(centre: tuple[float, float], radius: float) -> np.ndarray:
+def circle_line(center: tuple[float, float], radius: float) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, 181)
-    return np.array(centre) + radius * np.column_stack([np.cos(turn), np.sin(turn)])
+    return np.array(center) + radius * np.column_stack([np.cos(turn), np.sin(turn)])
 
 
 def distance_to_polygon() -> Example:
@@ -56,12 +56,12 @@ def raster_with_gaps() -> Example:
     x, y = np.meshgrid(np.linspace(0, 1.5, 121), np.linspace(0, 1, 81))
     values = 0.036 + 0.022 * np.sin(4.2 * x + 0.6) * np.cos(5 * y - 0.4)
     holes = [((0.45, 0.62), 0.15), ((1.1, 0.36), 0.19)]
-    for centre, radius in holes:
-        values[np.hypot(x - centre[0], y - centre[1]) < radius] = np.nan
+    for center, radius in holes:
+        values[np.hypot(x - center[0], y - center[1]) < radius] = np.nan
     size = sizing.Graded(sizing.Raster(values, BOX.lower, BOX.upper, missing="nearest"), growth=1.2)
     return Example(
         'Graded(Raster(h, ..., missing="nearest"))', size,
-        dashed=[circle_line(centre, radius) for centre, radius in holes],
+        dashed=[circle_line(center, radius) for center, radius in holes],
     )  # fmt: skip
 
 
@@ -117,12 +117,12 @@ def examples() -> list[Example]:
 def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
     from matplotlib import patheffects
 
-    from clvoro.report.cells import plot_cells
-    from clvoro.report.colours import colouring
-    from clvoro.report.keys import add_colour_bar
-    from clvoro.report.style import new_figure, styled
+    from clvoro.plotting.cells import plot_cells
+    from clvoro.plotting.colors import coloring
+    from clvoro.plotting.legends import add_color_bar
+    from clvoro.plotting.style import new_figure, styled
 
-    scheme = colouring("size")
+    scheme = coloring("size")
     halo = [patheffects.Stroke(linewidth=2.2, foreground="white"), patheffects.Normal()]
     with styled():
         figure = new_figure(10.5, 5.7)
@@ -140,7 +140,7 @@ def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
                 fontsize=8, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
             )  # fmt: skip
         everything = np.concatenate([result.size for _, result in results])
-        add_colour_bar(
+        add_color_bar(
             axes[0].collections[0], axes, scheme, everything, LIMITS,
             location="bottom", shrink=0.5, aspect=50,
         )  # fmt: skip

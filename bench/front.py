@@ -131,16 +131,16 @@ STYLES = {
     "exact": ("exact", "D", "#CC79A7"),
     "Gmsh": ("Gmsh, measured here", "X", "#D55E00"),
 }
-"""Group -> label, marker, colour."""
+"""Group -> label, marker, color."""
 
 
 def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
-    from clvoro.report.style import new_figure, styled
+    from clvoro.plotting.style import new_figure, styled
 
     with styled():
         figure = new_figure(7.0, 4.5)
         ax = figure.add_subplot()
-        for group, (label, marker, colour) in STYLES.items():
+        for group, (label, marker, color) in STYLES.items():
             mine = [r for r in records if r["group"] == group]
             if not mine:
                 continue
@@ -148,7 +148,7 @@ def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
                 line = sorted(mine, key=lambda r: r["mean_error"])
                 ax.plot(
                     [r["mean_error"] for r in line], [1 - r["mean_quality"] for r in line],
-                    color=colour, linewidth=1, alpha=0.6, zorder=2,
+                    color=color, linewidth=1, alpha=0.6, zorder=2,
                 )  # fmt: skip
             for k, r in enumerate(mine):
                 own = not group.startswith("adaptive") or "target" not in r["name"]
@@ -156,7 +156,7 @@ def draw_front(records: list[dict[str, Any]], path: Path, caption: str) -> None:
                 ax.scatter(
                     r["mean_error"], 1 - r["mean_quality"], marker=marker,
                     s=18 if not own else 90 if group in PAPER else 46,
-                    color=colour, edgecolor="white", linewidth=0.6, zorder=4 if own else 3,
+                    color=color, edgecolor="white", linewidth=0.6, zorder=4 if own else 3,
                     label=label if k == 0 else None,
                 )  # fmt: skip
         for k, (name, error, quality) in enumerate(NOTES):
@@ -201,9 +201,9 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
     from matplotlib.patches import Patch
     from PIL import Image
 
-    from clvoro.report import plot_cells
-    from clvoro.report.cells import COLOURINGS
-    from clvoro.report.style import new_figure, styled
+    from clvoro.plotting import plot_cells
+    from clvoro.plotting.cells import COLORINGS
+    from clvoro.plotting.style import new_figure, styled
 
     panels = [(results[key], title) for key, title in DEFECTS if key in results]
     window = ((0.72, 0.42), (1.52, 0.98))
@@ -227,18 +227,18 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
             )  # fmt: skip
         for ax in axes[len(panels) :]:
             ax.set_axis_off()
-        colours = COLOURINGS["sides"].colour_map.colors
+        colors = COLORINGS["sides"].color_map.colors
         labels = ("4 or fewer sides", "5", "6", "7", "8 or more")
         figure.legend(
             handles=[
                 Patch(facecolor=c, edgecolor="#1A1A1A", linewidth=0.4, label=label)
-                for c, label in zip(colours, labels, strict=True)
+                for c, label in zip(colors, labels, strict=True)
             ],
             loc="outside lower center", ncols=5, frameon=False, handlelength=1.2,
         )  # fmt: skip
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=300)
-    # Few colours: a palette makes the file several times smaller.
+    # Few colors: a palette makes the file several times smaller.
     with Image.open(drawn) as image:
         image.convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(
             path, optimize=True, dpi=(300, 300)

@@ -21,7 +21,7 @@ from _common import Report, counts, heading, make_adapter, parser
 from diagram import SETS, SETS_3D
 
 import clvoro
-from clvoro.tessellator import Tessellator
+from clvoro.tessellation.tessellator import Tessellator
 
 GRADED = {2: ("uniform", "cubed", "radial"), 3: ("uniform", "radial", "core")}
 COLUMNS = {

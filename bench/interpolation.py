@@ -69,7 +69,7 @@ def interpolation_error(
 ) -> dict[str, float]:
     """Return the L1, L2 and largest error of linear interpolation; parts of triangles are at most `width` long."""
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
-    on_walls = diagram.face_centroids[diagram.neighbours < 0]
+    on_walls = diagram.face_centroids[diagram.neighbors < 0]
     nodes = np.vstack([diagram.points, on_walls, corners])
     triangles = Delaunay(nodes).simplices
     x, values = nodes[triangles], u(nodes)[triangles]

@@ -14,7 +14,7 @@ two over that. In the fields of the second line sizes change several-fold from o
 The third line has all kinds of runs (`_kinds.py`, or some of them by their first word), one that is
 resumed and a transfer: shares of what is told that are held while the run is prepared, by the run,
 and while its diagram is read.
-`clvoro.memory.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
+`clvoro.adaptation.estimates.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ from _kinds import CUBE, KINDS, SQUARE, Kind
 
 import clvoro
 from clvoro import sizing
-from clvoro._program import Engine
-from clvoro.remap import transfer_values
-from clvoro.start import count_cells
-from clvoro.transfer import transfer_needed
+from clvoro.adaptation.sampling.start import count_cells
+from clvoro.opencl.program import Engine
+from clvoro.remapping.remap import transfer_values
+from clvoro.remapping.transfer import transfer_needed
 
 STEEP = {
     "jump": (SQUARE, "x < 0.5 ? 1.0 : 19.0"),
@@ -196,7 +196,7 @@ def transferred(options: Any, n: int) -> dict[str, Any]:
     """Measure a transfer of one column between meshes of random generators."""
     adapter, rng = make_adapter(options), np.random.default_rng(1)
     old, new = (adapter.diagram(SQUARE, rng.random((n, 2))) for _ in range(2))
-    sizes = [(n, len(mesh.neighbours)) for mesh in (old, new)]
+    sizes = [(n, len(mesh.neighbors)) for mesh in (old, new)]
     values, ledger = old.volumes, Ledger()
     with counted_buffers(ledger):
         transfer_values(old, values, new, 2, adapter=adapter)

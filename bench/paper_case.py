@@ -21,9 +21,9 @@ import numpy as np
 from _common import FIRST_SEED, make_adapter, parser
 
 import clvoro
-from clvoro.cases import load_case
-from clvoro.results import Result
-from clvoro.summary import summary
+from clvoro.cli.cases import load_case
+from clvoro.mesh.results import Result
+from clvoro.mesh.summary import summary
 
 METHODS = ("lloyd", "poisson", "coupled")
 
@@ -298,7 +298,7 @@ def main() -> int:
         print(f"{adapter.ctx.devices[0].name.strip()}, k = {arguments.k:g}")
         print_table(runs, verdicts)
     if arguments.pictures:
-        from clvoro.report import write_report
+        from clvoro.plotting import write_report
 
         case = load_case("paper")
         points = runs[0]["coupled"].initial.points

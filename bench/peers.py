@@ -8,7 +8,7 @@ Diagrams: random points in the unit square (the sets of `diagram.py`), in random
 time is from NumPy points to a diagram on the device with areas, centroids, faces and graph, and
 the second one with all arrays fetched. SciPy gives vertices and regions, no areas. Voro++
 (Debian: voro++-dev; its packaged version is three-dimensional and serial, so it runs on a slab
-one cell thick) computes cell, volume and neighbours; a small C++ program is compiled for it with
+one cell thick) computes cell, volume and neighbors; a small C++ program is compiled for it with
 g++ -O3. Best of two runs each, of one for SciPy. With `--dim 3` the sets are those of the unit
 cube ("core" has sizes 1 : 1000), Voro++ does the same there with blocks of five generators, and
 there are no meshes.
@@ -61,7 +61,7 @@ import clvoro
 
 UNIT = {2: SQUARE, 3: CUBE}
 EDGE = 1.0746
-"""Distance of neighbours in the lattice of regular hexagons of area 1."""
+"""Distance of neighbors in the lattice of regular hexagons of area 1."""
 
 VOROPP = r"""
 #include <chrono>
@@ -86,14 +86,14 @@ int main(int, char **arguments)
         box.put(int(i), x[0], x[1], DIM == 3 ? x[DIM - 1] : thick / 2);
     }
     voro::voronoicell_neighbor cell;
-    std::vector<int> neighbours;
+    std::vector<int> neighbors;
     double volume = 0;
     long faces = 0;
     voro::c_loop_all loop(box);
     if (loop.start()) do if (box.compute_cell(cell, loop)) {
         volume += cell.volume();
-        cell.neighbors(neighbours);
-        faces += neighbours.size();
+        cell.neighbors(neighbors);
+        faces += neighbors.size();
     } while (loop.inc());
     const std::chrono::duration<double> seconds = std::chrono::steady_clock::now() - start;
     printf("%.6f %.12f %ld\n", seconds.count(), volume / thick, faces);
@@ -121,7 +121,7 @@ def diagram_fetched(adapter: clvoro.Adapter, points: np.ndarray) -> float:
     def run() -> None:
         diagram = adapter.diagram(UNIT[points.shape[1]], points)
         corners = "cell_vertices" if points.shape[1] == 2 else "face_vertices"
-        for name in ("volumes", "centroids", "neighbours", "face_measures", "vertices", corners):
+        for name in ("volumes", "centroids", "neighbors", "face_measures", "vertices", corners):
             getattr(diagram, name)
 
     run()

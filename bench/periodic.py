@@ -27,10 +27,10 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro.forecast import images_expected
+from clvoro.adaptation.forecast import images_expected
+from clvoro.adaptation.sampling.start import density_tree
 from clvoro.sizing import Expression
-from clvoro.start import density_tree
-from clvoro.tessellator import Tessellator
+from clvoro.tessellation.tessellator import Tessellator
 
 CHANNELS = {2: "0.05 + 0.9 * fmin(y, 1 - y)", 3: "0.1 + 0.6 * fmin(y, 1 - y)"}
 

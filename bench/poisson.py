@@ -22,8 +22,8 @@ import scipy.sparse.linalg as sla
 from _common import Report, best, clock_of, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro._program import Engine
-from clvoro.poisson import Poisson
+from clvoro.opencl.program import Engine
+from clvoro.solvers.poisson import Poisson
 
 try:
     import pyamg
@@ -69,8 +69,8 @@ def ours(
 ) -> Outcome:
     poisson = Poisson(engine)
     arrays = (
-        engine.upload(diagram.neighbour_starts, np.int32),
-        engine.upload(diagram.neighbours, np.int32),
+        engine.upload(diagram.neighbor_starts, np.int32),
+        engine.upload(diagram.neighbors, np.int32),
         engine.upload(diagram.face_measures),
         engine.upload(diagram.points),
     )
@@ -99,9 +99,9 @@ def ours(
 def matrix(diagram: clvoro.Diagram) -> sp.csr_matrix:
     """Return A = -Laplacian as a SciPy matrix."""
     n = len(diagram)
-    rows = np.repeat(np.arange(n), np.diff(diagram.neighbour_starts))
-    inner = diagram.neighbours >= 0
-    i, j = rows[inner], diagram.neighbours[inner]
+    rows = np.repeat(np.arange(n), np.diff(diagram.neighbor_starts))
+    inner = diagram.neighbors >= 0
+    i, j = rows[inner], diagram.neighbors[inner]
     d = np.linalg.norm(diagram.points[i] - diagram.points[j], axis=1)
     W = sp.csr_matrix((diagram.face_measures[inner] / d, (i, j)), (n, n))
     W = 0.5 * (W + W.T)

@@ -36,9 +36,9 @@ from _common import (
 )
 
 import clvoro
-from clvoro._program import Engine
-from clvoro.stages import Stages
-from clvoro.tessellator import Tessellator
+from clvoro.adaptation.stages import Stages
+from clvoro.opencl.program import Engine
+from clvoro.tessellation.tessellator import Tessellator
 
 MOST_RATIO = 1.3
 MESHES = (
@@ -51,7 +51,7 @@ MESHES = (
 
 
 def coast(
-    k: int, seed: int, centre: tuple[float, float], radii: tuple[float, float], rough: float
+    k: int, seed: int, center: tuple[float, float], radii: tuple[float, float], rough: float
 ) -> np.ndarray:
     """Return a closed curve of `k` corners, a rough ellipse: a random Fourier series of falling amplitude."""
     rng = np.random.Generator(np.random.PCG64(seed))
@@ -60,7 +60,7 @@ def coast(
     phases = rng.uniform(0, 2 * np.pi, len(waves))
     bulge = np.cos(np.outer(t, waves) + phases) @ waves**-1.4
     r = np.exp(rough * bulge)[:, None]
-    return np.array(centre) + np.array(radii) * r * np.column_stack([np.cos(t), np.sin(t)])
+    return np.array(center) + np.array(radii) * r * np.column_stack([np.cos(t), np.sin(t)])
 
 
 def lake(edges: int, rough: float = 0.08) -> clvoro.Polygon:

@@ -5,14 +5,14 @@
     python bench/precision.py --noise
 
 The size grows linearly, by the grading from its least value to its largest one: away from the circle of radius
-0.3 about (0.9, 0.75) in the box 2.5 x 1.5, from that circle's centre alone ("point"), or from the sphere
+0.3 about (0.9, 0.75) in the box 2.5 x 1.5, from that circle's center alone ("point"), or from the sphere
 of radius 0.25 about (0.5, 0.5, 0.4) in the unit cube; it is scaled to the count. h and e are evaluated on the host, in
 float64, at the generators as they are; medians over the starts. "spacing" is that of positions in
 float32 over h, at the least size and as a mean over the cells. "more" is what float32 adds to the mean
 error, "scatter" the range of float64's over the starts; exits with 1 where more is above 1e-3 and the
 scatter, and no warning came beforehand.
 `--noise` moves the generators of uniform meshes by a little at random, and prints how much of it the
-error changes by: `clvoro.precision.ADDED`.
+error changes by: `clvoro.adaptation.precision.ADDED`.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from _common import (
 
 import clvoro
 from clvoro import sizing
+from clvoro.adaptation.precision import MOST_ADDED
+from clvoro.adaptation.sampling.start import count_cells
 from clvoro.errors import PrecisionWarning
-from clvoro.precision import MOST_ADDED
-from clvoro.start import count_cells
 
 SHAPES = {
     "circle": (BOX, sizing.Circle((0.9, 0.75), 0.3), 1.4671),

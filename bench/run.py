@@ -39,7 +39,7 @@ from _common import (
 )
 
 import clvoro
-from clvoro.profile import Profile
+from clvoro.opencl.profile import Profile
 
 SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
 """Programs that solve linear systems."""
@@ -61,7 +61,7 @@ def run_once(
     field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
     start = time.perf_counter()
     result = adapter.run(BOX, field, effort=effort, method=method, seed=FIRST_SEED)
-    result.diagram.neighbours  # noqa: B018  fetched when asked for
+    result.diagram.neighbors  # noqa: B018  fetched when asked for
     result.diagram.vertices  # noqa: B018
     result.diagram.cell_vertices  # noqa: B018
     return result, time.perf_counter() - start
@@ -74,7 +74,7 @@ def measure(
     history = result.history
     cost = work(history)
     finest = history["level"] == 0
-    # Time between two rows of the finest level, reorganising included.
+    # Time between two rows of the finest level, reorganizing included.
     between = np.diff(history["seconds"])[finest[1:] & finest[:-1]]
     record: dict[str, Any] = {
         "method": method, "effort": effort, "seconds": seconds,

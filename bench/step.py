@@ -42,14 +42,14 @@ from _common import (
 )
 
 import clvoro
-from clvoro._program import Engine
-from clvoro.krylov import Solution
-from clvoro.mesh import Mesh
-from clvoro.methods import Method, ProjectedMethod, WeightedMethod
-from clvoro.plans import Step, plan_adaptive
-from clvoro.profile import Profile, profiled_queue
+from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
+from clvoro.adaptation.schedule import Step, plan_adaptive
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import Mesh
+from clvoro.opencl.profile import Profile, profiled_queue
+from clvoro.opencl.program import Engine
 from clvoro.sizing import Sizing
-from clvoro.stages import Stages
+from clvoro.solvers.conjugate_gradient import Solution
 
 CELLS_OF_F2 = 22972
 SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
@@ -73,7 +73,7 @@ NEEDS = {
     "cells.match_faces": (0, 4, 0),
     "cells.measure_cells": (2 + 1 + 2 + 3, 6 + 6 + 4 + 6 + 12, 6 * 75 + 40),
     "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
-    "metric.compare_neighbours": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
+    "metric.compare_neighbors": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
     "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
     "shape.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),

@@ -44,7 +44,7 @@ def make_mesh(adapter: clvoro.Adapter, dim: int, n: int, seed: int, random: bool
         made = adapter.diagram(box, np.random.default_rng(seed).random((n, dim)))
     else:
         made = adapter.run(box, n ** (-1 / dim), effort="fast", seed=seed).diagram
-    for name in ("volumes", "centroids", "neighbours"):
+    for name in ("volumes", "centroids", "neighbors"):
         getattr(made, name)
     return made
 

@@ -15,19 +15,20 @@ True
 Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls. Sizes:
 numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`. `Adapter.run` gives a `Result` (and
 `Adapter.diagram` a `Diagram` alone): arrays, `save`, `plot`, `check`, `transfer`; `load` reads it again. Errors and
-warnings are in `clvoro.errors`, pictures in `clvoro.report`, times of kernels in `clvoro.profile`. The command is
+warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
 ``clvoro``; begin with ``clvoro --help``.
 """
 
-from . import profile, sizing
+from . import sizing
 from .adapter import Adapter
-from .device import create_context, list_devices
-from .domain import Box
 from .errors import ClvoroError
+from .geometry.boundary_layers import Layers
+from .geometry.box import Box
+from .geometry.polygon import Polygon
 from .io import load
-from .layers import Layers
-from .polygon import Polygon
-from .results import Diagram, Displacements, Result
+from .mesh.results import Diagram, Displacements, Result
+from .opencl import profile
+from .opencl.devices import create_context, list_devices
 
 __version__ = "0.1.0"
 

@@ -12,22 +12,22 @@ from typing import NoReturn
 import numpy as np
 import pyopencl as cl
 
-from . import device
-from ._arrays import Naming, check_callable, check_number, check_points
-from ._probe import check_process
-from ._program import Engine
-from .domain import Domain
+from .adaptation.diagnostics import warn_of_errors
+from .adaptation.estimates import check_memory, memory_needed
+from .adaptation.options import Options
+from .adaptation.preparation import Preparation
+from .adaptation.run import Files, carry_out
+from .adaptation.stages import Stages
+from .arguments import Naming, check_callable, check_number, check_points
 from .errors import InputError, InputTypeError, MemoryLimitError, UnusedOptionWarning
-from .fetch import fetch_diagram
-from .layers import Layers
-from .memory import check_memory, memory_needed
-from .misfits import warn_of_errors
-from .options import Options
-from .preparation import Preparation
-from .results import Diagram, Result
-from .run import Files, carry_out
-from .stages import Stages
-from .tessellator import Tessellator
+from .geometry.boundary_layers import Layers
+from .geometry.box import Domain
+from .mesh.results import Diagram, Result
+from .opencl import devices as device
+from .opencl.probe import check_process
+from .opencl.program import Engine
+from .tessellation.readback.fetch import fetch_diagram
+from .tessellation.tessellator import Tessellator
 
 CHECKPOINT_EVERY = 60.0
 """Seconds from one checkpoint to the next, unless the caller says otherwise."""
@@ -252,7 +252,7 @@ class Adapter:
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the
             right size; "exact" lets every cell take the size asked for, to about 1e-4. The others repeat one kind of
             step: "lloyd", "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density
-            h^-d (see `clvoro.methods`).
+            h^-d (see `clvoro.adaptation.methods`).
         n_cells : int, optional
             Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" end with
             exactly that many; they scale the size field by the common factor at which the mean of log(L / h) vanishes,

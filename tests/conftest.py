@@ -22,7 +22,7 @@ for number, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signa
 
 @pytest.fixture(scope="session")
 def ctx():
-    from clvoro.device import create_context
+    from clvoro.opencl.devices import create_context
 
     return create_context()
 
@@ -39,6 +39,6 @@ def meshio_for_vtu():
 
 
 if "CLVORO_TEST_GROUPS" in os.environ:
-    from gpu_like import use_groups
+    from tests.robustness.gpu_like import use_groups
 
     use_groups(int(os.environ["CLVORO_TEST_GROUPS"]))

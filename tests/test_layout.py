@@ -11,26 +11,40 @@ from pathlib import Path
 import pytest
 
 import clvoro
-from clvoro._program import kernel_folder
+from clvoro.opencl.program import kernel_folder
 
 PACKAGE = Path(clvoro.__file__).parent
 KERNELS = kernel_folder()
-SOURCES = sorted([*KERNELS.glob("*.cl"), *KERNELS.glob("common/*.h")])
+SOURCES = sorted([*KERNELS.rglob("*.cl"), *KERNELS.rglob("*.h")])
+HERE = Path(__file__).parent
 HOUSE = PACKAGE.parent
 CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
-FACES = {"cli", "jobs", "outputs", "sequence", "report", "io", "cases", "__init__", "__main__"}
-"""What stands on the library, which does without: command line, pictures, files."""
+ORDER = (
+    "errors", "arguments", "files", "opencl", "geometry", "mesh", "io", "sizing", "tessellation", "solvers",
+    "adaptation", "remapping", "plotting", "adapter", "__init__", "cli", "__main__",
+)  # fmt: skip
+"""Packages and root modules: each imports only from those before it."""
+UPWARD = {("mesh.results", "io"), ("mesh.results", "plotting"), ("mesh.results", "remapping")}
+"""Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, transfer."""
+MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
+"""Files directly in `clvoro/`, and in each of its folders."""
+TWICE = {
+    "remove_mean", "count_children", "keep_inside", "reflect_inside", "add_run", "corner_of", "eliminate", "cross8",
+    "fold_rows", "choose_lanes", "wrap_cells", "join", "update", "place_of", "assemble", "clip_cells", "match_faces",
+    "clip_cell", "clip_by_row", "find_owners", "add_face", "start_cell", "clip_by_bins", "place_vertices",
+}  # fmt: skip
+"""Names of kernels and device functions that are still in two files."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")
 """An expression in Python that stands for the kernels of a file."""
 PARTS = {
-    "poisson": {"krylov", "multigrid"},
-    "multigrid": {"coarsening"},
-    "loops": {"agreement"},
-    "agreement": {"corners"},
-    "repair": {"cells"},
+    "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
+    "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
+    "tessellation.topology3d.loops": {"tessellation.topology3d.face_matching"},
+    "tessellation.topology3d.face_matching": {"tessellation.topology3d.corners"},
+    "tessellation.incremental": {"tessellation.cells"},
 }
-"""Stages that are made of others."""
+"""Modules with kernels that use the kernels of others."""
 
 
 def name_of(path):
@@ -94,23 +108,27 @@ def modules():
     return found
 
 
-def imports(name, tree, known):
-    """Return which modules of the package are imported when `name` is, with the names taken: {module: names}."""
+def imports(name, tree, known, lazy=False):
+    """Return which modules of the package are imported when `name` is, with the imported names: {module: names}.
+
+    With `lazy`, those imported inside functions, too; never those for type checkers only.
+    """
     found = {}
     package = name.split(".")[:-1]
-    lazy = set()
+    skipped = set()
     for node in ast.walk(tree):
-        if isinstance(node, (ast.FunctionDef, ast.If)) and not (
-            isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test)
-        ):
-            lazy |= {id(n) for n in ast.walk(node)}
+        typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if typing or (isinstance(node, ast.FunctionDef) and not lazy):
+            skipped |= {id(n) for n in ast.walk(node)}
     for node in ast.walk(tree):
-        if not isinstance(node, ast.ImportFrom) or not node.level or id(node) in lazy:
+        if not isinstance(node, ast.ImportFrom) or not node.level or id(node) in skipped:
             continue
         base = package[: len(package) - (node.level - 1)] + (node.module or "").split(".")
         base = [part for part in base if part]
         for alias in node.names:
             whole = ".".join([*base, alias.name])
+            if whole not in known:
+                whole = ".".join([*base, alias.name, "__init__"])
             if whole not in known:
                 whole = ".".join(base)
                 whole = whole if whole in known else ".".join([*base, "__init__"])
@@ -120,37 +138,58 @@ def imports(name, tree, known):
 
 
 def stages():
-    """Return the names of files of kernels."""
-    return {path.stem for path in KERNELS.glob("*.cl")}
+    """Return the files of kernels as Python names them: their path without the suffix."""
+    return {path.relative_to(KERNELS).with_suffix("").as_posix() for path in KERNELS.rglob("*.cl")}
 
 
 # Modules.
 
 
-def test_imports_go_down_only():
-    """In no circle, and from a layer to those below it."""
+def test_packages_import_only_from_those_before_them():
     trees = modules()
-    graph = {name: set(imports(name, tree, trees)) for name, tree in trees.items()}
-    assert len(graph) > 80
-    left = dict(graph)
+    against = set()
+    for name, tree in trees.items():
+        top = name.split(".")[0]
+        for need in imports(name, tree, trees, lazy=True):
+            below = need.split(".")[0]
+            if ORDER.index(below) > ORDER.index(top):
+                against.add((name, below))
+    assert against == UPWARD
+
+
+def test_modules_import_each_other_in_no_circle():
+    trees = modules()
+    left = {name: set(imports(name, tree, trees)) for name, tree in trees.items()}
+    assert len(left) > 80
     while True:
         ground = {name for name, needs in left.items() if not needs & set(left) - {name}}
         if not ground:
             break
         for name in ground:
             del left[name]
-    assert not left, "modules that import each other, or stand on such"
-    for name, needs in graph.items():
-        top = name.split(".")[0]
-        for need in needs:
-            assert top in FACES or need.split(".")[0] not in FACES, f"{name} imports {need}"
-            if name.startswith("_") and name not in FACES:
-                allowed = need.startswith("_") or need in ("errors", "device", "domain")
-                assert allowed, f"{name}, which knows nothing of meshes, imports {need}"
+    assert not left, "modules that import each other, or import such modules"
 
 
-def test_stages_import_no_stages():
-    """But for what they hand on (data, constants), and where a stage is made of others."""
+def test_folders_stay_small():
+    folders = collections.Counter(path.parent for path in PACKAGE.rglob("*.py"))
+    assert folders.pop(PACKAGE) <= MOST_IN_ROOT
+    assert max(folders.values()) <= MOST_IN_PACKAGE
+
+
+def test_kernels_and_tests_have_the_folders_of_the_package():
+    packages = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in PACKAGE.rglob("*")
+        if (path / "__init__.py").is_file()
+    }
+    kernels = {path.parent.relative_to(KERNELS).as_posix() for path in SOURCES}
+    assert kernels - {"simd"} <= packages
+    tests = {path.parent.relative_to(HERE).as_posix() for path in HERE.rglob("test_*.py")}
+    assert tests - {".", "robustness"} <= packages
+
+
+def test_modules_with_kernels_use_no_others():
+    """But for what they hand on (data, constants), and for those that consist of others (`PARTS`)."""
     trees = modules()
     makers = {  # classes that have kernels
         name: {
@@ -160,10 +199,15 @@ def test_stages_import_no_stages():
         }
         for name, tree in trees.items()
     }
+    makers = {
+        name: classes
+        for name, classes in makers.items()
+        if classes and not name.startswith("opencl")
+    }
     seen = set()
-    for name in sorted(stages() & set(trees)):
+    for name in makers:
         for other, taken in imports(name, trees[name], trees).items():
-            if other in stages() and taken & makers[other]:
+            if taken & makers.get(other, set()):
                 assert other in PARTS.get(name, ()), f"{name} imports {taken} of {other}"
                 seen.add((name, other))
     assert seen == {(name, part) for name, parts in PARTS.items() for part in parts}
@@ -179,7 +223,7 @@ def test_every_header_is_used():
         for tree in modules().values()
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
-        for name in re.findall(r"^common/\w+\.h$", node.value)
+        for name in re.findall(r"^\w+(?:/\w+)+\.h$", node.value)
     }
     assert included | by_python == set(SOURCES)
 
@@ -214,7 +258,7 @@ def test_kernels_are_those_that_python_asks_for():
     """Each kernel is named in a module that builds its file, and no other one is."""
     asked = {stage: set() for stage in stages()}
     for module, tree in modules().items():
-        built = set(re.findall(r"\.kernels\('(\w+)'", ast.unparse(tree)))
+        built = set(re.findall(r"\.kernels\('([\w/]+)'", ast.unparse(tree)))
         assert built <= stages(), module
         if not built:
             continue
@@ -239,7 +283,9 @@ def test_kernels_are_those_that_python_asks_for():
                     assert node.attr in known, f"{module} asks for {node.attr}"
         for stage in built:
             asked[stage] |= names
-    asked["copy"] = kernels_of("copy")  # the only one: the profile takes what there is
+    asked["opencl/copy"] = kernels_of(
+        "opencl/copy"
+    )  # the only one: the profile takes what there is
     for stage in stages():
         assert kernels_of(stage), stage
         assert kernels_of(stage) <= asked[stage], f"{stage}: nobody asks for these"
@@ -272,7 +318,10 @@ def test_no_kernel_returns_before_a_barrier():
                 # What a function that waits has found may be returned.
                 before = re.sub(r"\breturn\b[^;]*$", "", body[: calls[-1]])
                 assert not returns.search(before), (stage, name)
-    assert {("krylov", "solve_alone"), ("poisson", "compatible")} <= checked
+    assert {
+        ("solvers/conjugate_gradient", "solve_alone"),
+        ("solvers/poisson", "compatible"),
+    } <= checked
 
 
 def test_kernels_are_formatted():
@@ -290,3 +339,13 @@ def test_kernels_are_formatted():
         text=True,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_names_of_kernels_and_functions_are_unique():
+    """A name leads to one file; within it, variants by dimension may share the name."""
+    files = collections.defaultdict(set)
+    for path in SOURCES:
+        for name, _, _ in functions(path):
+            files[name].add(name_of(path))
+    assert len(files) > 300, "the patterns find nothing any more"
+    assert {name for name, paths in files.items() if len(paths) > 1} == TWICE

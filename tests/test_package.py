@@ -18,7 +18,7 @@ SOURCES = ("clvoro", "cl_kernels", "pyproject.toml", "README.md", "LICENSE")
 PROGRAM = """
 import numpy as np
 import clvoro
-from clvoro._program import kernel_folder
+from clvoro.opencl.program import kernel_folder
 
 points = np.random.default_rng(7043).random((60, 2))
 diagram = clvoro.Adapter().diagram(clvoro.Box((0, 0), (1, 1)), points)

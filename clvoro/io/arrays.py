@@ -14,8 +14,8 @@ from typing import cast
 
 import numpy as np
 
-from .._files import open_plain
 from ..errors import InputError
+from ..files import open_plain
 from .atomic import atomic_file
 
 EXPANSION, LEAST = 16, 1 << 22

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..results import Result
+from ..mesh.results import Result
 from .atomic import atomic_file, atomic_folder, make_folder
 from .polymesh import PolyMesh, poly_mesh
 
 _FILES = {
     "points": "vectorField",
     "owner": "labelList",
-    "neighbour": "labelList",
+    "neighbor": "labelList",
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
@@ -47,20 +47,20 @@ def write_foam(
     make_folder(folder)
     note = (
         f"nPoints:{len(mesh.points)} nCells:{len(result.diagram)} nFaces:{len(mesh.owner)} "
-        f"nInternalFaces:{len(mesh.neighbour)}"
+        f"nInternalFaces:{len(mesh.neighbor)}"
     )
     bodies = {
         "points": (len(mesh.points), _vectors(mesh.points)),
         "faces": (len(mesh.owner), _faces(mesh.starts, mesh.corners)),
         "owner": (len(mesh.owner), _labels(mesh.owner)),
-        "neighbour": (len(mesh.neighbour), _labels(mesh.neighbour)),
+        "neighbor": (len(mesh.neighbor), _labels(mesh.neighbor)),
         "boundary": (len(mesh.patches), [_boundary(mesh)]),
     }
     # `faces` is put in place last: a case without it is plainly incomplete.
     with atomic_folder(folder / "faces") as target:
         for name, kind in _FILES.items():
             count, body = bodies[name]
-            head = _header(name, kind, note if name in ("owner", "neighbour") else "")
+            head = _header(name, kind, note if name in ("owner", "neighbor") else "")
             with open(target.with_name(name), "w", encoding="ascii", newline="\n") as file:
                 file.write(f"{head}{count}\n(\n")
                 file.writelines(body)
@@ -103,13 +103,13 @@ def _faces(starts: np.ndarray, corners: np.ndarray) -> Iterator[str]:
 
 
 def _boundary(mesh: PolyMesh) -> str:
-    body, start = "", len(mesh.neighbour)
+    body, start = "", len(mesh.neighbor)
     for patch in mesh.patches:
         body += f"    {patch.name}\n    {{\n        type            {patch.kind};\n"
         if patch.across:
             vector = " ".join(repr(x) for x in patch.separation)
             body += (
-                f"        neighbourPatch  {patch.across};\n        transform       translational;\n"
+                f"        neighborPatch  {patch.across};\n        transform       translational;\n"
                 f"        separationVector ({vector});\n        matchTolerance  0.0001;\n"
             )
         body += f"        nFaces          {patch.size};\n        startFace       {start};\n    }}\n"

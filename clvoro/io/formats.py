@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..results import Result
+from ..mesh.results import Result
 from .atomic import atomic_folder
 from .vtu import cell_data, in_space
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ClvoroError
-from ..faces import face_keys, face_owners
-from ..outlines import face_ends, next_faces
-from ..results import Diagram
+from ..mesh.connectivity import face_keys, face_owners
+from ..mesh.outlines import face_ends, next_faces
+from ..mesh.results import Diagram
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class HalfEdges:
     begin, end : (h,) int
         The diagram's vertices.
     next, previous : (h,) int
-        Neighbours in the loop.
+        Neighbors in the loop.
     twin : (h,) int
         The other half, -1 where there is none.
     edge : (h,) int
@@ -89,7 +89,7 @@ def half_edges(diagram: Diagram, glued: bool) -> HalfEdges:
 
 def _twins(diagram: Diagram, rows: np.ndarray, glued: bool) -> np.ndarray:
     """Return for each of `rows` the place in them of the same face from the other side; -1 where there is none."""
-    joined = diagram.neighbours[rows] >= 0
+    joined = diagram.neighbors[rows] >= 0
     if not glued:
         joined &= ~diagram.shifts[rows].any(axis=1)
     inner = np.flatnonzero(joined)

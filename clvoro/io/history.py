@@ -6,7 +6,7 @@ import csv
 import io
 from os import PathLike
 
-from ..results import Result
+from ..mesh.results import Result
 from .atomic import atomic_file
 
 

@@ -15,8 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
-from ..faces import neighbour_points
-from ..results import Diagram, Result
+from ..mesh.connectivity import neighbor_points
+from ..mesh.results import Diagram, Result
 from .half_edges import HalfEdges, half_edges
 from .netcdf import NetCDF
 from .trisk import find_weights
@@ -146,7 +146,7 @@ def _measure(diagram: Diagram, halves: HalfEdges) -> _Shape:
     begin, end = (diagram.vertices[v] - own for v in (halves.begin, halves.end))
     inner = halves.twin >= 0
     line, middle = np.zeros_like(own), (begin + end) / 2
-    line[inner] = neighbour_points(diagram, halves.rows[inner]) - own[inner]
+    line[inner] = neighbor_points(diagram, halves.rows[inner]) - own[inner]
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
     # In polygons a cell may have got a piece of another one, whose edges are on no bisector of its generator.

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.io import netcdf_file
 
 from ..errors import InputError
-from ..results import Result
+from ..mesh.results import Result
 from .atomic import atomic_file
 
 _MOST = (

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from .._files import open_plain
-from ..domain import Box, Domain
-from ..polygon import Polygon
-from ..results import HISTORY_DTYPE, Diagram, Displacements, Result
-from ..walls import wall_count
+from ..files import open_plain
+from ..geometry.boundary import wall_count
+from ..geometry.box import Box, Domain
+from ..geometry.polygon import Polygon
+from ..mesh.results import HISTORY_DTYPE, Diagram, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
 
 FORMAT, VERSION = "clvoro-result", 1
@@ -40,7 +40,7 @@ _PARTS = {
 _SHAPES = {
     "points": "nd", "size": "n", "error": "n", "quality": "n", "history": "h",
     "diagram.points": "nd", "diagram.volumes": "n", "diagram.centroids": "nd",
-    "diagram.neighbour_starts": "N", "diagram.neighbours": "m", "diagram.shifts": "md", "diagram.face_measures": "m",
+    "diagram.neighbor_starts": "N", "diagram.neighbors": "m", "diagram.shifts": "md", "diagram.face_measures": "m",
     "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
     "diagram.cell_vertices": "c", "diagram.face_vertex_starts": "M", "diagram.face_vertices": "f",
     "initial.points": "ad", "initial.lloyd": "ad", "initial.poisson": "ad",  # before any were inserted
@@ -48,7 +48,7 @@ _SHAPES = {
 }  # fmt: skip
 
 _INTEGERS = {
-    "diagram.neighbour_starts", "diagram.neighbours", "diagram.shifts", "diagram.cell_vertex_starts",
+    "diagram.neighbor_starts", "diagram.neighbors", "diagram.shifts", "diagram.cell_vertex_starts",
     "diagram.cell_vertices", "diagram.face_vertex_starts", "diagram.face_vertices",
 }  # fmt: skip
 
@@ -122,7 +122,7 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
         if array.ndim != len(axes) or array.shape != expected:
             raise FileError(f"{name} has shape {array.shape}, which does not fit the other arrays")
     for starts, items, rows, bound in (
-        ("diagram.neighbour_starts", "diagram.neighbours", ("cell", "n"), sizes["n"]),
+        ("diagram.neighbor_starts", "diagram.neighbors", ("cell", "n"), sizes["n"]),
         ("diagram.cell_vertex_starts", "diagram.cell_vertices", ("cell", "n"), sizes.get("v", 0)),
         ("diagram.face_vertex_starts", "diagram.face_vertices", ("face", "m"), sizes.get("v", 0)),
     ):
@@ -192,19 +192,19 @@ def _not_in(domain: Domain) -> tuple[str, ...]:
 
 def _check_domain(arrays: Mapping[str, np.ndarray], domain: Domain) -> None:
     """Check what must fit the domain, so that nobody indexes out of bounds later."""
-    neighbours = arrays["diagram.neighbours"]
-    if neighbours.size and neighbours.min() < -wall_count(domain):
-        raise FileError("diagram.neighbours points to what does not exist")
+    neighbors = arrays["diagram.neighbors"]
+    if neighbors.size and neighbors.min() < -wall_count(domain):
+        raise FileError("diagram.neighbors points to what does not exist")
     shifts = arrays.get("diagram.shifts")
     if shifts is not None and shifts.size and not (shifts.min() >= -1 and shifts.max() <= 1):
         raise FileError("diagram.shifts has others than -1, 0 and 1")
     if isinstance(domain, Polygon):
         starts = arrays["diagram.face_vertex_starts"]
-        if not np.array_equal(starts, 2 * np.arange(len(neighbours) + 1)):
+        if not np.array_equal(starts, 2 * np.arange(len(neighbors) + 1)):
             raise FileError("diagram.face_vertices does not have two ends for each face")
     else:
-        same = arrays.get("diagram.cell_vertex_starts", arrays["diagram.neighbour_starts"])
-        if not np.array_equal(same, arrays["diagram.neighbour_starts"]):
+        same = arrays.get("diagram.cell_vertex_starts", arrays["diagram.neighbor_starts"])
+        if not np.array_equal(same, arrays["diagram.neighbor_starts"]):
             raise FileError("diagram.cell_vertices does not have as many corners as faces")
 
 

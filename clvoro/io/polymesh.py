@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..domain import Domain
 from ..errors import ClvoroError, InputError, InputTypeError
-from ..faces import (
+from ..geometry.boundary import wall_groups
+from ..geometry.box import Domain
+from ..geometry.polygon import Polygon
+from ..mesh.connectivity import (
     Faces,
     cell_corners,
     face_corners,
@@ -23,9 +25,7 @@ from ..faces import (
     faces_once,
     take_rows,
 )
-from ..polygon import Polygon
-from ..results import Diagram
-from ..walls import wall_groups
+from ..mesh.results import Diagram
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ class PolyMesh:
     ----------
     points : (v, 3) float
     starts : (f + 1,) int, corners : int
-        Corners of each face, counter-clockwise as seen from its neighbour or from outside.
+        Corners of each face, counter-clockwise as seen from its neighbor or from outside.
     owner : (f,) int
         Cell behind each face.
-    neighbour : (inner,) int
-        Cell in front of each inner face; owner < neighbour. Inner faces come first, in upper-triangular
-        order: by owner, then by neighbour.
+    neighbor : (inner,) int
+        Cell in front of each inner face; owner < neighbor. Inner faces come first, in upper-triangular
+        order: by owner, then by neighbor.
     patches : list of Patch
         One after the other behind the inner faces.
     """
@@ -73,7 +73,7 @@ class PolyMesh:
     starts: np.ndarray
     corners: np.ndarray
     owner: np.ndarray
-    neighbour: np.ndarray
+    neighbor: np.ndarray
     patches: list[Patch]
 
 
@@ -99,7 +99,7 @@ def poly_mesh(diagram: Diagram, patches: Mapping[str, Iterable[int]] | None = No
     domain = diagram.domain
     names, groups = wall_groups(domain) if patches is None else _named(domain, patches)
     faces = _by_group(faces_once(diagram), groups)
-    counts = np.bincount(groups[-1 - faces.neighbour[faces.inner :]], minlength=len(names))
+    counts = np.bincount(groups[-1 - faces.neighbor[faces.inner :]], minlength=len(names))
     made = [Patch(name, "patch", int(k)) for name, k in zip(names, counts, strict=True)]
     seams = []
     if any(domain.periodic):
@@ -109,7 +109,7 @@ def poly_mesh(diagram: Diagram, patches: Mapping[str, Iterable[int]] | None = No
             if not domain.periodic[axis]
         ]
         faces, seams = _with_seams(diagram, faces)
-    owner, neighbour = faces.owner, faces.neighbour[: faces.inner]
+    owner, neighbor = faces.owner, faces.neighbor[: faces.inner]
     if domain.dim == 2:
         points, starts, corners = _extruded(diagram, faces.corners, domain)
     else:
@@ -123,7 +123,7 @@ def poly_mesh(diagram: Diagram, patches: Mapping[str, Iterable[int]] | None = No
         owner = np.concatenate([owner, *2 * [np.arange(len(diagram))]])
         made += [Patch("back", "empty", len(diagram)), Patch("front", "empty", len(diagram))]
     used, corners = np.unique(corners, return_inverse=True)
-    return PolyMesh(points[used], starts, corners.ravel(), owner, neighbour, made)
+    return PolyMesh(points[used], starts, corners.ravel(), owner, neighbor, made)
 
 
 def _axes(domain: Domain) -> list[int]:
@@ -198,7 +198,7 @@ def _with_seams(diagram: Diagram, faces: Faces) -> tuple[Faces, list[_Seam]]:
     seam_starts, seam_corners = take_rows(starts, corners, rows)
     return Faces(
         np.concatenate([faces.owner[kept], face_owners(diagram)[rows]]),
-        np.concatenate([faces.neighbour[kept], np.full(len(rows), -1, np.int32)]),
+        np.concatenate([faces.neighbor[kept], np.full(len(rows), -1, np.int32)]),
         np.concatenate([faces.rows[kept], rows]),
         np.concatenate([kept_starts, kept_starts[-1] + seam_starts[1:]]),
         np.concatenate([kept_corners, seam_corners]),
@@ -287,12 +287,12 @@ def _named(domain: Domain, patches: Mapping[str, Iterable[int]]) -> tuple[list[s
 
 def _by_group(faces: Faces, groups: np.ndarray) -> Faces:
     """Return `faces` with those on the boundary in the order of their groups."""
-    outer = np.argsort(groups[-1 - faces.neighbour[faces.inner :]], kind="stable") + faces.inner
+    outer = np.argsort(groups[-1 - faces.neighbor[faces.inner :]], kind="stable") + faces.inner
     if (np.diff(outer) > 0).all():
         return faces
     order = np.concatenate([np.arange(faces.inner), outer])
     starts, corners = take_rows(faces.starts, faces.corners, order)
-    return Faces(faces.owner[order], faces.neighbour[order], faces.rows[order], starts, corners)
+    return Faces(faces.owner[order], faces.neighbor[order], faces.rows[order], starts, corners)
 
 
 def _extruded(

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..faces import cell_corners
-from ..polygon import Polygon
-from ..results import Result
+from ..geometry.polygon import Polygon
+from ..mesh.connectivity import cell_corners
+from ..mesh.results import Result
 from .half_edges import HalfEdges, half_edges
 from .netcdf import NetCDF
 
@@ -124,6 +124,6 @@ def _role(name: str) -> dict[str, str | np.generic]:
 def _walls(result: Result, halves: HalfEdges) -> np.ndarray:
     """Return the number of the wall that each edge lies on, in a polygon as its edge was given; -1 for none."""
     domain = result.diagram.domain
-    walls = -1 - result.diagram.neighbours[halves.rows[halves.first]]
+    walls = -1 - result.diagram.neighbors[halves.rows[halves.first]]
     numbers = domain.edge_numbers if isinstance(domain, Polygon) else np.arange(2 * domain.dim)
     return np.where(walls >= 0, numbers[np.maximum(walls, 0)], -1)

@@ -15,10 +15,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..faces import face_corners, face_owners
-from ..outlines import count_sides, next_faces
-from ..polygon import Polygon
-from ..results import Diagram, Result
+from ..geometry.polygon import Polygon
+from ..mesh.connectivity import face_corners, face_owners
+from ..mesh.outlines import count_sides, next_faces
+from ..mesh.results import Diagram, Result
 from .atomic import atomic_file
 
 _POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
@@ -82,12 +82,12 @@ def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
         written = np.cumsum(np.diff(starts) > 0) - 1  # in 3D a face without a loop is left out
         seam = np.flatnonzero(diagram.shifts.any(axis=1) & (np.diff(starts) > 0))
         if domain.dim == 2:
-            written = np.arange(len(diagram.neighbours))
+            written = np.arange(len(diagram.neighbors))
         return {
             "box_corners": in_space(np.array([domain.lower, domain.upper])),
             "box_periodic": np.array(domain.periodic, np.uint8),
             "seam_faces": written[seam].astype(np.int32),
-            "seam_neighbours": diagram.neighbours[seam],
+            "seam_neighbors": diagram.neighbors[seam],
             "seam_shifts": in_space(diagram.shifts[seam]).astype(np.int32),
         }
     if not isinstance(domain, Polygon):
@@ -106,7 +106,7 @@ def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
 
     Corners alone do not tell a bridge from the two sides of a slit that has no width in single precision.
     """
-    starts, following = diagram.neighbour_starts, next_faces(diagram)
+    starts, following = diagram.neighbor_starts, next_faces(diagram)
     cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
     ends = following != np.arange(1, len(following) + 1)
     loop = np.concatenate([[0], np.cumsum(ends)[:-1]])
@@ -115,11 +115,11 @@ def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
     place = np.arange(len(following)) - starts[cell] + np.maximum(2 * earlier - 1, 0)
     bridge = np.ones(len(diagram.cell_vertices), bool)
     bridge[diagram.cell_vertex_starts[cell] + place] = False
-    walls = np.flatnonzero(diagram.neighbours < 0)
+    walls = np.flatnonzero(diagram.neighbors < 0)
     return {
         "bridges": np.flatnonzero(bridge).astype(np.int32),
         "wall_faces": walls.astype(np.int32),
-        "wall_edges": (-1 - diagram.neighbours[walls]).astype(np.int32),
+        "wall_edges": (-1 - diagram.neighbors[walls]).astype(np.int32),
     }
 
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..faces import face_owners
-from ..outlines import count_sides
-from ..polygon import Polygon
-from ..results import Diagram
+from ..geometry.polygon import Polygon
+from ..mesh.connectivity import face_owners
+from ..mesh.outlines import count_sides
+from ..mesh.results import Diagram
 
 
 def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
@@ -32,7 +32,7 @@ def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
             given["CellData.sides"] = arrays["CellData.sides"]
             expected["CellData.sides"] = count_sides(diagram)
     else:
-        expected["CellData.faces_of_cell"] = np.diff(diagram.neighbour_starts)
+        expected["CellData.faces_of_cell"] = np.diff(diagram.neighbor_starts)
         # Every corner of a cell once, in ascending order.
         cell = np.repeat(face_owners(diagram).astype(np.int64), np.diff(diagram.face_vertex_starts))
         keys = np.unique(cell * v + diagram.face_vertices)

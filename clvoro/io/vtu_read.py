@@ -19,13 +19,13 @@ from xml.parsers import expat
 
 import numpy as np
 
-from .._files import open_plain
-from ..check.rebuilt import rebuild
-from ..domain import Box, Domain
 from ..errors import InputError
-from ..polygon import Polygon
-from ..results import HISTORY_DTYPE, Diagram, Result
-from ..walls import wall_count
+from ..files import open_plain
+from ..geometry.boundary import wall_count
+from ..geometry.box import Box, Domain
+from ..geometry.polygon import Polygon
+from ..mesh.check.rebuilt import rebuild
+from ..mesh.results import HISTORY_DTYPE, Diagram, Result
 from .arrays import EXPANSION, LEAST
 from .vtu_more import check_repeated
 
@@ -39,7 +39,7 @@ _USED = {
     "CellData.size", "CellData.error", "CellData.quality", "CellData.volume", "CellData.generator",
     "CellData.label", "CellData.sides", "CellData.faces_of_cell",
     "FieldData.box_corners", "FieldData.box_periodic",
-    "FieldData.seam_faces", "FieldData.seam_neighbours", "FieldData.seam_shifts",
+    "FieldData.seam_faces", "FieldData.seam_neighbors", "FieldData.seam_shifts",
     "FieldData.domain_vertices", "FieldData.domain_ring_starts", "FieldData.domain_piece_of_ring",
     "FieldData.domain_edge_numbers", "FieldData.bridges", "FieldData.wall_faces", "FieldData.wall_edges",
 }  # fmt: skip
@@ -228,18 +228,18 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
     else:
         flat, starts = corners, face_starts
         face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    neighbours = _neighbours(owner, face, flat, starts, x, domain)
+    neighbors = _neighbors(owner, face, flat, starts, x, domain)
     if "FieldData.wall_faces" in arrays:
-        _set_walls(arrays, neighbours, domain)
-    across = _seam(arrays, neighbours, dim, len(kinds)) if periodic else {}
+        _set_walls(arrays, neighbors, domain)
+    across = _seam(arrays, neighbors, dim, len(kinds)) if periodic else {}
     known = {
         "points": points, "volumes": arrays["CellData.volume"].astype(float),
-        "neighbour_starts": cell_starts, "neighbours": neighbours, "vertices": x,
+        "neighbor_starts": cell_starts, "neighbors": neighbors, "vertices": x,
         **across,
     }  # fmt: skip
     if polygon is not None:
         rows = np.bincount(owner, minlength=len(kinds))
-        known["neighbour_starts"] = np.concatenate([[0], np.cumsum(rows)])
+        known["neighbor_starts"] = np.concatenate([[0], np.cumsum(rows)])
         known |= {"face_vertex_starts": starts, "face_vertices": flat}
     if face_starts is None:
         known |= {"cell_vertex_starts": cell_starts, "cell_vertices": corners}
@@ -267,16 +267,16 @@ def _periodic_box(arrays: dict[str, np.ndarray], dim: int) -> Box:
 
 
 def _seam(
-    arrays: dict[str, np.ndarray], neighbours: np.ndarray, dim: int, n: int
+    arrays: dict[str, np.ndarray], neighbors: np.ndarray, dim: int, n: int
 ) -> dict[str, np.ndarray]:
-    """Put in the neighbours across the seams, whose faces share no corners, and return the shifts."""
-    faces = _indices(arrays["FieldData.seam_faces"], len(neighbours), "seam_faces")
-    others = _indices(arrays["FieldData.seam_neighbours"], n, "seam_neighbours")
+    """Put in the neighbors across the seams, whose faces share no corners, and return the shifts."""
+    faces = _indices(arrays["FieldData.seam_faces"], len(neighbors), "seam_faces")
+    others = _indices(arrays["FieldData.seam_neighbors"], n, "seam_neighbors")
     steps = arrays["FieldData.seam_shifts"].reshape(-1, 3)[:, :dim]
     if not len(faces) == len(others) == len(steps) or (np.abs(steps.astype(float)) > 1).any():
         raise _FileError("its seams do not fit its cells")
-    neighbours[faces] = others
-    shifts = np.zeros((len(neighbours), dim), np.int8)
+    neighbors[faces] = others
+    shifts = np.zeros((len(neighbors), dim), np.int8)
     shifts[faces] = steps
     return {"shifts": shifts}
 
@@ -292,13 +292,13 @@ def _polygon(arrays: dict[str, np.ndarray]) -> Polygon | None:
     return Polygon.described(**values)
 
 
-def _set_walls(arrays: dict[str, np.ndarray], neighbours: np.ndarray, domain: Domain) -> None:
+def _set_walls(arrays: dict[str, np.ndarray], neighbors: np.ndarray, domain: Domain) -> None:
     """Put in the edges behind faces on the boundary, as the file has them."""
-    faces = _indices(arrays["FieldData.wall_faces"], len(neighbours), "wall_faces")
+    faces = _indices(arrays["FieldData.wall_faces"], len(neighbors), "wall_faces")
     edges = _indices(arrays["FieldData.wall_edges"], wall_count(domain), "wall_edges")
     if len(faces) != len(edges):
         raise _FileError("its faces on walls do not fit each other")
-    neighbours[faces] = -1 - edges
+    neighbors[faces] = -1 - edges
 
 
 def _bridges(arrays: dict[str, np.ndarray], owner: np.ndarray, loops: np.ndarray) -> np.ndarray:
@@ -360,7 +360,7 @@ def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nd
     return np.array(cells, np.int64), faces, _indices(corners, v, "corners of faces")
 
 
-def _neighbours(
+def _neighbors(
     owner: np.ndarray,
     face: np.ndarray,
     corners: np.ndarray,

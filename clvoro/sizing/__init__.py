@@ -1,5 +1,7 @@
 """Size fields h(x), the wanted edge length of a cell, and the stage that evaluates them."""
 
+from ..geometry.shapes import Circle, Edges, Polygon, Polyline, Segment, Sphere
+from ..geometry.surface import Surface
 from .bind import bind
 from .distance import Distance
 from .expression import Expression
@@ -7,10 +9,8 @@ from .feature import FeatureSize
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
 from .raster import Raster, Scattered
-from .shapes import Circle, Edges, Polygon, Polyline, Segment, Sphere
 from .solution import gradient_size, hessian_size
 from .stage import Sizing
-from .surface import Surface
 
 __all__ = [
     "Circle",

@@ -35,7 +35,7 @@ def slope_of(what: str, growth: object, slope: object) -> float:
         rate = positive(f"{what} growth", growth)
         if not 1 <= rate <= _MOST_GROWTH:
             raise InputError(
-                f"{what} growth is {growth}, expected 1 to {_MOST_GROWTH}: the ratio of neighbouring cells, such as "
+                f"{what} growth is {growth}, expected 1 to {_MOST_GROWTH}: the ratio of neighboring cells, such as "
                 "1.2 where each is a fifth larger; write slope= for dh/dx"
             )
         return math.log(rate)

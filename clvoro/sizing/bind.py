@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .._program import source_text
 from ..errors import InputError
+from ..opencl.program import source_text
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
-    from .._program import Engine
-    from ..domain import Domain
+    from ..geometry.box import Domain
+    from ..opencl.program import Engine
     from .field import Field
 
 
@@ -45,7 +45,7 @@ class Binder:
         self._stored = 0
         self._names = 0
 
-    def normalise(self, points: np.ndarray) -> np.ndarray:
+    def normalize(self, points: np.ndarray) -> np.ndarray:
         """Return physical `points` (..., d) in the device's coordinates, still in float64."""
         return (points - self.origin) / self.scale
 
@@ -99,7 +99,7 @@ class Bound(NamedTuple):
 def bind(
     field: Field, domain: Domain, real: DTypeLike = np.float64, engine: Engine | None = None
 ) -> Bound:
-    """Return `field` as OpenCL for the normalised coordinates of `domain`.
+    """Return `field` as OpenCL for the normalized coordinates of `domain`.
 
     Geometry is converted to those coordinates in float64, so that float32 is as accurate far from
     the origin as near it. `Expression` alone computes in physical coordinates.
@@ -129,7 +129,7 @@ def bind(
         )
     body = "\n".join(f"    {line}" for line in binder.statements)
     prelude = (
-        f'{source_text("common/size_fields.h")}\n#line 1 "size_at"\n'
+        f'{source_text("sizing/size_fields.h")}\n#line 1 "size_at"\n'
         "REAL size_at(const REAL *x, __global const REAL *data)\n"
         f"{{\n{body}\n    return {result};\n}}\n"
     )

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from ..polygon import Polygon
+from ..geometry.polygon import Polygon
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..domain import Domain
+    from ..geometry.box import Domain
 
 LEAST = 0.5
 """Share of a domain that a box covers if it is meant for that domain."""

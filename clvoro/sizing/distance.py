@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..domain import Box, Domain
 from ..errors import InputError, InputTypeError
-from ..polygon import Polygon as PolygonalDomain
+from ..geometry.box import Box, Domain
+from ..geometry.bvh import Tree
+from ..geometry.polygon import Polygon as PolygonalDomain
+from ..geometry.shapes import Circle, Edges, Polygon, Polyline, Segment
+from ..geometry.surface import Surface, box_surface
+from ..geometry.triangles import segment_distance2
 from .arguments import positive, slope_of
 from .field import Field
-from .shapes import Circle, Edges, Polygon, Polyline, Segment
-from .surface import Surface, box_surface
-from .tree import Tree
-from .triangles import segment_distance2
 
 if TYPE_CHECKING:
     from .bind import Binder
@@ -45,7 +45,7 @@ class Distance(Field):
     h_min : float
         Size on the shapes.
     growth : float, optional
-        Geometric growth rate g >= 1, the ratio of the sizes of neighbouring cells (the paper's
+        Geometric growth rate g >= 1, the ratio of the sizes of neighboring cells (the paper's
         section 4: 1.3). A row of cells of sizes h_min, h_min g, h_min g^2, ... has log h growing by
         ln g over each h, so dh/dx = ln g: the slope is ln(growth).
     h_max : float, optional
@@ -224,7 +224,7 @@ class Distance(Field):
 
         An item is its begin, vector, 1 / length^2 (0 for a point) and radius.
         """
-        begin, end = (binder.normalise(p).astype(binder.real) for p in (self._begin, self._end))
+        begin, end = (binder.normalize(p).astype(binder.real) for p in (self._begin, self._end))
         radius = (self._radius / binder.scale).astype(binder.real)
         tree = Tree(*_item_boxes(begin, end, radius))
         begin, end, radius = begin[tree.order], end[tree.order], radius[tree.order]
@@ -258,6 +258,6 @@ def _item_boxes(
     begin: np.ndarray, end: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     # What a negative radius adds is not in a box, and need not be: distances to boxes stay lower bounds.
-    # Rounding of centre -+ radius may cut a circle's box by an ulp: widen those.
+    # Rounding of center -+ radius may cut a circle's box by an ulp: widen those.
     wide = (np.maximum(radius, 0) * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]
     return np.minimum(begin, end) - wide, np.maximum(begin, end) + wide

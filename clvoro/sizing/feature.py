@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, InputTypeError
-from ..polygon import Polygon
+from ..geometry.polygon import Polygon
+from ..geometry.shapes import Edges
 from .arguments import positive, slope_of
 from .covering import covered_share
 from .distance import Distance
 from .field import Constant, Field
 from .gaps import gaps, radii_of_curvature
-from .shapes import Edges
 
 if TYPE_CHECKING:
-    from ..domain import Domain
+    from ..geometry.box import Domain
     from .bind import Binder
 
 _FINEST, _COARSEST = 1e-3, 0.1  # of the domain's longest side, by default

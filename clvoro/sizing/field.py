@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from .._arrays import check_callable
+from ..arguments import check_callable
 from ..errors import ClvoroError, InputError, InputTypeError, SizeFieldError
 from .arguments import positive
 
 if TYPE_CHECKING:
-    from ..domain import Domain
+    from ..geometry.box import Domain
     from .bind import Binder
 
 _MOST_PARTS = 256  # the time to build kernels grows faster than they do: 3 s for 200, 20 s for 400
@@ -189,7 +189,7 @@ class Constant(Field):
 
 
 class Function(Field):
-    """A vectorised Python callable ``h(points (n, d)) -> (n,)``, evaluated on the host.
+    """A vectorized Python callable ``h(points (n, d)) -> (n,)``, evaluated on the host.
 
     Each evaluation brings the points to the host and takes the sizes back (8 to 16 bytes per
     coordinate both ways, and the queue waits meanwhile), and runs at the speed of the callable,
@@ -227,7 +227,7 @@ class Function(Field):
             kind = InputTypeError if isinstance(error, TypeError) else InputError
             raise kind(
                 f"{self!r} failed for points of shape {points.shape} ({error}), expected sizes of shape ({n},); it "
-                "must be vectorised: points[:, 0] are all x, numpy.sqrt takes arrays, and numpy.where stands for if"
+                "must be vectorized: points[:, 0] are all x, numpy.sqrt takes arrays, and numpy.where stands for if"
             ) from error
         try:
             sizes = np.asarray(given)
@@ -245,13 +245,13 @@ class Function(Field):
             what = "None" if given is None else f"values of type {sizes.dtype}"
             raise InputTypeError(f"{self!r} returned {what}, expected real numbers of shape ({n},)")
         if sizes.shape != (n,):
-            hint = "it must be vectorised, h(points (n, d)) -> (n,)"
+            hint = "it must be vectorized, h(points (n, d)) -> (n,)"
             if sizes.shape == ():
-                hint = "it must be vectorised; of a size that is the same everywhere give the number itself"
+                hint = "it must be vectorized; of a size that is the same everywhere give the number itself"
             elif sizes.shape == (n, 1):
                 hint = "return its only column, sizes[:, 0]"
             elif sizes.shape == points.shape[1:]:
-                hint = "it must be vectorised: points[:, 0] are all x, points[0] is a point"
+                hint = "it must be vectorized: points[:, 0] are all x, points[0] is a point"
             raise InputError(
                 f"{self!r} returned shape {sizes.shape} for {n} points, expected ({n},); {hint}"
             )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, InputTypeError
-from .shapes import coordinates
+from ..geometry.shapes import coordinates
 
 _MOST = 1 << 22  # nodes of a raster whose size nobody has asked for
 

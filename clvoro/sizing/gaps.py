@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..polygon import Polygon
+from ..geometry.polygon import Polygon
 
 FACING = math.radians(135)
 """Least angle between the directions from the middle of a gap to its walls: two walls that meet in a corner of
@@ -104,17 +104,17 @@ def _balls(
     for _ in range(_ROUNDS):
         if not active.size:
             break
-        centre = points[active] + radius[active, None] * normal[active]
-        _, nearest = domain.nearest_edge(centre)
-        inside = np.hypot(*(nearest - centre).T) < radius[active] * (1 - _CLOSE)
+        center = points[active] + radius[active, None] * normal[active]
+        _, nearest = domain.nearest_edge(center)
+        inside = np.hypot(*(nearest - center).T) < radius[active] * (1 - _CLOSE)
         across = nearest - points[active]
         along = (across * normal[active]).sum(axis=1)
         inside &= along > 0
         active, across, along = active[inside], across[inside], along[inside]
         radius[active] = (across**2).sum(axis=1) / (2 * along)
         touched[active], met[active] = nearest[inside], True
-    centre = points + radius[:, None] * normal
-    away = touched - centre
+    center = points + radius[:, None] * normal
+    away = touched - center
     facing = -(away * normal).sum(axis=1) <= math.cos(FACING) * np.hypot(*away.T)
     wide = np.hypot(*(touched - points).T) > most
     radius[~met | ~facing | wide] = math.inf

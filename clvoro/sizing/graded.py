@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._host_memory import host_memory
-from ..domain import Domain
 from ..errors import InputError, InputTypeError, MemoryLimitError
-from ..polygon import Polygon
+from ..geometry.box import Domain
+from ..geometry.polygon import Polygon
+from ..opencl.host_memory import host_memory
 from .arguments import slope_of
 from .covering import uncovered
 from .field import Field, as_field, counted
 from .raster import Raster
 
 if TYPE_CHECKING:
-    from .._program import Engine
+    from ..opencl.program import Engine
     from .bind import Binder
 
 _MOST = 1 << 22  # nodes
@@ -45,7 +45,7 @@ class Graded(Field):
     ----------
     field : Field, number or callable
     growth : float, optional
-        Geometric growth rate g >= 1, the ratio of the sizes of neighbouring cells: the slope is
+        Geometric growth rate g >= 1, the ratio of the sizes of neighboring cells: the slope is
         ln(growth), as for `Distance`.
     slope : float, optional
         The bound of |grad h| itself, in place of `growth`. 0 gives the least size everywhere.
@@ -151,7 +151,7 @@ class Graded(Field):
         return raster._emit(binder)
 
     def _compute(self, box: Domain, engine: Engine) -> Raster:
-        from ..gradation import Gradation
+        from .gradation import Gradation
         from .stage import Sizing
 
         evaluate = Sizing(engine, box, self.field)
@@ -311,8 +311,8 @@ def _checked(resolution: int | Sequence[int], dim: int | None) -> int | tuple[in
 def _default_engine(dim: int) -> Engine:
     import pyopencl as cl
 
-    from .._program import Engine
-    from ..device import create_context
+    from ..opencl.devices import create_context
+    from ..opencl.program import Engine
 
     ctx = create_context()
     return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))

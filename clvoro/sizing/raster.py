@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..polygon import Polygon
+from ..geometry.polygon import Polygon
 from .covering import uncovered
 from .field import Field
 from .filling import filled, scattered_values
@@ -17,7 +17,7 @@ from .filling import filled, scattered_values
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from ..domain import Domain
+    from ..geometry.box import Domain
     from .bind import Binder
 
 _MANY, _WITHIN = 8, 0.1
@@ -37,16 +37,16 @@ class Raster(Field):
         ``image[::-1]``; an array indexed [x, y] as its transpose.)
     lower, upper : sequences of 2 or 3 floats
         The box that the array covers.
-    at : "nodes" or "centres"
+    at : "nodes" or "centers"
         With "nodes" the first and last values of a row lie on the box's sides, as in
-        ``linspace(lower, upper, nx)``; with "centres" each value is the centre of one of nx equal
+        ``linspace(lower, upper, nx)``; with "centers" each value is the center of one of nx equal
         pixels.
     missing : "error" or "nearest"
         Whether values that are missing (NaN, or under a NumPy mask) are refused, or filled with the
         nearest one that is there.
     outside : "nearest" or "error", optional
         Whether a domain that reaches beyond the box is served with the value of the nearest edge of the array, or
-        refused with the place. (With "centres", the nearest value holds within half a pixel of the sides anyway.)
+        refused with the place. (With "centers", the nearest value holds within half a pixel of the sides anyway.)
         By default the nearest, and a run warns (`MisfitWarning`) if less than half of the domain is covered.
 
     Raises
@@ -173,7 +173,7 @@ class Raster(Field):
                 "overlap; are units and the order of the coordinates (x, y) the same?"
             )
         gain, origin = self._index_map()
-        shift = -binder.normalise(origin) * (gain * binder.scale)
+        shift = -binder.normalize(origin) * (gain * binder.scale)
         at = binder.store(gain * binder.scale, shift, self.values / binder.scale)
         counts = ", ".join(map(str, [*self._counts.tolist(), 1][:3]))
         return binder.variable(f"size_raster(x, data + {at}, {counts})")
@@ -256,6 +256,6 @@ def check_corners(
             f"{what} got lower {lower} and upper {upper}, expected finite numbers with lower < upper; turn the "
             "values of an axis that runs downwards round, as in values[::-1]"
         )
-    if at not in ("nodes", "centres"):
-        raise InputError(f"{what} got at={at!r}, expected 'nodes' or 'centres'")
+    if at not in ("nodes", "centers"):
+        raise InputError(f"{what} got at={at!r}, expected 'nodes' or 'centers'")
     return low, high

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..domain import Domain
+    from ..geometry.box import Domain
 
 _MANY = 1e6
 """Cells that a size field makes at most which is nowhere under the bound that is proposed."""

@@ -35,7 +35,7 @@ def hessian_size(
 ) -> Raster:
     r"""Return the size that interpolates a solution best in the L^p norm.
 
-    Loseille and Alauzet (Continuous mesh framework, I and II, SIAM J. Numer. Anal. 49, 2011) minimise
+    Loseille and Alauzet (Continuous mesh framework, I and II, SIAM J. Numer. Anal. 49, 2011) minimize
     the L^p norm of the interpolation error of u over all metrics of complexity N,
 
         M = D (det |H|)^(-1 / (2 p + d)) |H|,   D = N^(2/d) (integral (det |H|)^(p / (2 p + d)))^(-2/d),
@@ -72,7 +72,7 @@ def hessian_size(
     -------
     Raster
 
-    Second derivatives are central differences over neighbouring values (at the sides those one row
+    Second derivatives are central differences over neighboring values (at the sides those one row
     further in). They magnify noise by 1 / spacing^2: smooth noisy data first.
 
     Measured on a layer (bench/interpolation.py): the default p within `Graded`, growth 1.2 to 1.4, and an `h_max` of a
@@ -192,7 +192,7 @@ def _solution(
     if counts.min(initial=least) < least:
         raise InputError(
             f"{what} values have shape {shape}, expected at least {least} along each axis; "
-            "derivatives need neighbours"
+            "derivatives need neighbors"
         )
     spacing = (high - low) / (counts - 1 if at == "nodes" else counts)
     return filled(f"{what} values", values, missing, spacing), (low, high), spacing

@@ -14,8 +14,8 @@ from .remedy import remedy_for
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
-    from .._program import Engine
-    from ..domain import Domain
+    from ..geometry.box import Domain
+    from ..opencl.program import Engine
 
 _NONE_BAD = np.iinfo(np.int32).max
 
@@ -35,7 +35,7 @@ _GRADIENT_STEP = {np.dtype(np.float64): 1e-3, np.dtype(np.float32): 5e-2}
 class Sizing:
     """A size field on a domain, ready to be evaluated on the device.
 
-    All lengths on the device are the normalised ones of `domain.frame`: x' = (x - origin) / scale,
+    All lengths on the device are the normalized ones of `domain.frame`: x' = (x - origin) / scale,
     h' = h / scale.
 
     Parameters
@@ -79,7 +79,7 @@ class Sizing:
             self._bad = engine.upload([_NONE_BAD], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
-                "sizing", defines={"GRADIENT_STEP": repr(step), "MOST_SIZE": repr(MOST_SIZE)},
+                "sizing/size_field", defines={"GRADIENT_STEP": repr(step), "MOST_SIZE": repr(MOST_SIZE)},
                 prelude=self.prelude,
             )  # fmt: skip
         else:
@@ -119,7 +119,7 @@ class Sizing:
     def evaluate_with_gradient(
         self, points: cla.Array, n: int, h_out: cla.Array, grad_out: cla.Array
     ) -> None:
-        """Write h' into `h_out` (>= n,) and the normalised grad log h into `grad_out` (>= n, d).
+        """Write h' into `h_out` (>= n,) and the normalized grad log h into `grad_out` (>= n, d).
 
         Central differences over a small part of h; both sample points stay inside the domain's
         bounding box.
@@ -187,9 +187,9 @@ class Sizing:
             return self._on_host(np.asarray(points, dtype=float))
         return self._values(np.asarray(points, dtype=float), check=True)
 
-    def _physical(self, normalised: np.ndarray) -> np.ndarray:
+    def _physical(self, normalized: np.ndarray) -> np.ndarray:
         """Return physical coordinates, kept inside the domain's bounding box against rounding."""
-        x = normalised.astype(float) * self._scale + self._origin
+        x = normalized.astype(float) * self._scale + self._origin
         return np.clip(x, self.domain.lower, self.domain.upper)
 
     def _with_device_parts(self, field: Field) -> Field:
@@ -223,10 +223,10 @@ class Sizing:
         found = np.empty(len(points))
         for first in range(0, len(points), AT_ONCE):
             part = slice(first, first + AT_ONCE)
-            normalised = (points[part] - self._origin) / self._scale
-            x, h = self.engine.upload(normalised), self.engine.empty(len(normalised))
+            normalized = (points[part] - self._origin) / self._scale
+            x, h = self.engine.upload(normalized), self.engine.empty(len(normalized))
             self._taken = max(self._taken, self.held + x.nbytes + h.nbytes)
-            self.evaluate(x, len(normalised), h)
+            self.evaluate(x, len(normalized), h)
             if check:
                 self.check(x, h)
             found[part] = h.get().astype(float) * self._scale

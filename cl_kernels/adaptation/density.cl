@@ -1,0 +1,158 @@
+#include "geometry/domain.h"
+#include "opencl/blocks.h"
+#include "opencl/reduce.h"
+#include "opencl/row_entries.h"
+
+/* The size field as a density of generators, rho = h^-d, and what follows from it. */
+
+/* Per generator i:
+   density  rho = h^-d
+   weight   V rho, the number of generators that the cell should hold
+   excess   r = log(V / h^d) = d log(L / h): the cell is too large by this share of its volume
+
+   Four generators per work-item, as their logarithms come at the price of one on a CPU. */
+kernel void evaluate_density(const int size, global const REAL *volumes, global const REAL *h, global REAL *density,
+                             global REAL *weight, global REAL *excess, global REAL *log_h)
+{
+    const int begin = 4 * get_global_id(0);
+    if (begin >= size)
+        return;
+    if (begin + 4 <= size) {
+        const REAL4 target = vload4(0, h + begin), volume = vload4(0, volumes + begin);
+        const REAL4 rho = 1 / (DIM == 2 ? target * target : target * target * target), v = volume * rho;
+        vstore4(rho, 0, density + begin);
+        vstore4(v, 0, weight + begin);
+        vstore4(log(v), 0, excess + begin);
+        vstore4(log(target), 0, log_h + begin);
+        return;
+    }
+    for (int i = begin; i < size; ++i) {
+        const REAL target = h[i];
+        const REAL rho = 1 / (DIM == 2 ? target * target : target * target * target);
+        density[i] = rho;
+        weight[i] = volumes[i] * rho;
+        excess[i] = log(volumes[i] * rho);
+        log_h[i] = log(target);
+    }
+}
+
+/* Displacement to a cell's centroid weighted by h^-(d + 2) (the paper's 2.4; the density whose centroidal diagrams have
+   cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell, g = grad log h, that is
+   c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
+   nothing. */
+inline void weight_offset(const int i, const REAL *gradient, global const REAL *offsets, global const REAL *covariances,
+                          global REAL *lloyd)
+{
+    REAL g[DIM];
+    EACH_AXIS(a)
+    g[a] = -(DIM + 2) * gradient[a];
+#if DIM == 2
+    const REAL xx = covariances[3 * i], xy = covariances[3 * i + 1], yy = covariances[3 * i + 2];
+    lloyd[2 * i] = offsets[2 * i] + xx * g[0] + xy * g[1];
+    lloyd[2 * i + 1] = offsets[2 * i + 1] + xy * g[0] + yy * g[1];
+#else
+    global const REAL *c = covariances + 6 * i;
+    lloyd[3 * i] = offsets[3 * i] + c[0] * g[0] + c[1] * g[1] + c[2] * g[2];
+    lloyd[3 * i + 1] = offsets[3 * i + 1] + c[1] * g[0] + c[3] * g[1] + c[4] * g[2];
+    lloyd[3 * i + 2] = offsets[3 * i + 2] + c[2] * g[0] + c[4] * g[1] + c[5] * g[2];
+#endif
+}
+
+/* Per generator i: grad log h by least squares over the neighbors, weighted by 1 / distance^2, and the displacement to
+   the weighted centroid. One evaluation of h per generator serves all that needs its gradient, and the fit averages
+   over kinks of h at the scale of the cells. */
+kernel void fit_gradient(const int size, global const int *starts, global const int *neighbors,
+                         global const REAL *points, global const REAL *log_h, global const REAL *offsets,
+                         global const REAL *covariances, global REAL *gradient, global REAL *lloyd PERIOD_ARGS)
+{
+    WORK_ITEM(i);
+    MANY(REAL) sums[DIM][DIM], rises[DIM];
+    REAL m[DIM][DIM], b[DIM], g[DIM];
+    EACH_AXIS(p)
+    {
+        rises[p] = 0;
+        EACH_AXIS(q)
+        sums[p][q] = 0;
+    }
+    const int faces = starts[size], end = starts[i + 1];
+    for (int k = starts[i]; k < end; k += AT_ONCE) {
+        const MANY(int) facing = TAKE(int, neighbors, k, faces), counts = INSIDE(k, end) & (facing >= 0);
+        const MANY(int) j = CHOOSE(int, counts, facing, i);
+        MANY(REAL) d[DIM], d2 = 0;
+        EACH_AXIS(a)
+        {
+            d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
+            d2 += d[a] * d[a];
+        }
+        /* What does not count is at no distance. */
+        const MANY(REAL) weight = 1 / CHOOSE(REAL, counts, d2, 1), rise = PICK(REAL, log_h, j, 1, 0) - log_h[i];
+        EACH_AXIS(p)
+        {
+            const MANY(REAL) weighted = d[p] * weight;
+            rises[p] += weighted * rise;
+            EACH_AXIS(q)
+            if (q >= p)
+                sums[p][q] += weighted * d[q];
+        }
+    }
+    EACH_AXIS(p)
+    {
+        b[p] = SUM(REAL, rises[p]);
+        EACH_AXIS(q)
+        if (q >= p)
+            m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
+    }
+    /* Too few or collinear neighbors leave the gradient undetermined: take none. Divided by infinity, as PoCL 6 with
+       LLVM 18 dies of a branch here. */
+    const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);
+    const REAL least = sqrt(REAL_EPS);
+#if DIM == 2
+    const REAL det = m[0][0] * m[1][1] - m[0][1] * m[1][0];
+    const REAL over = det > least * trace * trace ? det : INFINITY;
+    g[0] = (b[0] * m[1][1] - b[1] * m[0][1]) / over;
+    g[1] = (m[0][0] * b[1] - m[1][0] * b[0]) / over;
+#else
+    const REAL c0 = m[1][1] * m[2][2] - m[1][2] * m[2][1];
+    const REAL c1 = m[1][2] * m[2][0] - m[1][0] * m[2][2];
+    const REAL c2 = m[1][0] * m[2][1] - m[1][1] * m[2][0];
+    const REAL det = m[0][0] * c0 + m[0][1] * c1 + m[0][2] * c2;
+    const REAL over = det > least * trace * trace * trace ? det : INFINITY;
+    g[0] =
+        (b[0] * c0 + b[1] * (m[0][2] * m[2][1] - m[0][1] * m[2][2]) + b[2] * (m[0][1] * m[1][2] - m[0][2] * m[1][1])) /
+        over;
+    g[1] =
+        (b[0] * c1 + b[1] * (m[0][0] * m[2][2] - m[0][2] * m[2][0]) + b[2] * (m[0][2] * m[1][0] - m[0][0] * m[1][2])) /
+        over;
+    g[2] =
+        (b[0] * c2 + b[1] * (m[0][1] * m[2][0] - m[0][0] * m[2][1]) + b[2] * (m[0][0] * m[1][1] - m[0][1] * m[1][0])) /
+        over;
+#endif
+    EACH_AXIS(a)
+    gradient[DIM * i + a] = g[a];
+    weight_offset(i, g, offsets, covariances, lloyd);
+}
+
+/* Block-wise, two launches: r -= mean r, weighted by V rho. A wrong count of generators shows as the mean: strain
+   cannot mend it, insertion and deletion can. partial: the groups' sums of V rho r, then those of V rho. */
+kernel void sum_excess(const int size, global const REAL *weight, global const REAL *excess, global REAL *partial)
+{
+    local REAL scratch[GROUP_SIZE];
+    Sum weighed = SUM_ZERO, total = SUM_ZERO;
+    for (BLOCK_LOOP(i, size)) {
+        sum_add(&weighed, weight[i] * excess[i]);
+        sum_add(&total, weight[i]);
+    }
+    const REAL sums[2] = {group_sum(weighed.value, scratch), group_sum(total.value, scratch)};
+    if (get_local_id(0) == 0) {
+        partial[get_group_id(0)] = sums[0];
+        partial[get_num_groups(0) + get_group_id(0)] = sums[1];
+    }
+}
+
+kernel void remove_mean(const int size, global const REAL *partial, global REAL *excess)
+{
+    local REAL scratch[GROUP_SIZE];
+    const REAL mean = total_sum(partial, scratch) / total_sum(partial + get_num_groups(0), scratch);
+    for (BLOCK_LOOP(i, size))
+        excess[i] -= mean;
+}

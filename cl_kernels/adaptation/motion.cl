@@ -1,0 +1,102 @@
+#include "geometry/domain.h"
+
+/* Per generator i: u = -grad phi (the paper's 3.3). The solver's potential is psi = -phi, from -div grad psi = e, so
+   that u = grad psi, with grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i), which is exact for linear
+   psi in a closed cell; walls carry no flux. */
+kernel void follow_potential(const int size, global const int *starts, global const int *neighbors,
+                             global const FACE *face_measures, global const FACE *face_centroids,
+                             global const REAL *volumes, global const REAL *points, global const REAL *psi,
+                             global REAL *u PERIOD_ARGS)
+{
+    WORK_ITEM(i);
+    REAL sum[DIM] = {0};
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        const int j = neighbors[k];
+        if (j < 0)
+            continue;
+        REAL d2 = 0;
+        EACH_AXIS(a)
+        {
+            const REAL d = DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]);
+            d2 += d * d;
+        }
+        const REAL flux = face_measures[k] / sqrt(d2) * (psi[j] - psi[i]);
+        EACH_AXIS(a)
+        sum[a] += flux * face_centroids[DIM * k + a];
+    }
+    EACH_AXIS(a)
+    u[DIM * i + a] = sum[a] / volumes[i];
+}
+
+/* Per generator i: correction = alpha u with one alpha for all, alpha = min(limit, k / max_i(|u_i| / h_i)) (the paper's
+   3.5); summaries[4 slot + 3] is that maximum. */
+kernel void relax_globally(const int size, global const REAL *summaries, const int slot, const REAL limit, const REAL k,
+                           global REAL *u, global REAL *speed)
+{
+    WORK_ITEM(i);
+    const REAL fastest = summaries[4 * slot + 3];
+    const REAL alpha = fastest * limit > k ? k / fastest : limit;
+    EACH_AXIS(a)
+    u[DIM * i + a] *= alpha;
+    speed[i] *= alpha;
+}
+
+/* Per generator i: length of a displacement over h. Both displacements of a step in one launch took PoCL twice as long
+   as in two: it no longer found vectors. */
+kernel void measure_displacement(const int size, global const REAL *u, global const REAL *h, global REAL *speed)
+{
+    WORK_ITEM(i);
+    REAL u2 = 0;
+    EACH_AXIS(a)
+    u2 += u[DIM * i + a] * u[DIM * i + a];
+    speed[i] = sqrt(u2) / h[i];
+}
+
+/* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the
+   domain. velocity is the displacement that came of it. */
+kernel void move_generators(const int size, global const REAL *lloyd, const REAL a, global const REAL *correction,
+                            const REAL b, global const REAL *h, const REAL clip, DOMAIN_ARGS, global REAL *points,
+                            global REAL *velocity)
+{
+    WORK_ITEM(i);
+    REAL d[DIM], x[DIM], y[DIM];
+    REAL d2 = 0;
+    EACH_AXIS(c)
+    {
+        d[c] = a * lloyd[DIM * i + c] + b * correction[DIM * i + c];
+        d2 += d[c] * d[c];
+    }
+    const REAL longest = clip * h[i];
+    const REAL scale = clip > 0 && d2 > longest * longest ? longest / sqrt(d2) : 1;
+    EACH_AXIS(c)
+    {
+        x[c] = points[DIM * i + c];
+        y[c] = x[c] + scale * d[c];
+    }
+    /* Generators that stay where they are may stand outside of the part of the domain that is left to the others. */
+    if (d2 > 0)
+        reflect_inside(x, y, DOMAIN);
+    EACH_AXIS(c)
+    {
+        points[DIM * i + c] = y[c];
+        velocity[DIM * i + c] = DIFFERENCE(c, x[c], y[c]);
+    }
+}
+
+/* Per generator i that does not move, labels[i] < fixed: no displacement. */
+kernel void hold_generators(const int size, global const int *labels, const int fixed, global REAL *displacement)
+{
+    WORK_ITEM(i);
+    if (labels[i] < fixed)
+        EACH_AXIS(a)
+    displacement[DIM * i + a] = 0;
+}
+
+/* Per generator i: lloyd = factor * lloyd + share * velocity. */
+kernel void add_momentum(const int size, const REAL factor, global const REAL *velocity, const REAL share,
+                         global REAL *lloyd)
+{
+    WORK_ITEM(i);
+    EACH_AXIS(a)
+    lloyd[DIM * i + a] = factor * lloyd[DIM * i + a] + share * velocity[DIM * i + a];
+}

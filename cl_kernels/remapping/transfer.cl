@@ -1,0 +1,307 @@
+#include "opencl/real.h"
+#include "tessellation/bins.h"
+#include "remapping/piece.h"
+
+/* What became of a cell. */
+#define DONE 0
+#define LIST_FULL 1   /* it meets more old cells than the list holds */
+#define PIECE_LARGE 2 /* more faces than a piece holds */
+#define FAILED 3
+
+/* The old cells that a new cell is known to meet: a queue, and a hash table with open addressing, of twice its capacity
+   (a power of two), that says which are in it. */
+typedef struct {
+    int n, capacity;
+    global int *queue, *table;
+} visited_t;
+
+/* Add j, unless it is there already; false if there is no room. */
+inline bool visit(visited_t *seen, int j)
+{
+    const int mask = 2 * seen->capacity - 1;
+    int slot = (int)((uint)j * 2654435761u >> 7) & mask;
+    while (seen->table[slot] >= 0) {
+        if (seen->table[slot] == j)
+            return true;
+        slot = (slot + 1) & mask;
+    }
+    if (seen->n == seen->capacity)
+        return false;
+    seen->table[slot] = j;
+    seen->queue[seen->n++] = j;
+    return true;
+}
+
+/* The generator nearest to x, of those with the given graph: from one in x's bin (or near it, where that is empty) from
+   neighbor to neighbor as long as one is nearer. Nothing can end that early: whoever is not in a generator's cell is
+   nearer to one of its neighbors. */
+inline int nearest_generator(global const REAL *x, int n, global const int *items, global const int2 *bins,
+                             global const FRAME *grid_frames, global const int4 *grid_shapes, global const int *starts,
+                             global const int *neighbors, global const REAL *points)
+{
+    int bin = bin_in_grid(x, grid_frames[0], grid_shapes[0]);
+    while (bins[bin].s1 != bins[bin + 1].s1) {
+        const int grid = bins[bin].s1;
+        bin = bin_in_grid(x, grid_frames[grid], grid_shapes[grid]);
+    }
+    const REAL4 here = load_vector(x, 0);
+    int j = items[min(bins[bin].s0, n - 1)], best = j;
+    REAL4 d = load_vector(points, j) - here;
+    REAL best2 = product(d, d);
+    do {
+        j = best;
+        for (int k = starts[j]; k < starts[j + 1]; ++k) {
+            const int q = neighbors[k];
+            if (q < 0)
+                continue;
+            d = load_vector(points, q) - here;
+            const REAL d2 = product(d, d);
+            if (d2 < best2) {
+                best2 = d2;
+                best = q;
+            }
+        }
+    } while (best != j);
+    return j;
+}
+
+/* Leave of a piece, relative to x, what lies in old cell j: { y : |y - x_j| <= |y - x_k| for its neighbors k }. The
+   plane between two cells is computed in one way for both, so that the two get complements. One of PIECE_*. */
+inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, global const int *starts,
+                       global const int *neighbors, global const REAL *points)
+{
+    int what = PIECE_WHOLE;
+    const REAL4 xj = load_vector(points, j);
+    for (int k = starts[j]; k < starts[j + 1]; ++k) {
+        const int q = neighbors[k];
+        if (q < 0)
+            continue;
+        const REAL4 xq = load_vector(points, q);
+        const REAL4 low = j < q ? xj : xq, high = j < q ? xq : xj;
+        const REAL4 a = low - x, b = high - x;
+        REAL4 normal = high - low;
+        REAL level = product(normal, a + b) / 2;
+        const REAL noise = 4 * REAL_EPS * sqrt(product(normal, normal));
+        const REAL depth = noise * (reach + sqrt(fmax(product(a, a), product(b, b))));
+        if (j > q) {
+            normal = -normal;
+            level = -level;
+        }
+        const int cut = cut_piece(piece, normal, level, depth, q);
+        if (cut >= PIECE_EMPTY)
+            return cut;
+        what = cut == PIECE_CUT ? PIECE_CUT : what;
+    }
+    return what;
+}
+
+/* Per new cell i = todo[first + p]: the mean of what is given in the old cells j,
+
+       q_i = sum_j |V_i and V_j| (q_j + g_j . (c_ij - c_j)) / sum_j |V_i and V_j|,
+
+   with the centroid c_ij of the piece V_i and V_j. The pieces are found by flooding: from the old cell that holds x_i
+   over the faces that the pieces have in common with each other.
+
+   values, least, most (n_old, width)  of the old cells: q_j, and bounds of what is in them
+   slopes (n_old, width, DIM)          g_j; with_slopes = 0: none
+   centroids (n_old, DIM)              c_j - x_j
+   means, low, high (n_new, width)     q_i, and the bounds of what it is made of
+   volumes, found (n_new)              of the cell, of its pieces together
+   queues, tables                      (capacity), (2 capacity) for each work-item */
+kernel void transfer(const int size, const int first, global const int *todo, const int capacity, global int *queues,
+                     global int *tables, global const REAL *points, global const int *starts,
+                     global const int *neighbors, const int n_old, global const REAL *old_points,
+                     global const int *old_starts, global const int *old_neighbors, global const int *items,
+                     global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                     const REAL4 box_lower, const REAL4 box_upper, const int width, global const REAL *values,
+                     global const REAL *least, global const REAL *most, const int with_slopes,
+                     global const REAL *slopes, global const REAL *centroids, global REAL *means, global REAL *low,
+                     global REAL *high, global REAL *volumes, global REAL *found, global int *status)
+{
+    WORK_ITEM(p);
+    const int i = todo[first + p];
+    const REAL4 x = load_vector(points, i);
+    visited_t seen = {0, capacity, queues + (size_t)p * capacity, tables + (size_t)p * 2 * capacity};
+    for (int k = 0; k < 2 * capacity; ++k)
+        seen.table[k] = -1;
+    piece_t whole, piece;
+    int what = build_piece(&whole, i, starts, neighbors, points, box_lower, box_upper);
+    if (what != PIECE_WHOLE) {
+        status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;
+        return;
+    }
+    REAL4 centroid;
+    volumes[i] = measure_piece(&whole, &centroid);
+    const REAL reach = sqrt(whole.reach2);
+    visit(&seen, nearest_generator(points + (size_t)DIM * i, n_old, items, bins, grid_frames, grid_shapes, old_starts,
+                                   old_neighbors, old_points));
+    for (int c = 0; c < width; ++c) {
+        means[(size_t)i * width + c] = 0;
+        low[(size_t)i * width + c] = REAL_MAX;
+        high[(size_t)i * width + c] = -REAL_MAX;
+    }
+    REAL sum = 0;
+    for (int k = 0; k < seen.n; ++k) {
+        const int j = seen.queue[k];
+        piece = whole;
+        what = cut_by_cell(&piece, x, reach, j, old_starts, old_neighbors, old_points);
+        if (what == PIECE_FULL || what == PIECE_BROKEN) {
+            status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;
+            return;
+        }
+        bool room = true;
+        if (what == PIECE_EMPTY) {
+            /* Rounding may have the search for the first cell end beside it. */
+            for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q)
+                room = room && (old_neighbors[q] < 0 || visit(&seen, old_neighbors[q]));
+        } else {
+            const REAL volume = measure_piece(&piece, &centroid);
+            const REAL4 off = (x - load_vector(old_points, j)) + centroid - load_vector(centroids, j);
+            sum += volume;
+            for (int c = 0; c < width; ++c) {
+                const size_t from = (size_t)j * width + c, to = (size_t)i * width + c;
+                REAL value = values[from];
+                if (with_slopes)
+                    for (int a = 0; a < DIM; ++a)
+                        value += slopes[from * DIM + a] * (a == 0 ? off.s0 : (a == 1 ? off.s1 : off.s2));
+                means[to] += volume * value;
+                low[to] = fmin(low[to], least[from]);
+                high[to] = fmax(high[to], most[from]);
+            }
+            for (EACH_FACE(&piece, f))
+                room = room && (face_label(&piece, f) < 0 || visit(&seen, face_label(&piece, f)));
+        }
+        if (!room) {
+            status[i] = LIST_FULL;
+            return;
+        }
+    }
+    found[i] = sum;
+    for (int c = 0; c < width; ++c)
+        means[(size_t)i * width + c] /= sum;
+    status[i] = sum > 0 ? DONE : FAILED;
+}
+
+/* Solve M g = b, M symmetric and not negative, in place of M and b: by elimination, the largest pivot first. False,
+   with b as it was, if M is singular but for rounding. */
+inline bool eliminate(REAL m[DIM][DIM], REAL *b)
+{
+    int order[DIM];
+    REAL x[DIM], scale = 0;
+    bool used[DIM];
+    for (int a = 0; a < DIM; ++a) {
+        used[a] = false;
+        x[a] = b[a];
+        scale = fmax(scale, m[a][a]);
+    }
+    for (int rank = 0; rank < DIM; ++rank) {
+        int p = -1;
+        for (int a = 0; a < DIM; ++a)
+            if (!used[a] && (p < 0 || m[a][a] > m[p][p]))
+                p = a;
+        if (!(m[p][p] > 256 * REAL_EPS * scale))
+            return false;
+        used[p] = true;
+        order[rank] = p;
+        for (int a = 0; a < DIM; ++a) {
+            if (used[a])
+                continue;
+            const REAL factor = m[a][p] / m[p][p];
+            for (int c = 0; c < DIM; ++c)
+                m[a][c] -= factor * m[p][c];
+            x[a] -= factor * x[p];
+        }
+    }
+    for (int r = DIM - 1; r >= 0; --r) {
+        const int p = order[r];
+        REAL sum = x[p];
+        for (int later = r + 1; later < DIM; ++later)
+            sum -= m[p][order[later]] * b[order[later]];
+        b[p] = sum / m[p][p];
+    }
+    return true;
+}
+
+/* Solve the normal equations M g = b in place of b. A direction that the neighbors say nothing about, as in the corner
+   of a box with one neighbor, gets no slope: the least solution, to the root of rounding. */
+inline void solve_normal(REAL m[DIM][DIM], REAL *b)
+{
+    REAL copy[DIM][DIM], trace = 0;
+    for (int a = 0; a < DIM; ++a) {
+        trace += m[a][a];
+        for (int c = 0; c < DIM; ++c)
+            copy[a][c] = m[a][c];
+    }
+    if (eliminate(copy, b))
+        return;
+    for (int a = 0; a < DIM; ++a)
+        for (int c = 0; c < DIM; ++c)
+            copy[a][c] = m[a][c] + (a == c ? sqrt(REAL_EPS) * trace : 0);
+    if (!(trace > 0) || !eliminate(copy, b))
+        for (int a = 0; a < DIM; ++a)
+            b[a] = 0;
+}
+
+/* Per old cell j and component c: the slope g_j that fits its neighbors k best,
+
+       min over g of sum_k w_k (q_k - q_j - g . (c_k - c_j))^2,   w_k = 1 / |c_k - c_j|^2,
+
+   and least, most: the bounds of the values of j and its neighbors. With `limited`, g_j is multiplied by the largest
+   factor <= 1 with which the linear function stays between those at all corners v of the cell (T. J. Barth and
+   D. C. Jespersen, The design and application of upwind schemes on unstructured meshes, AIAA 89-0366, 1989):
+
+       min over v of (most - q_j) / (g . (v - c_j)) or (least - q_j) / (g . (v - c_j)), by the sign of what divides. */
+kernel void fit_slopes(const int size, const int width, global const REAL *points, global const int *starts,
+                       global const int *neighbors, const REAL4 box_lower, const REAL4 box_upper,
+                       global const REAL *centroids, global const REAL *values, const int limited, global REAL *slopes,
+                       global REAL *least, global REAL *most, global int *status)
+{
+    WORK_ITEM(j);
+    const REAL4 x = load_vector(points, j), cj = load_vector(centroids, j);
+    piece_t cell;
+    const int what = build_piece(&cell, j, starts, neighbors, points, box_lower, box_upper);
+    status[j] = what == PIECE_WHOLE ? DONE : (what == PIECE_FULL ? PIECE_LARGE : FAILED);
+    if (what != PIECE_WHOLE)
+        return;
+    for (int c = 0; c < width; ++c) {
+        const REAL own = values[(size_t)j * width + c];
+        REAL m[DIM][DIM], g[DIM], bottom = own, top = own;
+        for (int a = 0; a < DIM; ++a) {
+            g[a] = 0;
+            for (int b = 0; b < DIM; ++b)
+                m[a][b] = 0;
+        }
+        for (int k = starts[j]; k < starts[j + 1]; ++k) {
+            const int q = neighbors[k];
+            if (q < 0)
+                continue;
+            const REAL there = values[(size_t)q * width + c];
+            const REAL4 d4 = (load_vector(points, q) - x) + (load_vector(centroids, q) - cj);
+            const REAL d[3] = {d4.s0, d4.s1, d4.s2};
+            const REAL weight = 1 / product(d4, d4);
+            bottom = fmin(bottom, there);
+            top = fmax(top, there);
+            for (int a = 0; a < DIM; ++a) {
+                g[a] += weight * (there - own) * d[a];
+                for (int b = 0; b < DIM; ++b)
+                    m[a][b] += weight * d[a] * d[b];
+            }
+        }
+        solve_normal(m, g);
+        REAL factor = 1;
+        for (int v = 0; limited && v < corner_count(&cell); ++v) {
+            const REAL4 off = corner_of(&cell, v) - cj;
+            REAL rise = g[0] * off.s0 + g[1] * off.s1;
+#if DIM == 3
+            rise += g[2] * off.s2;
+#endif
+            const REAL room = rise > 0 ? top - own : bottom - own;
+            if (fabs(rise) > fabs(room))
+                factor = fmin(factor, room / rise);
+        }
+        for (int a = 0; a < DIM; ++a)
+            slopes[((size_t)j * width + c) * DIM + a] = factor * g[a];
+        least[(size_t)j * width + c] = bottom;
+        most[(size_t)j * width + c] = top;
+    }
+}

@@ -1,0 +1,112 @@
+/* The measures of eight cells at a time, one in each lane of vectors: bit by bit those of `measure_cell`. Cells with a
+   wall among their faces are left to that. */
+#include "simd/eight_corners.h"
+#include "tessellation/measures.h"
+
+#define FACE8 CLVORO_JOIN(FACE, 8)
+#define FACE16 CLVORO_JOIN(FACE, 16)
+#define CONVERT_FACE8 CLVORO_JOIN(convert_, FACE8)
+
+/* Do the bits in `words` keep all of n faces? */
+inline bool keeps_all(global const uint *words, int n)
+{
+    bool all = true;
+    for (; n > 0; n -= 32, ++words)
+        all &= *words == (n < 32 ? (1u << n) - 1 : ~0u);
+    return all;
+}
+
+/* Measure the cells of LANES generators from number `first` on. */
+inline void measure_eight(const measures_t *to, int first, int size, const face_rows_t *rows, global const uint *keep,
+                          global const double *points, const double *lower, const double *upper)
+{
+    double2 behind[(ROW_CAPACITY + 1) * LANES];
+    double xs[LANES], ys[LANES];
+    long counts[LANES];
+    bool inside[LANES];
+    int most = 0;
+    for (int lane = 0; lane < LANES; ++lane) {
+        const int i = min(first + lane, size - 1), place = rows->places[i];
+        int n;
+        face_row(rows, i, &n);
+        /* A row that has lost a face is left to `measure_cell`, too. */
+        counts[lane] = n >= 3 && (place < 0 || keeps_all(keep + place, n)) ? n : 0;
+        most = max(most, (int)counts[lane]);
+        xs[lane] = points[2 * i];
+        ys[lane] = points[2 * i + 1];
+    }
+    /* All rows are read and written as far as the longest, as counts that differ from lane to lane would be guessed
+       wrong: behind its last face each begins again, and stays there; what it leaves in the next lane's place is
+       overwritten. */
+    const int end = to->starts[min(first + LANES, size)];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const int i = min(first + lane, size - 1), n = counts[lane];
+        const int start = first + lane < size ? to->starts[i] : end;
+        int least = INT_MAX, listed;
+        global const int *row = face_row(rows, i, &listed);
+        for (int k = 0; k <= most; ++k) {
+            const int face = n > 0 ? row[k < n ? k : 0] : -1;
+            least = min(least, face);
+            behind[ROW_PLACE(k, lane)] = vload2(max(face, 0), points);
+            if (start + k < end)
+                to->neighbors[start + k] = face;
+        }
+        inside[lane] = least >= 0;
+    }
+    outlines_t corners;
+    const double8 x = vload8(0, xs), y = vload8(0, ys);
+    fold_rows(behind, most, x, y);
+    find_corners(&corners, behind, most, x, y);
+
+    FACE8 lengths[ROW_CAPACITY];
+    FACE16 middles[ROW_CAPACITY];
+    double8 area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
+    const long8 ends = vload8(0, counts), last = max(ends - 1, (long8)(0));
+    double8 vx = pick(corners.x, last), vy = pick(corners.y, last);
+    for (int k = 0; k < most; ++k) {
+        const long8 here = k < ends;
+        const double8 wx = here ? corners.x[k] : 0, wy = here ? corners.y[k] : 0;
+        const double8 ex = wx - vx, ey = wy - vy, sx = vx + wx, sy = vy + wy;
+        lengths[k] = CONVERT_FACE8(sqrt(ex * ex + ey * ey));
+        middles[k].even = CONVERT_FACE8(sx / 2);
+        middles[k].odd = CONVERT_FACE8(sy / 2);
+        /* As `add_triangle` has it. */
+        const double8 cross = here ? cross8(vx, wy, vy, wx) : 0;
+        area += cross;
+        cx += cross * sx;
+        cy += cross * sy;
+        xx += cross * (vx * vx + wx * wx + sx * sx);
+        xy += cross * (vx * vy + wx * wy + sx * sy);
+        yy += cross * (vy * vy + wy * wy + sy * sy);
+        vx = wx;
+        vy = wy;
+    }
+    /* As `write_moments` has it. */
+    const long8 full = area > 0;
+    const double8 mx = full ? cx / (3 * area) : cx, my = full ? cy / (3 * area) : cy;
+    double results[6 * LANES];
+    vstore8(area / 2, 0, results);
+    vstore8(mx, 1, results);
+    vstore8(my, 2, results);
+    vstore8(full ? xx / (12 * area) - mx * mx : xx, 3, results);
+    vstore8(full ? xy / (12 * area) - mx * my : xy, 4, results);
+    vstore8(full ? yy / (12 * area) - my * my : yy, 5, results);
+    for (int lane = 0; lane < LANES && first + lane < size; ++lane) {
+        const int i = first + lane, start = to->starts[i];
+        if (!inside[lane]) {
+            int faces[ROW_CAPACITY];
+            const int n = kept_faces(faces, rows, keep, i);
+            measure_cell(to, i, faces, n, points, lower, upper);
+            continue;
+        }
+        for (int k = 0; k < min(most, end - start); ++k) {
+            to->face_measures[start + k] = LANE((const FACE *)lengths, k, lane);
+            vstore2(vload2(k * LANES + lane, (const FACE *)middles), start + k, to->face_centroids);
+        }
+        to->volumes[i] = LANE(results, 0, lane);
+        for (int a = 0; a < 2; ++a)
+            to->offsets[2 * i + a] = LANE(results, 1 + a, lane);
+        for (int a = 0; a < 3; ++a)
+            to->covariances[3 * i + a] = LANE(results, 3 + a, lane);
+    }
+}

@@ -1,0 +1,65 @@
+/* The corners of eight cells at a time, one in each lane of vectors: bit by bit those of `corner`
+   (tessellation/corner.h) where no wall is concerned. */
+#include "tessellation/face_rows.h"
+#include "simd/lanes.h"
+
+inline double8 cross8(double8 a, double8 b, double8 c, double8 d)
+{
+    const double8 cd = c * d;
+    return fma(a, b, -cd) + fma(-c, d, cd);
+}
+
+#ifdef FOLD_0
+/* Have rows of points, up to number `most`, as the images of them that are nearest to the points (x, y): there all
+   differences are as `corner` takes them. */
+inline void fold_rows(double2 *behind, int most, double8 x, double8 y)
+{
+    const double8 even = (double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6);
+    const double8 odd = (double8)(x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
+    const double8 periods =
+        (double8)((double4)(FOLD(0), FOLD(1), FOLD(0), FOLD(1)), (double4)(FOLD(0), FOLD(1), FOLD(0), FOLD(1)));
+    const double8 half_way = periods > 0 ? periods / 2 : INFINITY;
+    for (int k = 0; k <= most; ++k)
+        for (int side = 0; side < 2; ++side) {
+            const double8 at = vload8(2 * k + side, (const double *)behind), d = at - (side ? odd : even);
+            const double8 nearer = d > half_way ? at - periods : at;
+            vstore8(d < -half_way ? at + periods : nearer, 2 * k + side, (double *)behind);
+        }
+}
+#else
+#define fold_rows(behind, most, x, y)
+#endif
+
+/* Points along outlines, relative to the generators. */
+typedef struct {
+    double8 x[ROW_CAPACITY], y[ROW_CAPACITY];
+} outlines_t;
+
+/* The `most` first corners of cells whose generators are at (x, y), corner k between faces k and k + 1, from the
+   positions of what is behind the faces. */
+inline void find_corners(outlines_t *corners, const double2 *behind, int most, double8 x, double8 y)
+{
+    double8 ax, ay;
+    load_row(behind, 0, &ax, &ay);
+    double8 ux = ax - x, uy = ay - y;
+    double8 u2 = ux * ux + uy * uy;
+    for (int k = 0; k < most; ++k) {
+        double8 bx, by;
+        load_row(behind, k + 1, &bx, &by);
+        const double8 vx = bx - x, vy = by - y, wx = bx - ax, wy = by - ay;
+        const double8 v2 = vx * vx + vy * vy, w2 = wx * wx + wy * wy;
+        /* As `corner` has it: of u and v, or of w and -u where the two are near each other. */
+        const long8 apart = w2 > 1e-3 * u2;
+        const double8 px = apart ? ux : wx, py = apart ? uy : wy, p2 = apart ? u2 : w2;
+        const double8 qx = apart ? vx : -ux, qy = apart ? vy : -uy, q2 = apart ? v2 : u2;
+        const double8 inverse = 0.5 / cross8(px, qy, py, qx);
+        const double8 cx = cross8(p2, qy, q2, py) * inverse, cy = cross8(q2, px, p2, qx) * inverse;
+        corners->x[k] = apart ? cx : cx + ux;
+        corners->y[k] = apart ? cy : cy + uy;
+        ax = bx;
+        ay = by;
+        ux = vx;
+        uy = vy;
+        u2 = v2;
+    }
+}

@@ -1,0 +1,187 @@
+#include "simd/candidates.h"
+#include "simd/hull.h"
+
+/* The cells of eight generators at a time, one in each lane of vectors, as hulls (simd/hull.h): for CPUs.
+
+   Where any decision is near to rounding, or something does not fit, a cell is left to be clipped (`cells.cl`): rows do
+   not depend on which of the two has made them. */
+
+/* Lanes are searched for together if they are within so many spacings: rows of bins end within an eight. */
+#define SPREAD 20
+#ifndef EIGHTS
+#error "build with -DEIGHTS=eights of cells that a work-item does"
+#endif
+/* A work-item learns from each eight how far the next should look at first: as far as has been needed in the mean, and
+   WIDTH standard deviations more. What it has learned fades by MEMORY from eight to eight. */
+#define WIDTH 2.4
+#define MEMORY 0.75
+#define GROWTH 1.4 /* of the radius, from round to round: twice the area */
+#define MAX_ROUNDS 10
+
+/* Cut the lists to the corners of the hulls in the lanes that were wrapped, to nothing where a hull is lost, and to the
+   `kept` first candidates in the others. Returns how many are kept now. */
+inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, int kept)
+{
+    const long8 sizes = wrapped ? (hull->lost ? 0 : hull->sizes) : kept;
+    const int most = max_lane(sizes);
+    for (int k = 0; k < most; ++k) {
+        const long8 moved = wrapped & (k < sizes), stays = ~wrapped & (k < sizes);
+        list->x[k] = moved ? hull->x[k] : (stays ? list->x[k] : NAN);
+        list->y[k] = moved ? hull->y[k] : (stays ? list->y[k] : NAN);
+        list->places[k] = convert_int8(moved) ? hull->places[k] : list->places[k];
+    }
+    list->length = most;
+    list->largest2 = wrapped & hull->lost ? 0 : list->largest2;
+    list->nearest = wrapped ? 0 : list->nearest;
+    return most;
+}
+
+/* Choose from the lanes to do those near the first of them, no farther than what it calls far; the rectangle is to hold
+   all that is within r of them. */
+inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 far_away, double2 *lower, double2 *upper)
+{
+    long wanted[LANES];
+    double xs[LANES], ys[LANES], fars[LANES];
+    vstore8(todo, 0, wanted);
+    vstore8(x, 0, xs);
+    vstore8(y, 0, ys);
+    vstore8(far_away, 0, fars);
+    int first = 0;
+    while (!wanted[first])
+        ++first;
+    const double far = fars[first];
+    const long8 lanes = (long8)(0, 1, 2, 3, 4, 5, 6, 7);
+    const long8 chosen = todo & ((lanes == first) | ((fabs(x - xs[first]) <= far) & (fabs(y - ys[first]) <= far)));
+    const double8 slack = r * (1 + 1e-6);
+    *lower = (double2)(min_lane(chosen ? x - slack : DBL_MAX), min_lane(chosen ? y - slack : DBL_MAX));
+    *upper = -(double2)(min_lane(chosen ? -x - slack : DBL_MAX), min_lane(chosen ? -y - slack : DBL_MAX));
+    return chosen;
+}
+
+/* Write the rows of some lanes, whose first place is `own`; see `clip_cells`. */
+inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, global const int *items,
+                       global float *reach, global int *rows, global int *row_counts)
+{
+    long written[LANES], sizes[LANES];
+    double radii[LANES];
+    vstore8(lanes, 0, written);
+    vstore8(hull->sizes, 0, sizes);
+    vstore8(need, 0, radii);
+    for (int lane = 0; lane < LANES; ++lane) {
+        if (!written[lane])
+            continue;
+        const int i = items[own + lane], count = sizes[lane];
+        int labels[HULL_CAPACITY];
+        for (int k = 0; k < count; ++k) {
+            const int place = LANE((const int *)hull->places, k, lane);
+            labels[k] = place < 0 ? place : items[place];
+        }
+        write_labels(labels, count, rows + i * SLOT);
+        row_counts[i] = count;
+        reach[own + lane] = (float)radii[lane];
+    }
+}
+
+/* How far cells have looked in the end, in spacings: their number, sum and sum of squares, lane by lane. */
+typedef struct {
+    double8 number, sum, squares;
+} needs_t;
+
+inline void note_needs(needs_t *needs, long8 lanes, double8 need)
+{
+    needs->number += lanes ? (double8)1 : 0;
+    needs->sum += lanes ? need : 0;
+    needs->squares += lanes ? need * need : 0;
+}
+
+/* How far to look at first, at most `most`. */
+inline double first_look(needs_t *needs, double most)
+{
+    const double number = sum_lanes(needs->number);
+    if (number < LANES / 2)
+        return most;
+    const double mean = sum_lanes(needs->sum) / number;
+    const double variance = max(sum_lanes(needs->squares) / number - mean * mean, 0.0);
+    needs->number *= MEMORY;
+    needs->sum *= MEMORY;
+    needs->squares *= MEMORY;
+    return min(mean + WIDTH * sqrt(variance), most);
+}
+
+/* Per eight places in bin order: the rows of the generators there (see `clip_cells`), or row_counts[i] = 0 where a cell
+   is left to be clipped. `first_reach` is how far the first lists go at most, in units of the spacing. Only the first
+   `rows_wanted` generators get rows. */
+kernel void wrap_cells(const int size, const int n, const int rows_wanted, global const double *binned,
+                       global const int *items, global const float *spacing, global float *reach,
+                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                       const double4 box_lower, const double4 box_upper, const double first_reach, global int *rows,
+                       global int *row_counts, global int *places)
+{
+    WORK_ITEM(group);
+    needs_t needs = {0, 0, 0};
+    for (int own = group * EIGHTS * LANES; own < min((group + 1) * EIGHTS * LANES, n); own += LANES) {
+        double xs[LANES], ys[LANES], spacings[LANES];
+        long wanted[LANES];
+        for (int lane = 0; lane < LANES; ++lane) {
+            const int p = min(own + lane, n - 1), i = items[p];
+            const bool is_wanted = own + lane < n && i < rows_wanted;
+            wanted[lane] = is_wanted ? -1 : 0;
+            xs[lane] = binned[2 * p];
+            ys[lane] = binned[2 * p + 1];
+            spacings[lane] = spacing[p];
+            if (is_wanted) {
+                row_counts[i] = 0;
+                places[i] = i;
+            }
+        }
+        const double8 x = vload8(0, xs), y = vload8(0, ys);
+        near_t near;
+        list_t list;
+        hull_t hull;
+        list.length = 0;
+        list.largest2 = 0;
+        list.nearest = 0;
+        int kept = 0;
+        /* Of the generators nearer than `done` all are in the list that can be neighbors; now those nearer than `r`
+           are added. */
+        const double8 unit = vload8(0, spacings);
+        double8 done2 = 0, r = first_look(&needs, first_reach) * unit;
+        long8 todo = vload8(0, wanted), walled = 0;
+        for (int round = 0; any_lane(todo) && round < MAX_ROUNDS; ++round) {
+            double2 lower, upper;
+            long8 lanes = choose_lanes(todo, x, y, r, SPREAD * unit, &lower, &upper), doubt = 0;
+            bool fits = collect_near(&near, lower, upper, bins, grid_frames, grid_shapes);
+            for (int attempt = 0; !fits && attempt < 4; ++attempt) {
+                lanes = choose_lanes(todo, x, y, r, attempt == 0 ? 2 * unit : 0, &lower, &upper);
+                r = (lanes & (done2 == 0) & (attempt > 1 ? -1L : 0L)) ? r / 2 : r;
+                fits = collect_near(&near, lower, upper, bins, grid_frames, grid_shapes);
+            }
+            if (!fits) {
+                todo &= ~lanes;
+                continue;
+            }
+            if (any(lower < box_lower.s01) || any(upper > box_upper.s01)) {
+                add_walls(&list, x, y, lanes & ~walled, box_lower, box_upper, &doubt);
+                walled |= lanes;
+            }
+            const double8 to2 = add_near(&list, &near, binned, own, x, y, lanes, done2, r * r, &doubt);
+            r = (lanes & (to2 < r * r)) ? sqrt(to2) : r;
+            pad_list(&list);
+            wrap_hulls(&hull, &list, lanes);
+            double8 reach2, least;
+            measure_hulls(&hull, &list, &reach2, &least);
+            doubt |= is_uncertain(&hull, &list, reach2, least);
+            const double8 need = 2 * sqrt(reach2) * (1 + 8 * DBL_EPSILON);
+            const long8 again = lanes & ~doubt & (hull.lost | (need > r));
+            write_rows(&hull, lanes & ~doubt & ~again, need, own, items, reach, rows, row_counts);
+            note_needs(&needs, lanes & ~doubt & ~again, need / unit);
+            todo = (todo & ~lanes) | again;
+            if (!any_lane(todo))
+                break;
+            done2 = hull.lost ? 0 : (lanes ? to2 : done2);
+            walled &= ~hull.lost;
+            r = again ? (hull.lost ? 2 * r : fmin(need, GROWTH * r)) : r;
+            kept = keep_hulls(&list, &hull, lanes, kept);
+        }
+    }
+}

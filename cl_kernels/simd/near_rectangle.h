@@ -1,0 +1,62 @@
+/* Generators near a rectangle, as places in the order of bins. */
+#include "tessellation/bin_descent.h"
+
+#define NEAR_CAPACITY 512
+#define NEAR_STEP 16
+#define WHOLE 32 /* generators in divided bins that are taken as they are: more than that may be too far */
+
+/* Behind the last place there may be others, of no meaning. */
+typedef struct {
+    int count;
+    int places[NEAR_CAPACITY + NEAR_STEP];
+} near_t;
+
+inline bool add_run(near_t *near, int first, int end)
+{
+    const int count = near->count + end - first;
+    if (count > NEAR_CAPACITY)
+        return false;
+    const int16 steps = (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (int *to = near->places + near->count; first < end; first += NEAR_STEP, to += NEAR_STEP)
+        vstore16(first + steps, 0, to);
+    near->count = count;
+    return true;
+}
+
+/* Collect the generators in a rectangle, and some beside it. False if they are too many. */
+inline bool collect_near(near_t *near, double2 lower, double2 upper, global const int2 *bins,
+                         global const FRAME *grid_frames, global const int4 *grid_shapes)
+{
+    descent_t way; /* through rows and bins */
+    near->count = 0;
+    begin_descent(&way, (int4)(-1));
+    while (way.depth >= 0) {
+        const int grid = way.grids[way.depth];
+        const int4 place = way.places[way.depth];
+        const FRAME frame = grid_frames[grid];
+        const int4 shape = grid_shapes[grid];
+        const double inverse = FRAME_INVERSE(frame);
+        const int left = axis_bin(lower.s0, frame.s0, inverse, shape.s1);
+        const int right = axis_bin(upper.s0, frame.s0, inverse, shape.s1);
+        const int top = axis_bin(upper.s1, frame.s1, inverse, shape.s2);
+        int row = place.s0, next = place.s1, child = -1;
+        if (row < 0) {
+            row = axis_bin(lower.s1, frame.s1, inverse, shape.s2);
+            next = left;
+        }
+        while (row <= top && child < 0) {
+            global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
+            while (next <= right && child < 0) {
+                const int2 run = next_run(row_bins, &next, right, WHOLE, &child);
+                if (child < 0 && !add_run(near, run.s0, run.s1))
+                    return false;
+            }
+            if (next > right && child < 0) {
+                ++row;
+                next = left;
+            }
+        }
+        leave_grid(&way, child, (int4)(row, next, 0, 0), (int4)(-1));
+    }
+    return true;
+}

@@ -1,0 +1,139 @@
+/* Which cells of a walk are certain, and where they are written. */
+#include "tessellation/row_counts.h"
+#include "tessellation/periodic/halo.h"
+#include "simd/walk.h"
+
+/* What is certain: least ratio of squares of the distances of the nearest generator and of the farthest vertex; least
+   ratio of a face's area and the square of the distance of its own farthest vertex, as far as which vertices round:
+   that distance is the same from both sides of the face. */
+#define CERTAIN_NEAREST2 1e-7
+#define CERTAIN_AREA 1e-8
+
+/* Where cells are written to, in the layout of `clip_cells` (polyhedra.cl). */
+typedef struct {
+    int room;
+    global const int *items;
+    global float *reach;
+    global int *row_places, *row_counts, *labels, *report;
+    global double *measures, *centroids, *volumes, *offsets, *covariances;
+#ifdef SEAMS
+    seams_t seams;
+#endif
+} output_t;
+
+#ifdef SEAMS
+/* Look at the ball around vertex v of one lane's cell, of generator i at x. */
+inline void look_at_corner(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
+                           const output_t *out)
+{
+    const uchar4 corner = walk->lanes[lane].corner_faces[v];
+    const int faces[3] = {corner.s0, corner.s1, corner.s2};
+    double4 ways[3];
+    int labels[3];
+    for (int k = 0; k < 3; ++k) {
+        const int place = LANE(cells->places, faces[k], lane);
+        labels[k] = place < 0 ? place : out->items[place];
+        ways[k] = PLANE_LANE(cells->planes, faces[k], 3, lane) *
+                  (double4)(PLANE_LANE(cells->planes, faces[k], 0, lane), PLANE_LANE(cells->planes, faces[k], 1, lane),
+                            PLANE_LANE(cells->planes, faces[k], 2, lane), 0);
+    }
+    look_at_vertex(x, i, corner_at(walk, v, lane), ways, labels, &out->seams);
+}
+
+/* Look at the balls around the vertices of some lanes' cells, as far as they are of generators in the box. */
+inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
+                           global const double *binned, const output_t *out)
+{
+    const seams_t *seams = &out->seams;
+    double x[LANES][3];
+    long own[LANES];
+    int most = 0;
+    vstore8(some, 0, own);
+    for (int lane = 0; lane < LANES; ++lane) {
+        own[lane] = own[lane] && out->items[places[lane]] < seams->own ? -1 : 0;
+        most = own[lane] ? max(most, cells->corners[lane]) : most;
+        /* Lanes without a cell have no place. */
+        for (int a = 0; a < 3; ++a)
+            x[lane][a] = own[lane] ? binned[3 * places[lane] + a] : 0;
+    }
+#define ACROSS_LANES(a) (double8)(x[0][a], x[1][a], x[2][a], x[3][a], x[4][a], x[5][a], x[6][a], x[7][a])
+    const double8 low_x = seams->limits[0] + ACROSS_LANES(0), low_y = seams->limits[2] + ACROSS_LANES(1);
+    const double8 low_z = seams->limits[4] + ACROSS_LANES(2);
+    const double8 high_x = seams->limits[1] + seams->period.s0 - ACROSS_LANES(0);
+    const double8 high_y = seams->limits[3] + seams->period.s1 - ACROSS_LANES(1);
+    const double8 high_z = seams->limits[5] + seams->period.s2 - ACROSS_LANES(2);
+    const double widest = widest_of(seams);
+    const long8 mine = vload8(0, own), counts = convert_long8(vload8(0, cells->corners));
+    for (int v = 0; v < most; ++v) {
+        const planes_t *at = &walk->corners[v];
+        const double8 wide = widest * sqrt(fma(at->x, at->x, fma(at->y, at->y, at->z * at->z)));
+        const long8 inside = (wide - at->x <= low_x) & (wide + at->x <= high_x) & (wide - at->y <= low_y) &
+                             (wide + at->y <= high_y) & (wide - at->z <= low_z) & (wide + at->z <= high_z);
+        const long8 beyond = ~inside & mine & (v < counts);
+        if (!any(beyond))
+            continue;
+        long lanes[LANES];
+        vstore8(beyond, 0, lanes);
+        for (int lane = 0; lane < LANES; ++lane)
+            if (lanes[lane])
+                look_at_corner(cells, walk, v, lane, out->items[places[lane]], x[lane], out);
+    }
+}
+#endif
+
+/* Write the cells of some lanes, of generators at `places`, and return how many. `reach` is twice the distance of the
+   farthest vertex. */
+inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t *m, long8 done, const int *places,
+                       double8 reach, global const double *binned, const output_t *out)
+{
+    long lanes[LANES];
+    double reaches[LANES];
+    vstore8(done, 0, lanes);
+    vstore8(reach, 0, reaches);
+    int total = 0, made = 0;
+    for (int lane = 0; lane < LANES; ++lane) {
+        total += lanes[lane] ? cells->faces[lane] : 0;
+        made += lanes[lane] != 0;
+    }
+    if (made == 0)
+        return 0;
+#ifdef SEAMS
+    look_at_walked(cells, walk, done, places, binned, out);
+#endif
+    int place = take_places(out->report, total);
+    const bool fits = place + total <= out->room;
+    for (int lane = 0; lane < LANES; ++lane) {
+        if (!lanes[lane])
+            continue;
+        const int i = out->items[places[lane]], count = cells->faces[lane];
+        out->reach[places[lane]] = (float)reaches[lane];
+        out->row_places[i] = place;
+        out->row_counts[i] = count | CERTAIN;
+        for (int f = 0; f < count && fits; ++f, ++place) {
+            const int other = LANE(cells->places, f, lane);
+            out->labels[place] = other < 0 ? other : out->items[other];
+            const double4 face = LANE(cells->sums, f, lane);
+            out->measures[place] = face.s0;
+            out->centroids[3 * place] = face.s1;
+            out->centroids[3 * place + 1] = face.s2;
+            out->centroids[3 * place + 2] = face.s3;
+        }
+        out->volumes[i] = LANE((const double *)&m->volume, 0, lane);
+        out->offsets[3 * i] = LANE((const double *)&m->x, 0, lane);
+        out->offsets[3 * i + 1] = LANE((const double *)&m->y, 0, lane);
+        out->offsets[3 * i + 2] = LANE((const double *)&m->z, 0, lane);
+        out->covariances[6 * i] = LANE((const double *)&m->xx, 0, lane);
+        out->covariances[6 * i + 1] = LANE((const double *)&m->xy, 0, lane);
+        out->covariances[6 * i + 2] = LANE((const double *)&m->zx, 0, lane);
+        out->covariances[6 * i + 3] = LANE((const double *)&m->yy, 0, lane);
+        out->covariances[6 * i + 4] = LANE((const double *)&m->yz, 0, lane);
+        out->covariances[6 * i + 5] = LANE((const double *)&m->zz, 0, lane);
+    }
+    return made;
+}
+
+/* Lanes in which the cell, walked among all that is nearer than `reach`, is certain. */
+inline long8 certain_cells(const cells_t *cells, const moments_t *m, const list_t *list)
+{
+    return (list->nearest2 > CERTAIN_NEAREST2 * cells->reach2) & (m->least > CERTAIN_AREA);
+}

@@ -1,0 +1,157 @@
+/* Gradation limiting on a regular grid: the largest u <= f with |grad u| <= g, which is
+
+       u(x) = min over y of f(y) + g |x - y|,
+
+   the solution of the Eikonal equation |grad u| = g from above wherever u < f. At a node with the lesser neighbors a_k
+   and spacings d_k along the axes (Godunov's upwind scheme, first order):
+
+       sum over k of (max(u - a_k, 0) / d_k)^2 = g^2.
+
+   The grid is cut into tiles of TILE^DIM nodes; work-item i sweeps tile i in all 2^DIM directions, in place, if it is
+   awake. A node sees its neighbors along the axes alone, so tiles of one color of a checkerboard never read what
+   another of that color writes: the two colors take turns, and the result does not depend on the order of the
+   work-items. A tile whose side has changed wakes the tile beyond that side. Tiles wait while all that they could learn
+   lies above a threshold that rises from pass to pass, so that few are swept before their neighbors are final. u only
+   falls, and a fall of a few units in the last place counts as none, so all tiles are asleep at last. */
+#include "opencl/real.h"
+
+/* A fall that counts, relative to u. */
+#define NOTABLE (8 * REAL_EPS)
+
+/* The u of the scheme from the lesser neighbors a (REAL_MAX: none) at distances d: in the order of ascending a, as
+   many axes count as have a below the u that those before them give. */
+inline REAL upwind(REAL *a, REAL *d, REAL growth)
+{
+    for (int k = 1; k < DIM; ++k)
+        for (int j = k; j > 0 && a[j] < a[j - 1]; --j) {
+            REAL swap = a[j];
+            a[j] = a[j - 1];
+            a[j - 1] = swap;
+            swap = d[j];
+            d[j] = d[j - 1];
+            d[j - 1] = swap;
+        }
+    /* With b = a - a_0 and w = 1/d^2: u - a_0 = (S + sqrt(g^2 W - W T + S^2)) / W, W = sum w, S = sum w b, T = sum w
+       b^2. */
+    REAL rise = growth * d[0];
+    REAL W = 1 / (d[0] * d[0]), S = 0, T = 0;
+    for (int k = 1; k < DIM; ++k) {
+        const REAL b = a[k] - a[0];
+        if (!(b < rise))
+            break;
+        const REAL w = 1 / (d[k] * d[k]);
+        W += w;
+        S += w * b;
+        T += w * b * b;
+        rise = (S + sqrt(fmax(W * (growth * growth - T) + S * S, (REAL)0))) / W;
+    }
+    return a[0] + rise;
+}
+
+/* The least value of each tile. */
+kernel void tile_minima(const int size, const int nx, const int ny, const int nz, global const REAL *restrict u,
+                        global REAL *restrict lowest)
+{
+    WORK_ITEM(i);
+    const int count[3] = {nx, ny, nz};
+    int first[3] = {0, 0, 0}, last[3] = {0, 0, 0}, rest = i;
+    for (int a = 0; a < DIM; ++a) {
+        const int tiles = (count[a] + TILE - 1) / TILE;
+        first[a] = rest % tiles * TILE;
+        rest /= tiles;
+        last[a] = min(first[a] + TILE, count[a]) - 1;
+    }
+    REAL least = REAL_MAX;
+    for (int z = first[2]; z <= last[2]; ++z)
+        for (int y = first[1]; y <= last[1]; ++y)
+            for (int x = first[0]; x <= last[0]; ++x)
+                least = fmin(least, u[x + nx * (y + ny * z)]);
+    lowest[i] = least;
+}
+
+/* awake, wake: for each tile, 1 if it is to be swept now, next. Tiles of the other color than `color` stay awake, and
+   those with nothing below `threshold` in themselves and their neighbors. lowest: the least value of each tile.
+   u: values with x running fastest; nx, ny, nz of them, dx, dy, dz apart. */
+kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz, const REAL dx, const REAL dy,
+                        const REAL dz, const int color, const REAL growth, const REAL threshold,
+                        global const int *restrict awake, global int *restrict wake, global REAL *lowest,
+                        global REAL *u)
+{
+    WORK_ITEM(i);
+    if (!awake[i])
+        return;
+    const int count[3] = {nx, ny, nz};
+    const REAL spacing[3] = {dx, dy, dz};
+    int tile[DIM], tiles[DIM], first[DIM], last[DIM], stride[DIM];
+    int rest = i, parity = 0, jump = 1;
+    for (int a = 0; a < DIM; ++a) {
+        tiles[a] = (count[a] + TILE - 1) / TILE;
+        tile[a] = rest % tiles[a];
+        rest /= tiles[a];
+        parity += tile[a];
+        first[a] = tile[a] * TILE;
+        last[a] = min(first[a] + TILE, count[a]) - 1;
+        stride[a] = jump;
+        jump *= count[a];
+    }
+    if ((parity & 1) != color) {
+        atomic_or(wake + i, 1);
+        return;
+    }
+    REAL least = lowest[i], around = least;
+    jump = 1;
+    for (int a = 0; a < DIM; ++a) {
+        around = fmin(around, tile[a] > 0 ? lowest[i - jump] : REAL_MAX);
+        around = fmin(around, tile[a] < tiles[a] - 1 ? lowest[i + jump] : REAL_MAX);
+        jump *= tiles[a];
+    }
+    if (around > threshold) {
+        atomic_or(wake + i, 1);
+        return;
+    }
+    /* Bits 2 a and 2 a + 1: the lower and the upper side across axis a has changed. */
+    int changed = 0, sweeps_left = 1 << DIM, direction = 0;
+    /* Until a full round of directions has changed nothing; what a round leaves behind, the next one finds. */
+    while (sweeps_left > 0) {
+        int moved = 0;
+        int nodes = 1;
+        for (int a = 0; a < DIM; ++a)
+            nodes *= last[a] - first[a] + 1;
+        for (int k = 0; k < nodes; ++k) {
+            int at = 0, sides = 0, left = k, place[DIM];
+            for (int a = 0; a < DIM; ++a) {
+                const int width = last[a] - first[a] + 1;
+                const int step = left % width;
+                left /= width;
+                place[a] = (direction >> a) & 1 ? last[a] - step : first[a] + step;
+                at += place[a] * stride[a];
+                sides |= (place[a] == first[a]) << (2 * a) | (place[a] == last[a]) << (2 * a + 1);
+            }
+            REAL lesser[DIM], across[DIM];
+            for (int a = 0; a < DIM; ++a) {
+                const REAL below = place[a] > 0 ? u[at - stride[a]] : REAL_MAX;
+                const REAL above = place[a] < count[a] - 1 ? u[at + stride[a]] : REAL_MAX;
+                lesser[a] = fmin(below, above);
+                across[a] = spacing[a];
+            }
+            const REAL now = u[at], limit = upwind(lesser, across, growth);
+            if (limit < now * (1 - NOTABLE)) {
+                u[at] = limit;
+                least = fmin(least, limit);
+                moved = 1;
+                changed |= sides;
+            }
+        }
+        direction = (direction + 1) & ((1 << DIM) - 1);
+        sweeps_left = moved ? 1 << DIM : sweeps_left - 1;
+    }
+    lowest[i] = least;
+    jump = 1;
+    for (int a = 0; a < DIM; ++a) {
+        if ((changed >> (2 * a) & 1) && tile[a] > 0)
+            atomic_or(wake + i - jump, 1);
+        if ((changed >> (2 * a + 1) & 1) && tile[a] < tiles[a] - 1)
+            atomic_or(wake + i + jump, 1);
+        jump *= tiles[a];
+    }
+}

@@ -1,0 +1,223 @@
+/* The bricks of a size field. The host writes `size_at` out of calls to these functions and puts it, with this file,
+   in front of any kernel that needs h (clvoro/sizing/bind.py), so nothing here may lean on another header: only
+   DIM and REAL are known. Lengths and coordinates are the normalized ones, x' = (x - origin) / scale. */
+#pragma OPENCL FP_CONTRACT OFF
+#if defined(__OPENCL_C_VERSION__) && __OPENCL_C_VERSION__ < 120 && defined(cl_khr_fp64)
+#pragma OPENCL EXTENSION cl_khr_fp64 : enable
+#endif
+
+#define SIZE_JOIN_(a, b) a##b
+#define SIZE_JOIN(a, b) SIZE_JOIN_(a, b)
+#define SIZE_LARGEST_double DBL_MAX
+#define SIZE_LARGEST_float FLT_MAX
+#define SIZE_LARGEST SIZE_JOIN(SIZE_LARGEST_, REAL)
+
+/* Unlike fmin and fmax these hand a NaN on, so that a broken branch is seen and refused. */
+REAL size_min(REAL a, REAL b)
+{
+    return (a < b || a != a) ? a : b;
+}
+
+REAL size_max(REAL a, REAL b)
+{
+    return (a > b || a != a) ? a : b;
+}
+
+/* Multilinear interpolation between the nodes of a grid; outside, the value of the nearest edge.
+   data: gain (DIM), shift (DIM), then values with x running fastest; the index coordinate is gain * x + shift. */
+REAL size_raster(const REAL *x, __global const REAL *data, int nx, int ny, int nz)
+{
+    const int count[3] = {nx, ny, nz};
+    __global const REAL *values = data + 2 * DIM;
+    int base = 0, stride = 1, step[DIM];
+    REAL weight[DIM];
+    for (int a = 0; a < DIM; ++a) {
+        const REAL t = clamp(data[a] * x[a] + data[DIM + a], (REAL)0, (REAL)(count[a] - 1));
+        const int i = min((int)t, max(count[a] - 2, 0));
+        weight[a] = t - (REAL)i;
+        step[a] = count[a] > 1 ? stride : 0;
+        base += i * stride;
+        stride *= count[a];
+    }
+    REAL sum = 0;
+    for (int corner = 0; corner < (1 << DIM); ++corner) {
+        int at = base;
+        REAL w = 1;
+        for (int a = 0; a < DIM; ++a) {
+            const int far = (corner >> a) & 1;
+            w *= far ? weight[a] : 1 - weight[a];
+            at += far ? step[a] : 0;
+        }
+        sum += w * values[at];
+    }
+    return sum;
+}
+
+/* An item is a segment a + t d, 0 <= t <= 1, blown up to radius r: a segment has r = 0, a circle d = 0.
+   Stored as a (DIM), d (DIM), 1/|d|^2 (0 for a point), r. The distance is to the curve, from both sides. */
+#define SIZE_ITEM (2 * DIM + 2)
+
+/* Squared distance to the segment alone: no square root as long as all r are 0. */
+REAL size_segment_distance2(const REAL *x, __global const REAL *item)
+{
+    REAL v[DIM], t = 0, sum = 0;
+    for (int a = 0; a < DIM; ++a) {
+        v[a] = x[a] - item[a];
+        t += v[a] * item[DIM + a];
+    }
+    t = fmin(fmax(t * item[2 * DIM], (REAL)0), (REAL)1);
+    for (int a = 0; a < DIM; ++a) {
+        v[a] -= t * item[DIM + a];
+        sum += v[a] * v[a];
+    }
+    return sum;
+}
+
+/* A triangle with a corner at a: a (3), its sides b - a and c - a (3 each), the vectors that give the coordinates
+   s and t of a point a + s (b - a) + t (c - a) in its plane (3 each), the unit normal (3; 0 if it is so thin that it is
+   its sides), 1 / length^2 of b - a, c - a and c - b (0 for a point). */
+#define SIZE_TRIANGLE 21
+
+#if DIM == 3
+REAL size_dot(const REAL *a, __global const REAL *b)
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/* Squared distance to a side of which v = x - begin, its vector d and 1 / |d|^2 are known. */
+REAL size_side_distance2(const REAL *v, const REAL *d, REAL inverse)
+{
+    REAL t = v[0] * d[0] + v[1] * d[1] + v[2] * d[2], sum = 0;
+    t = fmin(fmax(t * inverse, (REAL)0), (REAL)1);
+    for (int a = 0; a < 3; ++a) {
+        const REAL w = v[a] - t * d[a];
+        sum += w * w;
+    }
+    return sum;
+}
+
+/* Where the foot of the perpendicular lies inside, s, t >= 0 and s + t <= 1, the nearest point is that foot. Else it
+   lies on a side that has the foot on its outer side: at the nearest point the way to the foot is a sum of outward
+   normals of the sides there, so the foot is beyond at least one of these. */
+REAL size_triangle_distance2(const REAL *x, __global const REAL *item)
+{
+    REAL v[3], side[3], best2 = SIZE_LARGEST;
+    for (int a = 0; a < 3; ++a)
+        v[a] = x[a] - item[a];
+    const REAL s = size_dot(v, item + 9), t = size_dot(v, item + 12);
+    const int thin = item[15] == 0 && item[16] == 0 && item[17] == 0;
+    if (!thin && s >= 0 && t >= 0 && s + t <= 1) {
+        const REAL height = size_dot(v, item + 15);
+        return height * height;
+    }
+    if (thin || s + t > 1) {
+        REAL w[3];
+        for (int a = 0; a < 3; ++a) {
+            side[a] = item[6 + a] - item[3 + a];
+            w[a] = v[a] - item[3 + a];
+        }
+        best2 = size_side_distance2(w, side, item[20]);
+    }
+    if (thin || t < 0) {
+        for (int a = 0; a < 3; ++a)
+            side[a] = item[3 + a];
+        best2 = fmin(best2, size_side_distance2(v, side, item[18]));
+    }
+    if (thin || s < 0) {
+        for (int a = 0; a < 3; ++a)
+            side[a] = item[6 + a];
+        best2 = fmin(best2, size_side_distance2(v, side, item[19]));
+    }
+    return best2;
+}
+#endif
+
+/* What the kinds of items are; always a literal, so only one branch is compiled in. */
+#define SIZE_STRAIGHT 0
+#define SIZE_ROUND 1
+#define SIZE_FLAT 2
+
+REAL size_item_distance2(const REAL *x, __global const REAL *items, int i, int kind)
+{
+#if DIM == 3
+    if (kind == SIZE_FLAT)
+        return size_triangle_distance2(x, items + i * SIZE_TRIANGLE);
+#endif
+    __global const REAL *item = items + i * SIZE_ITEM;
+    const REAL d2 = size_segment_distance2(x, item);
+    if (kind == SIZE_STRAIGHT)
+        return d2;
+    const REAL d = sqrt(d2) - item[2 * DIM + 1];
+    return d * d;
+}
+
+/* The least of best2 and the squared distances to n items, by looking at all. data: the items. */
+REAL size_nearest_few(const REAL *x, __global const REAL *data, int n, int kind, REAL best2)
+{
+    for (int i = 0; i < n; ++i)
+        best2 = fmin(best2, size_item_distance2(x, data, i, kind));
+    return best2;
+}
+
+/* h = min(h_min + slope * distance, h_max), the law all distances end in. law: h_min, slope, h_max, and the square of
+   the distance at which h_max takes over, where the search begins. */
+REAL size_law(REAL distance2, __global const REAL *law)
+{
+    return fmin(law[0] + law[1] * sqrt(distance2), law[2]);
+}
+
+REAL size_box_distance2(const REAL *x, __global const REAL *box)
+{
+    REAL sum = 0;
+    for (int a = 0; a < DIM; ++a) {
+        const REAL v = fmax(fmax(box[a] - x[a], x[a] - box[DIM + a]), (REAL)0);
+        sum += v * v;
+    }
+    return sum;
+}
+
+/* The same through a binary tree of bounding boxes with 2^levels leaves: leaf l holds the items
+   [l n / 2^levels, (l + 1) n / 2^levels), node k has the children 2 k + 1 and 2 k + 2. The nearer child is visited
+   first; a box that is farther than the best found so far is skipped.
+   data: the boxes (lower, upper) of 2^(levels + 1) - 1 nodes, the items. */
+REAL size_nearest_tree(const REAL *x, __global const REAL *data, int n, int levels, int kind, REAL best2)
+{
+    __global const REAL *boxes = data;
+    const int first_leaf = (1 << levels) - 1;
+    __global const REAL *items = boxes + (2 * first_leaf + 1) * 2 * DIM;
+    int waiting[24], top = 0, node = 0;
+    REAL bound2[24];
+    for (;;) {
+        if (node < first_leaf) {
+            int near = 2 * node + 1, far = near + 1;
+            REAL near2 = size_box_distance2(x, boxes + near * 2 * DIM);
+            REAL far2 = size_box_distance2(x, boxes + far * 2 * DIM);
+            if (far2 < near2) {
+                const REAL swap = near2;
+                near2 = far2;
+                far2 = swap;
+                far = near;
+                near = far + 1;
+            }
+            if (far2 < best2) {
+                waiting[top] = far;
+                bound2[top++] = far2;
+            }
+            if (near2 < best2) {
+                node = near;
+                continue;
+            }
+        } else {
+            const long leaf = node - first_leaf;
+            const int end = (int)(((leaf + 1) * n) >> levels);
+            for (int i = (int)((leaf * n) >> levels); i < end; ++i)
+                best2 = fmin(best2, size_item_distance2(x, items, i, kind));
+        }
+        do {
+            if (top == 0)
+                return best2;
+            --top;
+        } while (!(bound2[top] < best2));
+        node = waiting[top];
+    }
+}

@@ -1,0 +1,335 @@
+#include "tessellation/corner.h"
+
+#include "tessellation/vertex_walk.h"
+#include "tessellation/measures.h"
+#include "tessellation/widening.h"
+#if IN_LANES
+#include "simd/eight_cells.h"
+#endif
+
+/* Per place p in bin order: the cell of generator i = items[p] as its list of neighbors, counter-clockwise.
+
+   V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
+   after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
+   square of bins that it has seen covers that circle. Its radius is left in reach[p], which begins as a guess of it.
+   Only the first `rows_wanted` generators get cells.
+
+   With s = places[i], which is i for all but the longest:
+   rows[s * SLOT ...]  neighbors j, or -1 - wall; |row_counts[s]| of them, negative if rounding leaves a doubt
+
+   If `some`, rows that have faces are there already (`hulls.cl`, or where others had too many). */
+kernel void clip_cells(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
+                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                       global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                       const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
+                       global int *places, global int *flags)
+{
+    WORK_ITEM(p);
+    const int i = items[p];
+    if (i >= rows_wanted || (some && row_counts[i]))
+        return;
+    const REAL x[2] = {binned[2 * p], binned[2 * p + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    cell_t cell;
+    start_cell(&cell, i, x, lower, upper);
+    int flag = 0;
+    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
+    while (flag == 0) {
+        flag = clip_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
+        const REAL need = sqrt(cutting_distance2(&cell));
+        if (!(need > w)) /* ends with a NaN, too */
+            break;
+        inner = w;
+        w = fmin(need, 2 * w);
+    }
+    if (flag == 0)
+        reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+    places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
+}
+
+/* Twice the area of the cell of generator j by the faces that it lists. */
+inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    const REAL x[2] = {points[2 * j], points[2 * j + 1]};
+    int n;
+    global const int *row = face_row(rows, j, &n);
+    REAL area = 0;
+    if (n < 3)
+        return area;
+    const REAL2 origin = corner(j, x, row[n - 1], row[0], points, lower, upper);
+    REAL2 v = origin;
+    for (int k = 0; k < n; ++k) {
+        const REAL2 w = k == n - 1 ? origin : corner(j, x, row[k], row[k + 1], points, lower, upper);
+        area += difference_of_products(v.s0, w.s1, v.s1, w.s0);
+        v = w;
+    }
+    return area;
+}
+
+/* Per generator i: bit k of keep[its first slot ...] marks a neighbor that also lists i. Rounding may let one
+   of two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so
+   that the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two
+   cells, generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is
+   flagged. What borders on a generator without a row is not looked at.
+
+   If `repaired`, fits[i] tells of rows to whose neighbors i stands between the same two; of others it is not read. */
+kernel void match_faces(const int size, global const int *places, global const int *slots,
+                        global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
+                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int repaired,
+                        const REAL share, global int *fits, global uint *keep, global int *counts, global int *flags)
+{
+    WORK_ITEM(i);
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
+    int n;
+    global const int *row = face_row(&rows, i, &n);
+    const int place = places[i];
+    if (place < 0) {
+        counts[i] = n;
+        return;
+    }
+    const bool some = flags[1]; /* which the kernels before have written: no race with other work-items here */
+    if (repaired ? fits[i] : !some) {
+        /* All its faces are seen from both sides, as it fits its neighbors', or every new row is certain. */
+        for (int left = n, k = 0; left > 0; left -= 32, ++k)
+            keep[place + k] = left < 32 ? (1u << left) - 1 : ~0u;
+        counts[i] = n;
+        if (n < 3)
+            atomic_or(flags, FLAG_COLLAPSED);
+        return;
+    }
+    uint word = 0;
+    int count = 0;
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k];
+        const bool known = j >= 0 && j < size;
+        const bool doubtful = some && known && (slot_counts[place] < 0 || is_doubtful_row(&rows, j));
+        bool mutual = !known || !(doubtful || repaired);
+        if (!mutual) {
+            int m;
+            global const int *other = face_row(&rows, j, &m);
+            mutual = place_in_row(other, m, i) < m;
+        }
+        if (mutual) {
+            word |= 1u << (k % 32);
+            ++count;
+        } else if (!doubtful) {
+            atomic_or(flags, FLAG_COLLAPSED);
+        } else {
+            const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+            const REAL lower[2] = {box_lower.s0, box_lower.s1};
+            const REAL upper[2] = {box_upper.s0, box_upper.s1};
+            const int a = row[k == 0 ? n - 1 : k - 1];
+            const int b = row[k == n - 1 ? 0 : k + 1];
+            const REAL2 tip = corner(i, x, a, b, points, lower, upper);
+            const REAL2 u = corner(i, x, a, j, points, lower, upper) - tip;
+            const REAL2 v = corner(i, x, j, b, points, lower, upper) - tip;
+            const REAL cut = fabs(u.s0 * v.s1 - u.s1 * v.s0);
+            if (!(cut < 512 * REAL_EPS && cut <= share * listed_area(&rows, i, points, lower, upper) &&
+                  cut <= share * listed_area(&rows, j, points, lower, upper)))
+                atomic_or(flags, FLAG_COLLAPSED);
+            if (repaired) {
+                /* Now `before` and `after` follow each other. */
+                atomic_and(fits + i, 0);
+                if (a >= 0)
+                    atomic_and(fits + a, 0);
+                if (b >= 0)
+                    atomic_and(fits + b, 0);
+            }
+        }
+        if (k % 32 == 31 || k == n - 1) {
+            keep[place + k / 32] = word;
+            word = 0;
+        }
+    }
+    counts[i] = count;
+    if (count < 3)
+        atomic_or(flags, FLAG_COLLAPSED);
+}
+
+/* Per generator i: its faces as row i of the graph, and its cell's measures. All vectors are relative to x_i.
+
+   starts, neighbors        the graph; faces in counter-clockwise order
+   face_measures (m,)        length of a face
+   face_centroids (m, 2)
+   volumes (n,)              A_i
+   offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
+   covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area
+
+   In LANES a work-item takes so many generators, and there are so many fewer work-items. */
+kernel void measure_cells(const int size, global const int *places, global const int *slots,
+                          global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
+                          global const uint *keep, global const int *starts, global const REAL *points,
+                          const REAL4 box_lower, const REAL4 box_upper, global int *neighbors,
+                          global FACE *face_measures, global FACE *face_centroids, global REAL *volumes,
+                          global REAL *offsets, global REAL *covariances)
+{
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
+    const measures_t to = {starts, neighbors, face_measures, face_centroids, volumes, offsets, covariances};
+#if IN_LANES
+    const int first = (int)get_global_id(0) * LANES;
+    if (first < size)
+        measure_eight(&to, first, size, &rows, keep, points, lower, upper);
+#else
+    WORK_ITEM(i);
+    int faces[ROW_CAPACITY];
+    const int n = kept_faces(faces, &rows, keep, i);
+    measure_cell(&to, i, faces, n, points, lower, upper);
+#endif
+}
+
+/* Per generator i: the measures of its faces again, in full precision. */
+kernel void measure_faces(const int size, global const int *starts, global const int *neighbors,
+                          global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                          global REAL *measures, global REAL *centroids)
+{
+    WORK_ITEM(i);
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int begin = starts[i], end = starts[i + 1];
+    const REAL2 origin = corner(i, x, neighbors[end - 1], neighbors[begin], points, lower, upper);
+    REAL2 v = origin;
+    for (int k = begin; k < end; ++k) {
+        const REAL2 w = k == end - 1 ? origin : corner(i, x, neighbors[k], neighbors[k + 1], points, lower, upper);
+        const REAL2 e = w - v;
+        const REAL2 sum = v + w;
+        measures[k] = sqrt(dot(e, e));
+        centroids[2 * k] = sum.s0 / 2;
+        centroids[2 * k + 1] = sum.s1 / 2;
+        v = w;
+    }
+}
+
+/* Cells around a vertex from which on faces that are nothing may have been left out one after the other, and how far
+   off each other the places may be that they take for it. */
+#define MANY_AROUND 8
+#define MOST_SPREAD (64 * REAL_EPS)
+
+/* Do cells around corner c of cell i, which is at v, take places for it that are too far off, if they are many? The one
+   with the least angle there asks, if not more do: no more than 45 degrees. */
+inline bool is_spread(const int size, global const int *starts, global const int *neighbors, int i, int c, REAL2 v,
+                      const REAL *x, global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    const int last = starts[i + 1] - 1, most = starts[size];
+    const REAL2 one = face_direction(neighbors[c], x, points);
+    const REAL2 other = face_direction(neighbors[c > starts[i] ? c - 1 : last], x, points);
+    const REAL turn = dot(one, other);
+    if (turn > 0 || turn * turn < R(0.49) * dot(one, one) * dot(other, other))
+        return false;
+    int cell = i, at = c, count = 1;
+    bool back = false;
+    while (count < most && walk_on(size, starts, neighbors, i, c, &cell, &at, &back))
+        ++count;
+    if (count < MANY_AROUND)
+        return false;
+    cell = i;
+    at = c;
+    back = false;
+    for (int steps = 0; steps < count && walk_on(size, starts, neighbors, i, c, &cell, &at, &back); ++steps) {
+        const int before = neighbors[at > starts[cell] ? at - 1 : starts[cell + 1] - 1];
+        const REAL2 gap = corner_gap(v, i, cell, before, neighbors[at], points, lower, upper);
+        if (!(dot(gap, gap) <= MOST_SPREAD * MOST_SPREAD))
+            return true;
+    }
+    return false;
+}
+
+/* Per new cell, where some are doubtful: is its area positive, and do neighbors have their common faces where it has
+   them, if one of the two is doubtful? Where two cells see different neighbors, having left out different faces, what
+   they disagree about must be as little as rounding makes of the box, and no more than a share of the cell; else too
+   many were left out, which is flagged, as are faces that cross others: those are short beside their corners' distance
+   from the generators, which is what rounds. */
+kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
+                           global const int *starts, global const int *neighbors, global const REAL *volumes,
+                           global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
+                           global int *flags)
+{
+    WORK_ITEM(i);
+    if (places[i] < 0)
+        return;
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    global const int *row = neighbors + starts[i];
+    const int n = starts[i + 1] - starts[i];
+    const REAL least = fmin(512 * REAL_EPS, share * volumes[i]);
+    const REAL noise2 = flags[5] ? 16 * REAL_EPS * REAL_EPS : 0;
+    bool right = volumes[i] > 0;
+    const bool doubtful = slot_counts[places[i]] < 0;
+    bool any = doubtful;
+    for (int k = 0; k < n && !any; ++k)
+        any = row[k] >= 0 && row[k] < size && places[row[k]] >= 0 && slot_counts[places[row[k]]] < 0;
+    if (!any)
+        return;
+    REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
+    /* PoCL 6 with LLVM 18 dies of `right = right && ...` in this loop: conditions are written out. */
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k], before = row[k == 0 ? n - 1 : k - 1], after = row[k == n - 1 ? 0 : k + 1];
+        const REAL2 u = v;
+        v = corner(i, x, j, after, points, lower, upper);
+        if (j < 0) {
+            /* Opposite walls never meet: what was between them is lost. */
+            if (after < 0 && (-1 - j) / 2 == (-1 - after) / 2)
+                right = false;
+            continue;
+        }
+        if (j >= size)
+            continue;
+        /* Corner k. With all faces there is nothing to be put right. */
+        if (doubtful && !flags[5] && is_spread(size, starts, neighbors, i, starts[i] + k, u, x, points, lower, upper))
+            right = false;
+        const REAL2 e = v - u;
+        if (dot(e, e) < R(1e-4) * fmax(dot(u, u), dot(v, v)) && is_loop(size, starts, neighbors, i, starts[i] + k))
+            atomic_or(flags, FLAG_LOOPED);
+        global const int *other = neighbors + starts[j];
+        const int m = starts[j + 1] - starts[j];
+        const int q = place_in_row(other, m, i);
+        if (q == m) {
+            right = false;
+            continue;
+        }
+        const int p = other[q == 0 ? m - 1 : q - 1], s = other[q == m - 1 ? 0 : q + 1];
+        /* The area is no more than the gap times the distance of the farther corner. With all faces a gap that places
+           of corners have by rounding is none. */
+        const REAL reach2 = fmax(dot(u, u), dot(v, v));
+        if (p != after) {
+            const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
+            if (!(dot(gap, gap) <= fmax(least * least / reach2, noise2 * reach2)))
+                right = false;
+        }
+        if (s != before) {
+            const REAL2 gap = corner_gap(u, i, j, i, s, points, lower, upper);
+            if (!(dot(gap, gap) <= fmax(least * least / reach2, noise2 * reach2)))
+                right = false;
+        }
+    }
+    if (!right)
+        atomic_or(flags, FLAG_COLLAPSED);
+}
+
+/* Per generator i, all of whose rows are new: leave out of keep[its first slot ...] the faces that cross others. Where
+   two do, both go, and the four cells meet in a point. counts[i] is how many stay. */
+kernel void drop_loops(const int size, global const int *places, global const int *slot_counts,
+                       global const int *starts, global const int *neighbors, global uint *keep, global int *counts,
+                       global int *flags)
+{
+    WORK_ITEM(i);
+    const int place = places[i], listed = abs(slot_counts[place]);
+    int face = starts[i], count = 0;
+    for (int k = 0; k < listed; ++k) {
+        const uint bit = 1u << (k % 32);
+        if (!(keep[place + k / 32] & bit))
+            continue;
+        if (neighbors[face] >= 0 && is_loop(size, starts, neighbors, i, face))
+            keep[place + k / 32] &= ~bit;
+        else
+            ++count;
+        ++face;
+    }
+    counts[i] = count;
+    if (count < 3)
+        atomic_or(flags, FLAG_COLLAPSED);
+}

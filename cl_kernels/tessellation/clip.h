@@ -1,0 +1,369 @@
+/* The clip of a polyhedron by the half-space nearer to its generator than to a neighbor. A clip takes out the
+   triangles of the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new face. Only
+   that structure, never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
+#include "tessellation/clip_tolerance.h"
+#include "tessellation/polyhedron.h"
+
+#define CLIP_MISSED 0    /* the bisector does not cut the cell */
+#define CLIP_CUT 1       /* it does */
+#define CLIP_FULL 2      /* it does, and there are too many faces */
+#define CLIP_COLLAPSED 3 /* rounding leaves nothing, or much on the wrong side */
+#define CLIP_COINCIDE 4  /* another generator is at the place of the cell's own */
+
+/* Largest square of the distance of generators that are near each other, as a share of that to the cell's own. */
+#define NEAR_EACH_OTHER R(1e-3)
+/* Less than what any vertex is beyond, times the distance of two generators. */
+#define NOTHING (IS_DOUBLE ? R(1e-300) : R(1e-37))
+
+inline REAL4 cross_product(REAL4 a, REAL4 b)
+{
+    return (REAL4)(difference_of_products(a.s1, b.s2, a.s2, b.s1), difference_of_products(a.s2, b.s0, a.s0, b.s2),
+                   difference_of_products(a.s0, b.s1, a.s1, b.s0), 0);
+}
+
+/* The bisector with generator q instead of which that between p and q may be taken: where these two are near each other
+   beside their distance from the cell's own, the planes of both are nearly parallel, and their difference is not. */
+inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
+{
+    if (label_p < 0 || label_q < 0)
+        return q;
+    const REAL4 w =
+        (REAL4)(points[3 * label_q] - points[3 * label_p], points[3 * label_q + 1] - points[3 * label_p + 1],
+                points[3 * label_q + 2] - points[3 * label_p + 2], 0);
+    const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
+    if (w2 > 2 * NEAR_EACH_OTHER * p.s3) /* level is half a square */
+        return q;
+    return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + w2 / 2);
+}
+
+/* The point in which three planes meet, from the planes alone. */
+inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
+{
+    const REAL4 p = cell->planes[a];
+    const REAL4 q = better_row(cell->planes[b], p, cell->labels[b], cell->labels[a], points);
+    const REAL4 r0 = cell->planes[c];
+    REAL4 r = better_row(r0, p, cell->labels[c], cell->labels[a], points);
+    if (r.s3 == r0.s3 && r.s0 == r0.s0)
+        r = better_row(r0, cell->planes[b], cell->labels[c], cell->labels[b], points);
+    const REAL4 qr = cross_product(q, r), rp = cross_product(r, p), pq = cross_product(p, q);
+    const REAL inverse = 1 / (p.s0 * qr.s0 + p.s1 * qr.s1 + p.s2 * qr.s2);
+    return (qr * p.s3 + rp * q.s3 + pq * r.s3) * inverse;
+}
+
+/* Make what lies beyond one disc: grown from the farthest vertex by a triangle at a time, the farthest first, and where
+   that does not reach all that lies farther beyond than `doubt`, through the nearest that do not. The distances of
+   vertices that do not belong where rounding has put them are changed. False if something stays out of reach. */
+inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
+{
+    REAL *s = (REAL *)cell->beyond;
+    bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* of the disc: vertices, faces */
+    int added = 0, left = 0;                         /* left: vertices certainly beyond, and not in the disc yet */
+    for (int v = 0; v < cell->n; ++v) {
+        inside[v] = false;
+        added = s[v] > s[added] ? v : added;
+        left += s[v] > doubt;
+    }
+    for (int f = 0; f < FACE_CAPACITY; ++f)
+        on[f] = false;
+    while (added >= 0) {
+        const INDEX4 f = cell->faces[added];
+        inside[added] = on[f.s0] = on[f.s1] = on[f.s2] = true;
+        left -= s[added] > doubt;
+        const REAL least = left > 0 ? -64 * doubt : depth;
+        added = -1;
+        for (int v = 0; v < cell->n; ++v) {
+            if (inside[v] || !(s[v] > least) || (added >= 0 && !(s[v] > s[added])))
+                continue;
+            const INDEX4 g = cell->faces[v];
+            const bool ab = inside[cell->at[g.s1 * FACE_CAPACITY + g.s0]];
+            const bool bc = inside[cell->at[g.s2 * FACE_CAPACITY + g.s1]];
+            const bool ca = inside[cell->at[g.s0 * FACE_CAPACITY + g.s2]];
+            const int shared = ab + bc + ca;
+            if (shared == 2 || (shared == 1 && !on[ab ? g.s2 : (bc ? g.s0 : g.s1)]))
+                added = v;
+        }
+    }
+    for (int v = 0; v < cell->n; ++v) {
+        if (inside[v] && !(s[v] > depth))
+            s[v] = 2 * depth;
+        if (!inside[v] && s[v] > depth)
+            s[v] = 0;
+    }
+    return left == 0;
+}
+
+/* The edges over which a bisector leaves the cell. */
+typedef struct {
+    int gone;                                                  /* vertices beyond the bisector */
+    int n;                                                     /* edges */
+    ulong dead[FACE_WORDS];                                    /* faces all of which is beyond */
+    INDEX vertices[VERTEX_CAPACITY + 1];                       /* those beyond, ascending */
+    INDEX before[FACE_CAPACITY + 4], after[FACE_CAPACITY + 4]; /* faces of an edge, along the rim */
+    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];       /* its ends, kept and not */
+} rim_t;
+
+/* Find the rim; false if it is not one simple cycle. */
+inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
+{
+    const REAL *s = (const REAL *)cell->beyond;
+    int gone = 0, n = 0;
+    SHORT_LOOP
+    for (int v = 0; v < cell->n; ++v) {
+        rim->vertices[gone] = v;
+        gone += s[v] > depth;
+    }
+    rim->gone = gone;
+    ulong touched[FACE_WORDS], around[FACE_WORDS];
+    for (int w = 0; w < FACE_WORDS; ++w)
+        touched[w] = around[w] = 0;
+    SHORT_LOOP
+    for (int k = 0; k < gone; ++k) {
+        const int v = rim->vertices[k];
+        const INDEX4 f = cell->faces[v];
+        const int a = f.s0, b = f.s1, c = f.s2;
+        add_face(touched, a);
+        add_face(touched, b);
+        add_face(touched, c);
+        const int ab = cell->at[b * FACE_CAPACITY + a];
+        rim->before[n] = a;
+        rim->after[n] = b;
+        rim->in[n] = ab;
+        rim->out[n] = v;
+        n += !(s[ab] > depth);
+        const int bc = cell->at[c * FACE_CAPACITY + b];
+        rim->before[n] = b;
+        rim->after[n] = c;
+        rim->in[n] = bc;
+        rim->out[n] = v;
+        n += !(s[bc] > depth);
+        const int ca = cell->at[a * FACE_CAPACITY + c];
+        rim->before[n] = c;
+        rim->after[n] = a;
+        rim->in[n] = ca;
+        rim->out[n] = v;
+        n += !(s[ca] > depth);
+        if (n > FACE_CAPACITY)
+            return false;
+    }
+    rim->n = n;
+    SHORT_LOOP
+    for (int k = 0; k < n; ++k)
+        add_face(around, rim->before[k]);
+    int faces = 0, dead = 0;
+    for (int w = 0; w < FACE_WORDS; ++w) {
+        rim->dead[w] = touched[w] & ~around[w];
+        faces += (int)popcount(around[w]);
+        dead += (int)popcount(rim->dead[w]);
+    }
+    /* Simple cycles, and Euler's formula for a disc: enough up to six triangles. More may be a ring and a disc. */
+    if (faces != n || n != gone + 2 - 2 * dead)
+        return false;
+    if (gone > 6) {
+        INDEX next[FACE_CAPACITY];
+        SHORT_LOOP
+        for (int k = 0; k < n; ++k)
+            next[rim->before[k]] = rim->after[k];
+        int face = next[rim->before[0]], steps = 1;
+        while (face != rim->before[0]) {
+            face = next[face];
+            ++steps;
+        }
+        return steps == n;
+    }
+    return true;
+}
+
+/* Take out the faces that lie within the rim, and put one in their place; FACE_CAPACITY if there is no room. */
+inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
+{
+    for (int w = 0; w < FACE_WORDS; ++w)
+        cell->alive[w] &= ~rim->dead[w];
+    const int face = first_spare(cell->alive);
+    if (face < FACE_CAPACITY) {
+        add_face(cell->alive, face);
+        cell->labels[face] = label;
+    }
+    return face;
+}
+
+/* New vertices, where the plane meets the edges of the rim, by interpolation. */
+inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, REAL *nz)
+{
+    const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
+    SHORT_LOOP
+    for (int k = 0; k < rim->n; ++k) {
+        const int in = rim->in[k], out = rim->out[k];
+        const REAL s_in = s[in] < 0 ? s[in] : 0;
+        const REAL t = s_in / (s_in - s[out]);
+        nx[k] = x[in] + t * (x[out] - x[in]);
+        ny[k] = y[in] + t * (y[out] - y[in]);
+        nz[k] = z[in] + t * (z[out] - z[in]);
+    }
+}
+
+/* Join the rim to the new face by the new vertices. They take the places of those that are gone, then go behind the
+   last; places left over are filled from the end. */
+inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, const REAL *ny, const REAL *nz)
+{
+    REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
+    SHORT_LOOP
+    for (int k = 0; k < rim->n; ++k) {
+        const int v = k < rim->gone ? rim->vertices[k] : cell->n++;
+        x[v] = nx[k];
+        y[v] = ny[k];
+        z[v] = nz[k];
+        cell->faces[v] = (INDEX4)(rim->before[k], rim->after[k], face, 0);
+        link_vertex(cell, v);
+    }
+    SHORT_LOOP
+    for (int k = rim->gone - 1; k >= rim->n; --k) {
+        const int v = rim->vertices[k], last = --cell->n;
+        if (v != last) {
+            x[v] = x[last];
+            y[v] = y[last];
+            z[v] = z[last];
+            cell->faces[v] = cell->faces[last];
+            link_vertex(cell, v);
+        }
+        x[last] = y[last] = z[last] = 0;
+    }
+}
+
+/* How far vertex v is beyond the bisector between the generator at p, on whose bisector it lies, and that at p + w. */
+inline REAL beyond_from(const cell_t *cell, int v, REAL4 p, REAL4 w)
+{
+    return w.s0 * (X(cell)[v] - (p.s0 + w.s0 / 2)) + w.s1 * (Y(cell)[v] - (p.s1 + w.s1 / 2)) +
+           w.s2 * (Z(cell)[v] - (p.s2 + w.s2 / 2));
+}
+
+/* Where the generator at x + d is near that of a face of the cell, beside the way to both, the planes of the two differ
+   by less than the vertices of that face round: what decides there is the bisector between them, to their distance's
+   digits. Vertices beyond by no more than `depth`, or than they round, are then put on the bisector; false if there is
+   no such face. */
+inline bool look_from_near(cell_t *cell, REAL4 d, int label, REAL depth, global const REAL *points)
+{
+    REAL *s = (REAL *)cell->beyond;
+    bool found = false;
+    for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1)) {
+        const REAL4 p = cell->planes[f], between = d - p;
+        if (between.s0 * between.s0 + between.s1 * between.s1 + between.s2 * between.s2 >
+            2 * NEAR_EACH_OTHER * p.s3) /* level is half a square */
+            continue;
+        const int other = cell->labels[f];
+        if (other < 0 || other == label)
+            continue;
+        const REAL4 w = (REAL4)(points[3 * label] - points[3 * other], points[3 * label + 1] - points[3 * other + 1],
+                                points[3 * label + 2] - points[3 * other + 2], 0);
+        const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
+        for (int v = 0; v < cell->n && !found; ++v)
+            s[v] = s[v] > depth ? s[v] : fmin(s[v], R(0));
+        found = true;
+        const REAL rounding = 4 * REAL_EPS * sqrt(cell->reach2 * w2);
+        for (int v = 0; v < cell->n; ++v) {
+            const INDEX4 g = cell->faces[v];
+            if (g.s0 != f && g.s1 != f && g.s2 != f)
+                continue;
+            const REAL beyond = beyond_from(cell, v, p, w);
+            s[v] = beyond > rounding ? beyond : fmin(beyond, R(0));
+        }
+    }
+    return found;
+}
+
+inline bool any_beyond(const cell_t *cell, REAL depth)
+{
+    bool any = false;
+    for (int v = 0; v < cell->n; ++v)
+        any |= ((const REAL *)cell->beyond)[v] > depth;
+    return any;
+}
+
+/* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbors that are seen are known to have a face. */
+#ifndef CLIP_SHARPLY
+#define CLIP_SHARPLY 0
+#endif
+
+/* Cut off what is nearer to the neighbor at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before`
+   the neighbor may be a face of the cell already. */
+inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
+{
+    const REAL level = d2 / 2;
+    const int blocks = (cell->n + 7) / 8;
+    REAL8 far = -level;
+    for (int b = 0; b < blocks; ++b) {
+        const REAL8 s = fma(cell->x[b], d.s0, fma(cell->y[b], d.s1, fma(cell->z[b], d.s2, -level)));
+        cell->beyond[b] = s;
+        far = s > far ? s : far;
+    }
+    const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
+    const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
+    const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
+    /* As far as it rounds, where that matters. */
+    if (!(farthest > (cell->from_near ? -8 * REAL_EPS * (d2 + cell->reach2) : CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
+        return CLIP_MISSED;
+    const REAL distance = sqrt(d2), least = CLIP_SHARPLY ? 0 : distance * noise_length(distance);
+    const bool from_near = cell->from_near && look_from_near(cell, d, label, least, points);
+    const REAL depth = from_near ? NOTHING : least;
+    if (from_near ? !any_beyond(cell, depth) : !(farthest > depth))
+        return CLIP_MISSED;
+    if (seen_before)
+        for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1))
+            if (cell->labels[f] == label)
+                return CLIP_MISSED;
+
+    rim_t rim;
+    if (!find_rim(cell, depth, &rim)) {
+        if (rim.gone == cell->n)
+            return CLIP_COLLAPSED;
+        const REAL doubt = 64 * distance * (noise_length(distance) + REAL_EPS * sqrt(cell->reach2));
+        if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
+            return CLIP_COLLAPSED;
+    }
+    const int face = replace_faces(cell, &rim, label);
+    if (face == FACE_CAPACITY)
+        return CLIP_FULL;
+    cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
+
+    /* Interpolation rounds by eps of the edge's length; where that may be much beside the distance of the generators
+       (while the cell is not closed yet, or near-duplicates), planes are intersected instead. */
+    REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
+    cut_edges(cell, &rim, nx, ny, nz);
+    if (cell->reach2 > 16 * d2) {
+        const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
+        const REAL reach = distance * sqrt(cell->reach2);
+        for (int k = 0; k < rim.n; ++k) {
+            const int in = rim.in[k], out = rim.out[k];
+            const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
+            /* But for planes that are nearly parallel to the edge: there only interpolation stays on it. */
+            const REAL slack = 1 + reach / (s[out] - s[in]);
+            const REAL off = fabs(v.s0 - nx[k]) + fabs(v.s1 - ny[k]) + fabs(v.s2 - nz[k]);
+            const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
+            if (slack < 1024 && off < 1024 * REAL_EPS * (edge + sqrt(cell->reach2)) * slack) {
+                nx[k] = v.s0;
+                ny[k] = v.s1;
+                nz[k] = v.s2;
+            }
+        }
+    }
+    close_rim(cell, &rim, face, nx, ny, nz);
+    find_reach(cell);
+    return CLIP_CUT;
+}
+
+/* Clip by the generators in row i of a graph; one of CLIP_*, or CLIP_COINCIDE. */
+inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
+                       global const REAL *points)
+{
+    const int end = starts[i + 1];
+    for (int k = starts[i]; k < end; ++k) {
+        const int j = neighbors[k];
+        if (j < 0)
+            continue;
+        const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
+        const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
+        const int what = d2 == 0 ? CLIP_COINCIDE : clip_cell(cell, d, d2, j, false, points);
+        if (what >= CLIP_FULL)
+            return what;
+    }
+    return CLIP_CUT;
+}

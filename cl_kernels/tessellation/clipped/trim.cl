@@ -1,0 +1,393 @@
+#include "tessellation/moments.h"
+#include "tessellation/roundness.h"
+#include "tessellation/clipped/segments.h"
+#include "tessellation/clipped/wall_sides.h"
+#include "tessellation/clipped/trimmed.h"
+
+/* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a
+   cell, what lies in the domain is cut out: its pieces, each an outer loop and the islands in it. The piece with the
+   generator is the cell; the others, which a spit or a slit cuts off from it, go to the cell beside them with which
+   they share the longest face, and stay where they are only if there is none. */
+
+#define FLAG_ORPHANS 4 /* a cell is in several pieces */
+
+/* By which a corner may lie outside of the domain, as `check` allows. */
+#define MOST_OUTSIDE (256 * REAL_EPS)
+
+/* Does a segment on a face, from a corner of the cell to a chord's end or from there to a corner, leave the domain by
+   that chord's edge? Edges miss the tips of needles that are narrower than rounding. */
+inline bool leads_out(const segment_t *s, const chords_t *c)
+{
+    if ((s->from < 0) == (s->to < 0))
+        return false;
+    const int edge = c->edges[max(s->from, s->to)];
+    const REAL2 e = c->vertices[c->next_vertex[edge]] - c->vertices[edge];
+    const REAL2 inwards = s->from < 0 ? s->p - s->q : s->q - s->p;
+    return difference_of_products(e.s0, inwards.s1, e.s1, inwards.s0) < -MOST_OUTSIDE * sqrt(dot(e, e));
+}
+
+/* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
+
+   loop_chords   a chord with which each loop begins; -1: around the whole cell
+   loop_pieces   place of the outer loop that the loop belongs to, itself if it is one; -1: no loop
+   loop_roots    of outer loops: the generator that the piece goes to, -1 if that is not known yet
+   counts        segments of all loops of the cell */
+kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chord_loops, global int *loop_chords,
+                       global int *loop_pieces, global int *loop_roots, global int *counts, global int *flags)
+{
+    WORK_ITEM(u);
+    const chords_t c = CHORDS;
+    const convex_t cell = convex_cell(u, CONVEX);
+    const int first = list_starts[u] + u;
+    int loops = 0, outer = 0, main = -1, total = 0;
+    bool crossed = false, rim = false, main_winds = false, astray = false;
+    REAL nearest = REAL_MAX;
+    for (int k = 0; k < cell.chord_count; ++k)
+        chord_loops[cell.chords[k]] = -1;
+    /* First the loops with chords that come in over a face: they begin with one. */
+    for (int turn = 0; turn < 2 * cell.chord_count; ++turn) {
+        const int begin = cell.chords[turn % cell.chord_count];
+        if (chord_loops[begin] >= 0 || (turn < cell.chord_count && begins_inside(&c, begin)))
+            continue;
+        cursor_t cursor = loop_begin(begin);
+        REAL near = REAL_MAX;
+        int around = 0, count = 0;
+        bool open = false, lost = false;
+        /* A loop that takes more segments than there are has lost its way. */
+        const int most = 2 * (cell.chord_count + 1) * (cell.n + 2);
+        do {
+            const bool on_chord = cursor.chord >= 0;
+            if (on_chord)
+                chord_loops[cursor.chord] = loops;
+            const segment_t s = next_segment(&cursor, &cell, &c);
+            around += winding(s, 0);
+            near = fmin(near, squared_distance_to(s, 0));
+            open |= !on_chord;
+            astray |= !on_chord && leads_out(&s, &c);
+            lost |= !on_chord && s.label < 0; /* at a wall of the box, which is far outside */
+        } while (!is_complete(&cursor, begin) && ++count < most);
+        if (lost || count == most) {
+            /* What follows would not find to an end either. */
+            atomic_or(flags, FLAG_LOST);
+            for (int place = first; place < list_starts[u + 1] + u + 1; ++place)
+                loop_pieces[place] = -1;
+            counts[u] = 0;
+            return;
+        }
+        const int shell = c.shells[c.edges[begin]];
+        const bool is_outer = open || shell < 0;
+        /* A hole within the cell whose piece goes on beyond it: the cell's faces lie in the domain, if no chord leaves
+           it. */
+        rim |= !is_outer && c.cells[c.firsts[shell]] != cell.i;
+        const int place = first + loops;
+        loop_chords[place] = begin;
+        loop_pieces[place] = is_outer ? place : -1;
+        loop_roots[place] = -1;
+        crossed |= open;
+        total += count + 1;
+        /* The generator's own piece winds around it, closest of all that do; or the generator lies on its boundary. */
+        const bool winds = around > 0 || near <= ON_BOUNDARY * ON_BOUNDARY;
+        if (is_outer && (main < 0 || winds > main_winds || (winds == main_winds && near < nearest))) {
+            main = place;
+            main_winds = winds;
+            nearest = near;
+        }
+        outer += is_outer;
+        ++loops;
+    }
+    if (astray)
+        atomic_or(flags, FLAG_LOST);
+    if (!crossed && rim) {
+        const int place = first + loops++;
+        loop_chords[place] = -1;
+        loop_pieces[place] = place;
+        loop_roots[place] = -1;
+        ++outer;
+        total += cell.n;
+        /* Unless the generator is on an island in a hole. */
+        if (!main_winds)
+            main = place;
+    }
+    if (main < 0) {
+        atomic_or(flags, FLAG_LOST);
+        main = first;
+    }
+    for (int place = first; place < first + loops; ++place)
+        if (loop_pieces[place] < 0) {
+            /* A hole lies in the outer ring of its piece. Where that leaves the cell, one of the pieces that it leaves
+               by has it. */
+            const int shell = c.firsts[c.shells[c.edges[loop_chords[place]]]];
+            const int ring = c.cells[shell] == cell.i ? first + chord_loops[shell] : -1;
+            loop_pieces[place] = main;
+            if (ring >= 0 && !is_open(&cell, &c, loop_chords[ring])) {
+                loop_pieces[place] = ring;
+                continue;
+            }
+            for (int other = first; outer > 1 && other < first + loops; ++other)
+                if (loop_pieces[other] == other && is_open(&cell, &c, loop_chords[other]) &&
+                    lies_within(&cell, &c, loop_chords[other], loop_chords[place]))
+                    loop_pieces[place] = other;
+        }
+    loop_roots[main] = cell.i;
+    for (int place = first + loops; place < list_starts[u + 1] + u + 1; ++place)
+        loop_pieces[place] = -1;
+    counts[u] = total;
+    if (outer > 1)
+        atomic_or(flags, FLAG_ORPHANS);
+}
+
+/* Per touched cell u: its segments, behind segment_starts[u]; `places` tells the loop's piece. */
+kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const int *loop_chords,
+                           global const int *loop_pieces, global const int *segment_starts, global int *labels,
+                           global int *from, global int *to, global int *places, global REAL2 *p, global REAL2 *q)
+{
+    WORK_ITEM(u);
+    const chords_t c = CHORDS;
+    const convex_t cell = convex_cell(u, CONVEX);
+    const int first = list_starts[u] + u, end = list_starts[u + 1] + u + 1;
+    int at = segment_starts[u];
+    for (int piece = first; piece < end; ++piece) {
+        if (loop_pieces[piece] != piece)
+            continue;
+        /* The outer loop, then the islands. */
+        for (int turn = 0; turn < 2; ++turn)
+            for (int place = turn ? first : piece; place < (turn ? end : piece + 1); ++place) {
+                if (loop_pieces[place] != piece || (turn && place == piece))
+                    continue;
+                const int begin = loop_chords[place];
+                cursor_t cursor = loop_begin(begin);
+                do {
+                    const segment_t s = next_segment(&cursor, &cell, &c);
+                    labels[at] = s.label;
+                    /* Empty ones end where they begin; on the boundary -1. */
+                    from[at] = !s.empty ? s.from : (s.label < 0 ? -1 : s.to);
+                    to[at] = turn ? ISLAND : s.to;
+                    places[at] = piece;
+                    p[at] = s.p;
+                    q[at] = s.q;
+                    ++at;
+                } while (!is_complete(&cursor, begin) && at < segment_starts[u + 1]);
+            }
+    }
+}
+
+/* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a
+   generator outside the domain, and so the cells tile the domain. Where edges cross a face closer to each other than
+   rounding, they do not. And is anything left for the generator, beside those that are as near to the boundary as it
+   is? `n` generators are in the domain. */
+kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global const int *touched,
+                           global const int *slots, global const int *roots, global const int *starts,
+                           global const int *neighbors, global int *flags)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    bool fits = true;
+    REAL area = 0;
+    for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
+        const int j = s.labels[k];
+        if (roots[s.places[k]] == i)
+            area += difference_of_products(s.p[k].s0, s.q[k].s1, s.p[k].s1, s.q[k].s0);
+        if (j < 0 || is_empty(&s, k))
+            continue;
+        if (j >= n)
+            fits = false;
+        else if (slots[j] == UNTOUCHED)
+            fits &= s.from[k] < 0 && s.to[k] < 0;
+        else
+            fits &= other_side(&s, k, i, slots[j]) >= 0;
+    }
+    for (int f = starts[i]; f < starts[i + 1]; ++f) {
+        const int j = neighbors[f];
+        if (j < 0 || j >= n || slots[j] != UNTOUCHED)
+            continue;
+        bool found = false;
+        for (int k = s.starts[u]; k < s.starts[u + 1] && !found; ++k)
+            found = s.labels[k] == j;
+        fits &= found;
+    }
+    if (!fits || !(area > 0))
+        atomic_or(flags, FLAG_LOST);
+}
+
+/* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is
+   known. Only cells that the boundary passes through take pieces. */
+kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                         global const int *list_starts, global const int *loop_pieces, global const int *roots,
+                         global int *new_roots)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    for (int piece = list_starts[u] + u; piece < list_starts[u + 1] + u + 1; ++piece) {
+        if (loop_pieces[piece] != piece)
+            continue;
+        int root = roots[piece];
+        REAL longest = -1;
+        if (root < 0)
+            for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
+                if (s.places[k] != piece || s.labels[k] < 0 || is_empty(&s, k))
+                    continue;
+                const int other = other_root(&s, k, i, slots, roots);
+                const REAL2 e = s.q[k] - s.p[k];
+                if (other >= 0 && slots[other] != UNTOUCHED && dot(e, e) > longest) {
+                    longest = dot(e, e);
+                    root = other;
+                }
+            }
+        new_roots[piece] = root;
+    }
+}
+
+/* Per touched cell: a piece that nobody takes stays its own. orphans[place] = 1 for pieces that go to another cell,
+   whose untouched neighbors are to name that one: marked. */
+kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                          global const int *list_starts, global const int *loop_pieces, global int *roots,
+                          global int *orphans, global int *marks)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const int i = touched[u];
+    for (int piece = list_starts[u] + u; piece < list_starts[u + 1] + u + 1; ++piece) {
+        orphans[piece] = 0;
+        if (loop_pieces[piece] != piece)
+            continue;
+        if (roots[piece] < 0)
+            roots[piece] = i;
+        if (roots[piece] == i)
+            continue;
+        orphans[piece] = 1;
+        for (int k = s.starts[u]; k < s.starts[u + 1]; ++k)
+            if (s.places[k] == piece && s.labels[k] >= 0 && slots[s.labels[k]] == UNTOUCHED)
+                atomic_or(marks + s.labels[k], 1);
+    }
+}
+
+/* Per place of a loop: list the orphans, and the touched cell that each lies in. */
+kernel void list_orphans(const int size, global const int *ranks, global int *orphans)
+{
+    WORK_ITEM(place);
+    if (ranks[place + 1] > ranks[place])
+        orphans[ranks[place]] = place;
+}
+
+/* Per generator of the domain: faces of its cell, if the boundary does not pass through it. */
+kernel void count_whole(const int size, global const int *starts, global const int *slots, global int *counts)
+{
+    WORK_ITEM(i);
+    counts[i] = slots[i] == UNTOUCHED ? starts[i + 1] - starts[i] : 0;
+}
+
+/* Per touched cell: count the faces of each piece to the generator that the piece goes to. */
+kernel void count_trimmed(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
+                          global const int *roots, global int *counts)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    int other;
+    for (int k = s.starts[u]; k < s.starts[u + 1]; ++k) {
+        const int root = roots[s.places[k]];
+        if (is_face(&s, k, touched[u], root, slots, roots, &other))
+            atomic_inc(counts + root);
+    }
+}
+
+/* Per generator of the domain whose cell the boundary does not pass through: its row as it was. Where a neighbor's
+   piece goes to another cell (marks), that one is named. */
+kernel void copy_whole(const int size, global const int *starts, global const int *neighbors,
+                       global const REAL *face_measures, global const REAL2 *face_centroids, SEGMENT_ARGS,
+                       global const int *slots, global const int *roots, global const int *marks,
+                       global const int *new_starts, global int *new_neighbors, global REAL *new_measures,
+                       global REAL2 *new_centroids, global const REAL *volumes, global REAL2 *outlines)
+{
+    WORK_ITEM(i);
+    if (slots[i] != UNTOUCHED)
+        return;
+    const segments_t s = SEGMENTS;
+    const int shift = new_starts[i] - starts[i];
+    const bool marked = marks[i];
+    REAL perimeter = 0;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        int j = neighbors[k];
+        if (marked && j >= 0 && slots[j] != UNTOUCHED) {
+            const int u = slots[j];
+            for (int m = s.starts[u]; m < s.starts[u + 1]; ++m)
+                if (s.labels[m] == i && s.from[m] < 0 && s.to[m] < 0)
+                    j = roots[s.places[m]];
+        }
+        new_neighbors[k + shift] = j;
+        new_measures[k + shift] = face_measures[k];
+        new_centroids[k + shift] = face_centroids[k];
+        perimeter += face_measures[k];
+    }
+    outlines[i] = (REAL2)(polygon_quality(starts[i + 1] - starts[i], volumes[i], perimeter), 6);
+}
+
+/* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that
+   have changed cells, in order; place_cells[place] is the touched cell that they lie in.
+
+   outlines[i] = (quality, neighbors that a hexagonal lattice would have here) */
+kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const REAL2 *points,
+                          global const int *touched, global const int *slots, global const int *roots,
+                          global const int *orphans, const int orphan_count, global const int *place_cells,
+                          global const int *new_starts, global int *new_neighbors, global REAL *new_measures,
+                          global REAL2 *new_centroids, global int *face_segments, global REAL *volumes,
+                          global REAL *offsets, global REAL *covariances, global REAL2 *outlines)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    const shore_t shore = SHORE;
+    const int i = touched[u];
+    moments_t m = {0, 0, 0, 0, 0, 0};
+    outline_t o = no_outline();
+    REAL perimeter = 0;
+    int at = new_starts[i];
+    for (int turn = -1; turn < orphan_count; ++turn) {
+        /* First the pieces in this cell, then those that have come to it. */
+        const int place = turn < 0 ? -1 : orphans[turn];
+        if (turn >= 0 && roots[place] != i)
+            continue;
+        const int v = turn < 0 ? u : place_cells[place];
+        const int home = touched[v];
+        const REAL2 shift = points[home] - points[i];
+        for (int k = s.starts[v]; k < s.starts[v + 1]; ++k) {
+            if (turn < 0 ? roots[s.places[k]] != i : s.places[k] != place)
+                continue;
+            const REAL2 p = s.p[k] + shift, q = s.q[k] + shift, e = q - p;
+            add_triangle(&m, p, q);
+            int other;
+            if (!is_face(&s, k, home, i, slots, roots, &other))
+                continue;
+            if (other >= 0)
+                add_face(&o, p, q);
+            else if (begins_run(&shore, s.from[k], i))
+                add_run(&o, &shore, s.from[k], i, points[i]);
+            perimeter += sqrt(dot(e, e));
+            new_neighbors[at] = other;
+            new_measures[at] = sqrt(dot(e, e));
+            new_centroids[at] = (p + q) / 2;
+            face_segments[at] = k;
+            ++at;
+        }
+    }
+    write_moments(&m, i, volumes, offsets, covariances);
+    /* Two sides, of which one is bent, are no polygon. */
+    const REAL quality =
+        o.sides < 3 ? polygon_quality(3, m.area / 2, perimeter) : polygon_quality(o.sides, o.area / 2, o.perimeter);
+    outlines[i] = (REAL2)(fmax(quality, R(0)), 6 - o.missing);
+}
+
+/* Per touched cell: the places of its loops are its own, its chords those of the pieces that they bound. */
+kernel void name_owners(const int size, SEGMENT_ARGS, global const int *list_starts, global const int *listed,
+                        global const int *roots, global int *place_cells, global int *chord_owners)
+{
+    WORK_ITEM(u);
+    const segments_t s = SEGMENTS;
+    for (int place = list_starts[u] + u; place < list_starts[u + 1] + u + 1; ++place)
+        place_cells[place] = u;
+    for (int k = list_starts[u]; k < list_starts[u + 1]; ++k)
+        chord_owners[listed[k]] = -1;
+    for (int k = s.starts[u]; k < s.starts[u + 1]; ++k)
+        if (s.labels[k] < 0 && !is_empty(&s, k))
+            chord_owners[s.from[k]] = roots[s.places[k]];
+}

@@ -1,0 +1,87 @@
+#include "opencl/real.h"
+
+/* The difference along axis a from one generator to another. -DFOLD_0, -DFOLD_1: periods of a graph that is folded (see
+   seam.cl), in which a neighbor is the nearest image of its generator; 0 along an axis with walls. */
+#ifdef FOLD_0
+#define FOLD(a) ((a) == 0 ? R(FOLD_0) : R(FOLD_1))
+inline REAL fold_period(REAL d, REAL period)
+{
+    /* Faster than rint, which PoCL calls. */
+    return d > period / 2 ? d - period : (d < -period / 2 ? d + period : d);
+}
+#define BETWEEN(a, from, to) (FOLD(a) > 0 ? fold_period((to) - (from), FOLD(a)) : (to) - (from))
+/* From one neighbor to another, which may lie more than half a period from each other: by the directions to them,
+   whose differences are exact along a period (see geometry/domain.h). */
+#define APART(a, to_one, to_other, one, other) (FOLD(a) > 0 ? (to_other) - (to_one) : (other) - (one))
+#else
+#define FOLD(a) 0
+#define BETWEEN(a, from, to) ((to) - (from))
+#define APART(a, to_one, to_other, one, other) ((other) - (one))
+#endif
+
+/* From a place x to generator j. */
+inline REAL2 direction_of(const REAL *x, int j, global const REAL *points)
+{
+    return (REAL2)(BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1]));
+}
+
+/* The point as far from u and from v as from 0; u2 and v2 are their squares. */
+inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
+{
+    const REAL inverse = R(0.5) / difference_of_products(u.s0, v.s1, u.s1, v.s0);
+    return (REAL2)(difference_of_products(u2, v.s1, v2, u.s1) * inverse,
+                   difference_of_products(v2, u.s0, u2, v.s0) * inverse);
+}
+
+/* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators themselves: the
+   cells that share the corner agree on it to a rounding. */
+inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    if (a >= 0 && b >= 0) {
+        const REAL2 u = direction_of(x, a, points), v = direction_of(x, b, points);
+        const REAL2 w = (REAL2)(APART(0, u.s0, v.s0, points[2 * a], points[2 * b]),
+                                APART(1, u.s1, v.s1, points[2 * a + 1], points[2 * b + 1]));
+        const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
+        /* The circumcenter of the triangle, relative to x_i; where the other two are near each other its squares would
+           cancel, and it is taken relative to one of those. */
+        if (w2 > R(1e-3) * u2)
+            return circumcenter(u, v, u2, v2);
+        return circumcenter(w, -u, w2, u2) + u;
+    }
+    if (a < 0 && b < 0) {
+        /* Two walls: a corner of the box, one wall across each axis. */
+        const int wa = -1 - a, wb = -1 - b;
+        const int wx = wa < 2 ? wa : wb, wy = wa < 2 ? wb : wa;
+        return (REAL2)((wx % 2 ? upper[0] : lower[0]) - x[0], (wy % 2 ? upper[1] : lower[1]) - x[1]);
+    }
+    /* The bisector of o and q meets a wall. */
+    const int j = max(a, b), wall = -1 - min(a, b);
+    const int axis = wall / 2;
+    const int o = min(i, j), q = max(i, j);
+    const REAL level = wall % 2 ? upper[axis] : lower[axis];
+    const REAL d_across = points[2 * q + axis] - points[2 * o + axis];
+    const REAL d_along = BETWEEN(1 - axis, points[2 * o + 1 - axis], points[2 * q + 1 - axis]);
+    const REAL across = level - points[2 * o + axis];
+    const REAL d2 = d_across * d_across + d_along * d_along;
+    const REAL along = difference_of_products(R(0.5), d2, d_across, across) / d_along +
+                       BETWEEN(1 - axis, x[1 - axis], points[2 * o + 1 - axis]);
+    return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
+}
+
+/* From what cell j takes for a corner, between its faces p and q, to that corner of cell i, relative to x_i. */
+inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
+                        const REAL *upper)
+{
+    const REAL x[2] = {points[2 * j], points[2 * j + 1]};
+    const REAL2 from = direction_of(x, i, points);
+    return mine + from - corner(j, x, p, q, points, lower, upper);
+}
+
+/* Where j stands in a row of n; n if it does not. */
+inline int place_in_row(global const int *row, int n, int j)
+{
+    int q = 0;
+    while (q < n && row[q] != j)
+        ++q;
+    return q;
+}

@@ -1,0 +1,308 @@
+#include "tessellation/corner.h"
+#include "tessellation/face_rows.h"
+
+/* The diagram of generators that have moved a little, from the one before, without a search.
+
+   The intersection C_i of the box and the half-planes of *any* generators holds the cell V_i of them all. If around
+   every corner of C_i the cells that meet there name each other as neighbors, in the order of that corner, the C_i fit
+   together without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbors from
+   before, check that every cell is still convex and fits its neighbors (`check_rows`), clip those that do not by all
+   the neighbors of their neighbors (`clip_marked`), check these (`check_clipped`), and so on until all fit.
+
+   In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbors are nearest images. Cells without gap might
+   cover that more than once; their volumes tell. */
+
+/* A cell with more is clipped anew each time: it is rare, and would hold up its work-group. */
+#define CHECKED_FACES 16
+
+/* Is a gap between corners, given by its square, no more than their rounding? d2 is the squared distance of the
+   generators across the face. In single precision a spacing may be a thousand roundings of a position, and a corner is
+   worse. */
+inline bool is_rounding(REAL gap2, REAL d2)
+{
+    return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
+}
+
+/* Does i stand between `before` and `after` in a row of n? */
+inline bool stands_between(int i, int before, int after, global const int *row, int n)
+{
+    const int q = place_in_row(row, n, i);
+    return q < n && row[q == 0 ? n - 1 : q - 1] == before && row[q == n - 1 ? 0 : q + 1] == after;
+}
+
+/* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
+   `after`, at corners u and v; so in j's row i must stand between `after` and `before`, or what it stands between must
+   meet it there but for rounding. */
+inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
+                          global const REAL *points, const REAL *lower, const REAL *upper)
+{
+    const int q = place_in_row(row, n, i);
+    if (q == n) {
+        /* A face of no length, which i is then doubtful of, will be dropped. */
+        const REAL2 e = v - u;
+        return is_rounding(dot(e, e), d2);
+    }
+    const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
+    /* Where four or more cells meet in a point, cells may leave out different faces of no length. */
+    bool fits = true;
+    if (p != after) {
+        const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
+        fits = is_rounding(dot(gap, gap), d2);
+    }
+    if (fits && s != before) {
+        const REAL2 gap = corner_gap(u, i, j, i, s, points, lower, upper);
+        fits = is_rounding(dot(gap, gap), d2);
+    }
+    return fits;
+}
+
+/* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from
+   the directions, which are at hand, where both are generators. */
+inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
+                       const REAL *lower, const REAL *upper)
+{
+    if (a < 0 || b < 0)
+        return corner(i, x, a, b, points, lower, upper);
+    const REAL2 w = v - u;
+    const REAL u2 = dot(u, u), w2 = dot(w, w);
+    return w2 > R(1e-3) * u2 ? circumcenter(u, v, u2, dot(v, v)) : corner(i, x, a, b, points, lower, upper);
+}
+
+/* Check the row of generator i; see `check_rows`. Is it not as it should be? */
+inline bool check_row(int i, global const int *starts, global const int *neighbors, global const REAL *points,
+                      const REAL *lower, const REAL *upper, global int *fits, global int *marks)
+{
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const int start = starts[i], n = starts[i + 1] - start;
+    global const int *row = neighbors + start;
+    if (n > CHECKED_FACES) {
+        atomic_or(marks + i, 1);
+        return true;
+    }
+    /* Face k, its direction, and the corners u before it and v behind it; face `before` lies before it. */
+    int before = row[n - 1], face = row[0];
+    REAL2 d = face_direction(face, x, points);
+    REAL2 u = corner_of(i, x, before, face, face_direction(before, x, points), d, points, lower, upper);
+    REAL reach2 = 0, least2 = REAL_MAX;
+    int turns = 0;
+    bool bad = false, fit = true;
+    const bool known = fits[i];
+    for (int k = 0; k < n; ++k) {
+        const int after = row[k == n - 1 ? 0 : k + 1];
+        const REAL2 d_after = face_direction(after, x, points);
+        const REAL2 v = corner_of(i, x, face, after, d, d_after, points, lower, upper);
+        const REAL2 e = v - u;
+        const REAL r2 = dot(v, v);
+        reach2 = fmax(reach2, r2);
+        turns += d.s1 < 0 && d_after.s1 >= 0;
+        const REAL d2 = face >= 0 ? dot(d, d) : r2;
+        bool good =
+            d.s0 * d_after.s1 - d.s1 * d_after.s0 > 0 && d.s0 * e.s1 - d.s1 * e.s0 > 0 && dot(e, e) >= REAL_EPS * d2;
+        if (face >= 0) {
+            least2 = fmin(least2, d2);
+            if (!known) {
+                const int other = starts[face], m = starts[face + 1] - other;
+                const bool exact = stands_between(i, after, before, neighbors + other, m);
+                good = good && (exact || fits_neighbor(i, face, before, after, u, v, d2, neighbors + other, m, points,
+                                                       lower, upper));
+                fit = fit && exact;
+            }
+        }
+        if (!good) {
+            bad = true;
+            if (before >= 0)
+                atomic_or(marks + before, 1);
+            if (face >= 0)
+                atomic_or(marks + face, 1);
+            if (after >= 0)
+                atomic_or(marks + after, 1);
+        }
+        before = face;
+        face = after;
+        d = d_after;
+        u = v;
+    }
+    bad |= turns != 1 || least2 < sqrt(REAL_EPS) * reach2;
+    if (bad)
+        atomic_or(marks + i, 1);
+    if (!known)
+        fits[i] = fit;
+    return bad;
+}
+
+#if IN_LANES
+#include "simd/eight_marked.h"
+#include "simd/eight_rows.h"
+#endif
+
+/* Per generator i: marks[i] = 1, and its neighbors' at the face in question, where the neighbors from before no
+   longer enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; many may
+   write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up.
+
+   In LANES a work-item takes so many generators, and there are so many fewer work-items. Of these only every one in
+   `stride` is done, and what is not as it should be counted in flags[2]; or, as the `rest`, the others. */
+kernel void check_rows(const int size, const int stride, const int rest, global const int *starts,
+                       global const int *neighbors, global const REAL *points, const REAL4 box_lower,
+                       const REAL4 box_upper, global int *fits, global int *marks, global int *flags)
+{
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int id = get_global_id(0);
+    const int item = rest ? id + id / (stride - 1) + 1 : id * stride;
+#if IN_LANES
+    if (item * LANES >= size)
+        return;
+    const int found = check_eight(item * LANES, size, starts, neighbors, points, lower, upper, fits, marks);
+#else
+    if (item >= size)
+        return;
+    const int found = check_row(item, starts, neighbors, points, lower, upper, fits, marks);
+#endif
+    if (found && stride > 1 && !rest)
+        atomic_add(flags + 2, found);
+}
+
+/* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */
+kernel void list_marked(const int size, global const int *marks, global const int *sums, global int *listed)
+{
+    WORK_ITEM(i);
+    if (marks[i])
+        listed[sums[i]] = i;
+}
+
+/* Clip by the generators of row i that are near enough. */
+inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n, global const REAL *points)
+{
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k];
+        if (j < 0 || j == cell->generator)
+            continue;
+        const REAL d[2] = {BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1])};
+        const REAL d2 = d[0] * d[0] + d[1] * d[1];
+        if (d2 >= cutting_distance2(cell))
+            continue;
+        if (d2 == 0)
+            return FLAG_COINCIDE;
+        if (!clip_cell(cell, d, d2, j, true, points))
+            return FLAG_FULL;
+    }
+    return 0;
+}
+
+#if IN_LANES
+/* Per LANES generators that are listed first of all: their cells among a few candidates, into slots from 0 on, or
+   slot_counts[w] = 0 where one is left to be clipped. */
+kernel void wrap_marked(const int size, const int count, global const int *listed, global const int *places,
+                        global int *slots, global int *slot_counts, global const int *old_starts,
+                        global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
+                        const REAL4 box_upper)
+{
+    WORK_ITEM(group);
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
+    wrap_eight(group * LANES, count, listed, &rows, points, box_lower, box_upper, slots, slot_counts);
+}
+#endif
+
+/* Per listed generator: its cell, clipped by its neighbors and theirs, into slot base + w. If `wrapped`, rows that
+   have faces are there already. */
+kernel void clip_marked(const int size, global const int *listed, const int base, const int wrapped,
+                        global const int *places, global int *slots, global int *slot_counts,
+                        global const int *old_starts, global const int *old_neighbors, global const REAL *points,
+                        const REAL4 box_lower, const REAL4 box_upper, global int *fits, global int *flags)
+{
+    WORK_ITEM(w);
+    const int i = listed[w];
+    if (wrapped && slot_counts[base + w] > 0)
+        return;
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
+    cell_t cell;
+    start_cell(&cell, i, x, lower, upper);
+    int n, m;
+    global const int *row = face_row(&rows, i, &n);
+    int flag = clip_by_row(&cell, x, row, n, points);
+    for (int k = 0; k < n && flag == 0; ++k)
+        if (row[k] >= 0) {
+            global const int *other = face_row(&rows, row[k], &m);
+            flag = clip_by_row(&cell, x, other, m, points);
+        }
+#ifdef FOLD_0
+    /* There is no wall across a period: whoever is left with one has lost his neighbors. */
+    for (int k = 0; k < cell.n; ++k)
+        if (cell.faces[k] < 0 && FOLD((-1 - cell.faces[k]) / 2) > 0)
+            flag = FLAG_FULL;
+#endif
+    const int to = store_cell(&cell, flag, x, points, base + w, slots, slot_counts, flags),
+              count = abs(slot_counts[to]);
+    if (places[i] < 0)
+        return;
+    /* Clipped once more, it may leave some that have been found to fit it. */
+    for (int k = 0; k < n; ++k)
+        if (row[k] >= 0 && place_in_row(slots + to * SLOT, count, row[k]) == count)
+            atomic_and(fits + row[k], 0);
+}
+
+/* Per listed generator: put its new row in the place of the old one. It fits until a neighbor says otherwise. */
+kernel void place_clipped(const int size, global const int *listed, const int base, global const int *slots,
+                          global const int *slot_counts, global int *places, global int *marks, global int *fits)
+{
+    WORK_ITEM(w);
+    const int place = base + w;
+    places[listed[w]] = slot_counts[place] == ELSEWHERE ? slots[place * SLOT] : place;
+    marks[listed[w]] = 0;
+    fits[listed[w]] = 1;
+}
+
+inline void mark_both(int i, int j, global int *marks)
+{
+    atomic_or(marks + i, 1);
+    atomic_or(marks + j, 1);
+}
+
+/* Per listed generator: mark it and its neighbors where they do not fit together. Those who were not clipped have been
+   checked against each other before. */
+kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
+                          global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
+                          global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, global int *marks,
+                          global int *fits)
+{
+    WORK_ITEM(w);
+    const int i = listed[w];
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
+    int n, m;
+    global const int *row = face_row(&rows, i, &n);
+    for (int k = 0; k < n; ++k) {
+        const int j = row[k], a = row[k == 0 ? n - 1 : k - 1], b = row[k == n - 1 ? 0 : k + 1];
+        if (j < 0)
+            continue;
+        global const int *other = face_row(&rows, j, &m);
+        if (stands_between(i, b, a, other, m))
+            continue;
+        atomic_and(fits + i, 0);
+        atomic_and(fits + j, 0);
+        const REAL2 u = corner(i, x, a, j, points, lower, upper), v = corner(i, x, j, b, points, lower, upper);
+        const REAL2 d = face_direction(j, x, points);
+        if (!fits_neighbor(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
+            mark_both(i, j, marks);
+    }
+    /* Whom the row from before names is told as well: he may still name i. */
+    const int end = old_starts[i + 1];
+    for (int k = old_starts[i]; k < end; ++k) {
+        const int j = old_neighbors[k];
+        if (j < 0)
+            continue;
+        if (place_in_row(row, n, j) < n)
+            continue;
+        global const int *other = face_row(&rows, j, &m);
+        if (place_in_row(other, m, i) == m)
+            continue;
+        atomic_and(fits + j, 0);
+        if (!is_doubtful_row(&rows, j)) /* else its faces will be matched with its neighbors' */
+            mark_both(i, j, marks);
+    }
+}

@@ -1,0 +1,53 @@
+/* A cell's row of the graph and its measures, from its faces; see `measure_cells` in cells.cl. */
+#include "tessellation/corner.h"
+#include "tessellation/face_rows.h"
+#include "tessellation/moments.h"
+
+typedef struct {
+    global const int *starts;
+    global int *neighbors;
+    global FACE *face_measures, *face_centroids;
+    global REAL *volumes, *offsets, *covariances;
+} measures_t;
+
+/* The faces of generator i that are kept. Returns their number. */
+inline int kept_faces(int *faces, const face_rows_t *rows, global const uint *keep, int i)
+{
+    int n = 0, listed;
+    const int place = rows->places[i];
+    global const int *row = face_row(rows, i, &listed);
+    for (int k = 0; k < listed; ++k)
+        if (place < 0 || ((keep[place + k / 32] >> (k % 32)) & 1u))
+            faces[n++] = row[k];
+    return n;
+}
+
+inline void put_face(const measures_t *to, int at, int neighbor, REAL measure, REAL x, REAL y)
+{
+    to->neighbors[at] = neighbor;
+    to->face_measures[at] = measure;
+    to->face_centroids[2 * at] = x;
+    to->face_centroids[2 * at + 1] = y;
+}
+
+/* Measure the cell of generator i from its n faces. */
+inline void measure_cell(const measures_t *to, int i, const int *faces, int n, global const REAL *points,
+                         const REAL *lower, const REAL *upper)
+{
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const int start = to->starts[i];
+    moments_t moments = {0, 0, 0, 0, 0, 0};
+    if (n >= 3) {
+        const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
+        REAL2 v = origin;
+        for (int k = 0; k < n; ++k) {
+            const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
+            const REAL2 e = w - v;
+            const REAL2 sum = v + w;
+            add_triangle(&moments, v, w);
+            put_face(to, start + k, faces[k], sqrt(dot(e, e)), sum.s0 / 2, sum.s1 / 2);
+            v = w;
+        }
+    }
+    write_moments(&moments, i, to->volumes, to->offsets, to->covariances);
+}

@@ -1,0 +1,264 @@
+#include "tessellation/row_copy.h"
+#include "tessellation/row_counts.h"
+#include "tessellation/periodic/halo.h"
+#include "tessellation/search.h"
+
+inline REAL4 vertex_at(const cell_t *cell, int v)
+{
+    return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
+}
+
+inline REAL dot3(REAL4 a, REAL4 b)
+{
+    return a.s0 * b.s0 + a.s1 * b.s1 + a.s2 * b.s2;
+}
+
+inline REAL4 cross3(REAL4 a, REAL4 b)
+{
+    return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
+}
+
+#ifdef SEAMS
+/* Look at the balls around the vertices of the cell of generator i. */
+inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *seams)
+{
+    const REAL x[3] = {place.s0, place.s1, place.s2};
+    const REAL reach = sqrt(cell->reach2);
+    const int count = reaches_beyond(x, reach + widest_of(seams) * reach, seams) ? cell->n : 0;
+    for (int v = 0; v < count; ++v) {
+        const INDEX4 f = cell->faces[v];
+        const REAL4 ways[3] = {cell->planes[f.s0], cell->planes[f.s1], cell->planes[f.s2]};
+        const int labels[3] = {cell->labels[f.s0], cell->labels[f.s1], cell->labels[f.s2]};
+        look_at_vertex(x, i, vertex_at(cell, v), ways, labels, seams);
+    }
+}
+#endif
+
+/* Per place p in bin order: the cell of generator i = items[p], its faces and its measures.
+
+   V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
+   after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
+   cube of bins that it has seen covers that ball. Its radius is left in reach[p], which begins as a guess of it. With
+   `warm` the neighbors of an earlier, similar diagram are clipped first, and the search only has to confirm them. Only
+   the first `rows` generators get cells; of those in a periodic box the balls around their vertices are looked at.
+
+   A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
+   S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
+
+   row_places, row_counts (n,)   where in the arrays of faces the cell's are, and how many; cells come in no particular
+                                 order, the next kernels bring them into it
+   labels, measures, centroids   of the faces
+   volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
+kernel void clip_cells(const int size, const int rows, global const REAL *binned, global const int *items,
+                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                       global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                       const REAL4 box_upper, const int warm, global const int *old_starts,
+                       global const int *old_neighbors, const int again, const int from_near, const int room,
+                       const REAL share, global int *row_places, global int *row_counts, global int *labels,
+                       global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
+                       global REAL *covariances, global int *report SEAM_ARGS)
+{
+    WORK_ITEM(p);
+    const int i = items[p];
+    if (i >= rows || (again && row_counts[i] != UNFINISHED))
+        return;
+    const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
+    const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
+    cell_t cell;
+    start_cell(&cell, x, box_lower, box_upper, from_near);
+    int flag = 0;
+    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
+    if (warm) {
+        flag = flag_of(clip_by_row(&cell, i, x, old_starts, old_neighbors, points));
+        w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
+    }
+    while (flag == 0) {
+        flag = clip_by_bins(&cell, x, p, w, inner, warm, &in);
+        const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
+        if (!(need > w)) /* ends with a NaN, too */
+            break;
+        inner = w;
+        w = need < 4 * w ? need : 2 * w;
+    }
+    if (flag != 0) {
+        atomic_or(report, flag);
+        row_counts[i] = flag == FLAG_FULL ? UNFINISHED : 0;
+        return;
+    }
+
+    reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
+#ifdef SEAMS
+    SEAMS_GIVEN;
+    if (i < seams.own)
+        look_at_cell(&cell, i, x, &seams);
+#endif
+
+    /* A vertex of every face. */
+    INDEX start[FACE_CAPACITY];
+    SHORT_LOOP
+    for (int v = 0; v < cell.n; ++v) {
+        const INDEX4 f = cell.faces[v];
+        start[f.s0] = start[f.s1] = start[f.s2] = v;
+    }
+    const int face_count = cell.n / 2 + 2; /* Euler's formula */
+    const int place = take_places(report, face_count);
+    const bool fits = place + face_count <= room;
+    const REAL reach_length = sqrt(cell.reach2), near2 = sqrt(REAL_EPS) * cell.reach2;
+    const REAL slim = 512 * noise_length(reach_length);
+    int count = 0;
+    bool doubtful = false, narrow = false;
+    REAL volume = 0, lost = 0;
+    REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
+    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
+        const REAL4 plane = cell.planes[f];
+        const REAL d2 = plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2;
+        const REAL inverse = 1 / sqrt(d2);
+        const REAL4 normal = plane * inverse; /* and its distance */
+        const int first_vertex = start[f];
+        const REAL4 a = vertex_at(&cell, first_vertex);
+        int v = vertex_after(&cell, first_vertex, f);
+        REAL4 b = vertex_at(&cell, v);
+        REAL4 ab = b - a;
+        REAL area = 0;
+        REAL4 face_first = 0, face_square = 0, face_mixed = 0;
+        for (v = vertex_after(&cell, v, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
+            const REAL4 c = vertex_at(&cell, v);
+            const REAL4 ac = c - a;
+            const REAL weight = dot3(cross3(ab, ac), normal);
+            const REAL4 s = a + b + c;
+            area += weight;
+            face_first += weight * s;
+            face_square += weight * (a * a + b * b + c * c + s * s);
+            face_mixed += weight * (a.yzxw * a.zxyw + b.yzxw * b.zxyw + c.yzxw * c.zxyw + s.yzxw * s.zxyw);
+            b = c;
+            ab = ac;
+        }
+        volume += normal.s3 * area;
+        first += normal.s3 * face_first;
+        square += normal.s3 * face_square;
+        mixed += normal.s3 * face_mixed;
+        const int label = cell.labels[f];
+        /* Faces below rounding are none; smaller ones than a neighbor is sure to see, too, are doubtful. */
+        const REAL across2 = label >= 0 ? d2 : cell.reach2;
+        const bool small = !(area > sqrt(REAL_EPS) * across2);
+        if (small || !(area > slim * reach_length)) {
+            REAL width2 = 0;
+            for (v = vertex_after(&cell, first_vertex, f); v != first_vertex; v = vertex_after(&cell, v, f)) {
+                const REAL4 e = vertex_at(&cell, v) - a;
+                width2 = fmax(width2, dot3(e, e));
+            }
+            doubtful |= small && label >= 0;
+            if (!(area > 16 * noise_length(sqrt(across2)) * sqrt(width2))) {
+                lost += fabs(normal.s3 * area);
+                continue;
+            }
+            narrow |= !(area > slim / 2 * sqrt(width2));
+        }
+        doubtful |= across2 < near2;
+        if (fits) {
+            const REAL third = area > 0 ? 1 / (3 * area) : 0;
+            labels[place + count] = label;
+            measures[place + count] = area / 2;
+            centroids[3 * (place + count)] = face_first.s0 * third;
+            centroids[3 * (place + count) + 1] = face_first.s1 * third;
+            centroids[3 * (place + count) + 2] = face_first.s2 * third;
+        }
+        ++count;
+    }
+    row_places[i] = place;
+    row_counts[i] = count;
+    if (doubtful || narrow)
+        atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
+    /* In a box as thin as rounding all faces are below it. */
+    if (count < 4 || !(volume > 0 && lost <= share * volume))
+        atomic_or(report, FLAG_COLLAPSED);
+    const REAL inverse = 1 / volume;
+    first *= inverse / 4;
+    square = square * (inverse / 20) - first * first;
+    mixed = mixed * (inverse / 20) - first.yzxw * first.zxyw;
+    volumes[i] = volume / 6;
+    offsets[3 * i] = first.s0;
+    offsets[3 * i + 1] = first.s1;
+    offsets[3 * i + 2] = first.s2;
+    covariances[6 * i] = square.s0;
+    covariances[6 * i + 1] = mixed.s2;
+    covariances[6 * i + 2] = mixed.s1;
+    covariances[6 * i + 3] = square.s1;
+    covariances[6 * i + 4] = mixed.s0;
+    covariances[6 * i + 5] = square.s2;
+}
+
+/* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, rounding may let one
+   of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
+   If it is wider than rounding explains, generators are too close to tell apart so (from far away, two an ulp apart
+   have the same bisector), and that is flagged: cells are clipped once more, with `from_near` (tessellation/clip.h). So
+   it is where both see a face, but of areas that differ by more than a share of the cell. What borders on a generator
+   without a row is not looked at, nor are two cells that are certain.
+
+   A bisector of generators d apart rounds by eps R / d of the distance R from them, along all of its face: by
+   eps R³ / d, where that is little beside the cell. The area of all faces stands for R². */
+kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
+                        global const int *labels, global const REAL *measures, global const REAL *volumes,
+                        global const REAL *points, const REAL share, const int some_doubtful, global uchar *kept,
+                        global int *counts, global int *report)
+{
+    WORK_ITEM(i);
+    const int n = COUNT_OF(row_counts[i]);
+    const bool certain = (row_counts[i] & CERTAIN) != 0;
+    counts[i] = n;
+    if (!some_doubtful)
+        return;
+    int count = 0;
+    REAL surface = 0;
+    for (int k = row_places[i]; k < row_places[i] + n; ++k)
+        surface += measures[k];
+    REAL apart = 0; /* the volume of the cones to what faces differ by */
+    for (int k = row_places[i]; k < row_places[i] + n; ++k) {
+        const int j = labels[k];
+        bool mutual = j < 0 || j >= size || (certain && (row_counts[j] & CERTAIN) != 0);
+        if (!mutual) {
+            const int m = COUNT_OF(row_counts[j]);
+            global const int *row = labels + row_places[j];
+            int q = 0;
+            while (q < m && row[q] != i)
+                ++q;
+            mutual = q < m;
+            const REAL dx = points[3 * j] - points[3 * i];
+            const REAL dy = points[3 * j + 1] - points[3 * i + 1];
+            const REAL dz = points[3 * j + 2] - points[3 * i + 2];
+            const REAL distance = sqrt(dx * dx + dy * dy + dz * dz);
+            const REAL other = mutual ? measures[row_places[j] + q] : 0;
+            apart += fabs(measures[k] - other) * distance / 6;
+            const REAL rounded = fmin(64 * REAL_EPS * surface * sqrt(surface) / distance, sqrt(REAL_EPS) * surface);
+            if (!mutual && !(measures[k] < fmax(2048 * REAL_EPS * distance, rounded)))
+                atomic_or(report, FLAG_COLLAPSED);
+        }
+        kept[k] = mutual;
+        count += mutual;
+    }
+    counts[i] = count;
+    if (count < 4 || !(apart <= share * volumes[i]))
+        atomic_or(report, FLAG_COLLAPSED);
+}
+
+/* Per generator i: its faces, those kept, as row i of the graph; all if there is no doubt.
+
+   neighbors, face_measures (m,), face_centroids (m, 3)  areas, and centroids relative to x_i */
+kernel void place_faces(const int size, global const int *row_places, global const int *row_counts,
+                        global const int *labels, global const REAL *measures, global const REAL *centroids,
+                        global const uchar *kept, const int doubt, global const int *starts, global int *neighbors,
+                        global FACE *face_measures, global FACE *face_centroids)
+{
+    WORK_ITEM(i);
+    const int n = COUNT_OF(row_counts[i]), from = row_places[i];
+    int to = starts[i];
+    for (int k = from; k < from + n; ++k) {
+        if (doubt && !kept[k])
+            continue;
+        neighbors[to] = labels[k];
+        face_measures[to] = measures[k];
+        for (int axis = 0; axis < 3; ++axis)
+            face_centroids[3 * to + axis] = centroids[3 * k + axis];
+        ++to;
+    }
+}

@@ -1,0 +1,220 @@
+/* The search for generators that may cut a cell, through the bins around it. */
+#include "tessellation/bins.h"
+#include "tessellation/clip.h"
+
+/* Bits of the word in which kernels report what went wrong. */
+#define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
+#define FLAG_COINCIDE 2  /* two generators at the same place */
+#define FLAG_COLLAPSED 4 /* generators too close for the precision */
+#define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be matched with their neighbors */
+#define FLAG_NARROW 16   /* nor is it that some faces may be no wider than their vertices round; see loops.cl */
+
+#ifndef MAX_DEPTH
+#error "build with -DMAX_DEPTH=levels that the bins may have"
+#endif
+
+#define BATCH 256 /* generators that are sorted by distance at a time */
+#define SHELLS 32
+
+/* The flag that tells of an outcome of clip_cell or clip_by_row, or 0. */
+inline int flag_of(int what)
+{
+    return what < CLIP_FULL
+               ? 0
+               : (what == CLIP_FULL ? FLAG_FULL : (what == CLIP_COINCIDE ? FLAG_COINCIDE : FLAG_COLLAPSED));
+}
+
+/* Where to look for neighbors. */
+typedef struct {
+    global const REAL *points, *binned;
+    global const int *items;
+    global const int2 *bins;
+    global const FRAME *grid_frames;
+    global const int4 *grid_shapes;
+} search_t;
+
+/* Generators that may cut a cell: places in bin order. */
+typedef struct {
+    int n;
+    int places[BATCH];
+    REAL d2[BATCH];
+} batch_t;
+
+/* Clip the cell by the generators of a batch, about the nearest first: by shells of 1 / `per_shell` in squared
+   distance. Returns FLAG_* or 0. */
+inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
+{
+    ushort ends[SHELLS], order[BATCH];
+    uchar shell[BATCH];
+    for (int k = 0; k < SHELLS; ++k)
+        ends[k] = 0;
+    for (int k = 0; k < batch->n; ++k) {
+        const REAL place = batch->d2[k] * per_shell;
+        shell[k] = place < SHELLS - 1 ? (uchar)place : (uchar)(SHELLS - 1);
+        ++ends[shell[k]];
+    }
+    for (int k = 0, sum = 0; k < SHELLS; ++k) {
+        const int count = ends[k];
+        ends[k] = sum;
+        sum += count;
+    }
+    for (int k = 0; k < batch->n; ++k)
+        order[ends[shell[k]]++] = k;
+    for (int k = 0; k < batch->n; ++k) {
+        const REAL d2 = batch->d2[order[k]];
+        if (!(d2 < 4 * cell->reach2))
+            continue;
+        const int q = batch->places[order[k]];
+        if (d2 == 0)
+            return FLAG_COINCIDE;
+        const REAL4 d =
+            (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
+        const int what = clip_cell(cell, d, d2, in->items[q], warm, in->points);
+        if (what >= CLIP_FULL)
+            return flag_of(what);
+    }
+    batch->n = 0;
+    return 0;
+}
+
+/* Bins along one axis that [x - w, x + w] touches. */
+inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
+{
+    return (int2)(axis_bin(x - w, origin, inverse, side), axis_bin(x + w, origin, inverse, side));
+}
+
+/* Add those of the items begin .. end - 1 to the batch that may cut the cell; when it is full, clip by it.
+   Returns FLAG_* or 0. */
+inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
+                      const search_t *in)
+{
+    while (begin < end) {
+        const int stop = min(end, begin + BATCH - batch->n);
+        const REAL limit = 4 * cell->reach2;
+        int n = batch->n;
+        SHORT_LOOP
+        for (int q = begin; q < stop; ++q) {
+            const REAL dx = in->binned[3 * q] - x.s0;
+            const REAL dy = in->binned[3 * q + 1] - x.s1;
+            const REAL dz = in->binned[3 * q + 2] - x.s2;
+            const REAL d2 = dx * dx + dy * dy + dz * dz;
+            batch->places[n] = q;
+            batch->d2[n] = d2;
+            n += d2 < limit && q != own;
+        }
+        batch->n = n;
+        begin = stop;
+        if (n == BATCH) {
+            const int flag = clip_by_batch(cell, x, batch, per_shell, warm, in);
+            if (flag != 0)
+                return flag;
+        }
+    }
+    return 0;
+}
+
+/* A grid that is open: which, where it was left (layer, row, part of the row, bin), and whether its own bin was opened
+   for the inner cube. */
+typedef struct {
+    int grid, iz, iy, part, bin;
+    bool inside;
+} open_grid_t;
+
+/* Clip the cell of the generator at place `own` by every generator in the bins that the cube of half-width w covers
+   and the cube of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
+   the farthest vertex. Returns FLAG_* or 0. */
+inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
+{
+    open_grid_t open[MAX_DEPTH]; /* from the root down */
+    const REAL per_shell = SHELLS / (6 * w * w);
+    const FRAME root = in->grid_frames[0];
+    const REAL noise_y = bin_noise(x.s1, root.s1), noise_z = bin_noise(x.s2, root.s2);
+    batch_t batch;
+    batch.n = 0;
+    int depth = 0;
+    open[0].grid = open[0].part = 0;
+    open[0].iz = open[0].iy = open[0].bin = -1;
+    open[0].inside = inner >= 0;
+    while (depth >= 0) {
+        const open_grid_t here = open[depth];
+        const FRAME frame = in->grid_frames[here.grid];
+        const int4 shape = in->grid_shapes[here.grid];
+        const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
+        const int2 ys = bin_range(x.s1, w, frame.s1, inverse, shape.s2);
+        const int2 zs = bin_range(x.s2, w, frame.s2, inverse, shape.s3);
+        /* What the inner cube has taken. */
+        int2 done_x = (int2)(0, -1), done_y = done_x, done_z = done_x;
+        if (here.inside) {
+            done_x = bin_range(x.s0, inner, frame.s0, inverse, shape.s1);
+            done_y = bin_range(x.s1, inner, frame.s1, inverse, shape.s2);
+            done_z = bin_range(x.s2, inner, frame.s2, inverse, shape.s3);
+        }
+        int child = -1;
+        open_grid_t next = here; /* where to go on */
+        int iy = here.iy, part = here.part, at = here.bin;
+        for (int iz = max(here.iz, zs.s0); iz <= zs.s1 && child < 0; ++iz, iy = -1) {
+            const REAL away_z = row_distance(x.s2, frame.s2, edge, iz, edge * BIN_SHARE + noise_z);
+            const bool layer_done = iz >= done_z.s0 && iz <= done_z.s1;
+            for (iy = max(iy, ys.s0); iy <= ys.s1; ++iy, part = 0, at = -1) {
+                const REAL away_y = row_distance(x.s1, frame.s1, edge, iy, edge * BIN_SHARE + noise_y);
+                const REAL left2 = 4 * cell->reach2 - away_y * away_y - away_z * away_z;
+                if (!(left2 > 0))
+                    continue;
+                const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;
+                const int2 xs = bin_range(x.s0, span, frame.s0, inverse, shape.s1);
+                global const int2 *row_bins = in->bins + shape.s0 + (iz * shape.s2 + iy) * shape.s1;
+                /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
+                const bool row_done = layer_done && iy >= done_y.s0 && iy <= done_y.s1;
+                while (part < 3) {
+                    int from = xs.s0, to = xs.s1;
+                    if (row_done) {
+                        from = part == 0 ? from : max(from, part == 1 ? done_x.s0 : done_x.s1 + 1);
+                        to = part == 2 ? to : min(to, part == 0 ? done_x.s0 - 1 : done_x.s1);
+                    }
+                    from = max(at, from);
+                    if (from > to) {
+                        part = row_done ? part + 1 : 3;
+                        at = -1;
+                        continue;
+                    }
+                    /* A run of leaves beside each other is a run of items. */
+                    const int2 first = row_bins[from];
+                    int2 end = row_bins[to + 1];
+                    at = to + 1;
+                    if (first.s1 != end.s1) {
+                        /* There are divided bins ahead: one bin at a time. */
+                        end = row_bins[from + 1];
+                        at = from + 1;
+                        if (first.s1 != end.s1) {
+                            child = first.s1;
+                            break;
+                        }
+                    }
+                    if (part == 1 && row_done)
+                        continue;
+                    const int flag = take_items(cell, x, own, first.s0, end.s0, &batch, per_shell, warm, in);
+                    if (flag != 0)
+                        return flag;
+                }
+                if (child >= 0) {
+                    next.iz = iz;
+                    next.iy = iy;
+                    next.part = part;
+                    next.bin = at;
+                    open[depth] = next;
+                    open[depth + 1].inside = part == 1 && row_done;
+                    break;
+                }
+            }
+        }
+        if (child >= 0) {
+            ++depth;
+            open[depth].grid = child;
+            open[depth].part = 0;
+            open[depth].iz = open[depth].iy = open[depth].bin = -1;
+        } else {
+            --depth;
+        }
+    }
+    return clip_by_batch(cell, x, &batch, per_shell, warm, in);
+}

@@ -1,0 +1,208 @@
+#define CLIP_SHARPLY 1
+#include "tessellation/topology3d/join_vertices.h"
+#include "tessellation/clip.h"
+
+/* The corners of a diagram's cells in 3D, and which of them are surely one vertex. Each cell is clipped once more, by
+   its neighbors alone. Its vertices, the corners, are numbered cell by cell: corner u. Two corners are one vertex
+   where the same four generators or walls meet, whatever their positions have rounded to, and where an edge between
+   them has no length; the least corner of a vertex is its label. What is left to agree about is that of loops.cl.
+
+   starts, neighbors          the graph: faces k, in rows i
+   view_starts (n + 1,)        rows of views, a cell's faces as it sees them itself: those of the graph in its order,
+   then walls that the cell touches although the graph has no face there view_labels (v,)            a generator, or -1
+   - wall corner_starts (n + 1,)      first corner of each cell; its first turn is the triple of that turn_starts (v +
+   1,)        first turn of each view: its loop, counter-clockwise from outside turns (t,)                  corners */
+
+/* The cell of generator i; false if there is not enough room. */
+inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
+                      global const int *starts, global const int *neighbors)
+{
+    const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
+    start_cell(cell, x, lower, upper, true);
+    return clip_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
+}
+
+inline bool is_in_row(int label, int begin, int end, global const int *labels)
+{
+    for (int k = begin; k < end; ++k)
+        if (labels[k] == label)
+            return true;
+    return false;
+}
+
+/* Per generator i: how many corners its cell has, and how many views. full[0] is set if a cell has more than
+   FACE_CAPACITY faces. */
+kernel void count_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                          global const int *starts, global const int *neighbors, global int *corner_counts,
+                          global int *view_counts, global int *full)
+{
+    WORK_ITEM(i);
+    cell_t cell;
+    if (!make_cell(&cell, i, points, box_lower, box_upper, starts, neighbors)) {
+        atomic_or(full, 1);
+        return;
+    }
+    const int begin = starts[i], end = starts[i + 1];
+    int count = end - begin;
+    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
+        count += !is_in_row(cell.labels[f], begin, end, neighbors);
+    corner_counts[i] = cell.n;
+    view_counts[i] = count;
+}
+
+/* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each,
+   as the bisector of generators d apart rounds by r / d of what they do at the distance r. */
+inline REAL sharpness_of(const cell_t *cell, int v)
+{
+    const INDEX4 f = cell->faces[v];
+    const int faces[3] = {f.s0, f.s1, f.s2};
+    const REAL x = X(cell)[v], y = Y(cell)[v], z = Z(cell)[v];
+    const REAL r = sqrt(x * x + y * y + z * z);
+    REAL4 normals[3];
+    REAL shares = 1;
+    for (int k = 0; k < 3; ++k) {
+        const REAL4 plane = cell->planes[faces[k]];
+        const REAL d = sqrt(plane.s0 * plane.s0 + plane.s1 * plane.s1 + plane.s2 * plane.s2);
+        normals[k] = plane / d;
+        shares *= cell->labels[faces[k]] >= 0 ? d / (d + r) : 1;
+    }
+    const REAL4 c = cross_product(normals[1], normals[2]);
+    const REAL span = normals[0].s0 * c.s0 + normals[0].s1 * c.s1 + normals[0].s2 * c.s2;
+    return fabs(span) * shares;
+}
+
+/* Write the loops of the views of cell i. */
+inline void list_turns(const cell_t *cell, int base, int view, int end, global const int *view_labels,
+                       global int *turn_starts, global int *turns)
+{
+    INDEX start[FACE_CAPACITY];
+    for (int v = 0; v < cell->n; ++v) {
+        const INDEX4 f = cell->faces[v];
+        start[f.s0] = start[f.s1] = start[f.s2] = v;
+    }
+    int t = 3 * base;
+    for (; view < end; ++view) {
+        turn_starts[view] = t;
+        int f = next_face(cell->alive, 0);
+        while (f < FACE_CAPACITY && cell->labels[f] != view_labels[view])
+            f = next_face(cell->alive, f + 1);
+        if (f == FACE_CAPACITY) /* the graph has it, but clipping sharply leaves nothing */
+            continue;
+        const int first = start[f];
+        int v = first;
+        do {
+            turns[t++] = base + v;
+            v = vertex_after(cell, v, f);
+        } while (v != first);
+    }
+}
+
+/* Per generator i: its corners (c, 3), relative to x_i, how sharp each is, the labels of their faces (c, 3),
+   counter-clockwise, their owner, and its views. same[u] is the least corner of the cell that lies where corner u does,
+   joined to it by edges of no length. */
+kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                         global const int *starts, global const int *neighbors, global const int *corner_starts,
+                         global const int *view_starts, global REAL *corners, global float *sharpness,
+                         global int *corner_faces, global int *owners, global int *same, global int *view_labels,
+                         global int *turn_starts, global int *turns)
+{
+    WORK_ITEM(i);
+    cell_t cell;
+    make_cell(&cell, i, points, box_lower, box_upper, starts, neighbors);
+    const int base = corner_starts[i];
+    REAL least = 4 * noise_length(sqrt(cell.reach2));
+    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
+        if (cell.labels[f] >= 0)
+            least = fmin(least, sqrt(2 * cell.planes[f].s3) / 64);
+    INDEX joined[VERTEX_CAPACITY];
+    for (int v = 0; v < cell.n; ++v) {
+        const int u = base + v;
+        corners[3 * u] = X(&cell)[v];
+        corners[3 * u + 1] = Y(&cell)[v];
+        corners[3 * u + 2] = Z(&cell)[v];
+        const INDEX4 f = cell.faces[v];
+        corner_faces[3 * u] = cell.labels[f.s0];
+        corner_faces[3 * u + 1] = cell.labels[f.s1];
+        corner_faces[3 * u + 2] = cell.labels[f.s2];
+        sharpness[u] = (float)sharpness_of(&cell, v);
+        owners[u] = i;
+        joined[v] = v;
+    }
+    bool changed = true;
+    while (changed) {
+        changed = false;
+        for (int v = 0; v < cell.n; ++v) {
+            const INDEX4 f = cell.faces[v];
+            const int a[4] = {f.s0, f.s1, f.s2, f.s0};
+            for (int e = 0; e < 3; ++e) {
+                const int w = cell.at[a[e + 1] * FACE_CAPACITY + a[e]];
+                if (joined[w] >= joined[v])
+                    continue;
+                const REAL dx = X(&cell)[w] - X(&cell)[v], dy = Y(&cell)[w] - Y(&cell)[v],
+                           dz = Z(&cell)[w] - Z(&cell)[v];
+                if (dx * dx + dy * dy + dz * dz < least * least) {
+                    joined[v] = joined[w];
+                    changed = true;
+                }
+            }
+        }
+    }
+    for (int v = 0; v < cell.n; ++v)
+        same[base + v] = base + joined[v];
+    const int begin = starts[i], end = starts[i + 1], view = view_starts[i];
+    int to = view;
+    for (int k = begin; k < end; ++k)
+        view_labels[to++] = neighbors[k];
+    for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
+        if (!is_in_row(cell.labels[f], begin, end, neighbors))
+            view_labels[to++] = cell.labels[f];
+    list_turns(&cell, base, view, to, view_labels, turn_starts, turns);
+    if (i == size - 1)
+        turn_starts[to] = 3 * (base + cell.n);
+}
+
+/* Is label one of the three faces of corner u? */
+inline bool has_label(global const int *corner_faces, int u, int label)
+{
+    return corner_faces[3 * u] == label || corner_faces[3 * u + 1] == label || corner_faces[3 * u + 2] == label;
+}
+
+/* Per corner u of cell i, where the faces a, b, c meet: twin_corners[u], that of the first cell before i in which the
+   same four meet, or u. */
+kernel void match_corners(const int size, global const int *owners, global const int *corner_starts,
+                          global const int *corner_faces, global int *twin_corners)
+{
+    WORK_ITEM(u);
+    const int i = owners[u];
+    int best = i, found = u;
+    for (int k = 0; k < 3; ++k) {
+        const int j = corner_faces[3 * u + k];
+        if (j < 0 || j >= best)
+            continue;
+        const int one = corner_faces[3 * u + (k + 1) % 3], two = corner_faces[3 * u + (k + 2) % 3];
+        for (int w = corner_starts[j]; w < corner_starts[j + 1]; ++w)
+            if (has_label(corner_faces, w, i) && has_label(corner_faces, w, one) && has_label(corner_faces, w, two)) {
+                best = j;
+                found = w;
+                break;
+            }
+    }
+    twin_corners[u] = found;
+}
+
+/* Per corner u: pass on the least label to the corners that are one vertex with it. The least of all is where this
+   ends, in whatever order. */
+kernel void spread_labels(const int size, global const int *same, global const int *twin_corners, global const int *old,
+                          global int *new, global int *changed)
+{
+    WORK_ITEM(u);
+    bool any = join(old, new, u, same[u]);
+    any |= join(old, new, u, twin_corners[u]);
+    const int label = old[old[u]];
+    if (label < old[u]) {
+        atomic_min(new + u, label);
+        any = true;
+    }
+    if (any)
+        atomic_or(changed, 1);
+}

@@ -1,0 +1,47 @@
+#include "tessellation/corner.h"
+
+#include "tessellation/vertex_walk.h"
+
+/* Corners of cells and the vertices that they share. Corner k of cell i, at place c = starts[i] + k, lies between its
+   faces k - 1 and k. Walking from cell to cell around the point visits all corners that are one vertex; the least of
+   them owns it. The walk uses the graph alone, so it needs no tolerance and holds for any number of cells at a
+   point. */
+
+/* Per generator i: owners[c] of each of its corners. */
+kernel void find_owners(const int size, global const int *starts, global const int *neighbors, global int *owners,
+                        global int *is_owner)
+{
+    WORK_ITEM(i);
+    const int begin = starts[i], end = starts[i + 1], most = starts[size];
+    for (int c = begin; c < end; ++c) {
+        int owner = c, cell = i, at = c, steps = 0;
+        bool back = false;
+        while (++steps < most && walk_on(size, starts, neighbors, i, c, &cell, &at, &back))
+            owner = min(owner, at);
+        owners[c] = owner;
+        is_owner[c] = owner == c;
+    }
+}
+
+/* Per generator i: cell_vertices[c] = number of the vertex at corner c; the owner writes its position, relative to the
+   box's frame. ids are the prefix sums of is_owner. */
+kernel void place_vertices(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
+                           global const int *starts, global const int *neighbors, global const int *owners,
+                           global const int *ids, global int *cell_vertices, global REAL *vertices)
+{
+    WORK_ITEM(i);
+    const REAL x[2] = {points[2 * i], points[2 * i + 1]};
+    const REAL lower[2] = {box_lower.s0, box_lower.s1};
+    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    const int begin = starts[i], end = starts[i + 1];
+    for (int c = begin; c < end; ++c) {
+        const int v = ids[owners[c]];
+        cell_vertices[c] = v;
+        if (owners[c] == c) {
+            const int previous = neighbors[c == begin ? end - 1 : c - 1];
+            const REAL2 y = corner(i, x, previous, neighbors[c], points, lower, upper);
+            vertices[2 * v] = clamp(x[0] + y.s0, lower[0], upper[0]);
+            vertices[2 * v + 1] = clamp(x[1] + y.s1, lower[1], upper[1]);
+        }
+    }
+}

@@ -1,0 +1,101 @@
+"""What could be meant, but hardly is: units and places that do not agree, and sizes that no cells can follow."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import MisfitWarning, SizeErrorWarning
+from ..geometry.boundary_layers import Layers, columns_of
+from ..geometry.box import Domain
+from ..mesh.results import Result
+from ..sizing.field import Field
+
+COARSER, FINER = 2.0, 1e-3
+"""Layers so much coarser or finer than the size field asks for beside them are a mistake."""
+SAMPLE = 64
+"""Places along a layer at which that is seen."""
+MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
+"""Of finished meshes of fields that cells can follow means of |e| are 0.02 at most, and the largest 0.3; where sizes
+jump 1 : 2 from one cell to the next, the largest is 1."""
+
+
+def warn_of_misfits(
+    field: Field, domain: Domain, layers: Sequence[Layers], stacklevel: int
+) -> None:
+    """Warn of each part of the input that hardly meets `domain`, or of layers that hardly meet `field`.
+
+    Parameters
+    ----------
+    field : Field
+        As the caller gave it, without what layers add to it.
+    stacklevel : int
+        Of the caller that is to see it, as `warnings.warn` would take it there.
+
+    Warns
+    -----
+    MisfitWarning
+    """
+    found = field.misfits(domain)
+    for k, layer in enumerate(layers):
+        found += misfits_of_layer(f"layers[{k}]", layer, field, domain)
+    for text in found:
+        warnings.warn(text, MisfitWarning, stacklevel=stacklevel + 1)
+
+
+def misfits_of_layer(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
+    """Return what is to be said of `layer` if its cells are of quite another size than `field` asks for there.
+
+    Flat cells are what layers are for, so that finer ones are right; but a width along the wall that nobody has asked
+    for may be far too small.
+    """
+    feet, normals = columns_of(domain, layer)
+    some = slice(None, None, -(-len(feet) // SAMPLE))
+    for row in sorted({0, layer.count - 1}):
+        places = (feet + layer.rows[row] * normals)[some]
+        places = places[domain.contains(places)]
+        if not len(places):
+            continue
+        h, height = float(np.median(field(places))), float(layer.heights[row])
+        what = f"{name} has cells {layer.width:.3g} wide and {height:.3g} high where the size field asks for {h:.3g}"
+        if math.sqrt(layer.width * height) > COARSER * h:
+            remedy = "make the layers finer or the size field larger along these walls"
+            return [f"{what}: sizes jump there; {remedy}"]
+        if row == layer.count - 1 and layer.spacing is None and layer.width < FINER * h:
+            return [
+                f"{what}: their width is the last layer's height, as no spacing is given; are layers and size field in "
+                "the same unit? Otherwise give spacing, the width along the wall"
+            ]
+    return []
+
+
+def warn_of_errors(result: Result, stacklevel: int) -> None:
+    """Warn if the mesh of a run whose plan is completed does not meet its size field, and of where it does so least.
+
+    Parameters
+    ----------
+    stacklevel : int
+        As in `warn_of_misfits`.
+
+    Warns
+    -----
+    SizeErrorWarning
+    """
+    amounts = np.abs(result.error)
+    worst = int(amounts.argmax())
+    mean, largest = float(amounts.mean()), float(amounts[worst])
+    if mean < MEAN_ERROR and largest < LARGEST_ERROR:
+        return
+    place = ", ".join(f"{x:.6g}" for x in result.points[worst])
+    asked = float(result.size[worst])
+    made = float(result.diagram.volumes[worst]) ** (1 / result.points.shape[1])
+    warnings.warn(
+        f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at ({place}) has the size "
+        f"{made:.3g} where {asked:.3g} is asked for; sizes change there by more than cells can follow from one to the "
+        "next: bound their growth, as by sizing.Graded(size, growth=1.2), or use more cells",
+        SizeErrorWarning,
+        stacklevel=stacklevel + 1,
+    )

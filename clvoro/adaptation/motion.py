@@ -1,0 +1,91 @@
+"""Moving generators: the correction's displacement, and the move itself (`motion.cl`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl.array as cla
+
+from ..geometry.box import Domain
+from ..opencl.primitives import Summaries
+from ..opencl.program import Engine
+from ..tessellation.device_diagram import Tessellation
+
+
+class Motion:
+    """The kernels of `motion.cl`, one method each."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels("adaptation/motion")
+
+    def follow_potential(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
+        """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d)."""
+        self.engine.run_each(
+            self._kernels.follow_potential, t.n, t.starts, t.neighbors, t.face_measures,
+            t.face_centroids, t.volumes, t.points, psi, u, *self.engine.period_args,
+        )  # fmt: skip
+
+    def relax_globally(
+        self,
+        summaries: Summaries,
+        name: str,
+        limit: float,
+        k: float,
+        u: cla.Array,
+        speed: cla.Array,
+    ) -> None:
+        """Scale `u` and `speed` by alpha = min(limit, k / max(speed)), the paper's (3.5).
+
+        The summary `name` of the speeds has been collected.
+        """
+        real = self.engine.real.type
+        n = speed.shape[0]
+        self.engine.run_each(
+            self._kernels.relax_globally, n, summaries.values, np.int32(summaries.slots[name]),
+            real(limit), real(k), u, speed,
+        )  # fmt: skip
+
+    def measure_displacements(
+        self, u: cla.Array, v: cla.Array, h: cla.Array, u_speed: cla.Array, v_speed: cla.Array
+    ) -> None:
+        """Write |u| / h to `u_speed` (n,) and |v| / h to `v_speed` (n,)."""
+        kernel, n = self._kernels.measure_displacement, h.shape[0]
+        self.engine.run_each(kernel, n, u, h, u_speed)
+        self.engine.run_each(kernel, n, v, h, v_speed)
+
+    def move_generators(
+        self,
+        domain: Domain,
+        points: cla.Array,
+        lloyd: cla.Array,
+        a: float,
+        correction: cla.Array,
+        b: float,
+        h: cla.Array,
+        velocity: cla.Array,
+        clip: float = 0.0,
+    ) -> None:
+        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `domain`.
+
+        `velocity` (n, d) becomes the displacement.
+        """
+        real = self.engine.real.type
+        self.engine.run_each(
+            self._kernels.move_generators, h.shape[0], lloyd, real(a), correction, real(b), h,
+            real(clip), *domain.device_args(self.engine), points, velocity,
+        )  # fmt: skip
+
+    def hold_generators(self, labels: cla.Array, fixed: int, displacement: cla.Array) -> None:
+        """Set `displacement` (n, d) to 0 for generators whose label is less than `fixed`."""
+        self.engine.run_each(
+            self._kernels.hold_generators, len(labels), labels, np.int32(fixed), displacement
+        )
+
+    def add_momentum(
+        self, factor: float, lloyd: cla.Array, velocity: cla.Array, share: float
+    ) -> None:
+        """Set `lloyd` (n, d) to ``factor * lloyd + share * velocity``."""
+        real = self.engine.real.type
+        self.engine.run_each(
+            self._kernels.add_momentum, lloyd.shape[0], real(factor), velocity, real(share), lloyd
+        )

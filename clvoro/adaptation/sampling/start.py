@@ -1,0 +1,322 @@
+"""How many cells, and where they start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Integral, Real
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from ...errors import InputError, InputTypeError
+from ...geometry.box import Domain
+from ...geometry.polygon import Polygon
+from ...sizing import as_field
+from .boxes import Boxes
+from .cover import PolygonCover, cover_of
+from .quadrature import DensityTree
+
+_TRIES = 40
+_ROUNDINGS = 4  # of the precision, within which of a polygon's boundary no point is put
+_MOST_COVER = 1 << 15  # boxes that cover a polygon for uniform points
+_SHARE = 1.0  # most points that a box of the sampling may expect
+_TOLERANCE = 1e-3  # of the integral, in the tree that points are sampled from
+
+
+def count_cells(
+    field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4
+) -> float:
+    """Return the number of cells that `field` asks for: the integral of h^-d over the domain.
+
+    Parameters
+    ----------
+    field : Field, Sizing, callable or number
+        A `Sizing` is evaluated on its device, anything else on the host.
+    domain : Domain
+    tolerance : float
+        Relative error aimed at; see `clvoro.adaptation.sampling.quadrature.DensityTree` for what is guaranteed.
+
+    Returns
+    -------
+    float
+        May be less than 1 (h larger than the domain), and may be more than any memory holds.
+
+    Raises
+    ------
+    SizeFieldError
+        If h is not positive and finite somewhere; names the place.
+    """
+    if not isinstance(tolerance, Real) or not 0 < tolerance < 1:
+        raise InputError(f"tolerance is {tolerance!r}, expected a number between 0 and 1")
+    return DensityTree(_evaluator(field), domain, float(tolerance)).integral
+
+
+def density_tree(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain) -> DensityTree:
+    """Return the tree that `sample_density` needs, whose integral is the number of cells, good to 0.1 %.
+
+    Raises
+    ------
+    SizeFieldError
+        If h is not positive and finite somewhere; names the place.
+    """
+    return DensityTree(_evaluator(field), domain, tolerance=_TOLERANCE)
+
+
+def sample_density(
+    field: Callable[[np.ndarray], np.ndarray] | float,
+    domain: Domain,
+    n: int,
+    seed: int,
+    real: DTypeLike | None = None,
+    tree: DensityTree | None = None,
+) -> np.ndarray:
+    """Return `n` points distributed as h^-d.
+
+    The domain is cut into boxes that expect at most one point each, in the order of a Hilbert
+    curve; points are dealt out along the curve at equal steps of the cumulated expectation
+    (systematic sampling). So every box of the tree, large or small, gets its share rounded up or
+    down. Within its box a point is drawn from the log-linear density that fits there.
+
+    Parameters
+    ----------
+    field : Field, Sizing, callable or number
+    domain : Domain
+    n : int
+        At least 1.
+    seed : int
+        Of numpy's PCG64; the same seed gives the same points.
+    real : dtype, optional
+        Precision in which the points are told apart, in the device's coordinates; by default the
+        field's (`Sizing.real`), else float64.
+    tree : DensityTree, optional
+        Of the field, by `density_tree`, if there is one already; it is used up.
+
+    Returns
+    -------
+    (n, d) float64
+        Physical coordinates, distinct and strictly inside, in the order of the curve.
+
+    Raises
+    ------
+    SizeFieldError
+        If h is not positive and finite somewhere; names the place.
+    InputError
+        If `n` points cannot be told apart in the precision.
+    """
+    n, seed = _checked(n, seed)
+    field = _evaluator(field)
+    tree = density_tree(field, domain) if tree is None else tree
+    boxes, cover, slopes = tree.boxes, tree.cover, tree.slopes
+    share = tree.cells * (n / tree.integral)
+    while (chosen := (share > _SHARE) & (boxes.level < 45)).any():
+        share, slopes = _halve(tree, chosen, share, slopes)
+    reached = np.cumsum(share)
+    rng = np.random.Generator(np.random.PCG64(seed))
+    marks = (np.arange(n) + rng.random()) * (reached[-1] / n)
+    box = np.minimum(np.searchsorted(reached, marks, side="right"), len(boxes) - 1)
+
+    def draw(rows: np.ndarray, attempt: int) -> np.ndarray:
+        mine = box[rows]
+        slope = slopes[mine] * cover.sides(mine)
+        return cover.draw(_log_linear(rng.random((len(rows), domain.dim)), slope), mine, attempt)
+
+    precision = getattr(field, "real", np.float64) if real is None else real
+    return _distinct(draw, domain, n, np.dtype(precision))
+
+
+def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
+    """Return `n` independent uniform random points, the paper's start.
+
+    Parameters
+    ----------
+    domain : Domain
+    n : int
+        At least 1.
+    seed : int
+        Of numpy's PCG64; the same seed gives the same points.
+    real : dtype
+        Precision in which the points are told apart, in the device's coordinates.
+
+    Returns
+    -------
+    (n, d) float64
+        Physical coordinates, distinct and strictly inside.
+
+    Raises
+    ------
+    InputError
+        If `n` points cannot be told apart in the precision.
+    """
+    n, seed = _checked(n, seed)
+    rng = np.random.Generator(np.random.PCG64(seed))
+    place = _uniform_in(domain, rng)
+
+    def draw(rows: np.ndarray, attempt: int) -> np.ndarray:
+        del attempt
+        return place(len(rows))
+
+    return _distinct(draw, domain, n, np.dtype(real))
+
+
+@runtime_checkable
+class _Evaluator(Protocol):
+    """A field of a precision, as `Sizing` is."""
+
+    @property
+    def real(self) -> np.dtype: ...
+
+    def __call__(self, points: np.ndarray) -> np.ndarray: ...
+
+
+def _evaluator(field: object) -> Callable[[np.ndarray], np.ndarray]:
+    """Return `field` if it has a precision of its own (a stage), else as a `Field`."""
+    return field if isinstance(field, _Evaluator) else as_field(field)
+
+
+def _checked(n: int, seed: int) -> tuple[int, int]:
+    for name, value, least in (("n", n, 1), ("seed", seed, 0)):
+        if not isinstance(value, Integral) or isinstance(value, bool):
+            raise InputTypeError(f"{name} is {value!r}, expected an integer")
+        if value < least:
+            raise InputError(f"{name} is {value}, expected at least {least}")
+    return int(n), int(seed)
+
+
+def _halve(
+    tree: DensityTree, chosen: np.ndarray, share: np.ndarray, slopes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Split boxes of the tree; deal their shares out to the children as h^-d at the centers.
+
+    Returns the new shares, and slopes: for a child, those between the centers of its siblings.
+    """
+    boxes, cover, dim = tree.boxes, tree.cover, tree.boxes.dim
+    parent, child = cover.split(chosen)
+    new = child >= 0
+    share, slopes = share[parent], slopes[parent]
+    centers = boxes.points(np.full((1, dim), 0.5), new)
+    reached = cover.reached[new]
+    log_density = np.full(len(reached), -np.inf)
+    log_density[reached] = -dim * np.log(tree.sizes(cover.keep(centers, new)[reached, 0]))
+    log_density = log_density.reshape(-1, 1 << dim)
+    densest = log_density.max(axis=1, keepdims=True)
+    # A family without any part in the domain: slivers that were lost.
+    densest[densest == -np.inf] = 0
+    weight = cover.weigh(np.exp(log_density - densest).ravel(), new).reshape(log_density.shape)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+    # No slope towards where there is no domain.
+    log_density = np.where(log_density == -np.inf, densest, log_density)
+    share[new] *= weight.ravel()
+    # Which side of its parent each child is on, -1 or 1 per axis.
+    middle = centers.reshape(-1, 1 << dim, dim)
+    side = np.sign(middle - middle.mean(axis=1, keepdims=True))
+    slope = np.einsum("pkd,pk->pd", side, log_density) / (1 << (dim - 1))
+    slopes[new] = np.repeat(slope, 1 << dim, axis=0)
+    return share, slopes
+
+
+def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Turn uniform `u` into numbers in [0, 1] of density proportional to exp(slope x)."""
+    slope = np.clip(slope, -30, 30)
+    flat = np.abs(slope) < 1e-6
+    safe = np.where(flat, 1.0, slope)
+    return np.where(flat, u, np.log1p(u * np.expm1(safe)) / safe)
+
+
+def _distinct(
+    draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, n: int, real: np.dtype
+) -> np.ndarray:
+    """Draw points; draw again those that coincide or lie on a wall in precision `real`."""
+    origin, scale = domain.frame
+    points = np.empty((n, domain.dim))
+    rows, inside = np.arange(n), np.zeros(n, bool)
+    for attempt in range(_TRIES):
+        points[rows] = draw(rows, attempt)
+        working = ((points - origin) / scale).astype(real)
+        inside[rows] = _strictly_inside(domain, points[rows], working[rows])
+        rows = np.flatnonzero(~inside | _repeated(working))
+        if not rows.size:
+            return _in_all_pieces(domain, points)
+    raise InputError(
+        f"n is {n}: that many distinct points do not fit the size field in {real.name}; "
+        + ("use dtype='float64' or " if real != np.float64 else "")
+        + "ask for fewer cells"
+    )
+
+
+def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) -> np.ndarray:
+    """Tell for each of `points` (n, d) whether it and what the precision makes of it lies off the boundary.
+
+    `working` are the points in the domain's frame.
+    """
+    origin, scale = domain.frame
+    if isinstance(domain, Polygon):
+        margin = _ROUNDINGS * float(np.finfo(working.dtype).eps) * scale
+        return domain.contains_well(points, margin)
+    lower, upper = (
+        ((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper)
+    )
+    bad = ((working <= lower) | (working >= upper)).any(axis=1)
+    bad |= ((points <= domain.lower) | (points >= domain.upper)).any(axis=1)
+    return np.asarray(~bad)
+
+
+def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
+    """Give each piece of a domain a point, from the end of those of the piece that has most."""
+    if not isinstance(domain, Polygon) or domain.n_pieces == 1:
+        return points
+    if len(points) < domain.n_pieces:
+        raise InputError(
+            f"n is {len(points)}, expected at least {domain.n_pieces}: each piece of the domain holds a cell"
+        )
+    piece = domain.piece_of(points)
+    counts = np.bincount(piece, minlength=domain.n_pieces)
+    for missing in np.flatnonzero(counts == 0).tolist():
+        most = int(np.argmax(counts))
+        row = np.flatnonzero(piece == most)[-1]
+        points[row] = domain.inner_point(missing)
+        piece[row] = missing
+        counts[[most, missing]] += [-1, 1]
+    return points
+
+
+def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
+    """Return a function that draws so many uniform random points of the domain.
+
+    In a polygon: of boxes that cover it, at least half of them inside, those that lie in it.
+    """
+    boxes = Boxes(domain)
+    cover = cover_of(boxes, domain)
+    if not isinstance(cover, PolygonCover):
+        return lambda n: domain.lower + domain.extent * rng.random((n, domain.dim))
+    while True:
+        areas = np.where(cover.reached, boxes.volumes(), 0)
+        if areas.sum() <= 2 * domain.measure or len(boxes) >= _MOST_COVER:
+            break
+        cover.split(cover.reached & (cover.share < 1))
+    ends = np.cumsum(areas) / areas.sum()
+
+    def place(n: int) -> np.ndarray:
+        found = np.empty((0, 2))
+        while len(found) < n:
+            m = 2 * (n - len(found)) + 16
+            box = np.minimum(np.searchsorted(ends, rng.random(m), side="right"), len(boxes) - 1)
+            x = boxes.points(rng.random((m, 1, 2)), box)[:, 0]
+            found = np.concatenate([found, x[cover.holds(x)]])
+        return found[:n]
+
+    return place
+
+
+def _repeated(points: np.ndarray) -> np.ndarray:
+    """Tell for each of `points` (n, d) whether an earlier one is the same."""
+    repeated = np.zeros(len(points), bool)
+    # Only points whose first coordinate occurs twice can coincide: in double precision hardly any.
+    order = np.argsort(points[:, 0], kind="stable")
+    first = points[order, 0]
+    twin = np.flatnonzero(first[1:] == first[:-1])
+    candidates = np.unique(order[np.concatenate([twin, twin + 1])])
+    if candidates.size:
+        _, keep = np.unique(points[candidates], axis=0, return_index=True)
+        repeated[np.delete(candidates, keep)] = True
+    return repeated

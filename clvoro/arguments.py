@@ -1,0 +1,204 @@
+"""Checks at the door: what a caller passes is looked at once, here, and trusted from then on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from os import fsdecode, fsencode, fspath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import InputError, InputTypeError
+
+if TYPE_CHECKING:
+    from .geometry.box import Domain
+
+
+def check_points(points: object, domain: Domain) -> np.ndarray:
+    """Return `points` as a float64 array (n, d) inside `domain`.
+
+    Raises
+    ------
+    InputTypeError
+        If `points` is not an array of real numbers.
+    InputError
+        If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
+    """
+    array = check_rows("points", points, domain.dim)
+    if len(array) == 0:
+        raise InputError(f"points has shape {array.shape}, expected at least one generator")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"points[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of "
+            f"{len(array)} points are not); remove them"
+        )
+    bad = np.flatnonzero(~domain.contains(array))
+    if bad.size:
+        raise InputError(
+            f"points[{bad[0]}] is {array[bad[0]]}, outside {domain} ({bad.size} of {len(array)} "
+            "points are); move or remove them, or enlarge the domain"
+        )
+    return array
+
+
+def check_rows(name: str, value: object, d: int) -> np.ndarray:
+    """Return `value`, an array_like of real numbers, as a float64 array (n, d); n may be 0.
+
+    Raises
+    ------
+    InputTypeError
+        If it holds something else than real numbers.
+    InputError
+        If its shape is another one, or numbers are masked.
+    """
+    if np.ma.is_masked(value):
+        raise InputError(
+            f"{name} has {np.ma.count_masked(value)} masked numbers, expected all to be there; pass "
+            "numpy.ma.compress_rows(array)"
+        )
+    expected = f"expected an array of real numbers of shape (n, {d}), one row per point"
+    try:
+        array = np.asarray(value)
+    except Exception as error:  # whatever an array of another library says
+        kind = InputError if isinstance(error, ValueError) else InputTypeError
+        raise kind(f"{name} is no array ({error}); {expected}") from error
+    if array.ndim == 0:
+        inner = getattr(value, "points", None)
+        hint = f"; pass its points, {name}.points" if isinstance(inner, np.ndarray) else ""
+        raise InputTypeError(f"{name} is a {type(value).__name__}, {expected}{hint}")
+    if array.size == 0 and array.ndim < 3:
+        return np.empty((0, d))
+    if array.dtype.kind not in "fiu":
+        hint = "convert with astype(float)"
+        if array.dtype.kind == "c":
+            hint = "pass numpy.column_stack([z.real, z.imag])"
+        if array.dtype.names:
+            hint = "pass numpy.lib.recfunctions.structured_to_unstructured(array)"
+        raise InputTypeError(f"{name} has dtype {array.dtype}, expected real numbers; {hint}")
+    if array.ndim != 2 or array.shape[1] != d:
+        remedy = "reshape it"
+        if array.ndim == 2:
+            remedy = "pass its transpose, array.T"
+            if array.shape[0] != d:
+                remedy = f"pass its coordinates, array[:, :{d}]"
+        if array.ndim == 2 and array.shape[1] < d:
+            remedy = f"points have {d} coordinates here"
+        if array.ndim == 1:
+            one = len(array) == d
+            remedy = (
+                "pass [point] for a single one" if one else "pass numpy.column_stack([x, y]), say"
+            )
+        raise InputError(f"{name} has shape {array.shape}, expected (n, {d}); {remedy}")
+    return array.astype(np.float64)
+
+
+def check_path(name: str, value: object) -> str:
+    """Return `value`, the name of a file, as a string."""
+    try:
+        path = fspath(value)  # type: ignore[call-overload]
+    except TypeError:
+        raise InputTypeError(
+            f"{name} is {value!r} of type {type(value).__name__}, expected the name of a file"
+        ) from None
+    path = fsdecode(path)
+    if "\0" in path:
+        raise InputError(f"{name} is {path!r}, expected the name of a file, without zero bytes")
+    try:
+        fsencode(path)
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{name} is {path!r}, expected the name of a file, in characters that the file system knows "
+            f"({error.reason})"
+        ) from None
+    return path
+
+
+def check_callable(name: str, value: Callable[..., object], argument: str, hint: str) -> None:
+    """Refuse a callable that cannot be called with one argument, before it is; most tell what they take."""
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # that of many built-in functions is not known
+        return
+    try:
+        signature.bind(None)
+    except TypeError:
+        kind = "class " if isinstance(value, type) else ""
+        raise InputTypeError(
+            f"{name} is the {kind}{getattr(value, '__name__', type(value).__name__)}{signature}, expected what takes "
+            f"one argument, {argument}; {hint}"
+        ) from None
+
+
+def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
+    """Return the indices of two equal rows of `points` (n, d), or None."""
+    order = np.lexsort(points.T)
+    equal = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
+    if not equal.size:
+        return None
+    i, j = sorted(order[equal[0] : equal[0] + 2].tolist())
+    return i, j
+
+
+def check_integer(
+    name: str, value: object, least: int, most: float = 2**63 - 1, beside: str = ""
+) -> int:
+    """Return `value` as an int of at least `least`, at most `most`; errors say what is allowed `beside` integers."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        expected = f"an integer or {beside}" if beside else "an integer"
+        raise InputTypeError(
+            f"{name} is {value!r} of type {type(value).__name__}, expected {expected}"
+        )
+    if value < least:
+        raise InputError(f"{name} is {value}, expected at least {least}")
+    if value > most:
+        raise InputError(f"{name} has {len(str(value))} digits, expected at most {most:.3g}")
+    return int(value)
+
+
+def check_number(
+    name: str, value: object, *, above: float = -np.inf, least: float = -np.inf
+) -> float:
+    """Return `value` as a finite float above `above` and not under `least`."""
+    try:
+        if isinstance(value, str | bytes):  # in which float() would find a number
+            raise TypeError
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputTypeError(
+            f"{name} is {value!r} of type {type(value).__name__}, expected a number"
+        ) from None
+    except OverflowError:
+        number = np.inf
+    if not np.isfinite(number) or number <= above or number < least:
+        bound = f"> {above:g}" if above > -np.inf else f">= {least:g}"
+        raise InputError(f"{name} is {value!r}, expected a finite number {bound}")
+    return number
+
+
+def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    """Refuse `value` if it is none of `choices`."""
+    if value not in choices:
+        raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
+
+
+class Naming:
+    """Says which of the caller's points coincide, when the device has found that some do."""
+
+    def __init__(self, points: np.ndarray, domain: Domain, real: np.dtype) -> None:
+        self.points, self.domain, self.real = points, domain, real
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if not isinstance(error, InputError):
+            return
+        pair = coincident_pair(self.domain.place(self.points, self.real))
+        if pair is not None:
+            other = "" if self.real == np.float64 else " or use dtype='float64'"
+            raise InputError(
+                f"points[{pair[0]}] and points[{pair[1]}] coincide in {self.real}, expected distinct "
+                f"generators; remove duplicates (numpy.unique(points, axis=0)){other}"
+            ) from error

@@ -1,0 +1,5 @@
+"""The command `clvoro`."""
+
+from .command import main
+
+__all__ = ["main"]

@@ -1,0 +1,143 @@
+"""Turn the checked size tree of a case into an object of `clvoro.sizing`."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from ...geometry.box import Box, Domain
+from ...geometry.polygon import Polygon
+from ...io.arrays import read_array
+from .domains import edges_of
+from .files import locate
+from .naca import naca4
+
+
+def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
+    """Return the size field that `node` describes.
+
+    Parameters
+    ----------
+    node : mapping
+        A tree that `schema.size` has passed.
+    folder : Path
+        Where the files that it names are looked for.
+    domain : Domain
+        What a raster covers if it does not say so itself.
+    """
+    from ... import sizing
+
+    def inner(child: Mapping[str, Any]) -> Any:
+        return build_size(child, folder, domain)
+
+    kind = node["kind"]
+    if kind == "constant":
+        return sizing.Constant(node["value"])
+    if kind == "expression":
+        return sizing.Expression(node["expression"])
+    if kind == "raster":
+        values = load_array(folder / node["file"], "size.file")
+        corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
+        return sizing.Raster(values, *corners, **_given(node, "at", "missing", "outside"))
+    if kind in ("hessian", "gradient"):
+        values = load_array(folder / node["file"], "size.file")
+        corners = node.get("lower", domain.lower), node.get("upper", domain.upper)
+        options = _given(node, "n_cells", "eps", "p", "h_min", "h_max", "at", "missing")
+        make = sizing.hessian_size if kind == "hessian" else sizing.gradient_size
+        return make(values, *corners, **options)
+    if kind == "distance":
+        options = _given(node, "growth", "slope", "h_max")
+        shapes = [_shape(s, folder, domain) for s in node["shapes"]]
+        return sizing.Distance(shapes, node["h_min"], **options)
+    if kind == "feature":
+        if not isinstance(domain, Polygon):
+            raise InputError(
+                f"size.kind is 'feature', which needs a polygon as domain, not {domain}"
+            )
+        options = _given(node, "cells_across", "growth", "h_min", "h_max", "curvature")
+        return sizing.FeatureSize(domain, **options)
+    if kind == "graded":
+        options = _given(node, "growth", "slope", "resolution")
+        return sizing.Graded(inner(node["field"]), box=domain, **options)
+    if kind == "min":
+        return sizing.minimum(*map(inner, node["fields"]))
+    if kind == "max":
+        return sizing.maximum(*map(inner, node["fields"]))
+    if kind == "sum":
+        return functools.reduce(operator.add, map(inner, node["fields"]))
+    if kind == "product":
+        return functools.reduce(operator.mul, map(inner, node["fields"]))
+    if kind == "quotient":
+        return functools.reduce(operator.truediv, map(inner, node["fields"]))
+    if kind == "scale":
+        return node["factor"] * inner(node["field"])
+    raise AssertionError(f"the schema passed a size field of kind {kind!r}")
+
+
+def _given(node: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: node[key] for key in keys if key in node}
+
+
+def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
+    from ... import sizing
+
+    kind = node["kind"]
+    if kind == "surface":
+        surface = sizing.Surface.read(locate(folder, node["file"]), **_given(node, "join"))
+        if node.get("closed", False):
+            surface.require_closed()
+            if "join" not in node:  # corners a hair apart let their triangles cross by a hair
+                surface.check()
+        return surface
+    if kind == "boundary":
+        return _boundary(domain, node.get("edges"))
+    if kind == "box":
+        return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
+    if kind in ("circle", "sphere"):
+        return sizing.Circle(node["center"], node["radius"])
+    if kind == "segment":
+        return sizing.Segment(node["a"], node["b"])
+    if kind == "polyline":
+        return sizing.Polyline(node["points"])
+    if kind == "polygon":
+        return sizing.Polygon(node["points"])
+    return sizing.Polygon(naca4(**{key: value for key, value in node.items() if key != "kind"}))
+
+
+def _boundary(domain: Domain, edges: list[int] | None) -> Any:
+    """Return the domain's own boundary; `edges` number the rings as the case gives them."""
+    if not isinstance(domain, (Box, Polygon)) or (edges is not None and isinstance(domain, Box)):
+        raise InputError(f"edges of a boundary need a polygon as domain, not {domain}")
+    if isinstance(domain, Box) or edges is None:
+        return domain
+    return domain.boundary(edges_of(domain, edges))
+
+
+def load_array(path: Path, place: str) -> np.ndarray:
+    """Read an array from a `.npy` file, or the array `points` from a `.npz` file.
+
+    Raises
+    ------
+    InputError
+        If there is no such file or it holds no such array.
+    """
+    try:
+        return read_array(path, "points")
+    except InputError as error:
+        raise InputError(
+            f"{place} names {str(path)!r}, which cannot be read as an array ({error}); "
+            "give a .npy file beside the case file"
+        ) from error
+
+
+def named_files(node: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return every table of the tree that names a file, so that the files can be copied along."""
+    children = [*node.get("fields", []), *([node["field"]] if "field" in node else [])]
+    own = [part for part in (node, *node.get("shapes", [])) if "file" in part]
+    return own + [found for child in children for found in named_files(child)]

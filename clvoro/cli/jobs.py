@@ -1,0 +1,357 @@
+"""What `clvoro run` does: run a case's methods from one start and write everything down."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..adaptation.estimates import available_memory, in_bytes
+from ..adaptation.options import Options, uses, warn_of_unused
+from ..errors import Aborted, ClvoroError, InputError
+from ..geometry.polygon import Polygon
+from ..io import save, write_history
+from ..mesh.results import Result
+from ..mesh.summary import boundary_line, summary
+from ..opencl.profile import Profile
+from .cases import Case
+from .outputs import check_folder, do_all, refuse_own_files, require_plots
+from .sequence import frames_line, run_frames
+
+_REPEATED = (
+    "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
+    "seed", "dtype",
+)  # fmt: skip
+"""Settings that a run reports and that its `case.toml` fixes, whatever later defaults are."""
+
+_MANY = 5000
+"""Cells from which files and pictures take so long that one says so."""
+_STOPPING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGXCPU")
+"""Signals after which a run ends, with what there is: Ctrl-C, a batch system's, a lost terminal's."""
+_MUCH = 2**26
+"""Bytes on the device from which on one says how many."""
+
+
+@dataclass
+class Job:
+    """One call of `clvoro run`.
+
+    Attributes
+    ----------
+    case : Case
+    out : Path
+        Folder for the files; made if it does not exist.
+    device : str or None
+        As `clvoro.create_context` takes it.
+    report : bool
+        Whether to draw pictures and write `report.html`.
+    formats : tuple of str
+        Kinds of picture files.
+    quiet, as_json : bool
+        No progress and no summary; one JSON object per finished run on the standard output.
+    profile : bool
+        Whether to time every kernel, and print where the time went.
+    checkpoint, resume : Path or None
+    checkpoint_every : float or None
+        As `Adapter.run` takes them; for one method only.
+    """
+
+    case: Case
+    out: Path
+    device: str | None = None
+    report: bool = True
+    formats: tuple[str, ...] = ("png",)
+    quiet: bool = False
+    as_json: bool = False
+    profile: bool = False
+    checkpoint: Path | None = None
+    checkpoint_every: float | None = None
+    resume: Path | None = None
+    interrupted: bool = field(default=False, init=False)
+
+    def run(self) -> bool:
+        """Run all methods, write the files, print the summary; tell whether it was interrupted.
+
+        Raises
+        ------
+        ClvoroError
+            If the input is bad, there is no device, or a run fails.
+        OSError
+            If the output cannot be written.
+        """
+        from .. import Adapter, create_context
+
+        arguments, size = self.case.run_arguments(), self.case.size_field()
+        self._refuse_unknown(arguments, Adapter.run)
+        warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods], 2)
+        arguments |= self._checkpoints()
+        named = {"checkpoint": self.checkpoint, "resume": self.resume}
+        named |= {source.name: source for source in self.case.sources()}
+        refuse_own_files(self.out, named)
+        check_folder(self.out)
+        if self.report:
+            require_plots()
+        dtype = self.case.run.get("dtype", "float64")
+        adapter = Adapter(create_context(self.device, fp64=dtype == "float64"), dtype=dtype)
+        device = adapter.ctx.devices[0]
+        where = f"{device.platform.name.strip()} / {device.name.strip()}"
+        results: dict[str, Result] = {}
+        profiles: dict[str, Profile] = {}
+        with self._stopping_cleanly():
+            try:
+                for method in self.case.methods:  # the same seed gives all the same start
+                    profile = Profile(adapter) if self.profile else None
+                    with profile or nullcontext():
+                        result = self._run_one(adapter, size, method, dict(arguments))
+                    name = str(method or result.settings.get("method", "default"))
+                    results[name] = result
+                    if profile is not None:
+                        profiles[name] = profile
+                    self._announce(name, result, where, profile)
+                    if self.interrupted:
+                        break
+            except ClvoroError:
+                if results:  # a later method's failure does not cost the earlier ones' meshes
+                    self._write(adapter, size, results, where)
+                raise
+            self._write(adapter, size, results, where)
+            frames = []
+            if self.case.frames > 1 and not self.interrupted:
+                *_, last = results.values()
+                frames = run_frames(
+                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report,
+                    self._now_and_then(),
+                )  # fmt: skip
+        self._summarize(results, where, profiles)
+        if frames and not self.quiet and not self.as_json:
+            print(frames_line(frames))
+        return self.interrupted
+
+    def _run_one(
+        self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
+    ) -> Result:
+        from .progress import Progress
+
+        # What another method of the case uses is not for this one.
+        arguments = {k: v for k, v in arguments.items() if uses(method or Options.method, k)}
+        if method is not None:
+            arguments["method"] = method
+        most = arguments.get("max_steps", _default(type(adapter).run, "max_steps"))
+        title = f"{self.case.name} {method or ''}".strip()
+        progress: Any = nullcontext() if self.quiet else Progress(title, most)
+        with progress as shown:
+
+            def callback(row: np.void) -> bool:
+                if shown is not None:
+                    shown(row)
+                return self.interrupted
+
+            def told(needed: float) -> None:
+                if shown is not None and (shown.live or needed >= _MUCH):
+                    there = in_bytes(available_memory(adapter.ctx.devices[0]))
+                    shown.tell(f"{title}: takes {in_bytes(needed)} of the device's {there}")
+
+            adapter.told = told
+            try:
+                result: Result = adapter.run(self.case.domain, size, callback=callback, **arguments)
+            finally:
+                adapter.told = None
+        if result.stop_reason == "interrupted":
+            self.interrupted = True
+        return replace(result, stop_reason="interrupted") if self.interrupted else result
+
+    def _now_and_then(self) -> Callable[[str], None]:
+        """Return what prints a text for people, if the last one was long enough ago."""
+        from .progress import EVERY
+
+        shown = time.monotonic()
+
+        def tell(text: str) -> None:
+            nonlocal shown
+            if not self.quiet and time.monotonic() - shown >= EVERY:
+                print(f"{self.case.name}: {text}", file=sys.stderr, flush=True)
+                shown = time.monotonic()
+
+        return tell
+
+    def _refuse_unknown(self, arguments: dict[str, Any], run: Callable[..., Any]) -> None:
+        known = inspect.signature(run).parameters
+        for name in arguments:
+            if name not in known:
+                raise InputError(
+                    f"{self.case.name}: run.{name} is not a setting of this version of clvoro; "
+                    "leave it out"
+                )
+
+    def _checkpoints(self) -> dict[str, Any]:
+        """Return the arguments of `Adapter.run` that have to do with checkpoints."""
+        given = {
+            "checkpoint": self.checkpoint,
+            "checkpoint_every": self.checkpoint_every,
+            "resume": self.resume,
+        }
+        given = {name: value for name, value in given.items() if value is not None}
+        if "checkpoint_every" in given and self.checkpoint is None:
+            raise InputError(
+                "checkpoint_every is given, and no checkpoint; say which file: --checkpoint FILE"
+            )
+        if given and len(self.case.methods) > 1:
+            raise InputError(
+                f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
+                f"{len(self.case.methods)}; choose one with --method"
+            )
+        return given
+
+    @contextmanager
+    def _stopping_cleanly(self) -> Iterator[None]:
+        """Let the first of the signals end the run after its step, and the second at once."""
+
+        def stop(number: int, _: object) -> None:
+            if self.interrupted:
+                raise Aborted
+            self.interrupted = True
+            print(
+                "\nclvoro: stopping after this step; once more to quit without writing",
+                file=sys.stderr,
+            )
+
+        previous = {}
+        try:
+            for number in (getattr(signal, name, None) for name in _STOPPING):
+                # What is ignored stays so: nohup does that, and a shell with what it starts in the background.
+                if number and signal.getsignal(number) not in (None, signal.SIG_IGN):
+                    previous[number] = signal.signal(number, stop)
+        except ValueError:  # not the main thread: signals are someone else's
+            pass
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
+        from .. import __version__
+
+        *others, (_, main) = results.items()
+        if not self.quiet and (sys.stderr.isatty() or len(main.points) > _MANY):
+            work = "mesh and report" if self.report else "mesh"
+            print(f"{self.case.name}: writing {work} into {self.out}", file=sys.stderr, flush=True)
+        tasks: list[Callable[[], object]] = [
+            partial(save, main, self.out / "mesh.vtu"),
+            partial(save, main, self.out / "mesh.npz"),
+            partial(write_history, main, self.out / "history.csv"),
+        ]
+        for other, result in others:
+            tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
+            tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
+        note = "; interrupted: the mesh beside it is that of an earlier step" * self.interrupted
+        header = (
+            f"Written by clvoro {__version__} on {where}{note}.",
+            "Repeat it with: clvoro run case.toml",
+        )
+        repeatable = self._repeatable(results)
+        tasks.append(partial(repeatable.write, self.out, header))
+        if self.report:
+            tasks.append(
+                lambda: self._report(adapter, size, results, where, repeatable.text(header))
+            )
+        do_all(tasks)
+
+    def _report(
+        self, adapter: Any, size: Any, results: dict[str, Result], where: str, case: str
+    ) -> None:
+        from ..plotting import write_report
+
+        *_, main = results.values()
+        write_report(
+            results,
+            self.out,
+            initial=self._initial(adapter, size, main),
+            size=size,
+            title=self.case.title,
+            case=case,
+            facts={"device": where, "precision": str(adapter.dtype)},
+            formats=self.formats,
+        )
+
+    def _repeatable(self, results: dict[str, Result]) -> Case:
+        """Return the case with all settings that took their default values written out."""
+        settings: dict[str, Any] = {}
+        for result in results.values():  # the last one is the main one
+            settings |= result.settings
+        known = {key: settings.get(key) for key in _REPEATED}
+        if known["start"] == "points":
+            known["start"] = None
+        if len(self.case.methods) > 1:  # of which each may choose its own levels
+            return self.case.with_run(**{**known, "levels": None}, methods=self.case.run["methods"])
+        return self.case.with_run(**known, method=settings.get("method"))
+
+    def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
+        """Return the mesh before the first step."""
+        if main.initial is None or main.history["level"][0] > 0:
+            return None  # no step, or a first one on a coarser level
+        points = np.clip(main.initial.points, self.case.domain.lower, self.case.domain.upper)
+        return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
+
+    def _announce(self, name: str, result: Result, where: str, profile: Profile | None) -> None:
+        """Print the run as JSON if that was asked for."""
+        if self.as_json:
+            entry = {
+                "case": self.case.name,
+                "method": name,
+                "device": where,
+                "out": str(self.out),
+                **summary(result),
+                "settings": result.settings,
+            }
+            if profile is not None:
+                entry["profile"] = profile.as_dict()
+            print(json.dumps(entry, default=_plain), flush=True)
+
+    def _summarize(
+        self, results: dict[str, Result], where: str, profiles: dict[str, Profile]
+    ) -> None:
+        """Print a table for people."""
+        if self.quiet or self.as_json:
+            return
+        print(f"{self.case.title} on {where}")
+        print(
+            f"{'method':10}{'cells':>9}{'steps':>7}{'mean |e|':>10}{'max |e|':>10}"
+            f"{'mean Q':>9}{'min Q':>8}{'seconds':>9}  stopped"
+        )
+        for name, result in results.items():
+            s = summary(result)
+            print(
+                f"{name:10}{s['cells']:9d}{s['steps']:7d}{s['mean_error']:10.4f}"
+                f"{s['max_error']:10.3f}{s['mean_quality']:9.4f}{s['min_quality']:8.3f}"
+                f"{s['seconds']:9.2f}  {s['stop_reason']}"
+            )
+        for name, result in results.items():
+            if result.diagram.domain.dim == 3:
+                print(f"{name}: {result.measures.line()}")
+            if isinstance(result.diagram.domain, Polygon):
+                print(f"{name}: {boundary_line(result)}")
+        first = "report.html" if self.report else "mesh.vtu"
+        print(f"written: {self.out / first} and what lies beside it")
+        for name, profile in profiles.items():
+            print(f"\nwhere the time of {name} went:\n{profile.table()}")
+
+
+def _default(function: Callable[..., Any], name: str) -> Any:
+    parameter = inspect.signature(function).parameters.get(name)
+    return None if parameter is None or parameter.default is parameter.empty else parameter.default
+
+
+def _plain(value: Any) -> Any:
+    """Turn NumPy's numbers and arrays, and whatever else, into what JSON has."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)

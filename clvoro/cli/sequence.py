@@ -1,0 +1,141 @@
+"""Frames of a case whose size field moves: each mesh adapted from the one before it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..adaptation.options import Options, uses
+from ..io import save
+from ..io.atomic import atomic_file, writing
+from ..mesh.results import Result
+
+if TYPE_CHECKING:
+    from .cases import Case
+
+_KEPT = ("n_cells", "max_steps", "tol", "alpha", "k", "seed", "effort", "error_target")
+"""Settings of a run that its later frames keep."""
+COLUMNS = (
+    "frame",
+    "time",
+    "cells",
+    "steps",
+    "mean_error",
+    "max_error",
+    "mean_quality",
+    "min_quality",
+    "seconds",
+)
+PICTURED = 6
+
+
+def run_frames(
+    case: Case,
+    adapter: Any,
+    first: Result,
+    out: Path,
+    stop: Callable[[], bool],
+    pictures: bool,
+    tell: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """Adapt `first`, the mesh of frame 0, to the later ones in turn, and write them into `out`.
+
+    Frame k of n has the time k / n. Written are ``frames/mesh-KKK.vtu``, ``frames.csv`` with `COLUMNS`, and with
+    `pictures` ``pictures/frames.png``. It ends early where `stop` returns True, and has `tell` say how far it has come.
+
+    Returns
+    -------
+    list of dict
+        One per frame, the first included.
+    """
+    folder = out / "frames"
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    method = case.methods[-1] or Options.method
+    arguments = {
+        k: v for k, v in case.run_arguments().items() if k in _KEPT and uses(method, k)
+    } | {"method": method}
+    result, rows, shown = first, [], {}
+    wanted = np.unique(np.linspace(0, case.frames - 1, min(PICTURED, case.frames)).round())
+    try:
+        for frame in range(case.frames):
+            time = frame / case.frames
+            if frame:
+                if stop():
+                    break
+                tell(f"frame {frame + 1} of {case.frames}")
+                result = adapter.run(
+                    case.domain, case.size_field(time), points=result.points,
+                    callback=lambda _: stop(), **arguments,
+                )  # fmt: skip
+            save(result, folder / f"mesh-{frame:03d}.vtu")
+            rows.append(_row(frame, time, result))
+            if pictures and frame in wanted:
+                shown[time] = result
+    finally:  # a frame that fails does not cost what is known of those before
+        _write_rows(rows, out / "frames.csv")
+    if shown and case.domain.dim == 2:
+        _draw(shown, out / "pictures" / "frames.png")
+    return rows
+
+
+def _write_rows(rows: list[dict[str, Any]], path: Path) -> None:
+    with atomic_file(path) as file:
+        lines = [",".join(COLUMNS), *(",".join(f"{row[c]:.6g}" for c in COLUMNS) for row in rows)]
+        file.write(("\n".join(lines) + "\n").encode())
+
+
+def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
+    error, history = np.abs(result.error), result.history
+    return {
+        "frame": frame, "time": time, "cells": len(error), "steps": int(history["step"][-1]),
+        "mean_error": error.mean(), "max_error": error.max(),
+        "mean_quality": result.quality.mean(), "min_quality": result.quality.min(),
+        "seconds": float(history["seconds"][-1]),
+    }  # fmt: skip
+
+
+def _draw(shown: Mapping[float, Result], path: Path) -> None:
+    """Draw frames side by side, colored by target size."""
+    from ..plotting import plot_cells
+    from ..plotting.colors import coloring
+    from ..plotting.legends import add_key
+    from ..plotting.pictures import render
+    from ..plotting.style import WIDTH, grid_height, new_figure, styled
+
+    results = list(shown.values())
+    domain = results[0].diagram.domain
+    columns = min(3, len(results))
+    lines = -(-len(results) // columns)
+    sizes = np.concatenate([r.size for r in results])
+    limits = (float(sizes.min()), float(sizes.max()))
+    with styled():
+        figure = new_figure(
+            WIDTH, grid_height(domain.lower, domain.upper, lines, columns, 0.65, 0.3)
+        )
+        axes = figure.subplots(lines, columns, squeeze=False).ravel()
+        for ax, (time, result) in zip(axes, shown.items(), strict=False):
+            title = f"t = {time:.2f}, {len(result.points)} cells"
+            plot_cells(result, "size", ax, limits=limits, key=False, title=title)
+            ax.set(xticks=[], yticks=[])
+        for ax in axes[len(results) :]:
+            ax.set_axis_off()
+        cells, scheme = axes[0].collections[0], coloring("size")
+        add_key(cells, list(axes), scheme, sizes, limits, below=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            file.write(render(figure))
+
+
+def frames_line(rows: list[dict[str, Any]]) -> str:
+    """Return in a line how the frames behind the first went."""
+    later = rows[1:] or rows
+    worst = max(row["mean_error"] for row in later)
+    return (
+        f"{len(rows)} frames: {min(r['steps'] for r in later)} to {max(r['steps'] for r in later)} steps each, "
+        f"mean |e| up to {worst:.4f}, mean Q down to {min(r['mean_quality'] for r in later):.4f}, "
+        f"{sum(r['seconds'] for r in later):.1f} seconds in all"
+    )

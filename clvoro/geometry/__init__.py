@@ -1,0 +1,1 @@
+"""Domains, their boundaries, shapes, surfaces, boundary layers, and readers of geometry files."""

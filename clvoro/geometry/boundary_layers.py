@@ -1,0 +1,295 @@
+"""Rows of generators along a boundary, which stay where they are: cells of a given height, in layers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from scipy.spatial import KDTree
+
+from ..arguments import check_integer, check_number
+from ..errors import InputError, InputTypeError
+from .box import Box, Domain
+from .layer_columns import count_columns, find_chains, place_columns
+from .polygon import Polygon
+
+_NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
+_SHORT = 1e-9  # of the domain: shorter edges of what layers leave are none
+_APART = 0.3  # of a width, between the last row and the generators that move
+_NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
+_OWN = 0.9  # of its distance from the wall: a generator that another wall is nearer to than this is not in its place
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Layers of cells along walls, for `Adapter.run`, in 2D.
+
+    Generators stand in columns across the wall, row over row, and do not move. Where the wall is straight their cells
+    are rectangles, layer k of height ``height * growth**k``; one row more, on the far side of the last layer, makes
+    that one's outer faces as regular. From there on sizes grow from `spacing` by `growth` a cell (see
+    `sizing.Distance`), up to the size field's.
+
+    Parameters
+    ----------
+    height : float
+        Of the first layer, in the domain's unit.
+    count : int
+        Number of layers.
+    growth : float
+        Ratio of the heights of neighboring layers, at least 1.
+    spacing : float, optional
+        Width of the cells along the wall; by default the height of the last layer.
+    edges : sequence of int, optional
+        Walls of the `Box` (0 to 3; where it is periodic there are none), or edges of the `Polygon` (see
+        `Polygon.edge_numbers` for their numbers in the rings as they were given); by default all.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is out of range.
+
+    Notes
+    -----
+    Where edges are 1.5 widths long or more, or all alike, cells have corners where the wall has: no wall's face is a
+    sliver. Along finer polygons cells are as wide as asked for, whatever the corners between them.
+
+    Examples
+    --------
+    >>> layers = clvoro.Layers(0.01, count=3, growth=1.2, edges=[2, 3])  # lower and upper wall of a box
+    >>> layers.heights.round(4).tolist(), round(layers.width, 4)
+    ([0.01, 0.012, 0.0144], 0.0144)
+    """
+
+    height: float
+    count: int = 1
+    growth: float = 1.2
+    spacing: float | None = None
+    edges: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        check_number("Layers height", self.height, above=0)
+        check_integer("Layers count", self.count, 1)
+        check_number("Layers growth", self.growth, least=1)
+        if self.spacing is not None:
+            check_number("Layers spacing", self.spacing, above=0)
+        if self.edges is not None:
+            if not isinstance(self.edges, Iterable):
+                raise InputTypeError(
+                    f"Layers edges is {self.edges!r}, expected a sequence of integers"
+                )
+            object.__setattr__(
+                self, "edges", tuple(check_integer("Layers edges", e, 0) for e in self.edges)
+            )
+
+    @property
+    def heights(self) -> np.ndarray:
+        """Heights of the layers, (count,)."""
+        return self.height * self.growth ** np.arange(self.count)
+
+    @property
+    def thickness(self) -> float:
+        """Height of all layers together, infinite where numbers end."""
+        count, g = self.count, self.growth
+        with np.errstate(over="ignore"):
+            return float(self.height * (count if g == 1 else np.expm1(count * np.log(g)) / (g - 1)))
+
+    @property
+    def width(self) -> float:
+        """Width of the cells along the wall."""
+        if self.spacing is not None:
+            return self.spacing
+        with np.errstate(over="ignore"):
+            return float(self.height * np.float64(self.growth) ** (self.count - 1))
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Distances of the generators from the wall, (count + 1,), so that bisectors are where layers meet.
+
+        At the share 1 / (1 + g) of each layer the bisectors of all layers fit; the last row mirrors the one before.
+        """
+        tops = np.cumsum(self.heights)
+        rows = tops - self.heights * (1 - 1 / (1 + self.growth))
+        return np.append(rows, 2 * tops[-1] - rows[-1])
+
+
+def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
+    """Return the generators (n, 2) of `layers` in `domain`.
+
+    Where layers meet, in corners and narrow gaps, each wall has what is nearer to it.
+
+    Raises
+    ------
+    InputError
+        If a layer does not fit the domain at all, or an edge is not there.
+    InputTypeError
+        If the domain is neither a `Box` nor a `Polygon` in 2D.
+    """
+    polygon, number = as_polygon(domain)
+    found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
+    for layer in layers:
+        for chain in find_chains(polygon, _chosen(polygon, number, layer)):
+            feet, normals = place_columns(chain, layer.width, layer.thickness)
+            for y in layer.rows:
+                found.append(feet + y * normals)
+                limits.append(np.full(len(feet), _NEAR * min(layer.width, layer.heights.min())))
+                walls.append(np.full(len(feet), y))
+    points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
+    kept = polygon.contains(points)
+    walls_of_all = np.concatenate([chosen_segments(domain, layer) for layer in layers])
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(walls_of_all)))
+    _, nearest = tree.query_nearest(
+        shapely.points(points[kept]), return_distance=True, all_matches=False
+    )
+    kept[kept] = nearest >= _OWN * wall[kept]
+    points, limit = points[kept], limit[kept]
+    # Those nearest to the wall come first, in every chain; of two that are too near the later one goes.
+    close = (
+        KDTree(points).query_pairs(limit.max(), output_type="ndarray")
+        if len(points)
+        else np.empty((0, 2), int)
+    )
+    apart = np.hypot(*(points[close[:, 0]] - points[close[:, 1]]).T)
+    close = close[apart < np.minimum(limit[close[:, 0]], limit[close[:, 1]])]
+    gone = np.zeros(len(points), bool)
+    for i, j in close[np.lexsort(close.T[::-1])].tolist():
+        if not gone[i]:
+            gone[j] = True
+    points = points[~gone]
+    if not len(points):
+        raise InputError(
+            f"layers of {[layer.thickness for layer in layers]} do not fit between the walls of the domain; "
+            "make them thinner"
+        )
+    return points
+
+
+def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
+    """Return how many generators `place_layers` will choose from, before it makes any.
+
+    Raises
+    ------
+    InputError
+        If the layers of one wall alone fill the domain, or an edge is not there.
+    InputTypeError
+        If something is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
+    """
+    polygon, number = as_polygon(domain)
+    total = 0
+    for layer in layers:
+        chains = find_chains(polygon, _chosen(polygon, number, layer))
+        if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
+            raise InputError(_NO_ROOM)
+        columns = sum(sum(count_columns(chain, layer.width, layer.thickness)) for chain in chains)
+        total += columns * (layer.count + 1)
+    return total
+
+
+def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
+    """Return a domain in 2D as a polygon, and for each of its edges the number by which `Layers.edges` means it.
+
+    The number is -1 where a periodic box has a seam in the place of a wall.
+    """
+    if isinstance(domain, Polygon):
+        return domain, np.arange(len(domain.vertices))
+    if not isinstance(domain, Box) or domain.dim != 2 or all(domain.periodic):
+        raise InputTypeError(
+            f"layers are for a Box with walls or a Polygon in 2D, not for {domain}"
+        )
+    (a, b), (c, d) = domain.lower, domain.upper
+    walls = np.array([2, 1, 3, 0])
+    return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.where(
+        np.take(domain.periodic, walls // 2), -1, walls
+    )
+
+
+def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
+    """Return the edges along which `layer` lies, (k, 2, 2): both ends of each."""
+    polygon, number = as_polygon(domain)
+    chosen = _chosen(polygon, number, layer)
+    ends = np.stack([polygon.vertices, polygon.vertices[polygon.next_vertex]], axis=1)
+    return ends[chosen]
+
+
+def _chosen(polygon: Polygon, number: np.ndarray, layer: Layers) -> np.ndarray:
+    if not isinstance(layer, Layers):
+        raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
+    if layer.edges is None:
+        return number >= 0
+    missing = np.setdiff1d(layer.edges, number)
+    if missing.size or not layer.edges:
+        walls = np.sort(number[number >= 0])
+        known = f"0 to {len(number) - 1}" if len(walls) == len(number) else str(walls.tolist())
+        raise InputError(f"Layers edges has {missing.tolist() or 'none'}, expected some of {known}")
+    return np.isin(number, layer.edges)
+
+
+def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
+    """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
+    polygon, number = as_polygon(domain)
+    chains = find_chains(polygon, _chosen(polygon, number, layer))
+    made = [place_columns(chain, layer.width, layer.thickness) for chain in chains]
+    feet, normals = zip(*made, strict=True)
+    return np.concatenate(feet), np.concatenate(normals)
+
+
+def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
+    """Return what is left of `domain` to generators that move, in its frame.
+
+    They keep a third of a width away from the last row.
+
+    Raises
+    ------
+    InputError
+        If nothing is left.
+    """
+    distances = [float(layer.rows[-1]) + _APART * layer.width for layer in layers]
+    if isinstance(domain, Box):
+        corners = np.array([domain.lower, domain.upper])
+        for layer, distance in zip(layers, distances, strict=True):
+            walls = [w for w in range(4) if not domain.periodic[w // 2]]
+            for wall in walls if layer.edges is None else layer.edges:
+                axis, end = divmod(wall, 2)
+                moved = (domain.lower, domain.upper)[end][axis] + (-distance if end else distance)
+                corners[end, axis] = (min if end else max)(corners[end, axis], moved)
+        if not (corners[0] < corners[1]).all():
+            raise InputError(_NO_ROOM)
+        return _FreeBox(tuple(corners[0]), tuple(corners[1]), domain.periodic, whole=domain)
+    polygon, _ = as_polygon(domain)
+    strips = [
+        shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer)))).buffer(
+            distance
+        )
+        for layer, distance in zip(layers, distances, strict=True)
+    ]
+    left = polygon.geometry.difference(shapely.union_all(strips))
+    # Where a strip ends beside a corner, an edge may be left that is no longer than a rounding.
+    left = shapely.make_valid(
+        shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max()))
+    )
+    every = [part for some in shapely.get_parts(left) for part in shapely.get_parts(some)]
+    parts = [part for part in every if part.area > 1e-6 * domain.measure]
+    if not parts:
+        raise InputError(_NO_ROOM)
+    inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
+    inner.framed_by = polygon
+    return inner
+
+
+@dataclass(frozen=True)
+class _FreeBox(Box):
+    """A box in the frame of another."""
+
+    whole: Box = None  # type: ignore[assignment]
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Those of the whole."""
+        return self.whole.frame
+
+
+def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
+    """Return those of `points` (n, 2) that lie in the `free` domain, and not on one of `rows` (k, 2)."""
+    apart = free.contains(points) & (KDTree(rows).query(points)[0] > 0)
+    return points[apart]

@@ -1,0 +1,287 @@
+"""Domains: what is meshed, as the host describes it and as the device sees it."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ..arguments import check_rows
+from ..errors import InputError, InputTypeError
+
+if TYPE_CHECKING:
+    from ..opencl.program import Engine
+
+LARGEST_EDGE = 1e50
+"""Longest edge, and one over the shortest: fifth powers of lengths must not leave the range of float64."""
+
+
+class ClipBox(Protocol):
+    """The box that cells are clipped by, all that stages know of a domain: a `Domain`, or a box of their own."""
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners in the device's coordinates, padded to four numbers as kernels take them."""
+        ...
+
+
+class Domain(ABC):
+    """What is meshed.
+
+    Attributes
+    ----------
+    lower, upper : tuples of d floats
+        Opposite corners of the bounding box.
+    periodic : tuple of d bool
+        Directions in which the domain goes on with itself beyond the bounding box.
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Directions in which the domain is periodic: none, unless a class says otherwise."""
+        return (False,) * self.dim
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return len(self.lower)
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Edge lengths of the bounding box, (d,)."""
+        return np.subtract(self.upper, self.lower)
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of pieces, none of which is without generators."""
+        return 1
+
+    @property
+    @abstractmethod
+    def measure(self) -> float:
+        """Area or volume."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return what files hold of the domain, as plain values."""
+
+    @abstractmethod
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If they are no numbers of that shape.
+        """
+
+    def wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
+        return np.asarray(points, float)
+
+    # The device's view.
+
+    @property
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
+
+        The scale is a power of two, so that scaling itself rounds nothing.
+        """
+        return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
+
+    def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
+        """Return positions (n, d) in the device's coordinates and precision."""
+        origin, scale = self.frame
+        return ((points - origin) / scale).astype(real)
+
+    @property
+    def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the box that cells are clipped by, whatever its walls mean."""
+        return np.array(self.lower), np.array(self.upper)
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of `clip_box` in the device's coordinates, padded to four numbers as kernels take them."""
+        # Every stage asks for them in every step.
+        known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = vars(self).setdefault("_corners", {})
+        if real not in known:
+            origin, scale = self.frame
+            corners = np.zeros((2, 4), real)
+            corners[:, : self.dim] = (np.array(self.clip_box) - origin) / scale
+            corners.setflags(write=False)
+            known[real] = corners[0], corners[1]
+        return known[real]
+
+    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
+        """Names and values that kernels are built with for this kind of domain; see geometry/domain.h."""
+        del real
+        return ()
+
+    def device_args(self, engine: Engine) -> tuple[object, ...]:
+        """Return what kernels take as DOMAIN_ARGS; see geometry/domain.h."""
+        return *self.device_corners(engine.real), *engine.period_args
+
+
+@dataclass(frozen=True)
+class Box(Domain):
+    """Axis-aligned box in 2D or 3D.
+
+    Parameters
+    ----------
+    lower, upper : sequences of 2 or 3 floats
+        Opposite corners. Wall ``2 a`` is the lower one of axis a, wall ``2 a + 1`` the upper one.
+    periodic : bool, or a sequence of 2 or 3
+        Directions without walls: what leaves on one side comes in on the other. One bool stands for all directions.
+
+    Raises
+    ------
+    InputError
+        If the corners are not 2 or 3 finite numbers each with lower < upper, or too near or far for float64.
+    InputTypeError
+        If `periodic` is something else than truth values.
+
+    Examples
+    --------
+    >>> channel = clvoro.Box((0, 0), (4, 1), periodic=(True, False))
+    >>> channel.measure, channel.contains(np.array([(0.5, 0.5), (0.5, 1.5)])).tolist()
+    (4.0, [True, False])
+
+    Notes
+    -----
+    On the device the lengths of periods, and coordinates along them, are multiples of 2^-52 (2^-23 in float32) of the
+    frame's unit, at most twice the longest edge. Adding a period is then exact and so are differences of positions,
+    which are the same for every image: cells on both sides of a seam see each other with the same numbers.
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    periodic: tuple[bool, ...] = False  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        try:
+            lower = np.asarray(self.lower, dtype=float)
+            upper = np.asarray(self.upper, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputTypeError(
+                f"Box got lower {self.lower!r} and upper {self.upper!r}, expected 2 or 3 numbers each; "
+                "write Box((0, 0), (2.5, 1.5))"
+            ) from error
+        if lower.ndim != 1 or lower.shape != upper.shape or lower.size not in (2, 3):
+            raise InputError(
+                f"Box got corners of shape {lower.shape} and {upper.shape}, expected 2 or 3 "
+                "coordinates each; write Box((0, 0), (2.5, 1.5))"
+            )
+        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
+            raise InputError(
+                f"Box got lower {self.lower} and upper {self.upper}, expected finite numbers with "
+                "lower < upper in every direction; exchange or correct the corners, as in Box((0, 0), (2.5, 1.5))"
+            )
+        with np.errstate(over="ignore"):
+            extent = upper - lower
+        if not (extent.min() >= 1 / LARGEST_EDGE and extent.max() <= LARGEST_EDGE):
+            raise InputError(
+                f"Box got edges of {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to {LARGEST_EDGE:g}: "
+                "volumes and moments of cells must be numbers, too; choose another unit of length"
+            )
+        object.__setattr__(self, "lower", tuple(lower.tolist()))
+        object.__setattr__(self, "upper", tuple(upper.tolist()))
+        object.__setattr__(self, "periodic", _directions(self.periodic, lower.size))
+
+    def __repr__(self) -> str:
+        periodic = f", periodic={self.periodic}" if any(self.periodic) else ""
+        return f"Box(lower={self.lower}, upper={self.upper}{periodic})"
+
+    @property
+    def measure(self) -> float:
+        """Area or volume."""
+        return float(np.prod(self.extent))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments that make this box."""
+        return {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.
+
+        In a periodic direction every finite position does.
+        """
+        points = check_rows("points", points, self.dim)
+        inside = (points >= self.lower) & (points <= self.upper)
+        return np.all(inside | (np.array(self.periodic) & np.isfinite(points)), axis=1)
+
+    def wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
+        points, lower, extent = np.asarray(points, float), np.array(self.lower), self.extent
+        inside = (points >= lower) & (points < self.upper)
+        with np.errstate(invalid="ignore"):  # who is given infinite ones says so
+            moved = lower + np.mod(points - lower, extent)
+        last = np.nextafter(np.array(self.upper), lower)  # where rounding has put one on the seam
+        moved = np.clip(moved, lower, last)
+        return np.where(inside | ~np.array(self.periodic), points, moved)
+
+    def periods(self, real: np.dtype) -> np.ndarray:
+        """Return the lengths of periods in the device's coordinates, (d,) float64; 0 across walls.
+
+        Raises
+        ------
+        InputError
+            If a period has no more than a thousand numbers of the precision.
+        """
+        step = float(np.finfo(real).eps)
+        lengths = np.rint(self.extent / self.frame[1] / step) * step
+        short = np.flatnonzero(np.array(self.periodic) & (lengths < 1000 * step))
+        if short.size:
+            raise InputError(
+                f"{self} is too thin along its periodic axis {short[0]} for {np.dtype(real).name}, expected at least "
+                f"{1000 * step:.1g} of the longest edge; use dtype='float64' or a thicker box"
+            )
+        return np.where(self.periodic, lengths, 0.0)
+
+    def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
+        """Return positions (n, d) in the device's coordinates and precision, along periods in [0, period)."""
+        if not any(self.periodic):
+            return super().place(points, real)
+        origin, scale = self.frame
+        x, periods = (self.wrap(points) - origin) / scale, self.periods(real)
+        along, step = np.array(self.periodic), float(np.finfo(real).eps)
+        x = np.where(along, np.rint(x / step) * step, x)
+        return np.where(along & (x >= periods), x - periods, x).astype(real)
+
+    def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+        """Corners in the device's coordinates, padded to four numbers as kernels take them."""
+        lower, upper = super().device_corners(real)
+        if any(self.periodic):
+            upper = upper.copy()
+            upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
+        return lower, upper
+
+    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
+        """Say how long the periods are, if there are any: kernels that do not name them take them as PERIOD_ARGS."""
+        if not any(self.periodic):
+            return ()
+        lengths = np.zeros(3)
+        lengths[: self.dim] = self.periods(real)
+        return (
+            ("PERIODIC", 1),
+            *((f"PERIOD_{a}", float(length).hex()) for a, length in enumerate(lengths)),
+        )
+
+
+def _directions(periodic: object, dim: int) -> tuple[bool, ...]:
+    """Return a truth value for each of `dim` directions."""
+    values = [periodic] * dim if isinstance(periodic, bool | np.bool_) else periodic
+    if not isinstance(values, list | tuple | np.ndarray) or any(
+        not isinstance(v, bool | np.bool_) for v in values
+    ):
+        raise InputTypeError(
+            f"Box got periodic {periodic!r}, expected True, False or one of them for each direction"
+        )
+    if len(values) != dim:
+        raise InputError(
+            f"Box got periodic {periodic!r} for {len(values)} directions, expected {dim}"
+        )
+    return tuple(bool(v) for v in values)

@@ -1,0 +1,132 @@
+"""A tree of bounding boxes over segments or triangles: what is nearest, and what overlaps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+_LEAF = 4  # items per leaf at most
+_BLOCK = 1 << 18  # points looked at together
+
+
+class Tree:
+    """Complete binary tree of boxes over n items.
+
+    Node k has the children 2 k + 1 and 2 k + 2; node j of a level with m nodes holds the items
+    ``order[j n // m : (j + 1) n // m]``. Each node halves its items across the longest side of the
+    box of their middles, so the tree depends on the items alone.
+
+    Parameters
+    ----------
+    low, high : (n, d) float
+        Boxes of the items.
+
+    Attributes
+    ----------
+    levels : int
+        Below the root; 2^levels leaves of at most 4 items.
+    order : (n,) int
+        The items in the order of the leaves.
+    boxes : (2^(levels + 1) - 1, 2 d) float
+        Lower and upper corners of the nodes.
+    """
+
+    def __init__(self, low: np.ndarray, high: np.ndarray):
+        self.n = len(low)
+        self.levels = max(0, math.ceil(math.log2(self.n / _LEAF)))
+        self.order = self._sort(0.5 * low.astype(float) + 0.5 * high)
+        low, high = low[self.order], high[self.order]
+        self.boxes = np.concatenate(
+            [
+                np.hstack([np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)])
+                for starts in (self.starts(level)[:-1] for level in range(self.levels + 1))
+            ]
+        )
+
+    def starts(self, level: int) -> np.ndarray:
+        """Return where the items of each node of a level begin, and the end: (2^level + 1,)."""
+        return (np.arange((1 << level) + 1, dtype=np.int64) * self.n) >> level
+
+    def _sort(self, center: np.ndarray) -> np.ndarray:
+        order = np.arange(self.n)
+        for level in range(self.levels):
+            starts = self.starts(level)
+            inside = center[order]
+            low = np.minimum.reduceat(inside, starts[:-1])
+            extent = np.maximum.reduceat(inside, starts[:-1]) - low
+            axis = extent.argmax(axis=1)
+            node = np.repeat(np.arange(1 << level), np.diff(starts))
+            longest = extent[np.arange(len(axis)), axis]
+            # One number says both node and place in it; equal places may go either way.
+            place = inside[np.arange(self.n), axis[node]] - low[node, axis[node]]
+            place /= np.where(longest > 0, longest, 1)[node]
+            order = order[np.argsort(node + 0.5 * place, kind="stable")]
+        return order
+
+    def nearest2(
+        self,
+        points: np.ndarray,
+        bound2: np.ndarray,
+        distance2: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    ) -> np.ndarray:
+        """Return the least of `bound2` and the squared distances of `points` to the items, (n,).
+
+        Parameters
+        ----------
+        points : (n, d) float
+        bound2 : (n,) float
+            What is farther is left out; the tighter, the faster.
+        distance2 : callable
+            Squared distances of points (m, d) to items (m,), given by index.
+        """
+        best2 = bound2.copy()
+        d = points.shape[1]
+        for first in range(0, len(points), _BLOCK):
+            who = np.arange(first, min(first + _BLOCK, len(points)))
+            node = np.zeros(len(who), np.int64)
+            for level in range(self.levels + 1):
+                box = self.boxes[node + (1 << level) - 1]
+                x = points[who]
+                away = np.maximum(np.maximum(box[:, :d] - x, x - box[:, d:]), 0)
+                near = (away**2).sum(axis=1) <= best2[who]
+                who, node = who[near], node[near]
+                if level < self.levels:
+                    who, node = np.repeat(who, 2), np.repeat(2 * node, 2)
+                    node[1::2] += 1
+            starts = self.starts(self.levels)
+            for slot in range(_LEAF):
+                place = starts[node] + slot
+                inside = place < starts[node + 1]
+                found = distance2(points[who[inside]], self.order[place[inside]])
+                np.minimum.at(best2, who[inside], found)
+        return best2
+
+    def overlaps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all pairs of items i < j in different leaves or in one whose leaves' boxes overlap.
+
+        Both are (m,) int; touching boxes overlap.
+        """
+        d = self.boxes.shape[1] // 2
+        i = j = np.zeros(1, np.int64)
+        for level in range(self.levels):
+            (i, j), (more_i, more_j) = (2 * i, 2 * j), (2 * i, 2 * j + 1)
+            distinct = i != j
+            i, j = (
+                np.concatenate([i, i + 1, more_i, (more_i + 1)[distinct]]),
+                np.concatenate([j, j + 1, more_j, (more_j - 1)[distinct]]),
+            )
+            first = (1 << (level + 1)) - 1
+            a, b = self.boxes[first + i], self.boxes[first + j]
+            meet = ((a[:, :d] <= b[:, d:]) & (b[:, :d] <= a[:, d:])).all(axis=1)
+            i, j = i[meet], j[meet]
+        starts = self.starts(self.levels)
+        found = []
+        for slot in range(_LEAF):
+            for other in range(_LEAF):
+                p, q = starts[i] + slot, starts[j] + other
+                inside = (p < starts[i + 1]) & (q < starts[j + 1]) & ((i != j) | (p < q))
+                found.append(np.stack([self.order[p[inside]], self.order[q[inside]]]))
+        pairs = np.sort(np.concatenate(found, axis=1), axis=0)
+        return pairs[0], pairs[1]

@@ -1,0 +1,61 @@
+"""Edges of a polygon in uniform bins, for the device: which edge does a way cross? See geometry/edges.h."""
+
+from __future__ import annotations
+
+import numpy as np
+
+BINS_PER_EDGE = 4
+LEAST_SIDE, LARGEST_SIDE = 32, 1024
+"""Bins along the longer side: small ones are quick to search, and empty ones cost nothing but memory."""
+
+
+def bin_edges(
+    begins: np.ndarray, ends: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Sort edges from `begins` to `ends`, (k, 2) each, into bins.
+
+    Returns
+    -------
+    frame : (4,) float
+        Origin (2), one over the edge of a bin, 0 for the caller to fill in.
+    shape : (4,) int32
+        Bins along x and y, 0, 0.
+    starts : (bins + 1,) int32
+        First edge listed of each bin, row by row.
+    listed : int
+        Numbers of the edges that pass through each bin, or so near that rounding matters.
+    """
+    lower = np.minimum(begins, ends).min(axis=0)
+    upper = np.maximum(begins, ends).max(axis=0)
+    extent = upper - lower
+    side = np.clip(np.sqrt(BINS_PER_EDGE * len(begins)), LEAST_SIDE, LARGEST_SIDE)
+    # A little more than the extent, so that nothing lies beyond the last bin.
+    edge = extent.max() * (1 + 1e-6) / side
+    counts = np.maximum(np.ceil(extent / edge).astype(int), 1)
+    slack = 1e-3  # of a bin: more than rounding, in single precision, too
+    a, b = (begins - lower) / edge, (ends - lower) / edge
+    # Row by row: each edge crosses some rows, and in each of them a range of bins.
+    first = np.clip(np.floor(np.minimum(a, b)[:, 1] - slack), 0, counts[1] - 1).astype(int)
+    last = np.clip(np.floor(np.maximum(a, b)[:, 1] + slack), 0, counts[1] - 1).astype(int)
+    number, row = _ranges(first, last)
+    along = b[number] - a[number]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (np.stack([row - slack, row + 1 + slack]) - a[number, 1]) / along[:, 1]
+    # A level edge has its whole length in its row.
+    t = np.where(np.isfinite(t), np.clip(t, 0, 1), [[0.0], [1.0]])
+    x = a[number, 0] + t * along[:, 0]
+    left = np.clip(np.floor(x.min(axis=0) - slack), 0, counts[0] - 1).astype(int)
+    right = np.clip(np.floor(x.max(axis=0) + slack), 0, counts[0] - 1).astype(int)
+    entry, column = _ranges(left, right)
+    bins = row[entry] * counts[0] + column
+    order = np.argsort(bins, kind="stable")
+    starts = np.searchsorted(bins[order], np.arange(counts.prod() + 1))
+    frame = np.array([*lower, 1 / edge, 0.0])
+    return frame, np.array([*counts, 0, 0], np.int32), starts.astype(np.int32), number[entry][order]
+
+
+def _ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all pairs (i, k) with first[i] <= k <= last[i]."""
+    lengths = last - first + 1
+    i = np.repeat(np.arange(len(first)), lengths)
+    return i, np.arange(len(i)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + first[i]

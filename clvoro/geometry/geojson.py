@@ -1,0 +1,173 @@
+"""Polygons of others, GeoJSON, well-known text and shapely's, as rings, piece by piece."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import shapely
+
+from ..errors import InputError, InputTypeError, MisfitWarning
+from ..files import LONGEST_GEOMETRY, read_text
+
+_GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
+_ALIKE = 0.95  # a degree of longitude over one of latitude, from which on they count as the same
+_DEEPEST = 8  # parentheses in each other: a MULTIPOLYGON has three, and GEOS calls itself for each
+
+
+def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
+    """Return the rings of a shapely Polygon or MultiPolygon, piece by piece."""
+    kind = getattr(geometry, "geom_type", type(geometry).__name__)
+    if kind not in ("Polygon", "MultiPolygon"):
+        several = isinstance(geometry, list | tuple | np.ndarray) or kind == "GeometryCollection"
+        hint = "; pass shapely.union_all(polygons)" if several else ""
+        raise InputTypeError(
+            f"geometry is a {kind}, expected a shapely Polygon or MultiPolygon{hint}"
+        )
+    parts = geometry.geoms if kind == "MultiPolygon" else [geometry]
+    found = [
+        [np.asarray(ring.coords)[:, :2] for ring in (part.exterior, *part.interiors)]
+        for part in parts
+        if not part.is_empty
+    ]
+    if not found:
+        raise InputError(f"geometry is an empty {kind}, expected at least one ring")
+    return found
+
+
+def pieces_of_wkt(text: str) -> list[list[np.ndarray]]:
+    """Return the rings of a POLYGON or MULTIPOLYGON in well-known text, piece by piece."""
+    if not isinstance(text, str):
+        raise InputTypeError(f"text is a {type(text).__name__}, expected well-known text")
+    letters = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
+    brackets = letters[(letters == ord("(")) | (letters == ord(")"))]
+    if np.where(brackets == ord("("), 1, -1).cumsum().max(initial=0) > _DEEPEST:
+        raise InputError(
+            f"text {text!r:.60} has more than {_DEEPEST} parentheses in each other, expected a POLYGON or MULTIPOLYGON"
+        )
+    try:
+        with np.errstate(all="ignore"):  # what is no number is refused below
+            geometry = shapely.from_wkt(text)
+    except shapely.errors.GEOSException as error:
+        numbers = " and finite numbers" if re.search(r"\bnan\b", text, re.IGNORECASE) else ""
+        raise InputError(
+            f"text {text!r:.60} is no well-known text ({error!s:.200}); expected closed rings{numbers}"
+        ) from error
+    return pieces_of_shape(geometry)
+
+
+def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[list[object]]:
+    """Return the rings of the polygons in a GeoJSON file, text or object, piece by piece."""
+    name = "GeoJSON"
+    # What shapely, geopandas and their kin make of themselves.
+    source = getattr(source, "__geo_interface__", source)
+    if isinstance(source, Mapping):
+        found: Any = source
+    else:
+        if not isinstance(source, (str, PathLike)):
+            raise InputTypeError(
+                f"source is a {type(source).__name__}, expected a path, a text or a dict of GeoJSON"
+            )
+        text = source if isinstance(source, str) and source.lstrip().startswith("{") else None
+        if text is None:
+            name = str(source)
+            try:
+                text = read_text(source, LONGEST_GEOMETRY)
+            except (OSError, UnicodeDecodeError) as error:
+                raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
+        try:
+            found = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{name} is no JSON ({error}), expected GeoJSON") from error
+    pieces = list(_pieces(found, name))
+    if not pieces:
+        raise InputError(f"{name} holds no Polygon, expected at least one")
+    _warn_of_degrees(found, pieces, name)
+    return pieces
+
+
+def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:
+    """Tell whether a bounding box may be one of longitudes and latitudes."""
+    return min(lower[0], -upper[0]) >= -180 and min(lower[1], -upper[1]) >= -90
+
+
+def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
+    """Warn if GeoJSON says that its coordinates are longitudes and latitudes, and a degree of both is not as long."""
+    crs = node.get("crs")
+    properties = crs.get("properties") if isinstance(crs, Mapping) else None
+    system = properties.get("name") if isinstance(properties, Mapping) else None
+    if not isinstance(system, str) or not _GEOGRAPHIC.search(system):
+        return
+    try:
+        x = np.concatenate([np.asarray(ring, float).reshape(-1, 2) for p in pieces for ring in p])
+    except (ValueError, TypeError):  # for others to refuse
+        return
+    if not len(x) or not may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist()):
+        return
+    latitude = float(np.abs(x[:, 1]).max())
+    if math.cos(math.radians(latitude)) < _ALIKE:
+        warnings.warn(
+            f"{name} is in longitudes and latitudes ({system}), which are taken as lengths in the plane: at latitude "
+            f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
+            "coordinates first, and leave out its crs if they are projected",
+            MisfitWarning,
+            stacklevel=4,
+        )
+
+
+_MEMBERS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
+
+
+def _pieces(node: object, name: str) -> Iterator[list[object]]:
+    """Walk through collections and features to the coordinates."""
+    kind = node.get("type") if isinstance(node, Mapping) else None
+    if not isinstance(node, Mapping) or not isinstance(kind, str):
+        raise InputError(f"{name} holds {node!r:.40}, expected an object with a type")
+    if kind in _MEMBERS:
+        for member in _list(node, _MEMBERS[kind], name):
+            yield from _pieces(member, name)
+    elif kind == "Feature":
+        if node.get("geometry") is None:
+            raise InputError(
+                f"{name} holds a Feature without geometry, expected Polygons only; leave it out"
+            )
+        yield from _pieces(node["geometry"], name)
+    elif kind == "Polygon":
+        yield [_flat(ring, name) for ring in _list(node, "coordinates", name)]
+    elif kind == "MultiPolygon":
+        for piece in _list(node, "coordinates", name):
+            if not isinstance(piece, (list, tuple)):
+                raise InputError(f"{name} has a MultiPolygon of {piece!r:.40}, expected lists")
+            yield [_flat(ring, name) for ring in piece]
+    else:
+        raise InputError(
+            f"{name} holds a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out"
+        )
+
+
+def _flat(ring: object, name: str) -> object:
+    """Leave out heights."""
+    if not isinstance(ring, (list, tuple)):
+        raise InputError(f"{name} has the ring {ring!r:.40}, expected a list of positions")
+    for k, p in enumerate(ring):
+        # NumPy would make numbers of these.
+        if isinstance(p, (list, tuple)) and any(type(c) in (bool, str) for c in p[:2]):
+            raise InputError(
+                f"{name} has the position {p!r:.60} at {k} of a ring, expected numbers"
+            )
+    return [p[:2] if isinstance(p, (list, tuple)) else p for p in ring]
+
+
+def _list(node: Mapping[str, Any], member: str, name: str) -> Sequence[Any]:
+    found = node.get(member)
+    if not isinstance(found, (list, tuple)):
+        raise InputError(
+            f"{name} has a {node['type']} with {member} {found!r:.40}, expected a list"
+        )
+    return found

@@ -1,0 +1,178 @@
+"""Where points lie in a region with straight edges: inside, in which piece, how far from which edge."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+
+from ..arguments import check_rows
+from .box import Domain
+from .rings import project
+
+_ROUNDINGS = 8  # of a coordinate, by which a point may lie off the boundary and still be on it
+
+
+class Region(Domain):
+    """What a `Polygon` tells of places; the attributes are described there."""
+
+    vertices: np.ndarray
+    ring_starts: np.ndarray
+    next_vertex: np.ndarray
+    piece_of_ring: np.ndarray
+
+    @property
+    def n_pieces(self) -> int:
+        """Number of pieces, each with one outer ring."""
+        return int(self.piece_of_ring[-1]) + 1
+
+    @property
+    def rings(self) -> list[np.ndarray]:
+        """Vertices (k, 2) of each ring."""
+        return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """How far the boundary turns to the left in each vertex, -pi to pi, (k,)."""
+        ahead = self.vertices[self.next_vertex] - self.vertices
+        ahead /= np.hypot(*ahead.T)[:, None]
+        after = ahead[self.next_vertex]
+        found = np.empty(len(ahead))
+        found[self.next_vertex] = np.arctan2(
+            ahead[:, 0] * after[:, 1] - ahead[:, 1] * after[:, 0], (ahead * after).sum(axis=1)
+        )
+        return found
+
+    @cached_property
+    def sharpest(self) -> np.ndarray:
+        """The vertex of each ring in which it turns farthest, the first but for roundings, (r,) int."""
+        found = []
+        for a, b in pairwise(self.ring_starts.tolist()):
+            by = np.abs(self.turns[a:b])
+            found.append(a + int(np.argmax(by >= (1 - 1e-9) * by.max())))
+        return np.array(found)
+
+    @cached_property
+    def pieces(self) -> list[Any]:
+        """Each piece as a shapely Polygon."""
+        found = []
+        for p in range(self.n_pieces):
+            mine = [
+                r for r, piece in zip(self.rings, self.piece_of_ring, strict=True) if piece == p
+            ]
+            found.append(shapely.Polygon(mine[0], mine[1:]))
+        return found
+
+    @cached_property
+    def geometry(self) -> Any:
+        """The domain as a shapely Polygon or MultiPolygon, prepared."""
+        whole = self.pieces[0] if self.n_pieces == 1 else shapely.MultiPolygon(self.pieces)
+        shapely.prepare(whole)
+        return whole
+
+    @cached_property
+    def _edges(self) -> Any:
+        """Tree of the edges."""
+        ends = np.stack([self.vertices, self.vertices[self.next_vertex]], axis=1)
+        return shapely.STRtree(np.asarray(shapely.linestrings(ends)))
+
+    @property
+    def _rounding(self) -> float:
+        far = max(map(abs, (*self.lower, *self.upper)))
+        return _ROUNDINGS * float(np.finfo(float).eps) * far
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether it lies in the domain; (n,) bool.
+
+        The boundary is included, and with it what lies off it by less than eight roundings of the largest
+        coordinate: points on slanted edges can be met no better.
+        """
+        points = check_rows("points", points, 2)
+        inside = self.covers(points)
+        near = self.lower - np.full(2, self._rounding), self.upper + np.full(2, self._rounding)
+        rest = np.flatnonzero(~inside & ((points >= near[0]) & (points <= near[1])).all(axis=1))
+        if rest.size:
+            rows, _ = self._edges.query(
+                shapely.points(points[rest]), predicate="dwithin", distance=self._rounding
+            )
+            inside[rest[rows]] = True
+        return inside
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether it lies in the domain exactly, boundary included; (n,) bool."""
+        return np.array(shapely.intersects_xy(self.geometry, points[:, 0], points[:, 1]))
+
+    def contains_well(self, points: np.ndarray, margin: float) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether it lies inside, more than `margin` from the boundary; (n,) bool."""
+        inside = self.covers(points)
+        rows = np.flatnonzero(inside)
+        near, _ = self._edges.query(
+            shapely.points(points[rows]), predicate="dwithin", distance=margin
+        )
+        inside[rows[near]] = False
+        return inside
+
+    def piece_of(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) in the domain the piece that holds it, (n,) int; -1 elsewhere."""
+        found = np.full(len(points), -1)
+        rows, pieces = shapely.STRtree(self.pieces).query(
+            shapely.points(points), predicate="intersects"
+        )
+        found[rows] = pieces
+        return found
+
+    def nearest_piece(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, 2) the piece that holds it or is nearest, (n,) int."""
+        found = self.piece_of(points)
+        rest = np.flatnonzero(found < 0)
+        if rest.size:  # off by a rounding
+            edge, _ = self.nearest_edge(points[rest])
+            ring = np.searchsorted(self.ring_starts, edge, side="right") - 1
+            found[rest] = self.piece_of_ring[ring]
+        return found
+
+    def inner_point(self, piece: int) -> np.ndarray:
+        """Return a place (2,) inside of a piece, off its boundary."""
+        return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])
+
+    def nearest_edge(
+        self, points: np.ndarray, within: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return for each of `points` (n, 2) an edge that is nearest, (n,) int, and the nearest point on it (n, 2).
+
+        Looking no farther than `within` is faster; where there is no edge, its number is -1.
+        """
+        points = np.asarray(points, dtype=float)
+        edge = np.full(len(points), -1)
+        rows, edges = self._edges.query_nearest(
+            shapely.points(points), max_distance=within, all_matches=False
+        )
+        edge[rows] = edges
+        return edge, project(points, self.vertices[edge], self.vertices[self.next_vertex[edge]])
+
+    def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
+        """Tell for each of `points` (n, 2) whether the boundary runs by more than once, within `within`; (n,) bool."""
+        rows, edges = self._edges.query(
+            shapely.points(points), predicate="dwithin", distance=within
+        )
+        after, count = self.next_vertex[edges], len(self.next_vertex)
+        on = np.hypot(*(self.vertices[after] - points[rows]).T) <= within
+        on &= np.isin(rows * count + after, rows * count + edges)
+        return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(
+            rows[on], minlength=len(points)
+        )
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return the nearest point of the domain to each of `points` (n, 2): itself, or one on the boundary."""
+        found = np.array(points, dtype=float)
+        outside = np.flatnonzero(~self.contains(found))
+        if outside.size:
+            found[outside] = self.nearest_edge(found[outside])[1]
+        return found
+
+    def boundary_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each of `points` (n, 2) to the boundary, inside and outside; (n,)."""
+        return np.hypot(*(self.nearest_edge(points)[1] - points).T)

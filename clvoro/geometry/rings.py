@@ -1,0 +1,282 @@
+"""Rings of a polygonal domain: cleaned, oriented and found sound, or refused with the ring and the place."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from ..arguments import check_rows
+from ..errors import InputError, InputTypeError
+from .box import LARGEST_EDGE
+
+SHORTEST_EDGE = 1e-12
+"""Least length of an edge, of the bounding box's longest edge."""
+_RESOLUTION = 2.0**-40  # least extent, of the largest coordinate: what is left of float64's digits
+_SPLIT = 2.0**27 + 1
+_NAMED = 4  # rings at one place
+
+
+@dataclass(frozen=True)
+class Ring:
+    """One closed chain of edges.
+
+    Attributes
+    ----------
+    vertices : (k, 2) float64
+        Without a closing vertex; the interior of the domain is on the left of every edge.
+    numbers : (k,) int64
+        Of each edge, the user's: in his ring, edge i goes from his vertex i to the next.
+    n_given : int
+        Edges of the ring as it was given.
+    name : str
+        As errors call it: "outer ring", "hole 2 of piece 0".
+    """
+
+    vertices: np.ndarray
+    numbers: np.ndarray
+    n_given: int
+    name: str
+
+
+def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
+    """Return the rings of each piece, its outer ring first, or raise an InputError.
+
+    Repeated vertices are dropped and clockwise rings reversed (holes: the others); all else that is
+    no polygon is refused.
+
+    Parameters
+    ----------
+    pieces : sequence of sequences of array_like (k, 2)
+        For each piece its outer ring and its holes, closed by a repeated first vertex or not.
+    """
+    if not len(pieces):
+        raise InputError("Polygon got no rings, expected an outer ring of at least 3 vertices")
+    several = len(pieces) > 1
+    rings: list[list[Ring]] = []
+    known: dict[tuple[bool, bytes], str] = {}
+    for p, piece in enumerate(pieces):
+        if not len(piece):
+            raise InputError(f"Polygon got no rings for piece {p}, expected an outer ring")
+        of = f" of piece {p}" if several else ""
+        names = [f"outer ring{of}", *(f"hole {h}{of}" for h in range(len(piece) - 1))]
+        rings.append([])
+        for k, (ring, name) in enumerate(zip(piece, names, strict=True)):
+            rings[-1].append(_cleaned(ring, name))
+            # Soon, as all pairs of such rings cross everywhere.
+            other = known.setdefault((k > 0, _shape_key(rings[-1][-1].vertices)), name)
+            if other != name:
+                raise InputError(
+                    f"Polygon's {name} is the {other} once more; leave one of them out"
+                )
+    flat = [ring for piece in rings for ring in piece]
+    for ring in flat:
+        _check_area(ring)
+    _check_lengths(flat)
+    shapes = [_shape(piece) for piece in rings]
+    for piece, shape in zip(rings, shapes, strict=True):
+        _check_valid(shape, piece)
+    if several:
+        _check_valid(shapely.multipolygons(shapes), flat)
+    return [[_oriented(ring, clockwise=i > 0) for i, ring in enumerate(piece)] for piece in rings]
+
+
+def signed_area(vertices: np.ndarray) -> float:
+    """Area that a ring (k, 2) encloses, positive if it runs counter-clockwise; correctly rounded."""
+    x, y = vertices.T
+    x_next, y_next = np.roll(vertices, -1, axis=0).T
+    terms = [*_product(x, y_next), *_product(-x_next, y)]
+    return 0.5 * math.fsum(np.concatenate(terms).tolist())
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a * b as an unevaluated sum of two numbers, without error (Dekker 1971)."""
+    p = a * b
+    (a_high, a_low), (b_high, b_low) = _halves(a), _halves(b)
+    return p, a_low * b_low - (((p - a_high * b_high) - a_low * b_high) - a_high * b_low)
+
+
+def _halves(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    t = _SPLIT * a
+    high = t - (t - a)
+    return high, a - high
+
+
+def _cleaned(given: object, name: str) -> Ring:
+    """Take a ring as it was given; drop vertices that are the same as the next."""
+    hint = _other_maker(given)
+    if hint:
+        raise InputTypeError(
+            f"Polygon's {name} is a {type(given).__name__}, expected its vertices (k, 2); {hint}"
+        )
+    try:
+        array = check_rows(f"Polygon's {name}", given, 2)
+    except (InputError, InputTypeError) as error:
+        hint = _other_nesting(given, name)
+        raise type(error)(f"{error}{hint}") from error
+    array = array + 0.0  # which makes -0.0 0.0: equal polygons have equal bytes
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"Polygon's {name} has vertex {bad[0]} at {_at(array[bad[0]])}, expected finite numbers"
+        )
+    if len(array) > 1 and (array[0] == array[-1]).all():
+        array = array[:-1]
+    long = (array != np.roll(array, -1, axis=0)).any(axis=1)
+    vertices = array[long]
+    if len(vertices) < 3:
+        raise InputError(
+            f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
+        )
+    return Ring(vertices, np.flatnonzero(long), len(array), name)
+
+
+def _shape_key(vertices: np.ndarray) -> bytes:
+    """Return what is the same for a ring from whichever vertex and in whichever direction it begins."""
+    first = np.lexsort(vertices.T)[0]
+    forth = np.roll(vertices, -first, axis=0)
+    back = np.roll(forth[::-1], 1, axis=0)
+    return min(forth.tobytes(), back.tobytes())
+
+
+def _other_maker(given: object) -> str:
+    """Tell how a Polygon is made of something that is no ring, but known."""
+    if isinstance(given, str | PathLike):
+        geojson = str(given).lstrip().startswith("{") or Path(given).suffix.endswith("json")
+        return f"write clvoro.Polygon.{'from_geojson' if geojson else 'from_wkt'}(...)"
+    if type(given).__module__.startswith("shapely"):
+        return "write clvoro.Polygon.from_shapely(...)"
+    if isinstance(given, Mapping) or hasattr(given, "__geo_interface__"):
+        return "write clvoro.Polygon.from_geojson(...)"
+    return ""
+
+
+def _other_nesting(given: object, name: str) -> str:
+    """Tell what is to be done with rings that are in too many lists, or in too few."""
+    if not isinstance(given, list | tuple | np.ndarray) or not len(given):
+        return ""
+    if isinstance(given[0], Real):
+        return (
+            ""
+            if name.startswith("outer") or len(given) != 2
+            else " (holes is a list of rings: of one, [ring])"
+        )
+    first = given[0]
+    nested = isinstance(first, list | tuple | np.ndarray) and len(first) and np.ndim(first[0]) == 1
+    return " (of several rings, write clvoro.Polygon(rings[0], rings[1:]))" if nested else ""
+
+
+def _check_lengths(rings: Sequence[Ring]) -> None:
+    """Refuse what float64 cannot hold: domains too large, too small or too far off, edges too short."""
+    every = np.concatenate([ring.vertices for ring in rings])
+    with np.errstate(over="ignore"):
+        extent = every.max(axis=0) - every.min(axis=0)
+    if not (extent.min() >= 1 / LARGEST_EDGE and extent.max() <= LARGEST_EDGE):
+        raise InputError(
+            f"Polygon has a bounding box of edges {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to "
+            f"{LARGEST_EDGE:g}: areas and moments of cells must be numbers, too; choose another unit of length"
+        )
+    if extent.max() < _RESOLUTION * np.abs(every).max():
+        raise InputError(
+            f"Polygon has vertices at {_at(every[0])} and extends over {extent.max():g} only: too few "
+            "digits of float64 are left; move it to the origin"
+        )
+    for ring in rings:
+        step = np.roll(ring.vertices, -1, axis=0) - ring.vertices
+        length = np.hypot(*step.T)
+        e = int(np.argmin(length))
+        if length[e] < SHORTEST_EDGE * extent.max():
+            raise InputError(
+                f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}, "
+                f"{_at(ring.vertices[e])}, expected at least {SHORTEST_EDGE:g} of the domain's size; "
+                "merge its ends (shapely.remove_repeated_points(geometry, tolerance) does)"
+            )
+
+
+def _check_area(ring: Ring) -> None:
+    # Relative to a vertex, as whatever lies on a line must be found to do so.
+    with np.errstate(over="ignore", invalid="ignore"):
+        offset = ring.vertices - ring.vertices[0]
+        far = offset[np.argmax(np.hypot(*offset.T))]
+        across = np.abs(offset @ np.array([-far[1], far[0]])) / np.hypot(*far)
+    if across.max() < SHORTEST_EDGE * np.hypot(*far):
+        raise InputError(
+            f"Polygon's {ring.name} has all its vertices on the line from {_at(ring.vertices[0])} to "
+            f"{_at(ring.vertices[0] + far)}: its area is zero"
+        )
+
+
+def _shape(piece: Sequence[Ring]) -> Any:
+    return shapely.Polygon(piece[0].vertices, [hole.vertices for hole in piece[1:]])
+
+
+_UNITE = "unite the pieces (shapely.union_all)"
+_REMEDIES = {
+    "Hole lies outside shell": "leave the hole out, or make it a piece of its own",
+    "Holes are nested": "unite the holes, or make what lies in a hole a piece of its own",
+    "Nested shells": _UNITE,
+    "Interior is disconnected": "give the parts as pieces of their own",
+}
+
+
+def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
+    """Refuse what is no polygon, with what shapely says about it and the rings at the place."""
+    reason = shapely.is_valid_reason(shape)
+    if reason == "Valid Geometry":
+        return
+    found = re.fullmatch(r"(.*)\[(\S+) (\S+)\]", reason)
+    if found is None:
+        raise InputError(f"Polygon is not valid: {reason}")
+    reason, place = found[1], np.array([float(found[2]), float(found[3])])
+    away = []
+    for ring in rings:
+        distance = distance_to_edges(place, ring.vertices)
+        away.append((float(distance.min()), int(ring.numbers[np.argmin(distance)])))
+    close = min(d for d, _ in away) + 1e-9 * float(np.ptp(rings[0].vertices, axis=0).max())
+    there = [  # by the numbers in their rings
+        f"edge {e} of the {ring.name}"
+        for ring, (d, e) in zip(rings, away, strict=True)
+        if d <= close
+    ]
+    more = len(there) - _NAMED
+    where = " and ".join([*there[:_NAMED], *([f"those of {more} more rings"] if more > 0 else [])])
+    remedy = "correct it (shapely.make_valid shows what can be made of it)"
+    if shape.geom_type == "MultiPolygon":  # each piece of which is valid
+        remedy = _UNITE
+    remedy = _REMEDIES.get(reason, remedy)
+    raise InputError(f"Polygon is not valid: {reason} at {_at(place)}, {where}; {remedy}")
+
+
+def distance_to_edges(point: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Distances (k,) of one point (2,) to the edges of one ring (k, 2)."""
+    nearest = project(point, vertices, np.roll(vertices, -1, axis=0))
+    return np.hypot(*(nearest - point).T)
+
+
+def project(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the nearest points (n, 2) to `points` on the segments from `start` to `end`, row by row."""
+    along = end - start
+    t = ((points - start) * along).sum(axis=-1) / (along * along).sum(axis=-1)
+    t = np.clip(t, 0.0, 1.0)[..., None]
+    # From the nearer end, so that both ends are met exactly.
+    return np.where(t <= 0.5, start + t * along, end - (1.0 - t) * along)
+
+
+def _oriented(ring: Ring, clockwise: bool) -> Ring:
+    if (signed_area(ring.vertices) < 0) == clockwise:
+        return ring
+    # Edge j of the reversed ring is edge k - 2 - j of the other: it begins where that ends.
+    numbers = np.roll(ring.numbers[::-1], -1)
+    return Ring(np.ascontiguousarray(ring.vertices[::-1]), numbers, ring.n_given, ring.name)
+
+
+def _at(place: np.ndarray) -> str:
+    return "(" + ", ".join(f"{c:.6g}" for c in place) + ")"

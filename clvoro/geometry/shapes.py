@@ -1,0 +1,187 @@
+"""Curves that distances are measured from: circles (spheres), segments, polylines and polygons."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError
+
+
+def coordinates(what: str, values: object, ndim: int) -> np.ndarray:
+    """Return `values` as a float array (d,) or (m, d) of finite numbers, d = 2 or 3."""
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputTypeError(f"{what} is {values!r}, expected numbers") from error
+    if array.ndim != ndim or array.shape[-1] not in (2, 3):
+        expected = "2 or 3 coordinates" if ndim == 1 else "shape (m, 2) or (m, 3)"
+        raise InputError(f"{what} has shape {array.shape}, expected {expected}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        index = tuple(bad[0].tolist())
+        raise InputError(f"{what}{list(index)} is {array[index]}, expected finite numbers")
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """Circle, in 3D the sphere.
+
+    Parameters
+    ----------
+    center : (2,) or (3,) float
+    radius : float
+        0 makes it a point.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is none, not finite, or the radius negative.
+    """
+
+    center: np.ndarray
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", coordinates("Circle center", self.center, 1))
+        if not isinstance(self.radius, Real):
+            raise InputTypeError(f"Circle radius is {self.radius!r}, expected a number")
+        if not (math.isfinite(self.radius) and self.radius >= 0):
+            raise InputError(f"Circle radius is {self.radius!r}, expected finite and not negative")
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        return self.center[None], self.center[None], np.array([float(self.radius)])
+
+
+Sphere = Circle
+"""The name of `Circle` in 3D."""
+
+
+@dataclass(frozen=True, eq=False)
+class Polyline:
+    """Open chain of straight segments.
+
+    Parameters
+    ----------
+    points : (m, 2) or (m, 3) float
+        Two or more.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If they are too few, not finite, or of another shape.
+    """
+
+    points: np.ndarray
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        array = coordinates(f"{name} points", self.points, 2)
+        least = self._least()
+        if len(array) < least:
+            raise InputError(f"{name} got {len(array)} points, expected at least {least}")
+        object.__setattr__(self, "points", array)
+
+    @staticmethod
+    def _least() -> int:
+        return 2
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        return self.points[:-1], self.points[1:], np.zeros(len(self.points) - 1)
+
+
+class Polygon(Polyline):
+    """Closed chain of straight segments, a curve; the domain that has an inside is `clvoro.Polygon`.
+
+    Parameters
+    ----------
+    points : (m, 2) or (m, 3) float
+        Three or more; the last joins the first.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If they are too few, not finite, or of another shape.
+    """
+
+    @staticmethod
+    def _least() -> int:
+        return 3
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        return self.points, np.roll(self.points, -1, axis=0), np.zeros(len(self.points))
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Straight segments that need not hang together; `clvoro.Polygon.boundary` gives them for edges of a domain.
+
+    Parameters
+    ----------
+    begin, end : (m, 2) or (m, 3) float
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If there is none, a number is not finite, or shapes differ.
+    """
+
+    begin: np.ndarray
+    end: np.ndarray
+
+    def __post_init__(self) -> None:
+        begin, end = (
+            coordinates("Edges begin", self.begin, 2),
+            coordinates("Edges end", self.end, 2),
+        )
+        if begin.shape != end.shape or not len(begin):
+            raise InputError(
+                f"Edges got begins of shape {begin.shape} and ends of shape {end.shape}, expected the same, "
+                "at least one"
+            )
+        object.__setattr__(self, "begin", begin)
+        object.__setattr__(self, "end", end)
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        return self.begin, self.end, np.zeros(len(self.begin))
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Straight segment.
+
+    Parameters
+    ----------
+    a, b : (2,) or (3,) float
+        Its ends.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a number is none or not finite, or the ends differ in dimension.
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+
+    def __post_init__(self) -> None:
+        a, b = coordinates("Segment a", self.a, 1), coordinates("Segment b", self.b, 1)
+        if a.shape != b.shape:
+            raise InputError(
+                f"Segment ends have {a.size} and {b.size} coordinates, expected the same number"
+            )
+        object.__setattr__(self, "a", a)
+        object.__setattr__(self, "b", b)
+
+    def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        return self.a[None], self.b[None], np.zeros(1)

@@ -1,0 +1,379 @@
+"""Triangulated surfaces, as arrays or from STL, OBJ, PLY and OFF files."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from numbers import Real
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError
+from ..files import open_plain, unlogged
+from .bvh import Tree
+from .shapes import coordinates
+from .triangles import crossing, triangle_distance2
+
+_FORMATS = ("stl", "obj", "ply", "off")
+_BLOCK = 1 << 18  # pairs of triangles, or of a point and a triangle, looked at together
+
+
+class Surface:
+    """A triangulated surface in 3D; for a `Distance`, both its sides are alike.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float
+    triangles : (t, 3) int
+        Rows of indices into `vertices`. Any order will do for distances; seen from outside
+        counter-clockwise for `contains`.
+    name : str
+        What errors call it.
+    join : float
+        Vertices so near to each other count as one for `closed` and its like, in the unit of the
+        coordinates; 0 joins those at the same place.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If there is no triangle, or none with an area, if a vertex is not finite, or an index points
+        to no vertex; names the first.
+
+    Notes
+    -----
+    Corners at the same place count as one vertex, so a file of separate triangles (STL) is as good
+    as one with shared vertices. Open, branching and self-intersecting surfaces are accepted: the
+    distance to them is well defined. `closed`, `open_edges`, `require_closed` and `check` are for
+    those who need more.
+
+    Examples
+    --------
+    Cells of 0.01 on a part, growing by a tenth per cell away from it::
+
+        part = clvoro.sizing.Surface.read("part.stl")
+        size = clvoro.sizing.Distance(part, h_min=0.01, growth=1.1, h_max=0.2)
+    """
+
+    def __init__(
+        self, vertices: object, triangles: object, name: str = "Surface", join: float = 0.0
+    ):
+        if not (isinstance(join, Real) and 0 <= join < math.inf):
+            raise InputError(f"{name} join is {join!r}, expected a finite distance, 0 or more")
+        self.name, self.join = name, float(join)
+        self.vertices = coordinates(f"{name} vertices", vertices, 2)
+        if self.vertices.shape[1] != 3:
+            raise InputError(
+                f"{name} vertices have shape {self.vertices.shape}, expected (v, 3); "
+                "in 2D use Polygon or Polyline"
+            )
+        given = np.asarray(triangles)
+        if given.size and given.dtype.kind not in "iu":
+            raise InputTypeError(
+                f"{name} triangles are of type {given.dtype}, expected integers, the indices of "
+                "vertices"
+            )
+        if given.ndim != 2 or given.shape[1] != 3 or not len(given):
+            raise InputError(
+                f"{name} triangles have shape {given.shape}, expected (t, 3) with at least one; "
+                "split larger faces into triangles"
+            )
+        bad = np.argwhere((given < 0) | (given >= len(self.vertices)))
+        if len(bad):
+            row, column = bad[0].tolist()
+            raise InputError(
+                f"{name} triangles[{row}, {column}] is {given[row, column]}, expected an index of "
+                f"one of the {len(self.vertices)} vertices, 0 to {len(self.vertices) - 1}"
+            )
+        self.triangles = given.astype(np.int64)
+        self.triangles.flags.writeable = False
+        if not (self.areas > 0).any():
+            raise InputError(
+                f"{name} has {len(given)} triangles, none of which has an area; expected a "
+                "surface. Is a column of the coordinates missing?"
+            )
+
+    @classmethod
+    def read(cls, path: str | PathLike[str], join: float = 0.0) -> Surface:
+        """Read a surface from an STL, OBJ, PLY or OFF file (needs trimesh); `join` as above.
+
+        Raises
+        ------
+        InputError
+            If trimesh is not installed, the file cannot be read, or holds no good surface.
+        """
+        path = Path(path)
+        kind = path.suffix.lower().lstrip(".")
+        if kind not in _FORMATS:
+            raise InputError(
+                f"{str(path)!r} ends in {path.suffix!r}, expected a surface file: "
+                + ", ".join(f".{f}" for f in _FORMATS)
+            )
+        if not path.exists():
+            raise InputError(f"there is no surface file {str(path)!r}")
+        try:
+            import trimesh
+        except ImportError as error:
+            raise InputError(
+                "reading a surface file needs trimesh; pip install 'clvoro[surfaces]' "
+                "(or pip install trimesh), or pass the arrays: Surface(vertices, triangles)"
+            ) from error
+        # Pictures and materials beside the surface are none of our business.
+        extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
+        try:
+            # What is no number among the coordinates is refused below.
+            with open_plain(path) as file, np.errstate(all="ignore"), unlogged("trimesh"):
+                mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
+            vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+        except MemoryError:
+            raise
+        except OSError as error:
+            raise InputError(
+                f"surface file {str(path)!r} cannot be read: {error.strerror or error}"
+            ) from error
+        except (
+            ModuleNotFoundError
+        ) as error:  # it would guess what the bytes that are no text could be
+            raise InputError(
+                f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged, or no text in UTF-8; export it anew"
+            ) from error
+        except Exception as error:  # a reader may fail in any way on a broken file
+            raise InputError(
+                f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: "
+                f"{error}); export it anew"
+            ) from error
+        if not triangles.size:
+            raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
+        return cls(vertices, triangles, f"surface {str(path)!r}", join)
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """Corners of the triangles, (t, 3, 3) float."""
+        return self.vertices[self.triangles]
+
+    @cached_property
+    def _unit_corners(self) -> np.ndarray:
+        """The corners about the middle of the vertices, in units of their largest extent."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        extent = (high - low).max()
+        return (self.corners - (low + 0.5 * (high - low))) / (extent if extent > 0 else 1.0)
+
+    @cached_property
+    def areas(self) -> np.ndarray:
+        """Areas of the triangles, (t,) float, in units of the largest extent squared."""
+        a, b, c = np.moveaxis(self._unit_corners, 1, 0)
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+    @cached_property
+    def tree(self) -> Tree:
+        """The boxes of the triangles."""
+        return Tree(self.corners.min(axis=1), self.corners.max(axis=1))
+
+    @cached_property
+    def _merged(self) -> np.ndarray:
+        """Triangles (t, 3) as indices of places: vertices at the same place are one."""
+        unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
+        if self.join > 0:
+            from scipy.sparse import coo_array
+            from scipy.sparse.csgraph import connected_components
+            from scipy.spatial import KDTree
+
+            near = KDTree(unique).query_pairs(self.join, output_type="ndarray")
+            shape = (len(unique), len(unique))
+            graph = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
+            places = connected_components(graph, directed=False)[1][places.reshape(-1)]
+        return places.reshape(-1)[self.triangles]
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Edges (e, 2) of places, how many triangles each has, and a triangle and side of each.
+
+        Triangles that have shrunk to an edge or a point have none.
+        """
+        merged = self._merged
+        whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
+        ends = np.stack([merged[whole], np.roll(merged[whole], -1, axis=1)], axis=2).reshape(-1, 2)
+        edges, first, count = np.unique(
+            np.sort(ends, axis=1), axis=0, return_index=True, return_counts=True
+        )
+        return edges, count, 3 * np.flatnonzero(whole)[first // 3] + first % 3
+
+    @cached_property
+    def open_edges(self) -> np.ndarray:
+        """Edges that bound one triangle alone, (k, 2) int, indices of vertices."""
+        _, count, where = self._edges
+        triangle, side = np.divmod(where[count == 1], 3)
+        return np.column_stack(
+            [self.triangles[triangle, side], self.triangles[triangle, (side + 1) % 3]]
+        )
+
+    @property
+    def closed(self) -> bool:
+        """Whether every edge belongs to an even number of triangles, so that there is an inside."""
+        return not (self._edges[1] % 2).any()
+
+    def require_closed(self) -> None:
+        """Raise if the surface is not closed.
+
+        Raises
+        ------
+        InputError
+            With the number of open edges and the first of them.
+        """
+        if self.closed:
+            return
+        edges = self.open_edges
+        if len(edges):
+            a, b = (self._place(self.vertices[i]) for i in edges[0])
+            raise InputError(
+                f"{self.name} is open: {len(edges)} edges bound one triangle only, the first from "
+                f"{a} to {b}; expected a closed surface: fill the holes, or pass join= if "
+                "vertices that should coincide are a little apart"
+            )
+        edges, count, where = self._edges
+        odd = np.flatnonzero(count % 2)
+        triangle, side = divmod(int(where[odd[0]]), 3)
+        a, b = (self._place(self.corners[triangle, (side + k) % 3]) for k in (0, 1))
+        raise InputError(
+            f"{self.name} is not closed: {len(odd)} edges bound an odd number of triangles, the "
+            f"first, from {a} to {b}, {count[odd[0]]}; remove the triangles too many"
+        )
+
+    def crossings(self) -> np.ndarray:
+        """Return the pairs of triangles that cross or cover each other, (k, 2) int, sorted.
+
+        Triangles that only touch, at shared corners and sides or elsewhere, do not; those thinner
+        than 1e-7 of their length are not looked at.
+        """
+        i, j = self.tree.overlaps()
+        corners = self._unit_corners
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        found = []
+        for first in range(0, len(i), _BLOCK):
+            p, q = i[first : first + _BLOCK], j[first : first + _BLOCK]
+            meet = ((low[p] <= high[q]) & (low[q] <= high[p])).all(axis=1)
+            p, q = p[meet], q[meet]
+            hit = crossing(corners[p], corners[q])
+            found.append(np.column_stack([p[hit], q[hit]]))
+        pairs = np.concatenate(found)
+        return pairs[np.lexsort(pairs.T[::-1])]
+
+    def check(self) -> None:
+        """Raise if the surface crosses itself.
+
+        Raises
+        ------
+        InputError
+            Naming the first two triangles that cross, their place and how many pairs do.
+        """
+        pairs = self.crossings()
+        if len(pairs):
+            p, q = pairs[0].tolist()
+            raise InputError(
+                f"{self.name} crosses itself: triangles {p}, about "
+                f"{self._place(self.corners[p].mean(axis=0))}, and {q}, about "
+                f"{self._place(self.corners[q].mean(axis=0))}, and {len(pairs) - 1} more pairs; "
+                "expected a surface without self-intersections. Mend it where it was made, for "
+                "instance with a boolean union of its parts"
+            )
+
+    def contains(self, points: object) -> np.ndarray:
+        """Tell for each of `points` (n, 3) whether it lies inside the closed surface, (n,) bool.
+
+        By the winding number, the sum of the triangles' solid angles over 4 pi, rounded: exact off
+        the surface itself. Costs n t operations on the host. Either orientation will do, if it is
+        the same throughout.
+
+        Raises
+        ------
+        InputError
+            If the surface is not closed.
+        """
+        self.require_closed()
+        x = coordinates("points", points, 2)
+        inside = np.zeros(len(x), bool)
+        rows = max(1, _BLOCK // len(self.corners))
+        for first in range(0, len(x), rows):
+            v = self.corners - x[first : first + rows, None, None]
+            length = np.linalg.norm(v, axis=-1)
+            a, b, c = np.moveaxis(v, -2, 0)
+            la, lb, lc = np.moveaxis(length, -1, 0)
+            # tan(angle / 2) = a . (b x c) / (abc + (a.b) c + (b.c) a + (c.a) b)
+            volume = np.einsum("...k,...k->...", a, np.cross(b, c))
+            rest = la * lb * lc
+            for p, q, r in ((a, b, lc), (b, c, la), (c, a, lb)):
+                rest += np.einsum("...k,...k->...", p, q) * r
+            angle = 2 * np.arctan2(volume, rest)
+            inside[first : first + rows] = np.abs(angle.sum(axis=1)) > 2 * np.pi
+        return inside
+
+    def distance2(self, points: np.ndarray) -> np.ndarray:
+        """Return the squared distances of `points` (n, 3) to the surface, (n,) float64."""
+        from scipy.spatial import KDTree
+
+        used = self.vertices[np.unique(self.triangles)]
+        bound = KDTree(used).query(points)[0] * (1 + 1e-12)
+        return self.tree.nearest2(
+            points, bound**2, lambda x, item: triangle_distance2(x, self.corners[item])
+        )
+
+    def landmarks(self, spacing: float, most: int) -> np.ndarray:
+        """Return at most `most` points on the surface, `spacing` apart or so."""
+        total = np.cumsum(self.areas)
+        unit = np.ptp(self.vertices, axis=0).max()
+        count = int(min(max(total[-1] * (unit / spacing) ** 2, 1), most))
+        # Evenly along the sum of areas, and in each triangle by the golden section.
+        item = np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1])
+        item = np.minimum(item, len(total) - 1)
+        k = np.arange(count)
+        s, t = np.sqrt((0.5 + 0.7548776662466927 * k) % 1), (0.5 + 0.5698402909980532 * k) % 1
+        weights = np.column_stack([1 - s, s * (1 - t), s * t])
+        return np.einsum("nk,nkd->nd", weights, self.corners[item])
+
+    def packed(self, origin: np.ndarray, scale: float, real: np.dtype) -> tuple[np.ndarray, Tree]:
+        """Return the triangles as the device takes them, (t, 21) in the tree's order, and the tree.
+
+        A corner a, the sides b - a and c - a, the two vectors that tell a point's coordinates s and
+        t in them, the unit normal, and 1 / length^2 of b - a, c - a, c - b; in coordinates
+        x' = (x - origin) / scale, rounded to `real` first, so that the rest fits what the device
+        sees. A triangle thinner than 1e-7 of its length has no normal: it is its sides.
+        """
+        corners = ((self.corners - origin) / scale).astype(real)
+        tree = Tree(corners.min(axis=1), corners.max(axis=1))
+        corners = corners[tree.order].astype(float)
+        a, side1, side2 = (
+            corners[:, 0],
+            corners[:, 1] - corners[:, 0],
+            corners[:, 2] - corners[:, 0],
+        )
+        normal = np.cross(side1, side2)
+        double_area = np.linalg.norm(normal, axis=1)
+        length2 = np.column_stack([(v**2).sum(axis=1) for v in (side1, side2, side2 - side1)])
+        longest = length2.max(axis=1)
+        sound = double_area > 1e-7 * longest
+        normal = np.where(sound[:, None], normal / np.where(sound, double_area, 1)[:, None], 0)
+        over = np.divide(1, double_area, out=np.zeros_like(double_area), where=sound)[:, None]
+        s, t = np.cross(side2, normal) * over, np.cross(normal, side1) * over
+        tiny = 4 * float(np.finfo(real).tiny)
+        inverse = np.divide(1, length2, out=np.zeros_like(length2), where=length2 > tiny)
+        return np.hstack([a, side1, side2, s, t, normal, inverse]), tree
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+    @staticmethod
+    def _place(point: np.ndarray) -> str:
+        return "(" + ", ".join(f"{c:.6g}" for c in point) + ")"
+
+    def __repr__(self) -> str:
+        return f"Surface({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
+
+
+def box_surface(lower: np.ndarray, upper: np.ndarray) -> Surface:
+    """Return the six sides of a box as twelve triangles, counter-clockwise from outside."""
+    bits = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return Surface(np.where(bits, upper, lower), triangles, "Box")

@@ -1,0 +1,111 @@
+"""What holds of faces beside what `check.py` asks: both cells have the same corners, measures fit each other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...geometry.boundary import wall_planes
+from ...geometry.polygon import Polygon
+from ..connectivity import face_keys, take_rows
+from ..outlines import face_ends
+from .findings import ROUNDINGS
+
+if TYPE_CHECKING:
+    from .findings import Check
+    from .rebuilt import Doubts, Rebuilt
+
+
+def check_corners(check: Check) -> None:
+    """Check that a face has the same corners from both sides: a vertex that is stored twice is found here.
+
+    In a polygon corners tell faces apart, and the graph is not symmetric otherwise. Across a seam each side has
+    vertices of its own.
+    """
+    d = check.diagram
+    if isinstance(d.domain, Polygon):
+        return
+    inner = np.flatnonzero((d.neighbors >= 0) & ~d.shifts.any(axis=1))
+    here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
+    if d.domain.dim == 2:
+        ends = face_ends(d)
+        wrong = (ends[here] != ends[there][:, ::-1]).any(axis=1)
+    else:
+        starts, corners = d.face_vertex_starts, d.face_vertices
+        a, b = (take_rows(starts, corners, rows) for rows in (here, there))
+        wrong = np.diff(a[0]) != np.diff(b[0])
+        same = ~wrong
+        row_a, row_b = (np.repeat(np.arange(len(here)), np.diff(x[0])) for x in (a, b))
+        one, two = a[1][same[row_a]], b[1][same[row_b]]
+        row = row_a[same[row_a]]
+        off = one[np.lexsort((one, row))] != two[np.lexsort((two, row))]
+        wrong[row[off]] = True
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
+    check.note(
+        "vertices once", wrong,
+        lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
+    )  # fmt: skip
+    if d.domain.dim == 2 and not any(d.domain.periodic):
+        # Of what covers a rectangle; across seams vertices have several numbers.
+        v, e = len(d.vertices), len(d.neighbors) - len(inner) // 2
+        check.note(
+            "Euler's formula", np.array([v - e + len(d) != 1]),
+            lambda _: f"{v} vertices - {e} faces + {len(d)} cells is {v - e + len(d)}, expected 1: faces cross, or "
+            "two vertices have one number",
+        )  # fmt: skip
+
+
+def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
+    """Check that the faces' measures close each cell, and give its volume, with their places as generators have them.
+
+    A cell is cut out around its generator: its measures round by its own size, not the domain's, as `positions` do,
+    unless they were made anew from a file's corners.
+    """
+    d = check.diagram
+    if g.remade:
+        return
+    dim, n = d.domain.dim, len(d)
+    own = ROUNDINGS * g.unit_of_cell
+    doubts = g.doubts(own)
+    normals, height = g.directions, g.spacings / 2
+    walls = np.flatnonzero(d.neighbors < 0)
+    planes, anchors = wall_planes(d.domain, -1 - d.neighbors[walls])
+    height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
+    loose = np.zeros(len(g.owner), bool)
+    if isinstance(d.domain, Polygon):
+        # Parts that were cut off from their generators have faces anywhere: these are where their corners are. Such a
+        # part lies at the boundary, and so does the cell that has it now, on one side of the face or the other.
+        there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
+        at_boundary = np.bincount(g.owner[walls], minlength=n) > 0
+        at_wall = (
+            at_boundary[g.owner] | at_boundary[np.where(d.neighbors < 0, g.owner, d.neighbors)]
+        )
+        off = np.linalg.norm(there - normals, axis=1) * g.measures
+        adopted = off > np.where(at_wall, doubts.measures, positions.measures)
+        adopted &= (d.neighbors >= 0) & (g.measures > 0)
+        normals = np.where(adopted[:, None], there, normals)
+        # Edges meet their corners to rounding.
+        loose = adopted | (d.neighbors < 0)
+    rounding = np.where(loose, 2 * positions.measures, 0.0)
+    # Across seams neighbors are off by what the device's periods are.
+    across = np.where(d.shifts.any(axis=1), g.period_off, 0.0) * d.face_measures
+    turned = across / g.spacings
+    width = np.bincount(g.owner, doubts.measures + rounding + turned, n)
+    gap = np.stack(
+        [np.bincount(g.owner, d.face_measures * normals[:, k], n) for k in range(dim)], axis=1
+    )
+    gap = np.linalg.norm(gap, axis=1)
+    check.note(
+        "measures close", np.maximum(gap - width, 0),
+        lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
+    )  # fmt: skip
+    if isinstance(d.domain, Polygon):  # how far off a part's faces are only corners tell
+        return
+    volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
+    gap = np.abs(d.volumes - volumes)
+    width = doubts.volumes + np.bincount(g.owner, across, n) / (2 * dim)
+    check.note(
+        "volumes", np.maximum(gap - width, 0),
+        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
+    )  # fmt: skip

@@ -1,0 +1,317 @@
+"""Is a mesh what it claims to be? Everything that can be known of it is computed anew, by NumPy on the host.
+
+Nothing here comes from the device's code: cells are rebuilt from their corners, errors and quality from the paper's
+formulas, and the diagram's one defining property - no generator is nearer to a corner than the cell's own - is asked
+of a search tree over all generators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...geometry.boundary import surface, wall_count, wall_distance
+from ...geometry.polygon import Polygon
+from ..connectivity import face_keys
+from .faces import check_corners, check_measures
+from .findings import ROUNDINGS, Check, MisfitError, Report
+from .polygon import check_cells, check_edges, check_outlines, hidden
+from .rebuilt import Doubts, Rebuilt
+from .values import check_values
+
+if TYPE_CHECKING:
+    from ..results import Diagram, Result
+
+
+def check_diagram(diagram: Diagram) -> Report:
+    """Check a diagram in 2D or 3D; see `Diagram.check`."""
+    return _finish(Check(diagram))
+
+
+def check_result(result: Result) -> Report:
+    """Check a result: its diagram, sizes, error (the paper's 3.1), quality (4.1) and history; see `Result.check`."""
+    check = Check(result.diagram)
+    return _finish(
+        check, result.settings.get("dtype"), lambda geometry: check_values(check, result, geometry)
+    )
+
+
+def _finish(
+    check: Check, dtype: object = None, more: Callable[[Rebuilt], None] | None = None
+) -> Report:
+    diagram, geometry = check.diagram, None
+    try:
+        # What is wrong may divide by 0, and is told as a finding.
+        with np.errstate(all="ignore"):
+            _check_structure(check)
+            geometry = Rebuilt(diagram, dtype)
+            _check_geometry(check, geometry)
+            if more is not None:
+                more(geometry)
+    except MisfitError:
+        pass
+    names = tuple(dict.fromkeys(check.checked))
+    real = "unknown precision" if geometry is None else geometry.real.name
+    faces = len(diagram.neighbors)
+    return Report(tuple(check.findings), names, len(diagram), faces, real)
+
+
+def _check_structure(check: Check) -> None:
+    """Check that the arrays fit each other, and that the graph is one."""
+    d = check.diagram
+    dim, n = d.domain.dim, len(d.points)
+    m = len(d.neighbors)
+    check.shape("points", d.points, (n, dim))
+    check.shape("volumes", d.volumes, (n,))
+    check.shape("centroids", d.centroids, (n, dim))
+    check.shape("neighbor_starts", d.neighbor_starts, (n + 1,), "iu")
+    check.shape("neighbors", d.neighbors, (m,), "i")
+    check.shape("shifts", d.shifts, (m, dim), "i")
+    check.shape("face_measures", d.face_measures, (m,))
+    check.shape("face_centroids", d.face_centroids, (m, dim))
+    check.shape("vertices", d.vertices, (len(d.vertices), dim))
+    _check_starts(check, "neighbor_starts", d.neighbor_starts, m)
+    if dim == 2:
+        check.shape("cell_vertex_starts", d.cell_vertex_starts, (n + 1,), "iu")
+        _check_starts(check, "cell_vertex_starts", d.cell_vertex_starts, len(d.cell_vertices))
+        corners = d.cell_vertices
+        if isinstance(d.domain, Polygon):
+            check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
+            check.shape("face_vertices", d.face_vertices, (2 * m,), "iu")
+            check.note(
+                "shapes", d.face_vertex_starts != 2 * np.arange(m + 1),
+                lambda k: f"face_vertex_starts[{k}] is {d.face_vertex_starts[k]}, expected {2 * k}", stop=True,
+            )  # fmt: skip
+            corners = np.concatenate([corners, d.face_vertices])
+        else:
+            check.note(
+                "shapes", d.cell_vertex_starts != d.neighbor_starts,
+                lambda i: f"cell_vertex_starts[{i}] is {d.cell_vertex_starts[i]}, expected as many corners "
+                f"as faces, {d.neighbor_starts[i]}", stop=True,
+            )  # fmt: skip
+    else:
+        check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
+        _check_starts(check, "face_vertex_starts", d.face_vertex_starts, len(d.face_vertices))
+        corners = d.face_vertices
+    check.note(
+        "corners exist", (corners < 0) | (corners >= len(d.vertices)),
+        lambda k: f"corner {k} is vertex {corners[k]} of {len(d.vertices)}", stop=True,
+    )  # fmt: skip
+    j, walls = d.neighbors, wall_count(d.domain)
+    check.note(
+        "neighbors exist", (j >= n) | (j < -walls),
+        lambda f: f"face {f} leads to {j[f]}, expected a cell below {n} or a wall from {-walls} to -1",
+        stop=True,
+    )  # fmt: skip
+    used = np.bincount(corners, minlength=len(d.vertices))
+    check.note("vertices used", used == 0, lambda v: f"vertex {v} is no cell's corner")
+
+    _check_shifts(check)
+    i = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+    check.note(
+        "neighbors", (i == j) & ~d.shifts.any(axis=1),
+        lambda f: f"cell {j[f]} is its own neighbor",
+    )  # fmt: skip
+    inner = np.flatnonzero(j >= 0)
+    there, back = face_keys(d, inner)
+    order = np.argsort(there)
+    sorted_ = there[order]
+
+    def pair(key: int) -> tuple[int, int]:
+        """Return the cells of a face."""
+        face = inner[order[np.searchsorted(sorted_, key)]]
+        return int(i[face]), int(j[face])
+
+    twice = np.flatnonzero(sorted_[1:] == sorted_[:-1])
+    check.note(
+        "neighbors", np.isin(np.arange(len(there)), twice),
+        lambda k: "cell {} lists cell {} twice".format(*pair(sorted_[k])),
+    )  # fmt: skip
+    lone = np.setdiff1d(there, back)
+    check.note(
+        "graph symmetric", np.ones(len(lone)),
+        lambda k: "cell {} lists cell {}, which does not list it".format(*pair(lone[k])), stop=True,
+    )  # fmt: skip
+    check_corners(check)
+    if isinstance(d.domain, Polygon):
+        check_outlines(check)
+
+
+def _check_shifts(check: Check) -> None:
+    """Check that only faces in periodic directions lead to images, and none to walls there."""
+    d = check.diagram
+    periodic = np.array(d.domain.periodic)
+    shifts, j = d.shifts, d.neighbors
+    allowed = np.where(periodic & (j >= 0)[:, None], 1, 0)
+    check.note(
+        "shifts", (np.abs(shifts) > allowed).any(axis=1),
+        lambda f: f"shifts[{f}] of the face to {j[f]} is {shifts[f]}, expected -1 to 1 along periodic axes, else 0",
+        stop=True,
+    )  # fmt: skip
+    if periodic.any():
+        walls = np.flatnonzero(j < 0)
+        check.note(
+            "walls", periodic[(-1 - j[walls]) // 2],
+            lambda k: f"face {walls[k]} leads to wall {-1 - j[walls[k]]}, across a periodic axis",
+            stop=True,
+        )  # fmt: skip
+
+
+def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> None:
+    good = len(starts) > 0 and starts[0] == 0 and starts[-1] == total
+    rises = np.diff(starts.astype(np.int64)) if len(starts) else np.zeros(0)
+    check.note(
+        "shapes", np.array([not good or bool((rises < 0).any())]),
+        lambda _: f"{name} does not cut {total} entries into rows", stop=True,
+    )  # fmt: skip
+
+
+def _check_geometry(check: Check, g: Rebuilt) -> None:
+    d = check.diagram
+    n, dim, domain = len(d), d.domain.dim, d.domain
+    slack = ROUNDINGS * g.unit
+    doubts = g.doubts(slack)
+    check.note(
+        "generators inside", ~domain.contains(d.points) | (domain.wrap(d.points) != d.points).any(axis=1),
+        lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
+    )  # fmt: skip
+    outside = np.flatnonzero(~domain.contains(d.vertices))
+    if isinstance(domain, Polygon):  # slanted edges are met to rounding only
+        outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
+    check.note(
+        "vertices inside", np.ones(len(outside)),
+        lambda k: f"vertex {outside[k]} at {d.vertices[outside[k]]} lies outside {domain}",
+    )  # fmt: skip
+    check.note(
+        "volumes", ~(d.volumes > 0), lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0"
+    )
+    check.note(
+        "orientation", ~(g.volumes >= -slack * (g.perimeters + slack)),
+        lambda i: f"the corners of cell {i} go around clockwise (volume {g.volumes[i]:.4g})",
+    )  # fmt: skip
+    excess = np.abs(d.volumes - g.volumes) - doubts.volumes - slack**dim
+    check.note(
+        "volumes", np.maximum(excess, 0),
+        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
+    )  # fmt: skip
+    total = float(d.volumes.sum())
+    allowed = slack * (g.perimeters.sum() / np.sqrt(n) + surface(domain))
+    check.note(
+        "volumes sum", np.array([abs(total - domain.measure) > allowed]),
+        lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",
+    )  # fmt: skip
+    _check_faces(check, g, slack, doubts)
+    check_measures(check, g, doubts)
+    off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
+    # A centroid is a quotient: where rounding is much of the cell, so it is of the centroid.
+    doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)
+    check.note(
+        "centroids", np.maximum(off - doubt, 0),
+        lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give "
+        f"{d.points[i] + g.centroids[i]}",
+    )  # fmt: skip
+    if isinstance(domain, Polygon):
+        check_edges(check, domain, g, slack)
+        check_cells(check, domain, g, slack)
+    _check_nearest(check, g, slack)
+
+
+def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
+    """Check faces: closed around each cell, measured right, outward, on their walls, the same from both sides."""
+    d = check.diagram
+    dim, n = d.domain.dim, len(d)
+    if dim == 3:
+        face, a, b = g.edges
+        key = (g.owner[face].astype(np.int64), np.minimum(a, b), np.maximum(a, b))
+        order = np.lexsort(key[::-1])
+        new = np.any([np.diff(k[order], prepend=-1) != 0 for k in key], axis=0)
+        group = np.cumsum(new) - 1
+        turns = np.bincount(group, np.where(a < b, 1, np.where(a > b, -1, 0))[order])
+        where = order[new]
+        odd = np.flatnonzero(turns)
+        turns[odd[g.are_slits(where[odd], slack)]] = 0
+        check.note(
+            "faces closed", turns != 0,
+            lambda k: f"cell {g.owner[face[where[k]]]} is open, or its faces turn different ways, at the edge "
+            f"from vertex {a[where[k]]} to {b[where[k]]}",
+        )  # fmt: skip
+    gap = np.stack([np.bincount(g.owner, g.areas[:, k], minlength=n) for k in range(dim)], axis=1)
+    gap = np.linalg.norm(gap, axis=1)
+    bound = np.full(n, slack)
+    if dim == 3:
+        # Between the corners of neighboring faces slits may be left, as wide as their bisectors round.
+        near = np.full(n, np.inf)
+        np.minimum.at(near, g.owner, g.spacings)
+        bound *= 2 * g.reach * (1 + g.reach / near)
+    check.note(
+        "faces closed", np.maximum(gap - bound, 0), lambda i: f"the faces of cell {i} do not close"
+    )
+    width = doubts.measures
+    wrong = np.abs(d.face_measures - g.measures) - width
+    check.note(
+        "face measures", np.maximum(wrong, 0),
+        lambda f: f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
+        f"{g.measures[f]:.17g}",
+    )  # fmt: skip
+    middle = d.face_centroids - d.points[g.owner]
+    off = np.linalg.norm(middle - g.middles, axis=1)
+    if dim == 3:  # a needle's may be anywhere along it: what rounds by so much is the first moment
+        off = np.minimum(off, off * g.measures / np.maximum(g.reach[g.owner], 1e-150) ** 2)
+    check.note(
+        "face centroids", np.maximum(off - 4 * doubts.middles, 0),
+        lambda f: f"face_centroids[{f}] of cell {g.owner[f]} is {d.face_centroids[f]}, its corners give "
+        f"{d.points[g.owner[f]] + g.middles[f]}",
+    )  # fmt: skip
+    inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
+    inward = -np.einsum("ij,ij->i", g.areas, g.directions)
+    if isinstance(d.domain, Polygon):
+        # A part that is cut off from its generator goes to the cell beyond a face, and its faces lie otherwise: some of
+        # those between the same two cells may look back.
+        pair = np.unique(
+            g.owner * (len(d) + 1) + np.maximum(d.neighbors, -1) + 1, return_inverse=True
+        )[1]
+        together = np.bincount(pair, inward)[pair]
+        inward = np.where(d.neighbors >= 0, np.minimum(inward, together), inward)
+    check.note(
+        "faces outward", np.maximum(inward - width, 0),
+        lambda f: f"face {f} of cell {g.owner[f]} does not look towards {d.neighbors[f]}",
+    )  # fmt: skip
+    middles = g.middles[walls] + d.points[g.owner[walls]]
+    height = wall_distance(d.domain, -1 - d.neighbors[walls], middles)
+    height[g.measures[walls] == 0] = 0  # no polygon, no place
+    check.note(
+        "walls", np.maximum(height - slack, 0),
+        lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
+    )  # fmt: skip
+    # The same face from both sides.
+    here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
+    off = np.abs(d.face_measures[here] - d.face_measures[there])
+    wide = np.maximum(width[here], width[there])
+    check.note(
+        "faces the same from both sides", np.maximum(off - 2 * wide, 0),
+        lambda k: f"the face of cells {g.owner[here[k]]} and {d.neighbors[here[k]]} measures "
+        f"{d.face_measures[here[k]]:.17g} and {d.face_measures[there[k]]:.17g}",
+    )  # fmt: skip
+
+
+def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
+    """Check what makes it a Voronoi diagram: no generator is nearer to a cell's corner than the cell's own."""
+    d = check.diagram
+    corners = d.vertices[g.corners]
+    own = np.linalg.norm(corners - d.points[g.cells], axis=1)
+    # A length of 0 is that of no period.
+    lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
+    last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
+    tree = KDTree(np.minimum(d.points - lower, last), boxsize=periods)
+    nearest = tree.query(d.vertices - lower)[0][g.corners]
+    excess = np.maximum(own - nearest - slack, 0)
+    if isinstance(d.domain, Polygon):
+        excess[hidden(d, d.domain, tree, np.flatnonzero(excess), g.corners, slack, g.unit)] = 0
+    check.note(
+        "nearest generators", excess,
+        lambda k: f"vertex {g.corners[k]} of cell {g.cells[k]} is nearer to another generator, by "
+        f"{own[k] - nearest[k]:.3g}",
+    )  # fmt: skip

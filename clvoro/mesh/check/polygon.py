@@ -1,0 +1,177 @@
+"""What holds of diagrams of polygonal domains beside what holds of all (`check.py`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from scipy.spatial import KDTree
+
+from ...geometry.polygon import BOUNDARY_SHIFTS
+from ..outlines import face_ends, next_faces
+
+if TYPE_CHECKING:
+    from ...geometry.polygon import Polygon
+    from ..results import Diagram
+    from .findings import Check
+    from .rebuilt import Rebuilt
+
+ASIDE = 16 + 2 * max(BOUNDARY_SHIFTS)
+"""How many roundings of a position corners may be off the domain: where it could not be followed, the boundary was put
+aside (in units of the device, which are up to twice the domain's size)."""
+
+
+def check_outlines(check: Check) -> None:
+    """Check that faces chain up to loops, and that the corners go along all of them, and bridges there and back."""
+    d = check.diagram
+    n, ends, following = len(d), face_ends(d), next_faces(d)
+    owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+    check.note(
+        "faces closed", ends[:, 1] != ends[following, 0],
+        lambda f: f"face {f} of cell {owner[f]} ends in vertex {ends[f, 1]}, where no face of it begins",
+    )  # fmt: skip
+    corners, starts = d.cell_vertices, d.cell_vertex_starts
+    places = np.arange(1, len(corners) + 1)
+    filled = starts[1:] > starts[:-1]
+    places[starts[1:][filled] - 1] = starts[:-1][filled]
+    cell = np.repeat(np.arange(n), np.diff(starts))
+    # Each way from vertex to vertex, less the ways back: what is left over of a bridge is nothing.
+    of = np.concatenate([owner, cell])
+    a = np.concatenate([ends[:, 0], corners])
+    b = np.concatenate([ends[:, 1], corners[places]])
+    times = np.repeat([1, -1], [len(owner), len(cell)]) * np.sign(b - a)
+    order = np.lexsort((np.maximum(a, b), np.minimum(a, b), of))
+    new = np.zeros(len(order), bool)
+    for key in (of, np.minimum(a, b), np.maximum(a, b)):
+        new |= np.diff(key[order], prepend=-1) != 0
+    left = np.bincount(np.cumsum(new) - 1, times[order])
+    where = order[new]
+    check.note(
+        "outlines", left != 0,
+        lambda k: f"the corners of cell {of[where[k]]} do not go along its faces between vertices "
+        f"{a[where[k]]} and {b[where[k]]}",
+    )  # fmt: skip
+
+
+def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
+    """Check that the faces on each edge of the polygon cover it, one after the other."""
+    d = check.diagram
+    rows = np.flatnonzero(d.neighbors < 0)
+    edge = -1 - d.neighbors[rows]
+    begin, end = domain.vertices, domain.vertices[domain.next_vertex]
+    length = np.hypot(*(end - begin).T)
+    along = (end - begin) / length[:, None]
+    first, last = (
+        ((d.vertices[v] - begin[edge]) * along[edge]).sum(axis=1) for v in face_ends(d)[rows].T
+    )
+    order = np.lexsort((first + last, edge))
+    edge, first, last = edge[order], first[order], last[order]
+    # Each begins where the one before ends, the first at 0; and behind the last one is the end.
+    new = np.diff(edge, prepend=-1) != 0
+    gap = np.abs(first - np.where(new, 0.0, np.roll(last, 1)))
+    check.note(
+        "edges covered", np.maximum(gap - 2 * slack, 0),
+        lambda k: f"on edge {edge[k]} there is a gap or an overlap of {gap[k]:.3g} before the face of cell "
+        f"{g.owner[rows[order[k]]]}",
+    )  # fmt: skip
+    reached = np.zeros(len(length))
+    reached[edge] = last  # the last one written is the last on the edge
+    rest = np.abs(length - reached)
+    check.note(
+        "edges covered", np.maximum(rest - 2 * slack, 0),
+        lambda e: f"the faces on edge {e} of length {length[e]:.6g} end {rest[e]:.3g} from its end",
+    )  # fmt: skip
+
+
+def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
+    """Check that each cell holds its generator: its faces go around it once."""
+    d = check.diagram
+    begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)
+    angle = np.arctan2(begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0], (begin * end).sum(axis=1))
+    turns = np.bincount(g.owner, angle, len(d)) / (2 * np.pi)
+    # A generator on the boundary is half inside, or as rounding will have it.
+    edge = end - begin
+    t = -(begin * edge).sum(axis=1) / np.maximum((edge**2).sum(axis=1), 1e-300)
+    off = np.linalg.norm(begin + np.clip(t, 0, 1)[:, None] * edge, axis=1)
+    near = np.full(len(d), np.inf)
+    np.minimum.at(near, g.owner, off)
+    wrong = np.flatnonzero((np.abs(turns - 1) > 1e-3) & (near > slack))
+    if wrong.size and len(d) > 1:
+        # Of two on the boundary in the same place but for roundings, either may be the one inside, and have all of it.
+        beside = KDTree(d.points).query(d.points[wrong], k=2)[0][:, 1]
+        wrong = wrong[(beside > slack) | (domain.boundary_distance(d.points[wrong]) > slack)]
+    check.note(
+        "generators in their cells", np.isin(np.arange(len(d)), wrong),
+        lambda i: f"the faces of cell {i} go {turns[i]:.3g} times around its generator, expected once",
+    )  # fmt: skip
+
+
+def hidden(
+    d: Diagram,
+    domain: Polygon,
+    tree: KDTree,
+    places: np.ndarray,
+    corners: np.ndarray,
+    slack: float,
+    unit: float,
+) -> np.ndarray:
+    """Return those of `places` in the cells' `corners` from which one of the nearest generators cannot be seen.
+
+    A corner belongs to the cell of the generator nearest to it if the way between them is all in the domain. Otherwise
+    the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
+    the domain touch in a point, either side sees both; a generator in that point belongs to one side alone. Likewise
+    what is seen from a corner that the boundary goes around may be hidden just beside it.
+
+    Corner k of `corners` is where face k begins.
+    """
+    at = d.vertices[corners[places]]
+    distances = tree.query(at - np.array(domain.lower))[0]
+    nearest = tree.query_ball_point(at - np.array(domain.lower), distances + 4 * slack)
+    place = np.repeat(np.arange(len(places)), [len(some) for some in nearest])
+    goal = d.points[np.array([j for some in nearest for j in some], int)]
+    way = goal - at[place]
+    # The corner itself may be off the domain.
+    part = np.minimum(ASIDE * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
+    ends = np.stack([at[place] + part[:, None] * way, goal], axis=1)
+    lines = np.asarray(shapely.linestrings(ends))
+    away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
+    # Which leads over slits that are no wider: from their sides nothing behind them is seen.
+    before = np.argsort(next_faces(d))
+    for faces in (places, before[places]):
+        edge = np.maximum(-1 - d.neighbors[faces], 0)
+        along = domain.vertices[domain.next_vertex[edge]] - domain.vertices[edge]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
+        away[place[(right > 4 * unit) & (d.neighbors[faces] < 0)[place]]] = True
+    # In those of a few roundings nobody can tell what is on this side, nor on which side a generator is.
+    away |= domain.is_slit(at, ASIDE * unit)
+    away[place[domain.is_slit(goal, ASIDE * unit)]] = True
+    away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
+    # Nor is anything seen through a point, or from one.
+    away[place[near_shared_corners(domain, lines, slack)]] = True
+    return places[away]
+
+
+def near_shared_corners(domain: Polygon, places: np.ndarray, slack: float) -> np.ndarray:
+    """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of a corner that several rings have."""
+    once, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    return near_places(places, once[times > 1], slack)
+
+
+def near_places(places: np.ndarray, others: np.ndarray, slack: float) -> np.ndarray:
+    """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of one of `others` (m, 2)."""
+    near = np.zeros(len(places), bool)
+    if len(places) and len(others):
+        tree = shapely.STRtree(np.asarray(shapely.points(others)))
+        shapes = shapely.points(places) if places.ndim == 2 else places
+        near[tree.query(shapes, predicate="dwithin", distance=slack)[0]] = True
+    return near
+
+
+def _reflex_corners(domain: Polygon) -> np.ndarray:
+    """Return the corners (m, 2) where the domain takes more than half of the surroundings."""
+    after = domain.next_vertex
+    edges = domain.vertices[after] - domain.vertices
+    turn = edges[:, 0] * edges[after, 1] - edges[:, 1] * edges[after, 0]
+    return domain.vertices[after[turn < 0]]

@@ -1,0 +1,302 @@
+"""The cells of a diagram rebuilt from their corners, by NumPy on the host: for checks, and for what files leave out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from scipy.spatial import KDTree
+
+from ...geometry.boundary import wall_planes
+from ...geometry.polygon import Polygon
+from ..connectivity import neighbor_points
+from ..outlines import face_ends, next_faces
+
+if TYPE_CHECKING:
+    from ..results import Diagram
+
+ADOPTED = 1024
+"""Roundings of a position by which a face may be off the bisector of its generators and still be a part of it."""
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """By how much rounding may have put off what is known of a diagram.
+
+    Attributes
+    ----------
+    measures, middles : (m,) float
+        Of the faces.
+    volumes : (n,) float
+    """
+
+    measures: np.ndarray
+    middles: np.ndarray
+    volumes: np.ndarray
+
+
+class Rebuilt:
+    """The cells of a diagram, from nothing but generators, corners and the graph.
+
+    Attributes
+    ----------
+    owner : (m,) int
+        Cell of each face.
+    areas : (m, d) float
+        Outward normal of each face times its measure.
+    middles : (m, d) float
+        Centroids of the faces.
+    perimeters : (n,) float
+        Sum of the faces' measures (surface in 3D).
+    volumes, centroids : (n,) and (n, d) float
+    cells, corners : (k,) int
+        Every corner of every cell: the cell and the vertex.
+    unit : float
+        The rounding of a position.
+    unit_of_cell : (n,) float
+        The rounding of a corner's place relative to its generator.
+    period_off : float
+        By how much a periodic box's periods round, together: see `Box`.
+    remade : bool
+        Whether the diagram's own measures of faces were made from its corners, too: they round as positions do.
+    """
+
+    directions: np.ndarray
+    """(m, d): from the cell's generator to the neighbor's or the wall, of length 1; of adopted faces the normal."""
+    adopted: np.ndarray
+    """(m,) bool: faces between cells of a polygon that do not lie between their generators, as the boundary has cut one
+    of the parts beside them off from its own generator."""
+
+    def __init__(self, d: Diagram, dtype: object = None) -> None:
+        dim, n = d.domain.dim, len(d)
+        self.real = _precision(d, dtype)
+        far = max(map(abs, (*d.domain.lower, *d.domain.upper)))
+        size = float(np.linalg.norm(d.domain.extent))
+        # What is on the host is in float64 again: the way from the origin rounds in that.
+        self.unit = float(np.finfo(self.real).eps) * size + np.finfo(float).eps * far
+        self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+        self.directions, self.spacings = _across(d, self.owner)
+        x = d.vertices
+        # All lengths relative to the cell's generator: small cells far from the origin keep their digits.
+        at = d.points[self.owner]
+        if dim == 2:
+            first, last = face_ends(d).T
+            a, b = x[first] - at, x[last] - at
+            edge = b - a
+            self.areas = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+            self.middles = (a + b) / 2
+            self.cells, self.corners = self.owner, first
+            self._on_wall = d.neighbors < 0
+            self._following = next_faces(d)
+        else:
+            face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
+            first = d.face_vertex_starts[:-1][face]
+            following = np.arange(1, len(face) + 1)
+            last = np.flatnonzero(np.diff(face, append=-1))
+            following[last] = first[last]
+            a = x[d.face_vertices] - at[face]
+            b = x[d.face_vertices[following]] - at[face]
+            o = x[d.face_vertices[first]] - at[face]
+            triangle = np.cross(a - o, b - o) / 2
+            m = len(self.owner)
+            self.areas = np.stack([np.bincount(face, triangle[:, k], m) for k in range(3)], axis=1)
+            total = np.linalg.norm(self.areas, axis=1)
+            normal = self.areas / np.where(total > 0, total, 1)[:, None]
+            weight = np.einsum("ij,ij->i", triangle, normal[face])
+            moment = weight[:, None] * (a + b + o) / 3
+            sums = np.stack([np.bincount(face, moment[:, k], m) for k in range(3)], axis=1)
+            self.middles = np.where(
+                (total > 0)[:, None], sums / np.where(total > 0, total, 1)[:, None], 0.0
+            )
+            self.cells, self.corners = self.owner[face], d.face_vertices
+            self.edges = (face, d.face_vertices, d.face_vertices[following])
+            self._tails, self._edge, self._before = a, b - a, np.argsort(following)
+        self.measures = np.linalg.norm(self.areas, axis=1)
+        self._find_adopted(d)
+        # The cell as the sum of the cones from its generator to its faces.
+        cones = np.einsum("ij,ij->i", self.areas, self.middles) / dim
+        self.volumes = np.bincount(self.owner, cones, minlength=n)
+        share = dim / (dim + 1)
+        moments = [
+            np.bincount(self.owner, cones * share * self.middles[:, k], n) for k in range(dim)
+        ]
+        safe = np.where(self.volumes > 0, self.volumes, 1)
+        self.centroids = np.stack(moments, axis=1) / safe[:, None]
+        self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
+        self._distances = np.linalg.norm(x[self.corners] - d.points[self.cells], axis=1)
+        self.reach = np.zeros(n)
+        np.maximum.at(self.reach, self.cells, self._distances)
+        self._vertex_count = len(x)
+        self.unit_of_cell = float(np.finfo(self.real).eps) * self.reach + np.finfo(float).eps * far
+        self.period_off = float(np.finfo(self.real).eps) * d.domain.frame[1] * dim**0.5 / 2
+        told = getattr(d, "face_measures", None)
+        self.remade = told is not None and np.array_equal(told, self.measures)
+
+    def _find_adopted(self, d: Diagram) -> None:
+        self.adopted = np.zeros(len(self.owner), bool)
+        if not isinstance(d.domain, Polygon):
+            return
+        inner = d.neighbors >= 0
+        across = np.where(inner, self.spacings, 0.0)
+        # By both ends: the middle of an adopted face may lie on the bisector, too.
+        half = np.stack([-self.areas[:, 1], self.areas[:, 0]], axis=1) / 2
+        ends = [self.middles - half, self.middles + half]
+        off = np.max(
+            [np.abs((end * self.directions).sum(axis=1) - across / 2) for end in ends], axis=0
+        )
+        far = np.max([np.linalg.norm(end, axis=1) for end in ends], axis=0)
+        # Nearer than that, shares would overflow.
+        least = np.maximum(1e-200 * far, np.finfo(float).tiny)
+        noise = ADOPTED * self.unit * (1 + far / np.maximum(across, least))
+        self.adopted = inner & (off > noise) & (self.measures > 0)
+        # On its bisector as well, by chance or where either generator has a part of the other's region: then another is
+        # nearer there, or neither sees it.
+        inward = np.flatnonzero(
+            inner & ~self.adopted & ((self.areas * self.directions).sum(axis=1) < 0)
+        )
+        if inward.size:
+            own = d.points[self.owner[inward]]
+            places = own + self.middles[inward]
+            away = np.linalg.norm(self.middles[inward], axis=1)
+            nearest = KDTree(d.points).query(places)[0]
+            ways = shapely.linestrings(np.stack([own, places], axis=1))
+            hidden = ~shapely.covers(d.domain.geometry, ways)
+            self.adopted[inward[hidden | (nearest < away - noise[inward] / 16)]] = True
+        normals = self.areas / np.maximum(self.measures, 1e-300)[:, None]
+        self.directions[self.adopted] = normals[self.adopted]
+
+    def are_slits(self, places: np.ndarray, slack: float) -> np.ndarray:
+        """Tell which edges of faces' loops (3D), open ones of their cells, border slits as narrow as rounding.
+
+        Where faces meet in the middle of an edge, give or take a rounding, one may have a vertex there that the other
+        lacks. Such an edge's middle lies on another open edge of the cell; that of a missing face does not. A face is
+        off as its bisector is (see `doubts`), where a position may be off by `slack`.
+        """
+        spacings = self.spacings[self.edges[0][places]]
+        width = slack * (1 + np.linalg.norm(self._tails[places], axis=1) / spacings)
+        result = np.zeros(len(places), bool)
+        ends, cells = self._tails[places] + self._edge[places], self.cells[places]
+        order = np.argsort(cells, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(cells[order])) + 1):
+            a, edge = self._tails[places[rows]], self._edge[places[rows]]
+            square = np.maximum((edge**2).sum(axis=1), 1e-300)
+            for row in rows:
+                middle = (self._tails[places[row]] + ends[row]) / 2
+                t = np.clip(((middle - a) * edge).sum(axis=1) / square, 0, 1)
+                off = np.linalg.norm(a + t[:, None] * edge - middle, axis=1)
+                off[rows == row] = np.sqrt(square[rows == row]) / 2
+                result[row] = (off <= np.maximum(width[row], width[rows])).any()
+        return result
+
+    def doubts(self, slack: float | np.ndarray) -> Doubts:
+        """Return what may be off by how much where a position may be off by `slack`, in all or each of the cells (n,).
+
+        The bisector of two generators, d apart, is off by e = ``slack (1 + r / d)`` at the distance r: what two
+        near-duplicates round by is their distance's share of r. A corner lies where its cell's bisectors meet, and
+        is off by more the more nearly parallel they are: with unit normals n, within the ellipsoid of
+        ``C = (sum n n^T / e^2)^-1``, but not beyond the cell. What follows from the corners is off by the sum of
+        what each changes it by, sqrt(g^T C g) for the gradient g.
+        """
+        doubts = self._doubts_2d if self.directions.shape[1] == 2 else self._doubts_3d
+        return doubts(np.broadcast_to(slack, self.reach.shape))
+
+    def _doubts_2d(self, per_cell: np.ndarray) -> Doubts:
+        slack = per_cell[self.cells]
+        here = np.arange(len(self.corners))
+        before = np.argsort(self._following)  # corner k lies between the faces before[k] and k
+        one, two = (1 + self._distances / self.spacings[f] for f in (before, here))
+        a, b = self.directions[before], self.directions[here]
+        sine = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        with np.errstate(all="ignore"):
+            off = slack * np.hypot(one, two) / sine
+        off = np.where(off < self.reach[self.cells], off, self.reach[self.cells])
+        of_domain = self._on_wall[before] & self._on_wall[here]
+        off[of_domain] = slack[of_domain]
+        # A vertex is where several cells have a corner, of which it is one.
+        worst = np.zeros(self._vertex_count)
+        np.maximum.at(worst, self.corners, np.maximum(off, slack))
+        off = worst[self.corners]
+        ends = np.maximum(off, off[self._following])
+        swept = np.bincount(self.owner, ends * self.measures, len(self.reach))
+        return Doubts(ends, ends, swept + per_cell**2)
+
+    def _doubts_3d(self, per_cell: np.ndarray) -> Doubts:
+        face, key = self.edges[0], self.cells.astype(np.int64) * self._vertex_count + self.corners
+        _, first, group = np.unique(key, return_index=True, return_inverse=True)
+        k, cells = len(first), self.cells[first]
+        slack, reach = per_cell[cells], self.reach[cells]
+        e = 1 + self._distances[first][group] / self.spacings[face]
+        normal = self.directions[face] / e[:, None]
+        m = np.empty((k, 3, 3))
+        for i in range(3):
+            for j in range(i, 3):
+                m[:, i, j] = m[:, j, i] = np.bincount(group, normal[:, i] * normal[:, j], k)
+        values, axes = np.linalg.eigh(m)
+        # Below rounding an eigenvalue is 0: along this axis the corner may be anywhere in the cell.
+        sure = values > 16 * np.finfo(float).eps * values[:, -1:]
+        off = slack[:, None] / np.sqrt(np.where(sure, values, 1.0))
+        off = np.where(sure & (off < reach[:, None]), off, np.maximum(reach, slack)[:, None])
+        # A vertex has the position of the corner that is sharpest.
+        best = np.full(self._vertex_count, np.inf)
+        np.minimum.at(best, self.corners[first], off.max(axis=1))
+        placed = np.maximum(best[self.corners[first]], slack)
+
+        def change(gradient: np.ndarray, which: np.ndarray) -> np.ndarray:
+            along = np.einsum("kij,ki->kj", axes[which], gradient) * off[which]
+            return np.linalg.norm(along, axis=1) + placed[which] * np.linalg.norm(gradient, axis=1)
+
+        preceding, ahead = -self._edge[self._before], self._edge
+        rim = np.cross(ahead - preceding, self.directions[face]) / 2
+        faces = np.bincount(face, change(rim, group), len(self.owner))
+        ears = np.cross(ahead, preceding) / 6
+        cone = np.stack([np.bincount(group, ears[:, i], k) for i in range(3)], axis=1)
+        cell = np.bincount(cells, change(cone, np.arange(k)), len(self.reach))
+        widths = self.reach[self.owner]
+        spread = faces * 2 * widths / np.maximum(self.measures, 1e-300)
+        own = per_cell[self.owner]
+        return Doubts(faces + own * widths, own + spread, cell + per_cell * self.perimeters)
+
+
+def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit vector across each face, outward, and the distance of its generators (infinite at a wall)."""
+    inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
+    across = np.zeros((len(owner), d.domain.dim))
+    across[inner] = neighbor_points(d, inner) - d.points[owner[inner]]
+    across[walls] = wall_planes(d.domain, -1 - d.neighbors[walls])[0]
+    distance = np.maximum(np.linalg.norm(across, axis=1), 1e-300)
+    spacing = distance.copy()
+    spacing[walls] = np.inf
+    return across / distance[:, None], spacing
+
+
+def _precision(d: Diagram, dtype: object) -> np.dtype:
+    """Return the precision in which `d` was made, which cannot be float32 if `dtype` is ``"float64"``.
+
+    float32 shows in volumes and in generators or lengths, as the device's unit is a power of two.
+    """
+    origin, scale = d.domain.frame
+    volumes = d.volumes / scale**d.domain.dim
+    points = (d.points - origin) / scale
+    lengths = getattr(d, "face_measures", points) / scale ** (d.domain.dim - 1)
+    # The way from the origin and back rounds. Some generators are put on a wall exactly, or back into a polygon, where
+    # all may be: where a quarter are in float32, all were.
+    noise = 4 * np.finfo(float).eps * np.maximum(np.abs(np.array(origin)) / scale, 1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(points - points.astype(np.float32))
+        single = bool((volumes == volumes.astype(np.float32)).all())
+        told = bool((lengths == lengths.astype(np.float32)).all())
+    single &= (told or bool((off <= noise).mean() >= 0.25)) and dtype != "float64"
+    return np.dtype(np.float32 if single else np.float64)
+
+
+def rebuild(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return what the corners of a diagram give of its other arrays: measures and centroids of faces, centroids."""
+    with np.errstate(all="ignore"):  # what is not finite is for the check to name
+        g = Rebuilt(diagram)
+    return {
+        "face_measures": g.measures,
+        "face_centroids": g.middles + diagram.points[g.owner],
+        "centroids": g.centroids + diagram.points,
+    }

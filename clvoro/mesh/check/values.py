@@ -1,0 +1,115 @@
+"""Is what a result says of its cells so? Sizes, error, quality and history, computed anew (beside `check.py`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...geometry.boundary import wall_count
+from ...geometry.polygon import Polygon
+from ..outlines import straighten
+from .findings import ROUNDINGS
+from .history import check_history
+
+if TYPE_CHECKING:
+    from ..results import Diagram, Result
+    from .findings import Check
+    from .rebuilt import Rebuilt
+
+
+def check_values(check: Check, result: Result, g: Rebuilt) -> None:
+    """Check the values of a result, whose diagram is right."""
+    d = result.diagram
+    n, dim = len(d), d.domain.dim
+    for name in ("size", "error", "quality"):
+        check.shape(name, getattr(result, name), (n,))
+    check.shape("points", result.points, (n, dim))
+    h, e, q = result.size, result.error, result.quality
+    check.note(
+        "points", (result.points != d.points).any(axis=1),
+        lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
+    )  # fmt: skip
+    check.note("size", ~(h > 0), lambda i: f"size[{i}] is {h[i]}, expected > 0", stop=True)
+    eps = float(np.finfo(g.real).eps)
+    length = np.maximum(d.volumes, 0) ** (1 / dim)
+    with np.errstate(all="ignore"):
+        error = (length - h) / np.minimum(length, h)
+        counts = np.diff(d.neighbor_starts)
+        perimeter = np.bincount(np.repeat(np.arange(n), counts), d.face_measures, minlength=n)
+        if dim == 2:
+            quality = straighten(d, g.real).quality()
+        else:
+            quality = 36 * np.pi * d.volumes**2 / perimeter**3
+    check.note(
+        "error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
+        lambda i: f"error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
+    )  # fmt: skip
+    # Where measures were made anew from a file's corners they round as positions do, as straightened boundaries do.
+    rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
+    off = np.abs(q - quality) - 64 * eps * (1 + quality)
+    if not g.remade:
+        loose = np.zeros(n, bool)
+        if isinstance(d.domain, Polygon):
+            loose = np.bincount(g.owner, d.neighbors < 0, minlength=n) > 0
+        elif dim == 3:
+            # The device has measured faces that have been left out, too.
+            doubtful = np.flatnonzero(off > 0)
+            loose[doubtful[borders_on_lost_faces(d, g, doubtful)]] = True
+        rounding *= loose
+    check.note(
+        "quality", np.maximum(off - 3 * rounding, 0),
+        lambda i: f"quality[{i}] is {q[i]:.10g}, the cell gives {quality[i]:.10g}",
+    )  # fmt: skip
+    check_history(check, result, eps)
+    _check_factor(check, result)
+
+
+def borders_on_lost_faces(d: Diagram, g: Rebuilt, cells: np.ndarray) -> np.ndarray:
+    """Tell at which of `cells` (k,), in 3D, faces may have been left out as they were as narrow as vertices round.
+
+    Such a face lay along an edge, or a part of it: two others meet there that are not neighbors of each other, or
+    whose edge has more than one part.
+    """
+    n, walls = len(d), wall_count(d.domain)
+    half = np.flatnonzero(np.isin(g.cells, cells))  # edges, as one of two faces has them
+    face, one, other = (ends[half] for ends in g.edges)
+    order = np.lexsort((np.maximum(one, other), np.minimum(one, other), g.owner[face]))
+    key = np.stack([g.owner[face], np.minimum(one, other), np.maximum(one, other)])[:, order]
+    first = np.flatnonzero((key[:, 1:] == key[:, :-1]).all(axis=0))
+    pair = np.sort(face[order[np.stack([first, first + 1])]], axis=0)
+    pair, parts = np.unique(pair, axis=1, return_counts=True)
+    split = g.owner[pair[0, parts > 1]]
+    pair = np.where(d.neighbors[pair[0]] >= 0, pair, pair[::-1])  # walls have no faces of their own
+    pair = pair[:, d.neighbors[pair[0]] >= 0]
+    across, along = d.neighbors[pair]
+    shifts = d.shifts.astype(np.int64)
+    step = np.where((along >= 0)[:, None], shifts[pair[1]] - shifts[pair[0]], 0)
+
+    def names(cell: np.ndarray, label: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        return (cell.astype(np.int64) * (n + walls) + label + walls) * 125 + (shift + 2) @ (
+            1,
+            5,
+            25,
+        )
+
+    beside = np.flatnonzero(np.isin(g.owner, across))
+    known = names(g.owner[beside], d.neighbors[beside], shifts[beside])
+    apart = ~np.isin(names(across, along, step), known)
+    return np.isin(cells, np.concatenate([split, g.owner[pair[0, apart]]]))
+
+
+def _check_factor(check: Check, result: Result) -> None:
+    """Check the factor on the sizes: there is one only where a count of cells was asked for."""
+    factor, asked = result.size_factor, result.settings.get("n_cells")
+    known = "n_cells" in result.settings and asked is None
+    number = isinstance(factor, int | float) and np.isfinite(factor) and factor > 0
+    check.note(
+        "size factor", [not number or (known and factor != 1)],
+        lambda _: f"size_factor is {factor!r:.40}, expected " + ("1: no count was asked for" if known else "> 0"),
+    )  # fmt: skip
+    told = result.settings.get("size_factor", factor)
+    check.note(
+        "size factor", [told != factor],
+        lambda _: f"size_factor is {factor!r:.40}, {told!r:.40} in the settings",
+    )  # fmt: skip

@@ -1,0 +1,160 @@
+"""The faces of a diagram on the host: their corners, each face once; for files, pictures and measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.polygon import Polygon
+from .outlines import face_ends
+from .results import Diagram
+
+
+def face_owners(diagram: Diagram) -> np.ndarray:
+    """Return the cell in whose row each face of the graph stands, (m,) int32."""
+    starts = diagram.neighbor_starts
+    return np.repeat(np.arange(len(diagram), dtype=np.int32), np.diff(starts))
+
+
+def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
+    """Return where the neighbors across `faces` (k,) stand, which lead to generators: (k, d), images where they do."""
+    shifts = diagram.shifts[faces] * diagram.domain.extent
+    return diagram.points[diagram.neighbors[faces]] + shifts
+
+
+def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers that name each of `faces` (k,), which lead to generators, and the same face from the other side.
+
+    Both are in the order of cell, neighbor and shift; in a polygon, where two cells may have several faces in common,
+    then of their vertices; (k,) int64 each.
+    """
+    n, dim = len(diagram), diagram.domain.dim
+    i, j = face_owners(diagram)[faces].astype(np.int64), diagram.neighbors[faces].astype(np.int64)
+    codes = (diagram.shifts[faces] + 1) @ 3 ** np.arange(dim)
+    here = (i * n + j) * 3**dim + codes
+    there = (j * n + i) * 3**dim + (3**dim - 1 - codes)
+    if not isinstance(diagram.domain, Polygon):
+        return here, there
+    begin, end = face_ends(diagram)[faces].T
+    columns = [np.concatenate(c) for c in ((end, begin), (begin, end), (here, there))]
+    order = np.lexsort(columns)
+    new = np.any([np.diff(c[order], prepend=-1) != 0 for c in columns], axis=0)
+    numbers = np.empty(len(order), np.int64)
+    numbers[order] = np.cumsum(new)
+    return numbers[: len(faces)], numbers[len(faces) :]
+
+
+def following(starts: np.ndarray) -> np.ndarray:
+    """Return, for each item of ragged rows that are loops, where the next one of its loop stands."""
+    places = np.arange(1, starts[-1] + 1)
+    filled = starts[1:] > starts[:-1]
+    places[starts[1:][filled] - 1] = starts[:-1][filled]
+    return places
+
+
+def take_rows(
+    starts: np.ndarray, items: np.ndarray, rows: np.ndarray, backwards: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ragged `rows` (indices) of `starts` and `items`, in that form again.
+
+    A row where `backwards` (bool, one per row) is set has its items in reverse, the first one staying first.
+    """
+    counts = np.diff(starts)[rows]
+    taken = np.concatenate([[0], np.cumsum(counts)])
+    within = np.arange(taken[-1]) - np.repeat(taken[:-1], counts)
+    if backwards is not None and backwards.any():
+        turned = np.repeat(backwards, counts) & (within > 0)
+        within = np.where(turned, np.repeat(counts, counts) - within, within)
+    return taken, items[np.repeat(starts[:-1][rows], counts) + within]
+
+
+def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of each face of the graph as ragged rows: starts (m + 1,) and vertices.
+
+    In 2D a face runs from its first to its second corner, its cell to the left. In 3D the corners go around
+    the face counter-clockwise as seen from outside of its cell. A corner that comes twice in a row is given
+    once; a face that has then no measure (fewer than 2 corners in 2D, 3 in 3D) has an empty row.
+    """
+    if diagram.domain.dim == 2:
+        ends = face_ends(diagram)
+        least, starts, corners = 2, 2 * np.arange(len(ends) + 1), ends.ravel()
+    else:
+        least, starts, corners = 3, diagram.face_vertex_starts, diagram.face_vertices
+    kept = corners != corners[following(starts)]
+    if kept.all() and (np.diff(starts) >= least).all():
+        return starts, corners
+    rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    counts = np.bincount(rows[kept], minlength=len(starts) - 1)
+    counts[counts < least] = 0
+    kept &= counts[rows] > 0
+    return np.concatenate([[0], np.cumsum(counts)]), corners[kept]
+
+
+def cell_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of each cell in 2D as ragged rows: starts (n + 1,) and vertices, counter-clockwise.
+
+    A corner that comes twice in a row is given once. Several loops are joined by bridges, as in the diagram.
+    """
+    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
+    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
+    kept = corners != corners[following(starts)]
+    counts = np.bincount(cell[kept], minlength=len(diagram))
+    return np.concatenate([[0], np.cumsum(counts)]), corners[kept]
+
+
+@dataclass(frozen=True)
+class Faces:
+    """Every face once: those between two cells first, in the order of (owner, neighbor), then the walls'.
+
+    Attributes
+    ----------
+    owner, neighbor : (f,) int32
+        Cells on both sides, owner < neighbor (or the same, in a periodic box); on a wall b the neighbor is
+        -1 - b. The walls stand one after the other, each in the order of the owners.
+    rows : (f,) int
+        Where in the diagram's graph the face is described.
+    starts : (f + 1,) int, corners : int
+        Vertices of each face; in 2D from the first to the second with the owner to the left, in 3D
+        counter-clockwise as seen from the neighbor.
+    """
+
+    owner: np.ndarray
+    neighbor: np.ndarray
+    rows: np.ndarray
+    starts: np.ndarray
+    corners: np.ndarray
+
+    @property
+    def inner(self) -> int:
+        """Number of faces between two cells."""
+        return int(np.count_nonzero(self.neighbor >= 0))
+
+
+def faces_once(diagram: Diagram) -> Faces:
+    """Return every face of `diagram` that has a measure, once."""
+    owner, neighbor = face_owners(diagram), diagram.neighbors
+    starts, corners = face_corners(diagram)
+    filled = np.diff(starts) > 0
+    inner = np.flatnonzero(filled & (neighbor >= 0))
+    low = np.minimum(owner[inner], neighbor[inner]).astype(np.int64)
+    high = np.maximum(owner[inner], neighbor[inner])
+    # Of both descriptions the one from the lower cell comes first, if there are both.
+    here, there = face_keys(diagram, inner)
+    flipped = here > there
+    key = np.minimum(here, there) * 2 + flipped
+    order = np.argsort(key, kind="stable")
+    pair = key[order] // 2
+    order = order[np.concatenate([[True], pair[1:] != pair[:-1]])] if len(order) else order
+    outer = np.flatnonzero(filled & (neighbor < 0))
+    outer = outer[np.lexsort((owner[outer], -neighbor[outer]))]
+    rows = np.concatenate([inner[order], outer])
+    backwards = np.concatenate([flipped[order], np.zeros(len(outer), bool)])
+    taken, vertices = take_rows(starts, corners, rows, backwards)
+    return Faces(
+        np.concatenate([low[order], owner[outer]]).astype(np.int32),
+        np.concatenate([high[order], neighbor[outer]]).astype(np.int32),
+        rows,
+        taken,
+        vertices,
+    )

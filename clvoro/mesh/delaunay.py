@@ -1,0 +1,35 @@
+"""The dual of a Voronoi diagram in the plane: the Delaunay triangles of its generators."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError
+from .results import Diagram
+
+
+def dual_triangles(diagram: Diagram) -> np.ndarray:
+    """Return the triples of generators whose cells meet in a vertex (t, 3) int32; see `Diagram.triangles`."""
+    if diagram.domain.dim != 2 or any(diagram.domain.periodic):
+        raise InputError(
+            f"triangles are for meshes in the plane without seams, not for {diagram.domain}; take "
+            "neighbors and shifts, which every diagram has"
+        )
+    n, starts = len(diagram), diagram.cell_vertex_starts
+    cells = np.repeat(np.arange(n, dtype=np.int64), np.diff(starts))
+    # A cell of several loops passes its bridges' ends twice.
+    pairs = np.unique(diagram.cell_vertices * np.int64(n) + cells)
+    vertices, cells = pairs // n, pairs % n
+    arms = diagram.points[cells] - diagram.vertices[vertices]
+    # Around each vertex counter-clockwise.
+    order = np.lexsort((np.arctan2(arms[:, 1], arms[:, 0]), vertices))
+    cells = cells[order]
+    first = np.flatnonzero(np.diff(vertices, prepend=-1))
+    counts = np.diff(first, append=len(vertices))
+    # Fans of counts - 2 triangles; at most vertices of one.
+    fans = np.maximum(counts - 2, 0)
+    apex = np.repeat(first, fans)
+    step = 1 + np.arange(len(apex)) - np.repeat(np.cumsum(fans) - fans, fans)
+    return np.column_stack([cells[apex], cells[apex + step], cells[apex + step + 1]]).astype(
+        np.int32
+    )

@@ -1,0 +1,198 @@
+"""Outlines of cells in 2D, on the host: ends of faces, loops, sides. Cells of polygons may have several loops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..geometry.polygon import Polygon
+
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
+
+    from .results import Diagram
+
+SIDE_TURN = np.pi / 6 * (1 + 2.0**-10)
+"""A side of a cell on the boundary turns by no more than this: 30 degrees, and a little so that it is never met.
+
+Sums of turns round, by some roundings each; yet an arc of 2 x 15 degrees shall be one side in any precision. Regular
+rings turn by a fraction of 360 degrees with a denominator that is no more than their number of edges.
+"""
+
+
+def face_ends(diagram: Diagram) -> np.ndarray:
+    """Return the vertices that each face of the graph runs from and to, (m, 2); its cell is on the left."""
+    if isinstance(diagram.domain, Polygon):
+        return diagram.face_vertices.reshape(-1, 2)
+    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
+    places = np.arange(1, len(corners) + 1)
+    filled = starts[1:] > starts[:-1]
+    places[starts[1:][filled] - 1] = starts[:-1][filled]
+    return np.stack([corners, corners[places]], axis=1)
+
+
+def next_faces(diagram: Diagram) -> np.ndarray:
+    """Return the face that comes after each face in its loop around the cell, (m,).
+
+    In a row the loops stand one after the other, and each goes on until its vertices do not.
+    """
+    ends, starts = face_ends(diagram), diagram.neighbor_starts
+    m = len(ends)
+    last = np.zeros(m, bool)
+    last[starts[1:][starts[1:] > starts[:-1]] - 1] = True
+    breaks = last.copy()
+    breaks[:-1] |= ends[:-1, 1] != ends[1:, 0]
+    places = np.arange(1, m + 1)
+    stops = np.flatnonzero(breaks)
+    places[stops] = np.concatenate([[0], stops[:-1] + 1])[: len(stops)]
+    return places
+
+
+def count_sides(diagram: Diagram) -> np.ndarray:
+    """Return the number of sides of each cell in 2D, (n,); see `straighten`."""
+    return straighten(diagram).sides
+
+
+@dataclass(frozen=True)
+class Straightened:
+    """The cells of a diagram in 2D as polygons with straight sides.
+
+    Attributes
+    ----------
+    sides : (n,) int
+    areas, perimeters : (n,) float
+    """
+
+    sides: np.ndarray
+    areas: np.ndarray
+    perimeters: np.ndarray
+
+    def quality(self) -> np.ndarray:
+        """Return the paper's (4.1), 4 A n tan(pi / n) / P^2, of each, (n,)."""
+        n = np.maximum(self.sides, 3)
+        return 4 * np.maximum(self.areas, 0) * n * np.tan(np.pi / n) / self.perimeters**2
+
+
+def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
+    """Return sides, areas and perimeters of cells in 2D, the boundary between two of their corners made straight.
+
+    Each face between cells is a side. So is each stretch of the boundary along which it turns by no more than 30
+    degrees (`SIDE_TURN`) in sum, as a straight line from its first end to its last; where it turns farther a new side
+    begins. Stretches go along the rings of the domain, from where the cell's part of a ring begins to where it ends; in
+    a ring that is all one cell's the first begins in its sharpest corner. Holes within a cell are no sides of it. Cells
+    with less than three sides are left as they are. In a box the sides are the faces.
+
+    Parameters
+    ----------
+    diagram : Diagram
+    real : dtype
+        Precision in which turns are added up, as the device does.
+    """
+    starts = diagram.neighbor_starts
+    counts, n = np.diff(starts), len(diagram)
+    owner, measures = np.repeat(np.arange(n), counts), diagram.face_measures
+    perimeters = np.bincount(owner, measures, minlength=n)
+    if not isinstance(diagram.domain, Polygon):
+        return Straightened(counts, diagram.volumes, perimeters)
+    of, first, final = _stretches(diagram, diagram.domain, owner, np.dtype(real))
+    rows, cells, last = np.flatnonzero(of >= 0), owner[first], len(first)
+    # From the generator, with what is known of it: of sides of one face nothing is left.
+    ends = face_ends(diagram)
+    p, q = (diagram.vertices[v] - diagram.points[owner] for v in ends.T)
+    length, area = (np.bincount(of[rows], x[rows], last) for x in (measures, _cross(p, q) / 2))
+    begin, end = p[first], q[final]
+    several = np.bincount(of[rows], minlength=last) > 1
+    longer = np.where(several, length - np.hypot(*(end - begin).T), 0.0)
+    beyond = np.where(several, area - _cross(begin, end) / 2, 0.0)
+    sides = np.bincount(owner[diagram.neighbors >= 0], minlength=n)
+    sides += np.bincount(cells, minlength=n)
+    polygons = sides >= 3
+    return Straightened(
+        sides,
+        diagram.volumes - polygons * np.bincount(cells, beyond, n),
+        perimeters - polygons * np.bincount(cells, longer, n),
+    )
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _stretches(
+    diagram: Diagram, domain: Polygon, owner: np.ndarray, real: np.dtype
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which stretch each face is a part of, (m,), -1 for none; and the first and last face of each, (s,)."""
+    following = _along_rings(diagram, domain)
+    edges = -1 - diagram.neighbors
+    begins = _beginnings(domain, following, edges, owner)
+    onward, of_face, cells = following.tolist(), edges.tolist(), owner.tolist()
+    next_edge, turns = domain.next_vertex.tolist(), list(domain.turns.astype(real))
+    stretch = np.full(len(edges), -1)
+    first: list[int] = []
+    final: list[int] = []
+    for begin in begins:
+        face, turned = begin, real.type(0)
+        first.append(face)
+        while True:
+            stretch[face] = len(first) - 1
+            next_, edge = onward[face], of_face[face]
+            if next_ < 0 or next_ == begin or cells[next_] != cells[begin] or stretch[next_] >= 0:
+                break
+            while edge != of_face[next_]:
+                edge = next_edge[edge]
+                turned += turns[edge]
+            if abs(turned) > real.type(SIDE_TURN):
+                final.append(face)
+                first.append(next_)
+                turned = real.type(0)
+            face = next_
+        final.append(face)
+    return stretch, np.array(first, int), np.array(final, int)
+
+
+def _along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
+    """Return for each face on the boundary the next one on its ring, (m,); -1 for others, and where there is none."""
+    rows = np.flatnonzero(diagram.neighbors < 0)
+    edge = -1 - diagram.neighbors[rows]
+    begin, end = face_ends(diagram)[rows].T.astype(np.int64)
+    # Edges may be too short for a face.
+    used = np.unique(edge)
+    ring = np.searchsorted(domain.ring_starts, used, side="right")
+    starts = np.flatnonzero(np.diff(ring, prepend=-1))
+    after = np.roll(used, -1)
+    after[np.append(starts[1:], len(used)) - 1] = used[starts]
+    onward = np.zeros(len(domain.vertices), np.int64)
+    onward[used] = after
+    keys = edge * len(diagram.vertices) + begin
+    order = np.argsort(keys, kind="stable")
+    following = np.full(len(diagram.neighbors), -1)
+    for on in (onward[edge], edge):
+        wanted = on * len(diagram.vertices) + end
+        places = order[np.minimum(np.searchsorted(keys[order], wanted), len(rows) - 1)]
+        found = keys[places] == wanted
+        following[rows[found]] = rows[places[found]]
+    return following
+
+
+def _beginnings(
+    domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray
+) -> list[int]:
+    """Return the faces on the boundary with which a cell's part of a ring begins; none where that is a whole hole."""
+    rows = np.flatnonzero(edges >= 0)
+    goes_on = rows[following[rows] >= 0]
+    before = np.full(len(edges), -1)
+    before[following[goes_on]] = goes_on
+    begins = rows[(before[rows] < 0) | (owner[before[rows]] != owner[rows])]
+    ring = np.searchsorted(domain.ring_starts, edges, side="right") - 1
+    divided = np.zeros(len(domain.sharpest), bool)
+    divided[ring[begins]] = True
+    is_outer = np.diff(domain.piece_of_ring, prepend=-1) > 0
+    # Of those that are all one cell's the first faces of edges, the nearest behind the sharpest corner.
+    firsts = rows[(edges[before[rows]] != edges[rows]) & (is_outer & ~divided)[ring[rows]]]
+    size = np.diff(domain.ring_starts)[ring[firsts]]
+    away = (edges[firsts] - domain.sharpest[ring[firsts]]) % size
+    order = np.lexsort((away, ring[firsts]))
+    nearest = np.diff(ring[firsts[order]], prepend=-1) > 0
+    return [*begins.tolist(), *firsts[order][nearest].tolist()]

@@ -1,0 +1,153 @@
+"""Measures of a mesh that matter to finite-volume methods, from a `Diagram` on the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.boundary import wall_planes
+from ..geometry.polygon import Polygon
+from .connectivity import face_owners
+from .outlines import straighten
+from .results import Diagram
+
+
+@dataclass(frozen=True, repr=False)
+class Measures:
+    """What `measure_mesh` finds: per cell (n,), or per face of the diagram's graph (m,).
+
+    The line between the generators x_i and x_j meets the plane of their face at a right angle and in its middle
+    (x_i + x_j) / 2, by the definition of a Voronoi diagram: with the unknowns at the generators a mesh has no
+    non-orthogonality. Behind a wall the generator's mirror image takes the place of x_j.
+
+    Attributes
+    ----------
+    quality : (n,) float
+        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon, less for all others; n is the number of
+        faces. Those on the boundary of a polygonal domain are taken together and straightened as long as they turn by
+        no more than 30 degrees: Q is that of the polygon with these sides.
+        3D: the isoperimetric quotient 36 pi V^2 / S^3, 1 for a ball, .753 for a truncated octahedron, .524 for a cube.
+    skewness : (m,) float
+        Distance from the centroid of the face to the point where the line between the generators meets its
+        plane, over the distance of the generators; infinite for a generator on a wall, or behind it (a cell may reach
+        around a corner of a polygon). A linear interpolation along the line is off the face's centroid by so much.
+    centroid_angle : (m,) float
+        Angle in degrees between the normal of the face and the line from centroid to centroid: the
+        non-orthogonality of solvers that keep their unknowns at the centroids. 0 on walls.
+    face_ratio : (n,) float
+        Measure of the cell's smallest face over that of its largest.
+    volume_ratio : (m,) float
+        Larger over smaller volume of the two cells at the face; 1 on walls.
+    faces : (n,) int
+        Number of faces of the cell.
+    inner : (m,) bool
+        Which faces are between two cells.
+    polygonal : bool
+        Whether the domain is a polygon.
+    """
+
+    quality: np.ndarray
+    skewness: np.ndarray
+    centroid_angle: np.ndarray
+    face_ratio: np.ndarray
+    volume_ratio: np.ndarray
+    faces: np.ndarray
+    inner: np.ndarray
+    polygonal: bool = False
+
+    def __repr__(self) -> str:
+        return f"Measures({self.line()})"
+
+    def line(self) -> str:
+        """Return in a line what finite-volume methods ask of a mesh."""
+        s = self.summary()
+        return (
+            f"{s['mean_faces']:.2f} faces per cell; skewness mean {s['mean_skewness']:.3f}, "
+            f"max {s['max_skewness']:.3f}; angle of centroids mean {s['mean_centroid_angle']:.2f}°, "
+            f"max {s['max_centroid_angle']:.1f}°"
+        )
+
+    def worst_of_cell(self, name: str) -> np.ndarray:
+        """Return the largest value of `name`, a measure of faces, among the faces of each cell, (n,)."""
+        values, counts = getattr(self, name), self.faces
+        worst = np.zeros(len(counts))
+        some = counts > 0
+        starts = np.cumsum(counts) - counts
+        worst[some] = np.maximum.reduceat(values, starts[some]) if len(values) else 0.0
+        return worst
+
+    def summary(self) -> dict[str, float]:
+        """Return the mean and the worst of every measure, by name.
+
+        Means of `centroid_angle` and `volume_ratio` are over the faces between cells, and so are mean and maximum of
+        `skewness` in a polygonal domain, whose walls may have generators behind them.
+        """
+        angle, ratio = (
+            values[self.inner] if self.inner.any() else values
+            for values in (self.centroid_angle, self.volume_ratio)
+        )
+        skewness = (
+            self.skewness[self.inner] if self.polygonal and self.inner.any() else self.skewness
+        )
+        return {
+            "mean_faces": float(self.faces.mean()),
+            "mean_quality": float(self.quality.mean()),
+            "min_quality": float(self.quality.min()),
+            "mean_skewness": float(skewness.mean()),
+            "max_skewness": float(skewness.max()),
+            "mean_centroid_angle": float(angle.mean()),
+            "max_centroid_angle": float(angle.max()),
+            "mean_face_ratio": float(self.face_ratio.mean()),
+            "min_face_ratio": float(self.face_ratio.min()),
+            "mean_volume_ratio": float(ratio.mean()),
+            "max_volume_ratio": float(ratio.max()),
+        }
+
+
+def measure_mesh(diagram: Diagram) -> Measures:
+    """Measure the cells and faces of a diagram in 2D or 3D.
+
+    A wall is a plane, whatever part of it is in the domain: one of a box, or through an edge of a polygon.
+    """
+    owner, neighbor = face_owners(diagram), diagram.neighbors
+    points, centroids, volumes = diagram.points, diagram.centroids, diagram.volumes
+    areas, middles = diagram.face_measures, diagram.face_centroids
+    starts = diagram.neighbor_starts
+    inner = neighbor >= 0
+    other = np.where(inner, neighbor, 0)
+    line = points[other] + diagram.shifts * diagram.domain.extent - points[owner]
+    walls = np.flatnonzero(~inner)
+    normals, anchors = wall_planes(diagram.domain, -1 - neighbor[walls])
+    gaps = ((anchors - points[owner[walls]]) * normals).sum(axis=1)
+    line[walls] = 2 * gaps[:, None] * normals
+    distance = np.linalg.norm(line, axis=1)
+    distance[walls[gaps <= 0]] = 0
+    meeting = points[owner] + 0.5 * line
+    offset = np.linalg.norm(middles - meeting, axis=1)
+    skewness = np.where(offset > 0, np.inf, 0.0)  # stays where the distance is none
+    np.divide(offset, distance, out=skewness, where=distance > 0)
+
+    angle = np.zeros(len(line))
+    between = centroids[other] + diagram.shifts * diagram.domain.extent - centroids[owner]
+    angle[inner] = _angles(line[inner], between[inner])
+
+    counts = np.diff(starts)
+    surface = np.add.reduceat(areas, starts[:-1])
+    largest, smallest = (f.reduceat(areas, starts[:-1]) for f in (np.maximum, np.minimum))
+    if diagram.domain.dim == 2:
+        quality = straighten(diagram).quality()
+    else:
+        quality = 36 * np.pi * volumes**2 / surface**3
+    here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
+    ratio = np.maximum(here, there) / np.minimum(here, there)
+    polygonal = isinstance(diagram.domain, Polygon)
+    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal)
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles in degrees between vectors (m, d), to full precision also where they are small."""
+    a = a / np.linalg.norm(a, axis=1)[:, None]
+    b = b / np.linalg.norm(b, axis=1)[:, None]
+    halves = np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    return np.degrees(2 * halves)

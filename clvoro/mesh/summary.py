@@ -1,0 +1,64 @@
+"""The figures that describe a run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..geometry.polygon import Polygon
+from .results import Result
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Return cells, steps, error, quality, share of changed cells, why it stopped, seconds.
+
+    Of a polygonal domain also those of the cells on the boundary and of the others; see `beside_boundary`.
+    """
+    error, history = np.abs(result.error), result.history
+    parts = beside_boundary(result) if isinstance(result.diagram.domain, Polygon) else {}
+    apart = {
+        f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()
+    }
+    return {
+        "cells": len(result.points),
+        "steps": int(history["step"][-1]) if len(history) else 0,
+        "mean_error": float(error.mean()),
+        "max_error": float(error.max()),
+        "mean_quality": float(result.quality.mean()),
+        "min_quality": float(result.quality.min()),
+        "size_factor": float(result.size_factor),
+        "ever_changed": float(history["ever_changed"][-1]) if len(history) else 0.0,
+        "converged": bool(result.converged),
+        "stop_reason": result.stop_reason,
+        "seconds": float(history["seconds"][-1]) if len(history) else 0.0,
+        **apart,
+    }
+
+
+def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
+    """Return the number, mean |e|, mean and least Q of cells on the `boundary` and of `inner` ones; None of none."""
+    d = result.diagram
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
+    on_boundary = np.bincount(owner, d.neighbors < 0, len(d)) > 0
+    found = {}
+    for name, which in (("boundary", on_boundary), ("inner", ~on_boundary)):
+        error, quality = np.abs(result.error[which]), result.quality[which]
+        some = bool(which.any())
+        found[name] = {
+            "cells": int(which.sum()),
+            "mean_error": float(error.mean()) if some else None,
+            "mean_quality": float(quality.mean()) if some else None,
+            "min_quality": float(quality.min()) if some else None,
+        }
+    return found
+
+
+def boundary_line(result: Result) -> str:
+    """Return in a line how cells on the boundary differ from the others."""
+    return "; ".join(
+        f"{s['cells']} {name} cells: mean |e| {s['mean_error']:.4f}, mean Q {s['mean_quality']:.4f}, "
+        f"min Q {s['min_quality']:.3f}"
+        for name, s in beside_boundary(result).items()
+        if s["cells"]
+    )

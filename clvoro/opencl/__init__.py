@@ -1,0 +1,1 @@
+"""OpenCL: choosing devices, building and launching kernels, arrays on the device, scans, profiling."""

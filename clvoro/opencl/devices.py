@@ -1,0 +1,393 @@
+"""Devices: which ones work, and the best of them.
+
+A device counts only once a small kernel has been built and run on it: runtimes exist that list a
+device and cannot build anything for it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import DTypeLike
+
+from ..errors import DeviceError, InputTypeError
+from . import probe as _probe
+from . import runtimes as _runtimes
+from .probe import has_fp64, one_line
+
+_runtimes.prepare()
+
+INSTALL_HINT = (
+    "install a CPU runtime (`apt-get install pocl-opencl-icd`, or without root rights on x86-64 "
+    'Linux `pip install "clvoro[cpu]"`) or your GPU\'s OpenCL driver'
+)
+"""The remedy in every message about a missing device."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One OpenCL device as `clvoro devices` shows it.
+
+    Attributes
+    ----------
+    index : str
+        ``"platform:device"``, accepted by `create_context`.
+    platform, name, version : str
+        As the runtime reports them.
+    kind : str
+        ``"gpu"``, ``"cpu"``, ``"accelerator"`` or ``"simulator"`` (Oclgrind, never chosen unasked).
+    memory : int
+        Global memory in bytes.
+    units : int
+        Compute units (cores of a CPU).
+    fp64 : bool
+        Whether it computes in float64.
+    works : bool
+        Whether a kernel has been built and run on it with the right result.
+    reason : str
+        Why it does not work; empty if it does.
+    default : bool
+        Whether `create_context` picks it when nothing is asked for.
+    """
+
+    index: str
+    platform: str
+    name: str
+    kind: str
+    version: str
+    memory: int
+    units: int
+    fp64: bool
+    works: bool
+    reason: str = ""
+    default: bool = False
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A device, where it stands in the lists of platforms, and how it is called."""
+
+    index: str
+    device: cl.Device
+    platform: str
+    name: str
+    kind: str
+
+    @property
+    def title(self) -> str:
+        return f"{self.platform} / {self.name}"
+
+    @property
+    def rank(self) -> tuple[int, int]:
+        """Sort key, best first: GPUs (with float64 before others), PoCL, other CPUs, the rest."""
+        if self.kind == "gpu":
+            return (0, 0 if has_fp64(self.device) else 1)
+        if self.kind == "cpu":
+            return (1 if self.platform.startswith("Portable Computing Language") else 2, 0)
+        return (3, 0)
+
+
+def create_context(device: str | cl.Device | None = None, *, fp64: bool = False) -> cl.Context:
+    """Return a context on the best working device.
+
+    The order is: `device`, the environment variable `PYOPENCL_CTX`, a GPU, PoCL, any other CPU.
+    The simulator Oclgrind is taken only if asked for by name or index.
+
+    Parameters
+    ----------
+    device : str or pyopencl.Device, optional
+        Part of a platform's name in any case (``"nvidia"``, ``"pocl"``) or, where no platform has it,
+        of a device's or vendor's; a kind (``"gpu"``, ``"cpu"``), or indices ``"platform:device"``
+        as `list_devices` gives them.
+    fp64 : bool
+        Take only devices that compute in float64.
+
+    Returns
+    -------
+    pyopencl.Context
+        Of one device.
+
+    Raises
+    ------
+    DeviceError
+        If nothing that was asked for works; the message says what was found and what to install.
+    InputTypeError
+        If `device` is of another type.
+    """
+    _probe.check_process()
+    if isinstance(device, cl.Device):
+        return _checked_context(_describe(device, "given"), fp64)
+    if device is not None and not isinstance(device, str):
+        raise InputTypeError(
+            f"device got a {type(device).__name__}, expected a string or a pyopencl.Device; "
+            'write device="gpu", part of its name, or "platform:device" indices'
+        )
+    if device is None and os.environ.get("PYOPENCL_CTX"):
+        return _checked_context(_from_environment(), fp64)
+
+    # Indices ask that platform alone: the way around one that crashes.
+    index = re.fullmatch(r"\s*(\d+)\s*:\s*\d+\s*", device or "")
+    found, broken = _candidates(only=int(index[1]) if index else None)
+    if device is None or not device.strip():
+        wanted = [c for c in found if c.kind != "simulator"]
+        subject = "no working OpenCL device"
+    else:
+        wanted = _matching(found, device.strip())
+        subject = f"device={device!r}: no working OpenCL device of that name or index"
+    failures = []
+    for candidate in sorted(wanted, key=lambda c: c.rank):
+        reason = _reason_against(candidate.device, fp64)
+        if not reason:
+            return cl.Context([candidate.device])
+        failures.append(f"{candidate.index} {candidate.title}: {reason}")
+    chosen = index is not None or "PYOPENCL_CTX" in os.environ
+    raise DeviceError(_complaint(subject, found, failures, broken, chosen, fp64))
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Try every OpenCL device and return one entry for each, in the order of the platforms.
+
+    A child process tries them first, so that a runtime that crashes is listed with its reason. That
+    takes about a second.
+
+    Returns
+    -------
+    list of DeviceInfo
+        With ``index``, ``name``, ``kind``, ``works`` and, if it does not, the ``reason``.
+
+    Examples
+    --------
+    >>> any(device.works for device in clvoro.list_devices())
+    True
+    """
+    _probe.check_process()
+    crashed = _probe.crashing_platforms()
+    found, broken = _candidates(skip=crashed)
+    reasons = {c.index: _probe.verdict(c.device) for c in found}
+    best = _default_index(found, reasons, [title for index, title, _ in broken if crashed])
+    entries = [
+        DeviceInfo(
+            index=c.index,
+            platform=c.platform,
+            name=c.name,
+            kind=c.kind,
+            version=c.device.version.strip(),
+            memory=int(c.device.global_mem_size),
+            units=int(c.device.max_compute_units),
+            fp64=has_fp64(c.device),
+            works=not reasons[c.index],
+            reason=reasons[c.index],
+            default=c.index == best,
+        )
+        for c in found
+    ]
+    for index, platform, reason in broken:
+        entries.append(DeviceInfo(index, platform, "-", "-", "-", 0, 0, False, False, reason))
+    return entries
+
+
+def format_devices(devices: Sequence[DeviceInfo]) -> str:
+    """Return `devices` as a table in plain text; ``*`` marks the one that is used unasked."""
+    if not devices:
+        return f"No OpenCL device found: {INSTALL_HINT}."
+    header = ("", "index", "kind", "units", "memory", "float64", "works", "platform / device")
+    rows = [
+        (
+            "*" if d.default else "",
+            d.index,
+            d.kind,
+            str(d.units),
+            f"{d.memory / 2**30:.1f} GiB",
+            "yes" if d.fp64 else "no",
+            "yes" if d.works else "NO",
+            f"{d.platform} / {d.name}",
+        )
+        for d in devices
+    ]
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = []
+    for row, entry in zip([header, *rows], [None, *devices], strict=True):
+        lines.append("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip())
+        if entry is not None and entry.reason:
+            lines.append(f"       {one_line(entry.reason, 300)}")
+    if any(d.kind in ("cpu", "-") and not d.works for d in devices):
+        lines.append(f"{_runtimes.cache_remedy()}.")
+    if any(d.default for d in devices):
+        lines.append("* is used when nothing is asked for.")
+    elif os.environ.get("PYOPENCL_CTX"):
+        lines.append(f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} chooses no working device.")
+    else:
+        lines.append(f"None is used unasked: {INSTALL_HINT}.")
+    return "\n".join(lines)
+
+
+def require_fp64(where: cl.Context | cl.Device, dtype: DTypeLike = np.float64) -> None:
+    """Check that a context's first device (or a device) computes in `dtype`.
+
+    Raises
+    ------
+    DeviceError
+        If `dtype` is float64 and the device has no double precision.
+    """
+    if np.dtype(dtype) != np.float64:
+        return
+    device = getattr(where, "devices", [where])[0]  # a context, or the device itself
+    if not has_fp64(device):
+        raise DeviceError(
+            f"dtype='float64' was asked for, but the device {device.name.strip()} has no double "
+            "precision; use dtype='float32', or another device (`clvoro devices` lists them)"
+        )
+
+
+def _describe(device: cl.Device, index: str) -> _Candidate:
+    """Name a device; Oclgrind calls itself CPU, GPU and accelerator at once."""
+    platform, name = device.platform.name.strip(), device.name.strip()
+    if "oclgrind" in f"{platform} {name}".lower():
+        kind = "simulator"
+    elif device.type & cl.device_type.GPU:
+        kind = "gpu"
+    elif device.type & cl.device_type.CPU:
+        kind = "cpu"
+    else:
+        kind = "accelerator"
+    return _Candidate(index, device, platform, name, kind)
+
+
+def _candidates(
+    only: int | None = None, skip: Mapping[int, str] | None = None
+) -> tuple[list[_Candidate], list[tuple[str, str, str]]]:
+    """Return all devices, and (index, platform, reason) of each platform that lists none.
+
+    With `only`, no other platform is asked; neither are those in `skip`, which gives their reasons.
+    """
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # the loader's way of saying that there is no platform
+        return [], []
+    if only is not None and only >= len(platforms):
+        only = None  # the message shall list what there is
+    found: list[_Candidate] = []
+    broken: list[tuple[str, str, str]] = []
+    for p, platform in enumerate(platforms):
+        devices: Collection[cl.Device] = []
+        reason = "it lists no device"
+        if only not in (None, p):
+            continue
+        if skip and p in skip:
+            reason = skip[p]
+        else:
+            try:
+                devices = platform.get_devices()
+            except cl.Error as error:
+                reason += f": {one_line(str(error), 300)}"
+        found += [_describe(device, f"{p}:{d}") for d, device in enumerate(devices)]
+        if not devices:
+            broken.append((f"{p}:-", platform.name.strip(), reason))
+    return found, broken
+
+
+def _matching(found: Iterable[_Candidate], query: str) -> list[_Candidate]:
+    """Return the devices that `query` means: equal indices, else a platform's name or the kind, else a device's."""
+    by_index = [c for c in found if c.index == query.replace(" ", "")]
+    if by_index:
+        return by_index
+    text = query.lower()
+    aliases = {"Portable Computing Language": "pocl"}
+    # The runtime before the device: PoCL calls a device by its processor, which may be an "Intel" one.
+    for parts in (
+        lambda c: f"{c.platform} / {aliases.get(c.platform, '')}",
+        lambda c: f"{c.device.vendor} / {c.platform} / {c.name}",
+    ):
+        meant = [c for c in found if text in parts(c).lower() or text == c.kind]
+        if meant:
+            return meant
+    return []
+
+
+def _from_environment() -> _Candidate:
+    """Return the first device that `PYOPENCL_CTX` chooses."""
+    value = os.environ["PYOPENCL_CTX"]
+    try:
+        device = cl.create_some_context(interactive=False).devices[0]
+    except Exception as error:
+        raise DeviceError(
+            f"PYOPENCL_CTX={value!r} chooses no OpenCL device ({one_line(str(error), 200)}); "
+            "unset it, or set it to indices that `clvoro devices` shows"
+        ) from error
+    return _describe(device, f"PYOPENCL_CTX={value!r}")
+
+
+def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
+    """Return a context on exactly this device, or say why it is of no use."""
+    reason = _reason_against(candidate.device, fp64)
+    if reason:
+        raise DeviceError(
+            f"the device {candidate.title} ({candidate.index}) cannot be used: {reason}; "
+            "choose another (`clvoro devices` lists them)"
+        )
+    return cl.Context([candidate.device])
+
+
+def _reason_against(device: cl.Device, fp64: bool) -> str:
+    if fp64 and not has_fp64(device):
+        return "it has no double precision (use dtype='float32')"
+    return _probe.verdict(device)
+
+
+def _default_index(
+    found: Iterable[_Candidate], reasons: dict[str, str], avoid: Iterable[str]
+) -> str | None:
+    """Return the index of the device that `create_context()` takes.
+
+    `avoid` are names of platforms that must not be asked.
+    """
+    wish = os.environ.get("PYOPENCL_CTX")
+    if wish:
+        first = wish.split(":")[0].strip().lower()
+        if first.isdigit() and not any(c.index.startswith(f"{first}:") for c in found):
+            return None
+        if any(first in name.lower() for name in avoid):
+            return None
+        try:
+            chosen = _from_environment().device
+        except DeviceError:
+            return None
+        return next((c.index for c in found if c.device == chosen and not reasons[c.index]), None)
+    usable = [c for c in found if c.kind != "simulator" and not reasons[c.index]]
+    return min(usable, key=lambda c: c.rank).index if usable else None
+
+
+def _complaint(
+    subject: str,
+    found: Sequence[_Candidate],
+    failures: Sequence[str],
+    broken: Sequence[tuple[str, str, str]],
+    chosen: bool,
+    fp64: bool,
+) -> str:
+    """Put together the message: what was looked for, what was there, what to do.
+
+    `chosen` tells that what is taken unasked may be another than the best of what was `found`.
+    """
+    lines = [subject]
+    lines += [f"  tried {text}" for text in failures]
+    lines += [f"  platform {title}: {reason}" for _, title, reason in broken]
+    others = [c for c in found if not any(f.startswith(f"{c.index} ") for f in failures)]
+    lines += [f"  there is {c.index} {c.title} ({c.kind})" for c in others]
+    if not found and not broken:
+        lines.append("  the OpenCL loader knows no platform")
+    elif failures or broken:
+        lines.append(f"  {_runtimes.cache_remedy()}")
+    remedy = INSTALL_HINT
+    left = [c for c in others if c.kind != "simulator" and (has_fp64(c.device) or not fp64)]
+    if left:
+        best = min(left, key=lambda c: c.rank)
+        how = f"ask for {best.index!r}" if chosen else "leave the device out"
+        remedy = f"{how} to use {best.title}, or install the OpenCL driver of the one that you want"
+    lines.append(f"  remedy: {remedy}; `clvoro devices` shows the verdict on each device")
+    return "\n".join(lines)

@@ -1,0 +1,124 @@
+"""Watch what is enqueued on a queue, whoever enqueues it.
+
+While anything is watched, PyOpenCL's ways to enqueue something (`enqueue_nd_range_kernel`,
+`Kernel.__call__`, `enqueue_copy`, `enqueue_fill`) are replaced by ones that also show the event to
+the watchers of that queue, and `Kernel.set_args` notes the size of the buffers it binds. So no
+stage needs to know of it, and what is not watched is no slower.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import pyopencl as cl
+
+MEMORY = "memory"
+"""Stage of what is no kernel: copies, fills, reads and writes by the host."""
+ARRAYS = "arrays"
+"""Stage of PyOpenCL's own kernels."""
+
+
+class Watcher(Protocol):
+    """Takes each event, its stage, the name of its kernel, its bytes if known, whether it has ended."""
+
+    def __call__(
+        self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
+    ) -> None:
+        """Take one event."""
+        ...
+
+
+_watched: list[tuple[cl.CommandQueue, Watcher]] = []
+_lock = threading.Lock()
+_original: dict[str, Callable[..., Any]] = {}
+
+
+@contextmanager
+def watching(queue: cl.CommandQueue, watcher: Watcher) -> Iterator[None]:
+    """Show every command on `queue` to `watcher` meanwhile."""
+    entry = (queue, watcher)
+    with _lock:
+        if not _watched:
+            for place, name, hook in _HOOKS:
+                _original[name] = getattr(place, name)
+                setattr(place, name, hook)
+        _watched.append(entry)
+    try:
+        yield
+    finally:
+        with _lock:
+            _watched.remove(entry)
+            if not _watched:
+                for place, name, _ in _HOOKS:
+                    setattr(place, name, _original[name])
+
+
+def _of(queue: cl.CommandQueue) -> list[Watcher]:
+    return [watcher for watched, watcher in _watched if watched == queue]
+
+
+def _enqueue_kernel(queue: cl.CommandQueue, kernel: cl.Kernel, *args: Any, **options: Any) -> Any:
+    event = _original["enqueue_nd_range_kernel"](queue, kernel, *args, **options)
+    for watch in _of(queue):
+        stage = getattr(kernel, "stage", ARRAYS)
+        watch(event, stage, kernel.function_name, getattr(kernel, "bytes_bound", None))
+    return event
+
+
+def _call_kernel(
+    kernel: cl.Kernel, queue: cl.CommandQueue, size: Any, group: Any, *args: Any, **options: Any
+) -> Any:
+    event = _original["__call__"](kernel, queue, size, group, *args, **options)
+    for watch in _of(queue):
+        stage = getattr(kernel, "stage", ARRAYS)
+        watch(event, stage, kernel.function_name, _bytes_of(args))
+    return event
+
+
+def _set_args(kernel: cl.Kernel, *args: Any) -> None:
+    _original["set_args"](kernel, *args)
+    kernel.bytes_bound = _bytes_of(args)  # type: ignore[attr-defined]
+
+
+def _bytes_of(arguments: tuple[Any, ...]) -> int:
+    """Return the sum of the sizes of the buffers (or of the arrays' buffers), each once."""
+    given = (getattr(a, "base_data", a) for a in arguments)
+    buffers = {a.int_ptr: a.size for a in given if isinstance(a, cl.MemoryObject)}
+    return sum(buffers.values())
+
+
+def _enqueue_copy(queue: cl.CommandQueue, dest: Any, src: Any, **options: Any) -> Any:
+    event = _original["enqueue_copy"](queue, dest, src, **options)
+    to_device, from_device = (isinstance(a, cl.MemoryObject) for a in (dest, src))
+    name = "copy" if to_device and from_device else "read" if from_device else "write"
+    if name == "copy":
+        moved = 2 * (options.get("byte_count") or src.size)
+    else:
+        host = dest if name == "read" else src
+        moved = getattr(host, "nbytes", None)
+    # A blocking transfer has ended, and its event would keep the host's array alive.
+    done = name != "copy" and options.get("is_blocking", True)
+    for watch in _of(queue):
+        watch(event, MEMORY, name, moved, done)
+    return event
+
+
+def _enqueue_fill(
+    queue: cl.CommandQueue, dest: Any, pattern: Any, size: int, *args: Any, **options: Any
+) -> Any:
+    event = _original["enqueue_fill"](queue, dest, pattern, size, *args, **options)
+    for watch in _of(queue):
+        watch(event, MEMORY, "fill", size)
+    return event
+
+
+_HOOKS: tuple[tuple[Any, str, Callable[..., Any]], ...] = (
+    (cl, "enqueue_nd_range_kernel", _enqueue_kernel),
+    (cl, "enqueue_copy", _enqueue_copy),
+    (cl, "enqueue_fill", _enqueue_fill),
+    (cl.Kernel, "__call__", _call_kernel),
+    (cl.Kernel, "set_args", _set_args),
+)

@@ -1,0 +1,271 @@
+"""Where the time of a run goes: every kernel's own time, from the device's events.
+
+Every command is timed, by whichever stage it is enqueued (see `_hooks`). A run without a profile keeps no events.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+
+from ..errors import InputError
+from . import hooks as _hooks
+from .costs import Cost, Span, tabulate
+from .program import build_program, build_seconds
+
+if TYPE_CHECKING:
+    from ..adapter import Adapter
+
+PENDING = 2048
+"""Most events that are kept: the older half is then read and let go, while the newer ones run."""
+LARGE = 256 << 20
+"""Bytes of the buffer that is copied to measure the bandwidth: more than any cache holds."""
+
+_bandwidths: dict[int, float] = {}
+
+
+class Profile:
+    """Times everything that an adapter does on the device while the profile is open.
+
+    The adapter works on another queue of its context meanwhile, one whose events know their times,
+    with buffers of its own. A first run also compiles; profile a second one to leave that out.
+
+    Parameters
+    ----------
+    target : Adapter or pyopencl.CommandQueue
+        A queue must have been made with profiling enabled (`profiled_queue`).
+
+    Attributes
+    ----------
+    costs : dict of (str, str) to Cost
+        Per stage and kernel; a stage is a file of kernels. Complete once the profile is closed.
+    spans : list of Span
+        The history's rows, each with the time that led to it, and what came after the last.
+    wall, building : float
+        Seconds by the clock between opening and closing, and those of them that went into building programs.
+
+    Raises
+    ------
+    InputError
+        If the queue has no profiling.
+
+    Examples
+    --------
+    >>> with Profile(adapter) as profile:  # doctest: +SKIP
+    ...     adapter.run(domain, size)
+    >>> print(profile.table())  # doctest: +SKIP
+    """
+
+    def __init__(self, target: Adapter | cl.CommandQueue) -> None:
+        enabled = cl.command_queue_properties.PROFILING_ENABLE
+        if isinstance(target, cl.CommandQueue):
+            if not target.properties & enabled:
+                raise InputError(
+                    "target is a queue without profiling, expected one made with PROFILING_ENABLE; "
+                    "use clvoro.profile.profiled_queue(ctx)"
+                )
+            self._adapter, self.queue = None, target
+        else:
+            own = target.queue
+            self._adapter = target
+            self.queue = own if own.properties & enabled else profiled_queue(target.ctx)
+        self.costs: dict[tuple[str, str], Cost] = {}
+        self.spans: list[Span] = []
+        self.wall = self.building = 0.0
+        self._pending: list[tuple[cl.Event, tuple[str, str], int | None, Span]] = []
+        self._closing = ExitStack()
+
+    def __enter__(self) -> Profile:
+        if self._adapter is not None:
+            self._closing.enter_context(self._adapter.watched(self.queue, self._end_span))
+        self._closing.enter_context(_hooks.watching(self.queue, self._add))
+        self.building -= build_seconds()
+        self._began = time.perf_counter()
+        self._span = Span(self._began)
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            self._collect(len(self._pending))
+        except cl.Error:
+            if kind is None:  # otherwise the run has failed, and has said why
+                raise
+        finally:
+            self._pending.clear()
+            now = time.perf_counter()
+            self.wall += now - self._began
+            self.building += build_seconds()
+            self._span.wall = now - self._span.began
+            self.spans.append(self._span)
+            self._closing.close()
+
+    # What the hooks and the loop call.
+
+    def _add(
+        self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
+    ) -> None:
+        """Note a command; `moved` are its bytes if they are known, `done` tells that it has ended."""
+        entry = (event, (stage, name), moved, self._span)
+        if done:
+            self._count(*entry)
+            return
+        self._pending.append(entry)
+        if len(self._pending) >= PENDING:
+            self._collect(PENDING // 2)
+
+    def _end_span(self, row: np.void) -> None:
+        span, now = self._span, time.perf_counter()
+        span.step, span.level, span.cells = (int(row[name]) for name in ("step", "level", "cells"))
+        span.wall = now - span.began
+        self.spans.append(span)
+        self._span = Span(now)
+
+    def _collect(self, count: int) -> None:
+        """Wait for the oldest `count` events, read their times, let them go."""
+        if count:
+            self._pending[count - 1][0].wait()
+        for entry in self._pending[:count]:
+            self._count(*entry)
+        del self._pending[:count]
+
+    def _count(self, event: cl.Event, key: tuple[str, str], moved: int | None, span: Span) -> None:
+        event.wait()
+        times = event.profile
+        seconds = 1e-9 * (times.end - times.start)
+        cost = self.costs.setdefault(key, Cost())
+        cost.calls += 1
+        cost.seconds += seconds
+        if moved is not None:
+            cost.bytes += moved
+            # Between host and device it is another memory's bandwidth that counts.
+            if key[1] not in ("read", "write") or key[0] != _hooks.MEMORY:
+                cost.seconds_known += seconds
+            elif key[1] == "read":
+                span.read += moved
+        span.stages[key[0]] = span.stages.get(key[0], 0.0) + seconds
+
+    # What came of it.
+
+    @property
+    def launches(self) -> int:
+        """Number of kernels and other commands."""
+        return sum(cost.calls for cost in self.costs.values())
+
+    @property
+    def device(self) -> float:
+        """Seconds that the device worked."""
+        return sum(cost.seconds for cost in self.costs.values())
+
+    @property
+    def host(self) -> float:
+        """Seconds that it did not: the host's own work, building programs, launches, waiting."""
+        return self.wall - self.device
+
+    @property
+    def steps(self) -> list[Span]:
+        """The spans of steps."""
+        return [span for span in self.spans if span.step]
+
+    @property
+    def bandwidth(self) -> float:
+        """Bytes per second that a copy of a large buffer reads and writes; measured once per device."""
+        device = self.queue.device.int_ptr
+        if device not in _bandwidths:
+            _bandwidths[device] = copy_bandwidth(self.queue.context)
+        return _bandwidths[device]
+
+    def of(self, *stages: str) -> float:
+        """Return the device time of these stages' kernels, in seconds."""
+        return sum(cost.seconds for (stage, _), cost in self.costs.items() if stage in stages)
+
+    def stages(self) -> dict[str, Cost]:
+        """Return the sum over each stage's kernels, the longest first."""
+        sums: dict[str, Cost] = {}
+        for (stage, _), cost in self.costs.items():
+            sums[stage] = sums.get(stage, Cost()) + cost
+        return dict(sorted(sums.items(), key=lambda item: -item[1].seconds))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as numbers, strings, lists and dicts; times in seconds, shares of `wall`."""
+        self._require_closed()
+
+        def figures(cost: Cost) -> dict[str, Any]:
+            rate = cost.rate
+            return {
+                "calls": cost.calls,
+                "seconds": cost.seconds,
+                "share": cost.seconds / self.wall,
+                "bytes_bound": cost.bytes if rate is not None else None,
+                "share_of_bandwidth": None if rate is None else rate / self.bandwidth,
+            }
+
+        return {
+            "wall": self.wall,
+            "device": self.device,
+            "host": self.host,
+            "building": self.building,
+            "bandwidth": self.bandwidth,
+            "stages": [{"stage": name, **figures(cost)} for name, cost in self.stages().items()],
+            "kernels": [
+                {"stage": stage, "kernel": name, **figures(cost)}
+                for (stage, name), cost in self.ranked()
+            ],
+            "spans": [
+                {"step": s.step, "level": s.level, "cells": s.cells, "wall": s.wall,
+                 "stages": dict(s.stages)}
+                for s in self.spans
+            ],
+        }  # fmt: skip
+
+    def table(self) -> str:
+        """Return stages and kernels as tables in plain text."""
+        self._require_closed()
+        return tabulate(self)
+
+    def _require_closed(self) -> None:
+        if not self.spans or self.spans[-1].step is not None:
+            raise InputError(
+                "the profile is open or has never been opened, expected a closed one; ask for its "
+                "figures after the `with` block"
+            )
+
+    def ranked(self) -> list[tuple[tuple[str, str], Cost]]:
+        """Return stages and kernels with their costs, the longest first."""
+        return sorted(self.costs.items(), key=lambda item: -item[1].seconds)
+
+
+def profiled_queue(ctx: cl.Context) -> cl.CommandQueue:
+    """Return a queue whose events know their times."""
+    return cl.CommandQueue(ctx, properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+
+def copy_bandwidth(ctx: cl.Context, repeat: int = 5) -> float:
+    """Return the bytes per second that are read and written by copying a large buffer on the device.
+
+    The better of the driver's own copy, which on a CPU may use one core only, and a kernel's; the
+    best of `repeat` calls.
+    """
+    queue = profiled_queue(ctx)
+    device = queue.device
+    size = min(LARGE, device.max_mem_alloc_size // 4, device.global_mem_size // 8) // 4096 * 4096
+    source, target = (cl.Buffer(ctx, cl.mem_flags.READ_WRITE, size) for _ in range(2))
+    cl.enqueue_fill(
+        queue, source, np.ones(1, np.int8), size
+    )  # pages exist once they have been written
+    kernel = build_program(ctx, "opencl/copy.cl", {}, "").all_kernels()[0]
+    kernel.set_args(source, target)
+    best = float("inf")
+    for _ in range(repeat):
+        for event in (
+            cl.enqueue_copy(queue, target, source, byte_count=size),
+            cl.enqueue_nd_range_kernel(queue, kernel, (size // 16,), (64,)),
+        ):
+            event.wait()
+            best = min(best, 1e-9 * (event.profile.end - event.profile.start))
+    source.release()
+    target.release()
+    return 2 * size / best

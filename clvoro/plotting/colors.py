@@ -1,0 +1,162 @@
+"""What the colors of cells stand for: error, quality, size, number of sides, skewness."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import (
+    BoundaryNorm,
+    LinearSegmentedColormap,
+    ListedColormap,
+    LogNorm,
+    Normalize,
+)
+
+from ..errors import InputError
+from ..mesh.outlines import count_sides
+from ..mesh.results import Result
+from .style import nice
+
+# Up to four, five, six, seven, eight and more sides: neutral for six, warm below, cool above.
+_SIDES = ("#7F2704", "#E6762B", "#EDEDED", "#5AA6D1", "#08306B")
+_SIDES_LABELS = ("4 or fewer", "5", "6", "7", "8 or more")
+# In 3D, where relaxed cells have some 14 faces.
+_FACES_LABELS = ("≤ 12", "13", "14", "15", "≥ 16")
+
+# Blue and red around white, without the darkest tenth at either end: faces must stay visible.
+_DIVERGING = LinearSegmentedColormap.from_list(
+    "error", colormaps["RdBu_r"](np.linspace(0.09, 0.91, 65))
+)
+
+
+@dataclass(frozen=True)
+class Coloring:
+    """What a color stands for.
+
+    Attributes
+    ----------
+    label : str
+        With its unit, for the color bar.
+    values : function of a Result
+        One number per cell.
+    color_map : str or color map
+        Perceptually uniform; diverging around zero for a signed quantity.
+    limits : function of the values
+        The scale's two ends.
+    logarithmic : bool
+    classes : tuple of str
+        Names of the whole numbers that are the values, from the lower limit on; none for a continuous quantity.
+    """
+
+    label: str
+    values: Callable[[Result], np.ndarray]
+    color_map: Any
+    limits: Callable[[np.ndarray], tuple[float, float]]
+    logarithmic: bool = False
+    classes: tuple[str, ...] = ()
+
+
+def _symmetric(values: np.ndarray) -> tuple[float, float]:
+    """Limits that 99 % of the values keep, the same on both sides of zero."""
+    bound = nice(float(np.quantile(np.abs(values), 0.99))) if values.size else 1.0
+    return -bound, bound
+
+
+def _up_to_one(values: np.ndarray) -> tuple[float, float]:
+    """Limits for a quality: from a round number below 99 % of the values up to 1."""
+    low = float(np.quantile(values, 0.01)) if values.size else 0.0
+    return min(np.floor(low * 20) / 20, 0.95), 1.0
+
+
+def _around_most(values: np.ndarray) -> tuple[float, float]:
+    """Limits for a quality that cannot reach 1: round numbers around 99 % of the values and the largest."""
+    low = float(np.quantile(values, 0.01)) if values.size else 0.0
+    high = float(values.max()) if values.size else 1.0
+    return np.floor(low * 20) / 20, max(np.ceil(high * 20), np.floor(low * 20) + 1) / 20
+
+
+def _from_zero(values: np.ndarray) -> tuple[float, float]:
+    """Limits from 0 to a round number that 99 % of the values keep, of those that are finite."""
+    values = values[np.isfinite(values)]
+    return 0.0, nice(float(np.quantile(values, 0.99))) if values.size else 1.0
+
+
+def _span(values: np.ndarray) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if high > low * (1 + 1e-6) else (low * 0.99, low * 1.01)
+
+
+COLORINGS = {
+    "error": Coloring(
+        "metric error $e$ [–]   (< 0 too small, > 0 too large)",
+        lambda r: r.error,
+        _DIVERGING,
+        _symmetric,
+    ),
+    "quality": Coloring("cell quality $Q$ [–]", lambda r: r.quality, "viridis", _up_to_one),
+    "size": Coloring(
+        "target size $h$ [units of length]", lambda r: r.size, "viridis", _span, logarithmic=True
+    ),
+    "sides": Coloring(
+        "number of sides",
+        lambda r: np.clip(count_sides(r.diagram), 4, 8),
+        ListedColormap(_SIDES),
+        lambda v: (3.5, 8.5),
+        classes=tuple(f"{label} sides" for label in _SIDES_LABELS),
+    ),
+    "skewness": Coloring(
+        "skewness of the worst face [–]",
+        lambda r: r.measures.worst_of_cell("skewness"),
+        "viridis_r",
+        _from_zero,
+    ),
+}
+"""What `plot_cells` can color by."""
+
+_SOLID_COLORINGS = {
+    **COLORINGS,
+    "quality": replace(
+        COLORINGS["quality"],
+        label=r"cell quality $Q = 36\pi V^2 / S^3$ [–]",
+        limits=_around_most,
+    ),
+    "sides": Coloring(
+        "number of faces",
+        lambda r: np.clip(np.diff(r.diagram.neighbor_starts), 12, 16),
+        ListedColormap(_SIDES),
+        lambda v: (11.5, 16.5),
+        classes=tuple(f"{label} faces" for label in _FACES_LABELS),
+    ),
+}
+
+
+def coloring(name: str, dim: int = 2) -> Coloring:
+    """Return the coloring of that name for cells in `dim` dimensions, or raise InputError."""
+    known = COLORINGS if dim == 2 else _SOLID_COLORINGS
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"color is {name!r:.60}, expected one of {', '.join(known)}")
+    return known[name]
+
+
+def shared_limits(results: Sequence[Result], color: str) -> tuple[float, float]:
+    """Return the scale that suits the cells of all `results` together."""
+    scheme = coloring(color, results[0].diagram.domain.dim)
+    return scheme.limits(np.concatenate([scheme.values(r) for r in results]))
+
+
+def cell_norm(scheme: Coloring, limits: tuple[float, float]) -> Normalize:
+    """Return the map from values to [0, 1] that `scheme` asks for."""
+    low, high = limits
+    if isinstance(scheme.color_map, ListedColormap):
+        classes = scheme.color_map.N
+        return BoundaryNorm(np.linspace(low, high, classes + 1), classes)
+    return LogNorm(low, high) if scheme.logarithmic and high > 3 * low > 0 else Normalize(low, high)
+
+
+def without_ends(values: np.ndarray) -> np.ndarray:
+    """Return `values` with large numbers in the place of infinite ones, for which Matplotlib has no color."""
+    return np.clip(values, -1e30, 1e30)

@@ -1,0 +1,233 @@
+"""The report: one HTML page that holds its pictures, and the pictures as files beside it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from ..geometry.polygon import Polygon
+from ..io.atomic import atomic_file, writing
+from ..mesh.results import Result
+from ..mesh.summary import beside_boundary, summary
+from .pictures import pictures_of, render
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; background: #fff; max-width: 60rem;
+       margin: 2rem auto; padding: 0 1.2rem; }
+h1 { font-size: 1.6rem; margin-bottom: 0; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+p.what { color: #555; margin-top: .2rem; }
+dl { display: flex; flex-wrap: wrap; gap: .7rem; }
+dl div { flex: 1 1 6rem; border: 1px solid #ddd; border-radius: .4rem; padding: .5rem .8rem; }
+dt { color: #555; font-size: .8rem; } dd { margin: 0; font-size: 1.25rem;
+     font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100%; }
+th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid #ddd; }
+th:first-child, td:first-child, th:last-child, td:last-child { text-align: left; }
+table.measures { width: auto; } table.measures td:last-child, table.measures th:last-child { text-align: right; }
+thead th { color: #555; font-weight: 600; font-size: .85rem; } tr.main td { font-weight: 600; }
+th { white-space: nowrap; }
+figure { margin: 1.5rem 0; break-inside: avoid; } img { max-width: 100%; height: auto; }
+figcaption { color: #444; font-size: .9rem; }
+pre { background: #f6f6f6; padding: .8rem 1rem; overflow-x: auto; font-size: .85rem; }
+"""
+
+
+def write_report(
+    results: Result | Mapping[str, Result],
+    folder: str | PathLike[str],
+    *,
+    initial: Result | None = None,
+    size: Callable[[np.ndarray], np.ndarray] | None = None,
+    title: str = "Voronoi mesh",
+    case: str = "",
+    facts: Mapping[str, str] | None = None,
+    formats: Sequence[str] = ("png",),
+    dpi: int = 170,
+) -> list[Path]:
+    """Write `report.html` and its pictures into `folder`.
+
+    Parameters
+    ----------
+    results : Result or mapping
+        One result, or several by the method's name from one start; the last is the main one.
+    folder : path
+        Made if it does not exist; the pictures go into `pictures/` inside.
+    initial : Result, optional
+        The mesh before the first step.
+    size : callable, optional
+        The size field h(points (n, d)), for its picture.
+    title : str
+    case : str
+        The case file's text, shown at the end.
+    facts : mapping, optional
+        More figures for the page's head.
+    formats : sequence of {"png", "pdf", "svg"}
+        Files per picture; the page itself always holds PNG.
+    dpi : int
+
+    Returns
+    -------
+    list of Path
+        The files written, the page first.
+
+    Raises
+    ------
+    OutputError, MemoryError, or whatever Matplotlib raises
+        The first of what went wrong, after all that can be written is.
+    """
+    if isinstance(results, Result):
+        method = results.settings.get("method") or "result"
+        results = {str(method): results}
+    target = Path(folder)
+    with writing(target / "pictures"):
+        (target / "pictures").mkdir(parents=True, exist_ok=True)
+    written, figures, failed = [], [], None
+    for name, caption, draw in pictures_of(results, initial, size):
+        try:
+            figure = draw()
+            png = render(figure, "png", dpi)
+            figures.append((caption, png))
+            for kind in formats:
+                path = target / "pictures" / f"{name}.{kind}"
+                _write(path, png if kind == "png" else render(figure, kind, dpi))
+                written.append(path)
+        except Exception as error:  # raised below: the other pictures are drawn all the same
+            failed = failed or error
+    page = target / "report.html"
+    _write(page, _page(results, title, case, facts or {}, figures).encode())
+    if failed is not None:
+        raise failed
+    return [page, *written]
+
+
+def _write(path: Path, content: bytes) -> None:
+    with atomic_file(path) as file:
+        file.write(content)
+
+
+def _page(
+    results: Mapping[str, Result],
+    title: str,
+    case: str,
+    facts: Mapping[str, str],
+    figures: Sequence[tuple[str, bytes]],
+) -> str:
+    name, main = list(results.items())[-1]
+    numbers = summary(main)
+    head = {
+        "cells": f"{numbers['cells']:,}".replace(",", " "),
+        "mean error |e|": f"{numbers['mean_error']:.4f}",
+        "largest |e|": f"{numbers['max_error']:.3f}",
+        "mean quality Q": f"{numbers['mean_quality']:.4f}",
+        "lowest Q": f"{numbers['min_quality']:.3f}",
+        "steps": str(numbers["steps"]),
+        "time": f"{numbers['seconds']:.2f} s",
+    }
+    cards = "".join(f"<div><dt>{_safe(k)}</dt><dd>{_safe(v)}</dd></div>" for k, v in head.items())
+    if main.size_factor != 1:
+        facts = {
+            **facts,
+            "size field scaled by": f"{main.size_factor:.4g} to fit the number of cells",
+        }
+    words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])
+    parts = [
+        f"<h1>{_safe(title)}</h1><p class=what>{_safe(words)}</p><dl>{cards}</dl>",
+        f"<h2>Runs</h2>{_table(results, name)}" if len(results) > 1 else
+        f"<p>Stopped: {_safe(main.stop_reason)}.</p>",
+        f"<h2>Cells on the boundary</h2>{_apart(results, name)}"
+        if isinstance(main.diagram.domain, Polygon) else "",
+        f"<h2>Measures for finite volumes</h2>{_measures(name, main)}",
+        "<h2>Pictures</h2>",
+    ]  # fmt: skip
+    for caption, png in figures:
+        data = base64.b64encode(png).decode()
+        parts.append(
+            f'<figure><img alt="{_safe(caption)}" src="data:image/png;base64,{data}">'
+            f"<figcaption>{_safe(caption)}</figcaption></figure>"
+        )
+    if case:
+        parts.append(
+            "<h2>To repeat it</h2><p>This is <code>case.toml</code> beside this page: "
+            f"call <code>clvoro run case.toml</code>.</p><pre>{_safe(case)}</pre>"
+        )
+    body = "\n".join(parts)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>{_safe(title)}</title><style>{_STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
+    )
+
+
+def _measures(name: str, result: Result) -> str:
+    """Return the table of `Result.measures`, and what they mean."""
+    s = result.measures.summary()
+    rows = (
+        ("faces per cell", s["mean_faces"], None),
+        ("skewness", s["mean_skewness"], s["max_skewness"]),
+        ("angle of centroids [°]", s["mean_centroid_angle"], s["max_centroid_angle"]),
+        ("smallest over largest face of a cell", s["mean_face_ratio"], s["min_face_ratio"]),
+        (
+            "volumes of neighbors, larger over smaller",
+            s["mean_volume_ratio"],
+            s["max_volume_ratio"],
+        ),
+    )
+    body = "".join(
+        f"<tr><td>{_safe(what)}</td><td>{mean:.4g}</td><td>{'' if worst is None else f'{worst:.3g}'}</td></tr>"
+        for what, mean, worst in rows
+    )
+    return (
+        f"<table class=measures><thead><tr><th>{_safe(name)}</th><th>mean</th><th>worst</th></tr></thead>"
+        f"<tbody>{body}</tbody></table><p class=what>With the unknowns at the generators there is no "
+        "non-orthogonality; the angle is what remains between a face's normal and the line from centroid to "
+        "centroid. Skewness: from a face's centroid to that line of the generators, over their distance.</p>"
+    )
+
+
+def _apart(results: Mapping[str, Result], main: str) -> str:
+    """Return the table of cells on the boundary, whose shape it decides, and of the others."""
+    rows = []
+    for method, result in results.items():
+        for part, s in beside_boundary(result).items():
+            numbers = (
+                f"{s['mean_error']:.4f}",
+                f"{s['mean_quality']:.4f}",
+                f"{s['min_quality']:.3f}",
+            )
+            texts = (
+                method,
+                f"{part} cells",
+                str(s["cells"]),
+                *(numbers if s["cells"] else ("–",) * 3),
+            )
+            columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
+            rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
+    names = ("method", "", "number", "mean |e|", "mean Q", "min Q")
+    head = "".join(f"<th>{_safe(n)}</th>" for n in names)
+    return f"<table class=measures><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _table(results: Mapping[str, Result], main: str) -> str:
+    names = ("method", "steps", "mean |e|", "max |e|", "mean Q", "min Q", "seconds", "stopped")
+    rows = []
+    for method, result in results.items():
+        s = summary(result)
+        texts = (
+            method, str(s["steps"]), f"{s['mean_error']:.4f}", f"{s['max_error']:.3f}",
+            f"{s['mean_quality']:.4f}", f"{s['min_quality']:.3f}", f"{s['seconds']:.2f}",
+            s["stop_reason"],
+        )  # fmt: skip
+        columns = "".join(f"<td>{_safe(t)}</td>" for t in texts)
+        rows.append(f"<tr{' class=main' if method == main else ''}>{columns}</tr>")
+    head = "".join(f"<th>{_safe(n)}</th>" for n in names)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _safe(text: object) -> str:
+    return html.escape(str(text))

@@ -1,0 +1,114 @@
+"""Colors, fonts and small helpers that all pictures share."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ..mesh.results import Result
+
+WIDTH = 7.0
+"""Width of a full-width picture, inches."""
+
+METHOD_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#555555")
+"""Okabe and Ito's palette: told apart by color-blind readers too."""
+
+SETTINGS: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "savefig.facecolor": "white",
+    "figure.facecolor": "white",
+}
+
+
+def styled() -> Any:
+    """Return the context in which every picture is drawn and saved."""
+    return rc_context(SETTINGS)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure, in inches, that no global state knows of."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def interactive_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that `matplotlib.pyplot.show` shows."""
+    from matplotlib import pyplot
+
+    return pyplot.figure(figsize=(width, height), layout="constrained")
+
+
+def nice(value: float, up: bool = True) -> float:
+    """Round to 1, 2 or 5 times a power of ten."""
+    if not (value > 0 and math.isfinite(value)):
+        return 1.0
+    steps = [m * 10.0**p for p in range(-12, 13) for m in (1, 2, 5)]
+    if up:
+        return next((s for s in steps if s >= value * (1 - 1e-9)), value)
+    return next((s for s in reversed(steps) if s <= value * (1 + 1e-9)), value)
+
+
+def frame_domain(ax: Any, lower: Any, upper: Any, ticks: bool = True) -> None:
+    """Show the rectangle from `lower` to `upper` to scale, framed."""
+    ax.set_aspect("equal")
+    ax.set_xlim(lower[0], upper[0])
+    ax.set_ylim(lower[1], upper[1])
+    for spine in ax.spines.values():
+        spine.set_visible(True)
+    if not ticks:
+        ax.set_xticks([])
+        ax.set_yticks([])
+
+
+def grid_height(
+    lower: Any, upper: Any, rows: int, columns: int, extra: float, each: float
+) -> float:
+    """Height of a picture of `rows` x `columns` domains: `each` inches more per row."""
+    extent = np.subtract(upper, lower)
+    return float(rows * (WIDTH / columns * extent[1] / extent[0] * 0.96 + each) + extra)
+
+
+def is_flat(lower: Any, upper: Any) -> bool:
+    """Tell whether a picture is too flat for a color bar beside it."""
+    extent = np.subtract(upper, lower)
+    return bool(extent[1] < 0.3 * extent[0])
+
+
+def single_height(lower: Any, upper: Any, legend: bool = False, title: bool = False) -> float:
+    """Height of a picture of one domain, with a color bar (below if flat) or a legend below, inches."""
+    extent = np.subtract(upper, lower)
+    flat = is_flat(lower, upper) and not legend
+    width = WIDTH - (0.55 if legend or flat else 1.5)
+    below = 0.35 * legend + 0.65 * flat
+    return float(width * extent[1] / extent[0] + 0.4 + below + 0.25 * title)
+
+
+def window_around_smallest(result: Result, across: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of a window `across` times as wide as the smallest target size.
+
+    It is four fifths as high as wide, lies in the domain, and has in its middle the leftmost of the
+    cells whose target size is within a tenth of the smallest: the nose of a wing section.
+    """
+    box = result.diagram.domain
+    lower, upper, extent = np.array(box.lower), np.array(box.upper), box.extent
+    smallest = np.flatnonzero(result.size <= 1.1 * result.size.min())
+    center = result.points[smallest[np.argmin(result.points[smallest, 0])]]
+    span = np.minimum(np.array([across, 0.8 * across]) * float(result.size.min()), extent)
+    corner = np.clip(center - span / 2, lower, upper - span)
+    return corner, corner + span

@@ -1,0 +1,1 @@
+"""Conservative transfer of cell data between meshes."""

@@ -1,0 +1,225 @@
+"""Cell data from one mesh to another, conservatively: what `Result.transfer` does."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl as cl
+
+from ..adaptation.estimates import available_memory, in_bytes
+from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
+from ..geometry.polygon import Polygon
+from ..mesh.results import Diagram, Result
+from ..opencl.devices import create_context
+from ..opencl.program import Engine
+from ..tessellation.bins import Bins
+from .overlap import transfer_on_host
+from .transfer import Content, Graph, Transfer, transfer_needed
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..adapter import Adapter
+
+DEFECT = 1e-3
+"""Share of a cell by which its parts may differ from it, beside single precision: else a part is missing."""
+
+
+def transfer_values(
+    old: Result | Diagram,
+    values: ArrayLike,
+    new: Result | Diagram,
+    order: int = 1,
+    limited: bool = True,
+    adapter: Adapter | None = None,
+) -> np.ndarray:
+    """Carry `values` of the cells of `old` over to those of `new`; see `Result.transfer`."""
+    source, target = _diagram("self", old), _diagram("onto", new)
+    if source.domain != target.domain:
+        raise InputError(
+            f"onto is a mesh of {target.domain}, the values are on {source.domain}; expected the same domain: make "
+            "both meshes with one domain"
+        )
+    on_host = isinstance(source.domain, Polygon) or any(source.domain.periodic)
+    if on_host and source.domain.dim == 3:
+        raise InputError(
+            f"the meshes are of {source.domain}, and values are not carried over in periodic boxes in 3D yet, expected "
+            "a domain with walls"
+        )
+    if isinstance(order, bool) or order not in (1, 2):
+        raise InputError(f"order is {order!r}, expected 1 or 2")
+    given = _checked(values, len(source))
+    columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
+    if columns.shape[1] == 0:
+        return np.zeros((len(target), 0))
+    # Numbers around 1, by powers of two: nothing is rounded, and no product leaves the range.
+    scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(columns).max(axis=0), 1e-300))))
+    task = source, target, columns / scale, order, bool(limited)
+    if on_host:
+        means, low, high = _transferred_on_host(*task)
+    else:
+        with adapter._alone() if adapter is not None else nullcontext():
+            ctx = _default_context() if adapter is None else adapter.ctx
+            means, low, high = _transferred(ctx, *task)
+    bounded = order == 1 or bool(limited)
+    kept = _keep_mass(columns / scale, source.volumes, means, target.volumes, low, high, bounded)
+    return (kept * scale).reshape(len(target), *given.shape[1:])
+
+
+def _diagram(name: str, mesh: object) -> Diagram:
+    """Return the diagram of a mesh."""
+    if isinstance(mesh, Result):
+        return mesh.diagram
+    if isinstance(mesh, Diagram):
+        return mesh
+    raise InputTypeError(
+        f"{name} is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram"
+    )
+
+
+def _checked(values: ArrayLike, n: int) -> np.ndarray:
+    """Return `values` as an array (n,) or (n, k) of finite float64."""
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(
+            f"values is no array ({error}), expected shape ({n},) or ({n}, k)"
+        ) from error
+    if array.dtype.kind not in "fiub":
+        raise InputTypeError(
+            f"values has dtype {array.dtype}, expected real numbers; of complex ones pass real and imaginary part as "
+            "two columns"
+        )
+    if array.ndim not in (1, 2) or array.shape[0] != n:
+        transposed = array.ndim == 2 and array.shape[1] == n
+        raise InputError(
+            f"values has shape {array.shape}, expected ({n},) or ({n}, k): a row for each cell of the mesh; "
+            + (
+                "pass values.T"
+                if transposed
+                else "pass the values of the mesh whose transfer() this is"
+            )
+        )
+    array = array.astype(np.float64)
+    bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
+    if bad.size:
+        raise InputError(
+            f"values[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} rows are not); fill "
+            "them first: a mean with one is none"
+        )
+    return array
+
+
+@lru_cache(maxsize=1)
+def _default_context() -> cl.Context:
+    """Return one context for all calls, so that programs are built once."""
+    return create_context()
+
+
+def _transferred(
+    ctx: cl.Context,
+    source: Diagram,
+    target: Diagram,
+    columns: np.ndarray,
+    order: int,
+    limited: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return means over the new cells and their bounds, (n, width) float64 each."""
+    queue = cl.CommandQueue(ctx)
+    # Whatever the meshes were made in: parts of cells are differences.
+    real = np.dtype(np.float64 if queue.device.double_fp_config else np.float32)
+    engine, box = Engine(ctx, queue, source.domain.dim, real), source.domain
+    before, after = ((len(mesh), len(mesh.neighbors)) for mesh in (source, target))
+    needed = transfer_needed(engine, before, after, columns.shape[1], order)
+    device = queue.device
+    if needed > available_memory(device):
+        raise MemoryLimitError(
+            f"carrying {columns.shape[1]} columns from {len(source)} cells to {len(target)} needs "
+            f"{in_bytes(needed)} on the device; {device.name.strip()} has {in_bytes(available_memory(device))}. Carry "
+            "fewer columns at a time, or use another device"
+        )
+    bins, stage = Bins(engine), Transfer(engine)
+    old, new = _upload(engine, source), _upload(engine, target)
+    sequence = bins.build(box, new.points, new.n).items[: new.n].copy()
+    binned = bins.build(box, old.points, old.n)
+    values = engine.upload(columns)
+    centroids = engine.upload((source.centroids - source.points) / box.frame[1])
+    if order == 2:
+        content = stage.fit_slopes(box, old, values, centroids, limited)
+    else:
+        content = Content(values, values, values, centroids)
+    got = stage.transfer(box, old, binned, content, new, sequence)
+    _demand_whole(got.found, got.volumes, box.dim)
+    return got.means.astype(float), got.low.astype(float), got.high.astype(float)
+
+
+def _transferred_on_host(
+    source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `_transferred` does, in a polygonal domain."""
+    means, low, high, found = transfer_on_host(source, target, columns, order, limited)
+    unit = source.domain.frame[1] ** 2
+    _demand_whole(found / unit, target.volumes / unit, 2)
+    return means, low, high
+
+
+def _demand_whole(found: np.ndarray, volumes: np.ndarray, dim: int) -> None:
+    """Raise ClvoroError unless the parts of each cell, `found` together, are all of it; in the device's unit."""
+    slack = 64 * np.finfo(np.float32).eps * volumes ** (1 - 1 / dim)
+    defect = np.abs(found - volumes) - DEFECT * volumes - slack
+    worst = int(defect.argmax())
+    if not defect[worst] <= 0:
+        raise ClvoroError(
+            f"the parts of new cell {worst} have {found[worst] / volumes[worst]:.6g} of its volume, expected "
+            "1: one of the meshes is not the Voronoi diagram of its points; ask their diagram.check()"
+        )
+
+
+def _upload(engine: Engine, diagram: Diagram) -> Graph:
+    """Return a diagram on the device."""
+    origin, scale = diagram.domain.frame
+    return Graph(
+        len(diagram),
+        engine.upload((diagram.points - origin) / scale),
+        engine.upload(diagram.neighbor_starts, np.int32),
+        engine.upload(diagram.neighbors, np.int32),
+    )
+
+
+def _keep_mass(
+    columns: np.ndarray,
+    old_volumes: np.ndarray,
+    means: np.ndarray,
+    volumes: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    bounded: bool,
+) -> np.ndarray:
+    """Return `means` (n, width) with the mass of `columns` under the volumes that the diagrams report.
+
+    The parts of a cell sum to its volume up to rounding, those of an old cell too, so that the mass is off by rounding.
+    What is missing goes to all cells in proportion to V times the room that they have up to the bound of what they are
+    made of; what is too much, down to it. No bound is broken by that, and where all is constant, nothing changes.
+    """
+    # Within the bounds already, but for rounding.
+    q = np.clip(means, low, high) if bounded else means.copy()
+    # Twice, as the first time rounds, too.
+    for _ in range(2):
+        for c in range(q.shape[1]):
+            missing = _sum(old_volumes, columns[:, c]) - _sum(volumes, q[:, c])
+            bound = high[:, c] if missing > 0 else low[:, c]
+            room = bound - q[:, c]
+            if not bounded:
+                room = np.maximum(room, 0) if missing > 0 else np.minimum(room, 0)
+            capacity = _sum(volumes, room)
+            if missing != 0 and capacity != 0:
+                q[:, c] += min(missing / capacity, 1.0) * room
+    return np.clip(q, low, high) if bounded else q
+
+
+def _sum(volumes: np.ndarray, values: np.ndarray) -> float:
+    """Return the sum of products, in extended precision where the machine has it."""
+    return np.sum(np.multiply(volumes, values, dtype=np.longdouble))

@@ -1,0 +1,1 @@
+"""The Voronoi diagram on the device."""

@@ -1,0 +1,218 @@
+"""Neighbor search: generators sorted into hierarchical bins (`bins.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+from numpy.typing import DTypeLike
+
+from ..geometry.box import ClipBox
+from ..opencl.device_array import buffer_of, read_number
+from ..opencl.primitives import Scan
+from ..opencl.program import Engine
+
+OCCUPANCY = 2
+"""Generators per bin that the grids aim at: fewer bins to open against fewer generators to test."""
+SPLIT_COUNT = {2: 10, 3: 18}
+"""A bin that holds more is divided by a grid of its own, in 2D and in 3D, where a division makes more bins. Uniform
+random sets (Poisson, mean 2) stay on one level."""
+SPACING_COUNT = 8
+"""Generators at least, where a grid has them, from whose number the spacing about a leaf is told."""
+_ZERO = np.zeros(1, np.int32)
+_WORK = ("_keys", "_counts", "_grid_of", "_grid_items", "_starts", "_flags", "_sizes")
+"""Buffers of what nobody asks for once generators are in their bins."""
+MAX_CHILD_SIDE = 64
+MAX_LEVELS = 8
+"""Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
+
+
+def root_edge(extent: np.ndarray, n: int) -> float:
+    """Return the edge of bins that cover a box and hold `OCCUPANCY` of `n` generators each, if these are anywhere.
+
+    Across an axis that is thinner there is one bin, and the others say how long it is: a needle of squares as thin as
+    it is would take any number of them.
+
+    Parameters
+    ----------
+    extent : (d,) float
+    n : int
+    """
+    wide = np.sort(extent)[::-1]
+    for axes in range(len(wide), 1, -1):
+        edge = float(np.prod(wide[:axes]) * OCCUPANCY / n) ** (1 / axes)
+        if edge <= wide[axes - 1]:
+            return edge
+    return float(wide[0] * OCCUPANCY / n)
+
+
+@dataclass(frozen=True)
+class BinnedPoints:
+    """Generators in bins, on the device; see `tessellation/bins.h` for the layout.
+
+    Attributes
+    ----------
+    items : (>= n,) int32
+        Generator indices in bin order, ascending within a bin.
+    points : (>= n, d) real
+        Positions in the same order.
+    reach : (>= n,) float32
+        Edge of the leaf that holds the generator, in the same order.
+    spacing : (>= n,) float32
+        The edge that a bin there would have if it held `OCCUPANCY` generators, by the bins about the leaf.
+    bins : (b, 2) int32
+    grid_frames : (g, 4) real
+    grid_shapes : (g, 4) int32
+    sides : d integers, on the host
+        Bins of the first grid along each axis.
+    """
+
+    items: cla.Array
+    points: cla.Array
+    reach: cla.Array
+    spacing: cla.Array
+    bins: cla.Array
+    grid_frames: cla.Array
+    grid_shapes: cla.Array
+    sides: tuple[int, ...]
+
+
+class Bins:
+    """Sort generators into bins. Buffers are kept from call to call and grow when needed."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._kernels = engine.kernels(
+            "tessellation/bins",
+            {
+                "SPLIT_COUNT": SPLIT_COUNT[engine.dim],
+                "MAX_CHILD_SIDE": MAX_CHILD_SIDE,
+                "OCCUPANCY": OCCUPANCY,
+                "SPACING_COUNT": SPACING_COUNT,
+            },
+        )
+        self._capacity: tuple[int, int] = (0, 0)
+
+    def _reserve(self, n: int, bins: int) -> None:
+        """Make room for `n` generators and `bins` bins, keeping what the bins hold."""
+        engine, d = self.engine, self.engine.dim
+        if n > self._capacity[0]:
+            self._keys = engine.empty(n, np.int32)
+            self._ranks = engine.empty(n, np.int32)
+            self._items = engine.empty(n, np.int32)
+            self._points = engine.empty((n, d))
+            self._reach = engine.empty(n, np.float32)
+        if bins > self._capacity[1]:
+            self._counts = self._grown("_counts", bins, np.int32)
+            self._bins = self._grown("_bins", bins * 2, np.int32)
+            self._grid_of = self._grown("_grid_of", bins, np.int32)
+            # A divided bin holds more than SPLIT_COUNT generators, so grids are far fewer than bins.
+            self._frames = self._grown("_frames", (bins // 4 + 1) * 4, engine.real)
+            self._shapes = self._grown("_shapes", (bins // 4 + 1) * 4, np.int32)
+            self._grid_items = self._grown("_grid_items", bins // 4 + 1, np.int32)
+            self._starts = engine.empty(bins + 1, np.int32)
+            self._flags = engine.empty(bins + 1, np.int32)
+            self._sizes = engine.empty(bins + 1, np.int32)
+        self._capacity = (max(n, self._capacity[0]), max(bins, self._capacity[1]))
+
+    def _grown(self, name: str, size: int, dtype: DTypeLike) -> cla.Array:
+        grown = self.engine.zeros(size, dtype)
+        old = getattr(self, name, None)
+        if old is not None:
+            grown[: old.size] = old
+        return grown
+
+    def _clear(self, array: cla.Array, first: int, count: int) -> None:
+        """Write zeros: by the queue itself, as a kernel takes several times as long."""
+        size = array.dtype.itemsize
+        cl.enqueue_fill(
+            self.engine.queue, buffer_of(array), _ZERO, count * size, offset=first * size
+        )
+
+    def clear(self) -> None:
+        """Let go of all buffers."""
+        self._let_go([name for name in vars(self) if isinstance(getattr(self, name), cla.Array)])
+
+    def clear_work(self) -> None:
+        """Let go of what only `build` takes; the next one makes all anew."""
+        self._let_go([name for name in _WORK if hasattr(self, name)])
+
+    def _let_go(self, names: list[str]) -> None:
+        for name in names:
+            delattr(self, name)
+        self._capacity = (0, 0)
+
+    def build(self, box: ClipBox, points: cla.Array, n: int) -> BinnedPoints:
+        """Sort the first `n` of `points` (n, d; normalized coordinates, within `box`) into bins.
+
+        The host reads two integers per level; uniform sets have one level.
+        """
+        engine, k, d = self.engine, self._kernels, self.engine.dim
+        lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
+        edge = root_edge(upper - lower, n)
+        sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
+        root_bins = int(np.prod(sides)) + 1
+        if not self._capacity[0]:
+            self.clear()
+        self._reserve(n, root_bins + n // 2)
+        self._clear(self._counts, 0, root_bins)
+        frame, shape = np.zeros(4, engine.real), np.ones(4, np.int32)
+        frame[:d], frame[3], shape[0], shape[1 : d + 1] = lower, 1 / edge, 0, sides
+        self._frames[:4] = frame
+        self._shapes[:4] = shape
+        self._clear(self._grid_of, 0, root_bins)
+        engine.run_each(
+            k.count_root, n, points, frame, shape, self._keys, self._ranks, self._counts
+        )
+        begin, size, grids = 0, root_bins, 1
+        for level in range(MAX_LEVELS):
+            end, may_divide = begin + size, np.int32(level < MAX_LEVELS - 1)
+            engine.run_each(
+                k.plan_children, size, self._counts, np.int32(begin), may_divide, self._flags,
+                self._sizes,
+            )  # fmt: skip
+            for values in (self._flags, self._sizes):
+                self._scan.exclusive(values, values, size)
+            self._scan.exclusive(self._counts, self._starts, size, first=begin)
+            engine.run_each(
+                k.place_bins, size, self._starts, np.int32(begin), self._grid_of, self._shapes,
+                self._grid_items, np.int32(grids), self._flags, self._bins,
+            )  # fmt: skip
+            new_grids = read_number(self._flags, size)
+            if new_grids == 0:
+                break
+            new_bins = read_number(self._sizes, size)
+            child_firsts = self._sizes  # _reserve may replace it
+            self._reserve(n, end + new_bins)
+            self._clear(self._counts, end, new_bins)
+            engine.run_each(
+                k.make_grids, size, self._bins, self._counts, np.int32(begin), np.int32(end),
+                child_firsts, self._grid_of, self._frames, self._shapes, self._grid_items,
+            )  # fmt: skip
+            engine.run_each(
+                k.count_children, n, points, self._bins, self._frames, self._shapes,
+                self._keys, self._ranks, self._counts,
+            )  # fmt: skip
+            begin, size, grids = end, new_bins, grids + new_grids
+        total = begin + size
+        engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
+        spacing = self._ranks.view(np.float32)  # ranks have done their work
+        engine.run_each(
+            k.sort_bins, total, self._bins, self._grid_of, self._frames, self._shapes, self._items,
+            self._reach, spacing,
+        )  # fmt: skip
+        engine.run_each(k.gather_items, n, self._items, points, self._points)
+        return BinnedPoints(
+            self._items, self._points, self._reach, spacing, self._bins, self._frames, self._shapes,
+            tuple(int(side) for side in sides),
+        )  # fmt: skip
+
+    def renumber(self, binned: BinnedPoints, n: int) -> None:
+        """Make of `binned` what `build` would make of its `n` generators in the order that they have there.
+
+        Bit by bit so: they lie in the same bins, and in their order.
+        """
+        self.engine.run_each(self._kernels.number_items, n, binned.items)

@@ -1,0 +1,407 @@
+"""The tessellation: each cell cut by neighbors and walls, its faces and moments (`cells.cl`; `hulls.cl` on CPUs)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ..errors import ClvoroError, MemoryLimitError
+from ..geometry.box import ClipBox
+from ..opencl.device_array import buffer_of
+from ..opencl.primitives import Scan
+from ..opencl.program import Engine
+from ..opencl.workspace import framed
+from .bins import MAX_LEVELS, BinnedPoints
+from .device_diagram import (
+    COINCIDE,
+    DOUBT,
+    EXACT_SHARE,
+    FULL,
+    LOOPED,
+    ROUGH_SHARE,
+    CloseError,
+    Tessellation,
+    restored,
+)
+from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
+
+CELL_CAPACITY = 24
+"""Faces that a cell may have while it is clipped."""
+ROW_CAPACITY = SLOT
+"""Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
+LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
+"""Faces that a cell may have, or a few more: on CPUs in boxes. On GPUs each of very many work-items has room of its own
+for so many; to trim such a cell by as many edges takes minutes."""
+LANES, EIGHTS = 8, 16
+"""Cells that a CPU's work-item makes at a time, in lanes of vectors, and how many times `hulls.cl` does so."""
+FIRST_REACH = 1.9
+"""How far it looks for neighbors at first, or less, in units of the spacing that the bins know."""
+
+
+class Cells:
+    """Tessellate a box.
+
+    Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
+    """
+
+    lanes = 1
+    """Cells that a work-item measures, or checks."""
+    searches = True
+    """Whether neighbors are searched for in bins."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._capacity = self._room = self._n = self._enlarged_for = 0
+        self._flags = engine.empty(6, np.int32)
+        self._no_flags: dict[tuple[int, int, bool], cla.Array] = {}
+        self._build(CELL_CAPACITY, ROW_CAPACITY)
+
+    def _build(self, cell_capacity: int, row_capacity: int) -> None:
+        self.cell_capacity, self.row_capacity = cell_capacity, row_capacity
+        engine, defines = self.engine, {**self.defines, "MAX_DEPTH": MAX_LEVELS}
+        self.lanes = LANES if engine.group_size == 1 and engine.real == np.float64 else 1
+        self._kernels = engine.kernels(
+            "tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)}
+        )
+        self._wrap = None
+        if self.lanes > 1 and self.searches:
+            hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
+            self._wrap = engine.kernels("simd/hulls", hulls).wrap_cells
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """The capacities, as kernels that work on the rows must be built with."""
+        return {
+            "CELL_CAPACITY": self.cell_capacity,
+            "ROW_CAPACITY": self.row_capacity,
+            "SLOT": SLOT,
+        }
+
+    def _reserve(self, n: int) -> None:
+        """Make room for the diagrams of `n` generators, but for their faces."""
+        engine, d = self.engine, self.engine.dim
+        if n > self._capacity:
+            # The old ones are let go of first.
+            self._of_cells = self._views = {}
+            self._of_cells = {
+                "starts": engine.empty(n + 1, np.int32),
+                "volumes": engine.empty(n),
+                "offsets": engine.empty((n, d)),
+                "covariances": engine.empty((n, d * (d + 1) // 2)),
+            }
+            self._capacity, self._room, self._n = n, 0, -1
+        if n != self._n:
+            self._views = {
+                name: array[: n + 1] if name == "starts" else array[:n]
+                for name, array in self._of_cells.items()
+            }
+            self._n = n
+
+    def _reserve_faces(self, n: int, m: int) -> None:
+        """Make room for the `m` faces of `n` cells.
+
+        Cells and walls are the nodes of a planar graph, which has at most 3 (n + 4) - 6 edges: two faces each, or one
+        at a wall. Rounding may add some, where many generators lie on a circle.
+        """
+        most = max(m, 6 * n + 12)
+        if most > self._room:
+            engine, d = self.engine, self.engine.dim
+            self._of_faces: dict[str, cla.Array] = {}
+            self._of_faces = {
+                "neighbors": engine.empty(most, np.int32),
+                "face_measures": engine.empty(most, engine.face),
+                "face_centroids": engine.empty((most, d), engine.face),
+            }
+            self._room = most
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
+    ) -> Tessellation:
+        """Return the diagram of `points` (n, d) that was `saved`, as it was: with room for so many more faces."""
+        n, m = len(points), len(saved["neighbors"])
+        self._reserve(n)
+        self._reserve_faces(n, m + spare)
+        faces = {name: array[: m + spare] for name, array in self._of_faces.items()}
+        return restored(points, {**self._views, **faces}, saved)
+
+    @framed
+    def tessellate(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        exact: bool = True,
+        wanted: int | None = None,
+    ) -> Tessellation:
+        """Tessellate `box` by the first `n` of `points` (n, d), which lie in `binned`.
+
+        Parameters
+        ----------
+        exact : bool
+            Refuse generators so close together that rounding makes more than `EXACT_SHARE` of a cell uncertain. Without
+            it only more than `ROUGH_SHARE`.
+        wanted : int, optional
+            Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
+
+        Raises
+        ------
+        InputError
+            If two generators coincide or are too close for the precision (`CloseError`).
+        MemoryLimitError
+            If the rows of faces are too many for 32-bit indices.
+        ClvoroError
+            If a cell has more than `LARGEST_ROW` faces, or `LARGEST_ELSEWHERE`, or a little more.
+        """
+        engine, total, n = self.engine, n, n if wanted is None else wanted
+        if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
+            # One mesh had a cell of very many faces; a larger one need not pay for that.
+            self._build(CELL_CAPACITY, ROW_CAPACITY)
+        self._reserve(n)
+        spare, whole = spare_slots(n), False
+        while True:
+            with engine.workspace.frame():
+                rows = self.take_rows(n, spare=spare, whole=whole)
+                flags, m = self._clip(rows, box, points, total, n, binned, exact)
+                if flags & CROWDED:
+                    # All anew: as many as have been asked for by now, and more by those that were not yet.
+                    spare = 2 * (int(rows.flags.get()[3]) - n)
+                    continue
+                t = None
+                if not flags & ~DOUBT:
+                    old = rows.places, rows.places
+                    t = self._measure(rows, box, points, n, *old, m, flags, exact)
+                if t is not None:
+                    return t
+                if whole or flags & COINCIDE:
+                    raise CloseError(points, total)
+                # Faces that were left out one by one may have been too many together.
+                whole = True
+
+    def _clip(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        total: int,
+        n: int,
+        binned: BinnedPoints,
+        exact: bool,
+    ) -> tuple[int, int]:
+        """Make the rows of the first `n` of `total` generators and match them: see `_match` for what is returned."""
+        engine, corners = self.engine, box.device_corners(self.engine.real)
+        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+        wrap = self._wrap
+        some = wrap is not None
+        if wrap is not None:
+            engine.run_each(
+                wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
+                binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
+                rows.slots, rows.counts, rows.places, group=1,
+            )  # fmt: skip
+        while True:
+            engine.run_each(
+                self._kernels.clip_cells, total, np.int32(n), binned.points, binned.items, *search,
+                points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags,
+            )  # fmt: skip
+            # Every row is new: there are none from before.
+            found = self._match(rows, box, points, n, rows.places, rows.places, exact)
+            if not found[0] & FULL or found[0] & CROWDED:
+                return found
+            self._enlarge(n)
+            # Only the cells that had too many faces, whose rows are empty; doubts about others stay.
+            some = True
+            self._reset_flags(n, len(rows.counts), byte_count=4)
+
+    def complete(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        previous: Tessellation,
+        fits: cla.Array,
+    ) -> Tessellation | None:
+        """Return the diagram of `points` whose rows are those of `previous` or, where `rows` has a place, new ones.
+
+        None if they do not make a diagram. `fits` (n,) has 1 for rows of which every neighbor names the generator
+        between the right two; 0 is put where a face that rounding has made is left out.
+        """
+        n, old = previous.n, (previous.starts, previous.neighbors)
+        flags, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
+        if flags & ~DOUBT:
+            return None
+        return self._measure(rows, box, points, n, *old, m, flags, exact=False)
+
+    def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
+        """Return `t`, a diagram of `box`, with what is known of faces in full precision, in arrays of its own."""
+        if t.face_measures.dtype == self.engine.real:
+            return t
+        engine, m = self.engine, len(t.neighbors)
+        measures, centroids = engine.empty(m), engine.empty((m, engine.dim))
+        engine.run_each(
+            self._kernels.measure_faces, t.n, t.starts, t.neighbors, t.points,
+            *box.device_corners(engine.real), measures, centroids,
+        )  # fmt: skip
+        return replace(t, face_measures=measures, face_centroids=centroids)
+
+    def _read_flags(self) -> tuple[int, int]:
+        """Read what has gone wrong, and m.
+
+        With `DOUBT` where any cell is doubtful, and `CROWDED` where there were too few spare slots.
+        """
+        wrong, doubtful, m, spare, slots, _ = (int(v) for v in self._flags.get())
+        wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
+        return wrong, m
+
+    def _match(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        old_starts: cla.Array,
+        old_neighbors: cla.Array,
+        exact: bool,
+        fits: cla.Array | None = None,
+    ) -> tuple[int, int]:
+        """Make the rows symmetric; return the flags and the number of faces."""
+        engine, starts = self.engine, rows.starts
+        engine.run_each(
+            self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, old_starts,
+            old_neighbors, points, *box.device_corners(engine.real),
+            np.int32(fits is not None), self._share(exact), rows.places if fits is None else fits,
+            rows.keep, starts, rows.flags,
+        )  # fmt: skip
+        return self._count(rows, starts, n)
+
+    def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> tuple[int, int]:
+        """Set `rows.starts` by the faces of each of `n` rows; return the flags and the number of faces."""
+        self._scan.exclusive(counts, rows.starts, n)
+        # The host reads all at once.
+        word = rows.starts.dtype.itemsize
+        cl.enqueue_copy(
+            self.engine.queue, buffer_of(rows.flags), buffer_of(rows.starts), byte_count=word, src_offset=n * word,
+            dst_offset=2 * word,
+        )  # fmt: skip
+        return self._read_flags()
+
+    def _measure(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        old_starts: cla.Array,
+        old_neighbors: cla.Array,
+        m: int,
+        flags: int,
+        exact: bool,
+    ) -> Tessellation | None:
+        """Write graph and measures of the rows; None if its doubtful cells do not fit."""
+        engine, corners, starts = self.engine, box.device_corners(self.engine.real), rows.starts
+        self._reserve_faces(n, m)
+        new, faces = self._views, self._of_faces
+        # The previous graph is read meanwhile, or stays if this call is broken off: unless no row is from there, and
+        # nothing can go wrong any more.
+        direct = old_starts is rows.places and not flags & DOUBT
+        neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
+        engine.run(
+            self._kernels.measure_cells, -(-n // self.lanes), np.int32(n), rows.places, rows.slots,
+            rows.counts, old_starts, old_neighbors, rows.keep, starts, points, *corners,
+            neighbors, faces["face_measures"], faces["face_centroids"], new["volumes"],
+            new["offsets"], new["covariances"],
+        )  # fmt: skip
+        if flags & DOUBT:
+            engine.run_each(
+                self._kernels.check_doubtful, n, rows.places, rows.counts, starts, neighbors,
+                new["volumes"], points, *corners, self._share(exact), rows.flags,
+            )  # fmt: skip
+            wrong = self._read_flags()[0] & ~DOUBT
+            if wrong & LOOPED and old_starts is rows.places:
+                return self._measure_without_loops(rows, box, points, n, neighbors, exact)
+            if wrong:
+                return None
+        copied = [(starts, new["starts"])]
+        if not direct:
+            copied.append((neighbors, faces["neighbors"]))
+        for array, to in copied:
+            cl.enqueue_copy(engine.queue, buffer_of(to), buffer_of(array), byte_count=array.nbytes)
+        return Tessellation(
+            n=n, points=points, starts=new["starts"], neighbors=faces["neighbors"],
+            face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=new["volumes"],
+            offsets=new["offsets"], covariances=new["covariances"],
+        )  # fmt: skip
+
+    def _measure_without_loops(
+        self,
+        rows: FaceRows,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        neighbors: cla.Array,
+        exact: bool,
+    ) -> Tessellation | None:
+        """Measure anew without the faces that cross others, in the graph by `rows.starts` and `neighbors`."""
+        counts = self.engine.scratch(n + 1, np.int32)
+        self._reset_flags(n, len(rows.counts), byte_count=4)
+        self.engine.run_each(
+            self._kernels.drop_loops, n, rows.places, rows.counts, rows.starts, neighbors, rows.keep, counts,
+            rows.flags,
+        )  # fmt: skip
+        flags, m = self._count(rows, counts, n)
+        if flags & ~DOUBT:
+            return None
+        return self._measure(rows, box, points, n, rows.places, rows.places, m, flags, exact)
+
+    def _share(self, exact: bool) -> np.floating:
+        return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
+
+    def take_rows(
+        self, n: int, slots: int | None = None, spare: int = 0, whole: bool = False
+    ) -> FaceRows:
+        """Return `n` rows of faces, of which as many as `slots` (by default all) may be new; no flags.
+
+        `spare` are the slots, behind these, for rows that are longer than one. If they are to be `whole`, faces that
+        are no longer than rounding stay.
+        """
+        engine, slots = self.engine, n if slots is None else slots
+        first, slots = slots, slots + spare
+        if slots * SLOT >= 2**31:
+            raise MemoryLimitError(
+                f"the faces of {n} cells need {slots * SLOT:.3g} entries, expected fewer than 2^31, which "
+                "32-bit indices can tell apart; use fewer cells, or perturb generators that lie on a common circle"
+            )
+        self._reset_flags(first, slots, whole)
+        return FaceRows(
+            engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32),
+            engine.scratch(slots, np.uint32), engine.scratch(n, np.int32), engine.scratch(n + 1, np.int32),
+            self._flags,
+        )  # fmt: skip
+
+    def _reset_flags(self, first: int, slots: int, whole: bool = False, **part: Any) -> None:
+        """Take the flags back, or a part of them, where `slots` from the `first` on are to spare."""
+        if (first, slots, whole) not in self._no_flags:
+            if len(self._no_flags) >= 4:
+                self._no_flags.clear()
+            # To be copied on the device: the host would have to wait for a transfer.
+            start = self.engine.upload([0, 0, 0, first, slots, whole], np.int32)
+            self._no_flags[first, slots, whole] = start
+        start = self._no_flags[first, slots, whole]
+        cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
+
+    def _enlarge(self, n: int) -> None:
+        """Double the capacities, for `n` cells."""
+        many = self.engine.group_size == 1 and not self.engine.trims
+        if self.row_capacity >= (LARGEST_ROW if many else LARGEST_ELSEWHERE):
+            raise ClvoroError(
+                f"a cell has more than {self.row_capacity} faces, and so many are not supported: remove or perturb "
+                "cocircular generators, or give thin layers a spacing nearer to the size of the cells beside them"
+            )
+        self._build(2 * self.cell_capacity, 2 * self.row_capacity)
+        self._enlarged_for = n

@@ -1,0 +1,1 @@
+"""Diagrams of polygonal domains: convex cells, clipped by the boundary."""

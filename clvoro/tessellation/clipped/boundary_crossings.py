@@ -1,0 +1,198 @@
+"""The boundary of a polygonal domain, cut by the cells of the convex diagram into chords (`chords.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ...errors import InputError
+from ...geometry.polygon import Polygon
+from ...opencl.primitives import Room, Scan
+from ...opencl.program import Engine
+from ..device_diagram import Tessellation
+
+LOST, OUTSIDE = 1, 2  # of the bits in chords.cl
+UNTOUCHED = 0x7FFFFFFF
+_ROUNDINGS = 4  # by which vertices lie off a face for sure; ON_FACE in chords.cl
+
+
+class BoundaryError(InputError):
+    """Rounding lets the boundary not be followed through the cells, or leaves cells along it open."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the boundary of the polygon cannot be followed through the cells: edges of it are too close to each "
+            "other, or generators are, for the precision; use dtype='float64', or a polygon without such slits"
+        )
+
+
+@dataclass(frozen=True)
+class Chords:
+    """Chords, edge by edge, and the cells that they lie in, on the device; see tessellation/clipped/boundary.h.
+
+    Attributes
+    ----------
+    count : int
+    arrays : tuple of arrays
+        What kernels take as CHORD_ARGS.
+    slots : (n,) int32
+        Number of each cell among those that the boundary passes through, `UNTOUCHED` for the others.
+    touched : (t,) int32
+        Those cells.
+    list_starts : (t + 1,) int32
+    listed : (count,) int32
+        The chords of each, in order.
+    tangents : (edges, 2) real
+        Unit vectors along the edges.
+    turns : tuple of arrays
+        The edge before each and how far the boundary turns there; see tessellation/clipped/wall_sides.h.
+    shift : (2,) float
+        By how much the boundary was put aside.
+    """
+
+    count: int
+    touched_count: int
+    arrays: tuple[cla.Array, ...]
+    slots: cla.Array
+    touched: cla.Array
+    list_starts: cla.Array
+    listed: cla.Array
+    tangents: cla.Array
+    turns: tuple[cla.Array, ...]
+    shift: np.ndarray
+
+
+def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
+    """Return vectors (k, 2), a few roundings long, from the vertices of `domain` inwards: between the edges."""
+    ahead = domain.vertices[domain.next_vertex] - domain.vertices
+    ahead /= np.hypot(*ahead.T)[:, None]
+    before = np.empty_like(ahead)
+    before[domain.next_vertex] = ahead
+    across = before + ahead
+    # Between the normals to the left; in a needle's tip, whose normals cancel, along it.
+    along = ahead - before
+    turn = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
+    sharp = np.hypot(*across.T) < np.hypot(*along.T)
+    way = np.where(
+        sharp[:, None],
+        np.where(turn > 0, 1, -1)[:, None] * along,
+        np.column_stack([-across[:, 1], across[:, 0]]),
+    )
+    return _ROUNDINGS * float(np.finfo(real).eps) * way / np.hypot(*way.T)[:, None]
+
+
+def shells(domain: Polygon) -> np.ndarray:
+    """Return for each edge of `domain` an edge of the outer ring of its piece, (k,); -1 on that ring itself."""
+    first = np.searchsorted(domain.piece_of_ring, domain.piece_of_ring)  # outer rings come first
+    found = np.where(first == np.arange(len(first)), -1, domain.ring_starts[first])
+    return np.repeat(found, np.diff(domain.ring_starts))
+
+
+class Boundary:
+    """Cut the boundary of one domain into chords."""
+
+    def __init__(self, engine: Engine, domain: Polygon) -> None:
+        self.engine = engine
+        # Counts change a little from step to step.
+        self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
+        self._kernels = engine.kernels("tessellation/clipped/boundary_crossings")
+        origin, scale = domain.frame
+        self.edges = len(domain.vertices)
+        vertices = (domain.vertices - origin) / scale
+        inner = vertices + inward(domain, engine.real)
+        # Rings that touch in a vertex have it in the same cell.
+        same = np.unique(domain.vertices, axis=0, return_index=True, return_inverse=True)
+        self._places = vertices, inner[same[1]][same[2].ravel()]
+        self.vertices, self.inner = (engine.upload(places) for places in self._places)
+        self.next_vertex = engine.upload(domain.next_vertex, np.int32)
+        self.shells = engine.upload(shells(domain), np.int32)
+        along = domain.vertices[domain.next_vertex] - domain.vertices
+        self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
+        before = np.empty_like(domain.next_vertex)
+        before[domain.next_vertex] = np.arange(self.edges)
+        before[domain.sharpest] = -1 - before[domain.sharpest]
+        self.turns = engine.upload(before, np.int32), engine.upload(domain.turns)
+        self.owners = engine.zeros(self.edges, np.int32)
+        self._known = 0  # cells that owners are among
+        self._flags = engine.empty(1, np.int32)
+
+    def cut(
+        self, t: Tessellation, generators: int, shift: tuple[float, float] = (0, 0)
+    ) -> Chords | np.ndarray:
+        """Walk along all edges, put aside by `shift` in the device's coordinates, through the cells of `t`.
+
+        Only the first `generators` of its generators lie in the domain. If the boundary passes through cells of others,
+        those are returned, (i,) int, counted from `generators` on.
+
+        Raises
+        ------
+        BoundaryError
+            If rounding lets a walk find no way.
+        """
+        engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
+        vertices, inner = self.vertices, self.inner
+        if any(shift):
+            vertices, inner = (engine.upload(places + shift) for places in self._places)
+        graph = (t.starts, t.neighbors, t.points)
+        if t.n < self._known:
+            self.owners.fill(0)
+        self._known = t.n
+        engine.run_each(k.find_owners, edges, inner, *graph, self.owners)
+        firsts = room("firsts", size=edges + 1, dtype=np.int32)
+        intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
+        self._flags.fill(0)
+        none = np.int32(0), firsts, firsts, firsts, vertices
+        walk = (np.int32(generators), vertices, self.next_vertex, self.owners, *graph)
+        engine.run_each(k.walk_edges, edges, *walk, *none, intruders, self._flags)
+        self._scan.exclusive(firsts, firsts, edges)
+        count = int(firsts[edges].get())
+        flags = int(self._flags.get()[0])
+        if flags & OUTSIDE:
+            return np.flatnonzero(intruders.get())
+        if flags & LOST:
+            raise BoundaryError
+        cells, of_edges = (room(name, size=count, dtype=np.int32) for name in ("cells", "of_edges"))
+        ends = room("ends", size=count)
+        engine.run_each(
+            k.walk_edges,
+            edges,
+            *walk,
+            np.int32(1),
+            firsts,
+            cells,
+            of_edges,
+            ends,
+            intruders,
+            self._flags,
+        )
+        arrays = (
+            vertices, self.next_vertex, self.owners, firsts, cells, of_edges, ends, self.shells
+        )  # fmt: skip
+        return self._sort(count, arrays, cells, t.n, np.array(shift, float))
+
+    def _sort(
+        self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int, shift: np.ndarray
+    ) -> Chords:
+        """List the cells, and the chords of each."""
+        engine, k, room = self.engine, self._kernels, self._room
+        slots = room("slots", size=n, dtype=np.int32).fill(UNTOUCHED)
+        ranks = room("ranks", size=count + 1, dtype=np.int32)
+        engine.run_each(k.find_firsts, count, cells, slots)
+        engine.run_each(k.flag_firsts, count, cells, slots, ranks)
+        self._scan.exclusive(ranks, ranks, count)
+        touched_count = int(ranks[count].get())
+        touched = room("touched", size=touched_count, dtype=np.int32)
+        starts = room("starts", size=touched_count + 1, dtype=np.int32)
+        listed = room("listed", size=count, dtype=np.int32)
+        engine.run_each(k.list_touched, count, cells, ranks, touched)
+        engine.run_each(k.number_touched, touched_count, touched, slots, starts)
+        engine.run_each(k.count_chords, count, cells, slots, ranks, starts)
+        self._scan.exclusive(starts, starts, touched_count)
+        engine.run_each(k.place_chords, count, cells, slots, ranks, starts, listed)
+        engine.run_each(k.sort_chords, touched_count, starts, listed)
+        return Chords(
+            count, touched_count, arrays, slots, touched, starts, listed, self.tangents, self.turns,
+            shift,
+        )  # fmt: skip

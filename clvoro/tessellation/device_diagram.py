@@ -1,0 +1,136 @@
+"""A diagram on the device: what the stages that make one hand on to all others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl.array as cla
+from scipy.spatial import KDTree
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from ..geometry.box import Domain
+    from .clipped.trim import Trimmed
+
+EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
+"""Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
+# Bits of tessellation/face_rows.h; its other means cells that collapsed.
+FULL, COINCIDE, DOUBT, NARROW, LOOPED = 1, 2, 8, 16, 32
+
+
+class CloseError(InputError):
+    """Generators cannot be told apart; stages know them by their order alone, and by places of the device.
+
+    Parameters
+    ----------
+    points : (n or more, d) real, on the device
+        In its coordinates.
+    n : int
+        How many there are.
+
+    Attributes
+    ----------
+    place : (d,) float
+        Of one of the two that are closest to each other: cells far away may be the first to show it.
+    gap : float
+        From that to the other.
+    """
+
+    def __init__(self, points: cla.Array, n: int) -> None:
+        x = points.get()[:n].astype(np.float64)
+        gaps = KDTree(x).query(x, k=2)[0][:, 1]
+        first = gaps.argmin()
+        self.place, self.gap, self.real = x[first], float(gaps[first]), points.dtype
+        super().__init__(self._text(self.place, self.gap))
+
+    def _text(self, place: np.ndarray, gap: float) -> str:
+        what = "coincide" if gap == 0 else "are too close to each other"
+        other = "" if self.real == np.float64 else ", or use dtype='float64'"
+        return (
+            f"generators at {place}, {gap:.3g} apart, {what} in {self.real}, which leaves too much of a cell to "
+            f"rounding; remove one or move it{other}"
+        )
+
+    def within(self, domain: Domain) -> InputError:
+        """Return what to tell the caller, in his units."""
+        gap, thin = self.gap * domain.frame[1], float(domain.extent.min())
+        if 0 < thin < gap:
+            wider = "" if self.real == np.float64 else "use dtype='float64', or "
+            return InputError(
+                f"{domain} is {thin:.3g} thin where generators are {gap:.3g} apart, which leaves too much of a cell to "
+                f"rounding in {self.real}; {wider}give it a thickness nearer to the size of cells"
+            )
+        return InputError(self._text(whereabouts(domain, self.place), gap))
+
+
+def whereabouts(domain: Domain, place: np.ndarray) -> np.ndarray:
+    """Return the position in `domain` of a place (d,) in the device's coordinates, which may be that of an image."""
+    origin, scale = domain.frame
+    x, lower = origin + scale * place, np.array(domain.lower)
+    return np.where(domain.periodic, lower + (x - lower) % domain.extent, x)
+
+
+@dataclass(frozen=True)
+class Tessellation:
+    """A Voronoi diagram on the device: normalized coordinates, vectors relative to the generator of the row.
+
+    Attributes
+    ----------
+    n : int
+    points : (n, d) real
+    starts : (n + 1,) int32
+    neighbors : (m,) int32
+        A generator, or ``-1 - wall``; counter-clockwise in 2D.
+    face_measures : (m,) real, or single
+    face_centroids : (m, d) real, or single
+        Relative to the generator; see `Engine.face` for the precision.
+    volumes : (n,) real
+    offsets : (n, d) real
+        Centroid minus generator: the Lloyd displacement.
+    covariances : (n, d (d + 1) / 2) real
+        Second moments about the centroid per unit volume: xx, xy, yy in 2D.
+    outlines : tuple of arrays
+        The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
+    trimmed : Trimmed, optional
+        How such a diagram came to be.
+    narrow : bool
+        Whether faces (in 3D) may be as narrow as their vertices round: of those, what has no loop in `Loops` is none.
+    near : bool
+        Whether generators (in 3D) are so near each other that rounding may have made cells wrong: what the caller gets
+        of such a diagram is checked.
+    """
+
+    n: int
+    points: cla.Array
+    starts: cla.Array
+    neighbors: cla.Array
+    face_measures: cla.Array
+    face_centroids: cla.Array
+    volumes: cla.Array
+    offsets: cla.Array
+    covariances: cla.Array
+    outlines: tuple[cla.Array, ...] = ()
+    trimmed: Trimmed | None = None
+    narrow: bool = False
+    near: bool = False
+
+
+def restored(
+    points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]
+) -> Tessellation:
+    """Return the diagram of `points` of which `arrays` are to hold what was `saved`, by the names of its fields.
+
+    Arrays may have more rows, which are filled with zeros.
+    """
+    for name, array in arrays.items():
+        known = len(saved[name])
+        array[:known].set(saved[name])
+        if len(array) > known:
+            array[known:].fill(0)
+    fields: dict[str, Any] = dict(arrays)
+    return Tessellation(n=len(points), points=points, **fields)

@@ -1,0 +1,1 @@
+"""Diagrams of periodic boxes: ghost images of generators across the seams."""

@@ -1,0 +1,321 @@
+"""The tessellation in 3D: cells cut by neighbors and walls, faces, moments (`polyhedra.cl`; `walks.cl` on CPUs)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ..errors import ClvoroError, MemoryLimitError
+from ..geometry.box import ClipBox
+from ..opencl.device_array import buffer_of
+from ..opencl.primitives import Scan
+from ..opencl.program import Engine
+from ..opencl.workspace import framed
+from .bins import MAX_LEVELS, BinnedPoints
+from .device_diagram import (
+    DOUBT,
+    EXACT_SHARE,
+    FULL,
+    NARROW,
+    ROUGH_SHARE,
+    CloseError,
+    Tessellation,
+    restored,
+)
+from .periodic.halo import seam_defines
+
+FINE_SHARE = 1e-3
+"""Share of a cell's volume that it may differ by from others about their common faces, before more is done about it."""
+FACE_CAPACITY = 64
+"""Faces that a cell may have while it is clipped; doubled for those cells that have more."""
+MOST_FACES = 512
+FACES_PER_CELL = 16.5
+"""Room for faces at first: random cells have 15.54 of them on average; walls add some."""
+STRETCH = 128
+"""Generators whose cells a CPU's work-item makes, eight at a time (`walks.cl`)."""
+CUBE = 8
+"""Bins each way of the cubes through which it goes from one to the next."""
+FIRST_REACH = 2.0
+"""How far it looks for neighbors at first, in units of the spacing that the bins know."""
+
+
+@dataclass(frozen=True)
+class _CutCells:
+    """Cells as they are cut, each by itself, on the device; see `clip_cells` in `polyhedra.cl`.
+
+    Attributes
+    ----------
+    places, counts : (n,) int32
+        Where the faces of each begin in the arrays of faces, and how many they are.
+    labels, measures, centroids
+        Of `m` faces.
+    cells : dict
+        Volumes, offsets and covariances.
+    doubtful : bool
+        Rounding might let a neighbor see a face otherwise.
+    """
+
+    places: cla.Array
+    counts: cla.Array
+    labels: cla.Array
+    measures: cla.Array
+    centroids: cla.Array
+    cells: dict[str, cla.Array]
+    m: int
+    doubtful: bool
+
+
+class Polyhedra:
+    """Tessellate a box in 3D.
+
+    Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._programs: dict[int, SimpleNamespace] = {}
+        self._kernels(FACE_CAPACITY)
+        self._wrap = None
+        if engine.group_size == 1 and engine.real == np.float64:
+            defines = {
+                "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **seam_defines(engine),
+            }  # fmt: skip
+            self._walks = engine.kernels("simd/walks", defines)
+            self._wrap = self._walks.wrap_cells
+        self._report = engine.empty(2, np.int32)
+        self._capacity = self._room = self._n = 0
+
+    def _kernels(self, capacity: int) -> SimpleNamespace:
+        if capacity not in self._programs:
+            defines = {
+                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **seam_defines(self.engine),
+            }  # fmt: skip
+            self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
+        return self._programs[capacity]
+
+    def _reserve_cells(self, n: int) -> None:
+        """Make room for `n` cells."""
+        if n <= self._capacity:
+            return
+        engine = self.engine
+        self._of_cells = {
+            "starts": engine.empty(n + 1, np.int32),
+            "volumes": engine.empty(n),
+            "offsets": engine.empty((n, 3)),
+            "covariances": engine.empty((n, 6)),
+        }
+        self._of_faces: dict[str, cla.Array] = {}
+        self._capacity = n
+
+    def _take_faces(self, m: int) -> tuple[cla.Array, cla.Array, cla.Array]:
+        """Return labels, measures and centroids of `m` faces of a diagram at work, in no order yet."""
+        if m >= 2**31 // 3:
+            raise MemoryLimitError(
+                f"the cells have {m:.3g} faces, expected fewer than {2**31 // 3:.3g}, which 32-bit "
+                "indices can tell apart; use fewer cells, or perturb generators that lie on a "
+                "common sphere"
+            )
+        engine, self._room = self.engine, m
+        return engine.scratch(m, np.int32), engine.scratch(m), engine.scratch((m, 3))
+
+    def _faces(self, m: int) -> dict[str, cla.Array]:
+        """Return room for the `m` faces of a diagram."""
+        engine, faces = self.engine, self._of_faces
+        if not faces or len(faces["neighbors"]) < m:
+            faces.clear()
+            m += m // 32  # their number changes a little from step to step
+            faces["neighbors"] = engine.empty(m, np.int32)
+            faces["face_measures"] = engine.empty(m)
+            faces["face_centroids"] = engine.empty((m, 3))
+        return faces
+
+    def restore(
+        self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
+    ) -> Tessellation:
+        """Return the diagram of `points` (n, 3) that was `saved`, as it was: with room for so many more faces."""
+        n, m = len(points), len(saved["neighbors"]) + spare
+        self._reserve_cells(n)
+        cells = {
+            name: a[: n + 1] if name == "starts" else a[:n] for name, a in self._of_cells.items()
+        }
+        faces = {name: array[:m] for name, array in self._faces(m).items()}
+        return restored(points, {**cells, **faces}, saved)
+
+    @framed
+    def tessellate(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        previous: Tessellation | None = None,
+        exact: bool = True,
+        rows: int | None = None,
+        seams: tuple[object, ...] = (),
+    ) -> Tessellation:
+        """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
+
+        Parameters
+        ----------
+        previous : Tessellation, optional
+            A diagram of the same generators at earlier positions: clipping starts from its neighbors.
+        exact : bool
+            Refuse generators so close together that cells differ by more than `EXACT_SHARE` of their volumes about
+            their common faces. Without it only by more than `ROUGH_SHARE`.
+        rows : int, optional
+            Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
+        seams : tuple, optional
+            What balls around the vertices of cells are held against, in a periodic box, and only there: SEAM_ARGS
+            (tessellation/periodic/halo.h).
+
+        Raises
+        ------
+        InputError
+            If two generators coincide or are too close for the precision (`CloseError`).
+        MemoryLimitError
+            If the faces are too many for 32-bit indices.
+        ClvoroError
+            If a cell has more than `MOST_FACES` faces.
+        """
+        engine, rows = self.engine, n if rows is None else rows
+        self._reserve_cells(rows)
+        share = EXACT_SHARE if exact else ROUGH_SHARE
+        first = engine.scratch(n, np.float32)
+        cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
+        # Where cells differ about a face, what generators near each other cut off is seen from there: it takes longer.
+        for from_near in (False, True):
+            # What is made once more is checked in the end.
+            most = engine.real.type(FINE_SHARE if exact and not from_near else share)
+            with engine.workspace.frame():
+                cut = self._cut(
+                    box, points, n, binned, first, previous, rows, most, seams, from_near
+                )
+                t = None if cut is None else self._match(cut, points, most)
+            if t is not None:
+                return replace(t, near=True) if from_near else t
+            self._begin_anew(binned, first, n)
+        raise CloseError(points, n)
+
+    def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
+        """Have the radii from before: the last bits depend on them, and should not on what has been tried."""
+        cl.enqueue_copy(
+            self.engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
+        )
+
+    def _cut(
+        self,
+        box: ClipBox,
+        points: cla.Array,
+        n: int,
+        binned: BinnedPoints,
+        first: cla.Array,
+        previous: Tessellation | None,
+        rows: int,
+        share: np.floating,
+        seams: tuple[object, ...],
+        from_near: bool,
+    ) -> _CutCells | None:
+        """Cut the first `rows` cells, again with more room for as long as any needs it; None if one collapses.
+
+        `first` (n,) float32 is what `binned.reach` has been to begin with; `from_near`: see tessellation/clip.h.
+        """
+        engine = self.engine
+        most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
+        faces = self._take_faces(most if rows != self._n else max(most, self._room))
+        self._n = rows
+        places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
+        lower, upper = box.device_corners(engine.real)
+        cells = {name: a[:rows] for name, a in self._of_cells.items() if name != "starts"}
+        of_cells = cells["volumes"], cells["offsets"], cells["covariances"], self._report
+        warm = previous is not None and previous.n == rows
+        old = (
+            (previous.starts, previous.neighbors)
+            if previous is not None and warm
+            else (counts, counts)
+        )
+        capacity, again, walk = FACE_CAPACITY, False, None if from_near else self._wrap
+        first_reach = engine.real.type(FIRST_REACH)
+        self._report.set(np.zeros(2, np.int32))
+        search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
+        while True:
+            room, written = np.int32(self._room), (places, counts, *faces, *of_cells)
+            if walk is not None and not again:
+                with engine.workspace.frame():
+                    order = self._ordered(binned, rows)
+                    engine.run_each(
+                        walk, -(-rows // STRETCH), np.int32(rows), order, binned.points,
+                        binned.items, binned.spacing, *search, lower, upper, first_reach, room,
+                        *written, *seams, group=1,
+                    )  # fmt: skip
+            how = np.int32(again or walk is not None), np.int32(from_near)
+            engine.run_each(
+                self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items,
+                *search, points, lower, upper, np.int32(warm), *old, *how, room, share, *written, *seams,
+                # Private arrays of a whole group lie on the stack of a CPU's thread.
+                group=1 if again else None,
+            )  # fmt: skip
+            flags, m = (int(v) for v in self._report.get())
+            if flags & ~(FULL | DOUBT | NARROW):
+                return None
+            if m > self._room:
+                # All anew: what did not fit was not kept.
+                self._begin_anew(binned, first, n)
+                faces = self._take_faces(m + m // 32 + 64)
+                capacity, again = FACE_CAPACITY, False
+                self._report.set(np.zeros(2, np.int32))
+            elif flags & FULL:
+                # Those cells alone, with more room.
+                capacity, again = 2 * capacity, True
+                if capacity > MOST_FACES:
+                    raise ClvoroError(
+                        f"a cell has more than {MOST_FACES} faces; so many generators on a common sphere "
+                        "are not supported: remove or perturb some"
+                    )
+                self._report.set(np.array([flags & (DOUBT | NARROW), m], np.int32))
+            else:
+                return _CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
+
+    def _match(self, cut: _CutCells, points: cla.Array, share: np.floating) -> Tessellation | None:
+        """Keep the faces that both cells see, and bring them into the order of rows; None if they differ by much."""
+        engine, k, m = self.engine, self._kernels(FACE_CAPACITY), cut.m
+        rows, cells, doubt = len(cut.counts), cut.cells, np.int32(cut.doubtful)
+        # The previous graph stays until all is done.
+        starts, neighbors = engine.scratch(rows + 1, np.int32), engine.scratch(m, np.int32)
+        kept = engine.scratch(m, np.uint8)
+        engine.run_each(
+            k.match_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cells["volumes"],
+            points, share, doubt, kept, starts, self._report,
+        )  # fmt: skip
+        flags = int(self._report.get()[0])
+        if flags & ~(DOUBT | NARROW):
+            return None
+        self._scan.exclusive(starts, starts, rows)
+        faces, of_rows = self._faces(m), self._of_cells["starts"][: rows + 1]
+        engine.run_each(
+            k.place_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cut.centroids,
+            kept, doubt, starts, neighbors, faces["face_measures"], faces["face_centroids"],
+        )  # fmt: skip
+        engine.run_each(k.put_graph, rows, starts, neighbors, of_rows, faces["neighbors"])
+        return Tessellation(
+            n=rows, points=points, starts=of_rows, neighbors=faces["neighbors"],
+            face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
+            offsets=cells["offsets"], covariances=cells["covariances"], narrow=bool(flags & NARROW),
+        )  # fmt: skip
+
+    def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
+        """Return the places of the first `rows` generators, so that those which follow each other are near."""
+        engine, k = self.engine, self._walks
+        cubes = math.prod(-(-side // CUBE) for side in binned.sides)
+        starts, order = engine.scratch(cubes + 1, np.int32), engine.scratch(rows, np.int32)
+        bins = np.int32(rows), binned.items, binned.bins, binned.grid_shapes
+        engine.run_each(k.count_cubes, cubes, *bins, starts, group=1)
+        self._scan.exclusive(starts, starts, cubes)
+        engine.run_each(k.order_places, cubes, *bins, starts, order, group=1)
+        return order

@@ -1,0 +1,1 @@
+"""Diagrams copied from the device to NumPy arrays."""

@@ -1,0 +1,132 @@
+"""From a tessellation of a periodic box to a `Diagram` on the host."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import pyopencl.array as cla
+
+from ...geometry.box import Box
+from ...opencl.program import Engine
+from ..device_diagram import Tessellation
+from ..periodic.torus import Unfolded
+from ..topology3d.loops import FaceLoops, Loops
+from ..vertices import VertexNumbering, Vertices
+from .fetch import _Fetched, kept_faces
+
+
+class _FetchedTorus(_Fetched):
+    """A tessellation of a periodic box.
+
+    Vertices come from the diagram that it was folded from, where cells beyond the seams are cells like all others: a
+    cell at a seam has its corners around its generator, in one piece, and of a vertex at a seam there is one for each
+    image that some cell of the box has for a corner.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        domain: Box,
+        t: Tessellation,
+        labels: cla.Array,
+        copy: bool,
+        unfolded: Unfolded,
+    ) -> None:
+        super().__init__(engine, domain, t, labels, copy)
+        m = len(self.t.neighbors)
+        whole, places = unfolded.tessellation, unfolded.folded.places
+        self.box = unfolded.images.box
+        self.codes = unfolded.folded.codes[:m].get()
+        self.places = np.arange(m) if places is None else places.get()
+        self.whole = kept_faces(whole, int(whole.starts[whole.n].get()), copy)
+
+    @cached_property
+    def shared(self) -> Vertices:
+        """Vertices of the extended diagram, in 2D."""
+        return VertexNumbering(self.engine).number(self.box, self.whole)
+
+    def _walked(self) -> Loops:
+        """Vertices and loops of the extended diagram, in 3D."""
+        return FaceLoops(self.engine).walk(self.box, self.whole)
+
+    def polygons(self) -> np.ndarray:
+        """Which of the folded faces are polygons, (m,) bool."""
+        # Of both sides of a seam each has a loop of its own.
+        seen = np.diff(self.loop_starts)[self.places] > 0
+        i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbors.get()
+        inner, last = np.flatnonzero(j >= 0), 3**self.engine.dim - 1
+        i, j, code = i[inner].astype(np.int64), j[inner].astype(np.int64), self.codes[inner]
+        here = inner[np.lexsort((code, j, i))]
+        there = inner[np.lexsort((last - code, i, j))]
+        seen[here] &= seen[there].copy()
+        return seen
+
+    @cached_property
+    def merged(self) -> np.ndarray:
+        """Vertex that stands for each one of the extended diagram, in 2D.
+
+        A face that was dropped, as its other cell does not see it, ends in one vertex: whoever has kept a face beside
+        it has one or the other.
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        count, starts = self.shared.count, self.whole.starts.get()[: self.n + 1]
+        if len(self.places) == starts[-1]:
+            return np.arange(count)
+        dropped = np.setdiff1d(np.arange(starts[-1]), self.places)
+        ends = np.arange(1, starts[-1] + 1)
+        ends[starts[1:] - 1] = starts[:-1]
+        vertices = self.shared.cell_vertices.get()
+        pairs = vertices[dropped], vertices[ends[dropped]]
+        graph = coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))
+        parts = connected_components(graph, directed=False)[1]
+        return np.unique(parts, return_index=True)[1][parts]
+
+    @cached_property
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices of the extended diagram that are corners of the box's cells, and the number of each corner's."""
+        return np.unique(self.extended_corners(), return_inverse=True)
+
+    @cached_property
+    def extended_places(self) -> np.ndarray:
+        """Place in the extended diagram of each face of the result, (m,)."""
+        return self.places[self.slots]
+
+    def extended_corners(self) -> np.ndarray:
+        """Corners of the result, as vertices of the extended diagram."""
+        if self.engine.dim == 2:
+            return self.merged[self.shared.cell_vertices.get()[self.extended_places]]
+        starts = self.face_vertex_starts()
+        shift = self.loop_starts[self.extended_places] - starts[:-1]
+        places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))
+        return self.loops.vertices.get()[places]
+
+    def points(self) -> np.ndarray:
+        positions = self._read(self.t.points, self.order, 1) + self.origin
+        lower, upper = np.array(self.domain.lower), np.array(self.domain.upper)
+        last = np.where(self.domain.periodic, np.nextafter(upper, lower), upper)
+        return np.clip(positions, lower, last)
+
+    def shifts(self) -> np.ndarray:
+        codes = self.codes[self.slots]
+        steps = [codes // 3**a % 3 - 1 for a in range(self.engine.dim)]
+        return np.stack(steps, axis=1).astype(np.int8)
+
+    def vertices(self) -> np.ndarray:
+        shared = self.shared if self.engine.dim == 2 else self.loops
+        used = shared.positions.get()[self.corners[0]].astype(np.float64)
+        positions = used * self.scale + self.origin
+        inside = np.clip(positions, self.domain.lower, self.domain.upper)
+        return np.where(self.domain.periodic, positions, inside)
+
+    def cell_vertices(self) -> np.ndarray:
+        return self.corners[1].astype(np.int32)
+
+    def face_vertex_starts(self) -> np.ndarray:
+        lengths = np.diff(self.loop_starts)[self.extended_places]
+        return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+
+    def face_vertices(self) -> np.ndarray:
+        return self.corners[1].astype(np.int32)

@@ -1,0 +1,85 @@
+"""The stages that make a diagram, and their order in a box with walls."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import pyopencl.array as cla
+
+from ..geometry.box import Domain
+from ..opencl.primitives import Gather
+from ..opencl.program import Engine
+from .bins import BinnedPoints, Bins
+from .cells import Cells
+from .clipped.trim import Trim
+from .device_diagram import Tessellation
+from .incremental import Repair
+from .periodic.folded import FoldedCells
+from .periodic.ghost_images import Seam
+from .polyhedra import Polyhedra
+
+
+class TessellationStages:
+    """The stages of one engine that make diagrams, each compiled when first used; meshes share their buffers."""
+
+    bins: Bins
+    cells: Cells | Polyhedra
+    repair: Repair
+    seam: Seam
+    folded: FoldedCells
+    trim: Trim
+    gather: Gather
+
+    CLASSES: ClassVar[dict[str, type]] = {
+        "bins": Bins, "cells": Cells, "repair": Repair, "seam": Seam, "folded": FoldedCells, "trim": Trim,
+        "gather": Gather,
+    }  # fmt: skip
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+
+    def __getattr__(self, name: str) -> object:
+        if name not in self.CLASSES:
+            raise AttributeError(name)
+        in_space = name == "cells" and self.engine.dim == 3
+        stage = (Polyhedra if in_space else self.CLASSES[name])(self.engine)
+        setattr(self, name, stage)
+        return stage
+
+    def clear(self, *names: str) -> None:
+        """Free the buffers of these stages, where they exist; their kernels stay."""
+        for name in names:
+            if name in self.__dict__:
+                getattr(self, name).clear()
+
+    def release(self) -> None:
+        """Free all stages and their buffers; a stage that is used again is made again."""
+        for name in self.CLASSES:
+            self.__dict__.pop(name, None)
+        self.engine.workspace.clear()
+        self.engine.pool.take_back()
+
+
+def tessellate_box(
+    stages: TessellationStages,
+    domain: Domain,
+    points: cla.Array,
+    n: int,
+    previous: Tessellation | None,
+    exact: bool,
+    binned: BinnedPoints | None = None,
+) -> Tessellation:
+    """Tessellate the box that cells of `domain` are clipped by; see `Tessellator.tessellate`."""
+    if isinstance(stages.cells, Polyhedra):
+        binned = stages.bins.build(domain, points, n) if binned is None else binned
+        return stages.cells.tessellate(domain, points, n, binned, previous, exact)
+    if previous is not None and not exact:
+        t = stages.repair.follow(stages.cells, domain, points, previous)
+        if t is not None:
+            return t
+        # What steps have worked on is of no use here, where bins need room.
+        stages.engine.workspace.clear()
+    if binned is None:
+        binned = stages.bins.build(domain, points, n)
+        stages.bins.clear_work()
+    return stages.cells.tessellate(domain, points, n, binned, exact)

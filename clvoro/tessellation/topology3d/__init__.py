@@ -1,0 +1,1 @@
+"""Faces and vertices of cells in 3D, made identical in all cells that share them."""

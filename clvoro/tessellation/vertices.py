@@ -1,0 +1,49 @@
+"""Voronoi vertices, each once, for output (`vertices.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ..geometry.box import ClipBox
+from ..opencl.primitives import Scan
+from ..opencl.program import Engine
+from .device_diagram import Tessellation
+
+
+@dataclass(frozen=True)
+class Vertices:
+    """Shared vertices on the device: `positions` (v, d) real, `cell_vertices` (m,) int32 parallel to the graph's faces.
+
+    Face k of a cell runs from its vertex k to its vertex k + 1, counter-clockwise.
+    """
+
+    count: int
+    positions: cla.Array
+    cell_vertices: cla.Array
+
+
+class VertexNumbering:
+    """Number the vertices of a tessellation."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._scan = Scan(engine)
+        self._kernels = engine.kernels("tessellation/vertices")
+
+    def number(self, box: ClipBox, t: Tessellation) -> Vertices:
+        """Return the vertices of `t`, numbered in the order of their least corner."""
+        engine, k = self.engine, self._kernels
+        m = int(t.starts[t.n].get())
+        owners, ids = engine.empty(m, np.int32), engine.empty(m + 1, np.int32)
+        engine.run_each(k.find_owners, t.n, t.starts, t.neighbors, owners, ids)
+        self._scan.exclusive(ids, ids, m)
+        count = int(ids[m].get())
+        cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, 2))
+        engine.run_each(
+            k.place_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
+            t.neighbors, owners, ids, cell_vertices, positions,
+        )  # fmt: skip
+        return Vertices(count, positions, cell_vertices)

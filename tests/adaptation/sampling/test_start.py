@@ -1,0 +1,334 @@
+"""Count and start: the quadrature against known integrals, samples against their expectation."""
+
+import math
+
+import numpy as np
+import pytest
+
+from clvoro import sizing
+from clvoro.adaptation.sampling.boxes import Boxes, hilbert_tables
+from clvoro.adaptation.sampling.quadrature import DensityTree
+from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
+from clvoro.errors import InputError, InputTypeError, SizeFieldError
+from clvoro.geometry.box import Box
+from clvoro.opencl.program import Engine
+
+BOX = Box((0, 0), (2.5, 1.5))
+CUBE = Box((1, 1, 1), (2, 2, 2))
+F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)
+F2 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.002, slope=0.08)
+F3 = 0.9306 / 4 * sizing.Distance(sizing.Circle((0.8, 0.75), 0.25), 0.02, growth=1.3, h_max=0.15)
+
+
+def _line_dip(h_min, slope, h_max, length, area):
+    """Cells of h = min(h_min + slope * distance, h_max) about a line that cuts the domain."""
+    reach = (h_max - h_min) / slope
+    inside = 2 * length * (1 / h_min - 1 / h_max) / slope
+    return inside + (area - 2 * length * reach) / h_max**2
+
+
+INTEGRALS = {
+    "constant": (BOX, 0.01, 37500),
+    "larger than the domain": (BOX, sizing.Constant(100.0), 3.75e-4),
+    "constant 3D": (CUBE, 0.05, 8000),
+    "needle": (Box((0, -1e-3), (1000, 1e-3)), 0.1, 200),
+    "far away and small": (Box((1e6, 1e6), (1e6 + 0.25, 1e6 + 0.5)), 0.01, 1250),
+    # Reference: the integral in polar coordinates by scipy.integrate.quad, to 1e-8.
+    "F1": (BOX, F1, 587.81130194),
+    "F2": (BOX, F2, 22972.2421613),
+    "F3": (BOX, F3, 11454.1213852),
+    "exponential": (BOX, sizing.Expression("0.05*exp(-2*x)"), 1.5 / 0.0025 * math.expm1(10) / 4),
+    "exponential 3D": (
+        CUBE,
+        sizing.Expression("0.2*exp(-(x+y+z-3))"),
+        (math.expm1(3) / 3) ** 3 / 0.008,
+    ),
+    "jump of 100 along a line": (
+        BOX,
+        sizing.Expression("x + 0.3*y < 1.50033 ? 0.005 : 0.5"),
+        (1.5 * 1.50033 - 0.15 * 1.5**2) * (1 / 0.005**2 - 4) + 3.75 * 4,
+    ),
+    "jump along the boxes": (
+        BOX,
+        sizing.Expression("x < 1.00001 ? 0.005 : 0.5"),
+        1.500015 * 40000 + 2.249985 * 4,
+    ),
+    # The dip is 1/170 of the domain wide: only the landmarks on the line show it.
+    "thin dip at a line": (
+        BOX,
+        sizing.Distance(sizing.Segment((-1, 0.7331), (3, 0.7331)), 0.001, slope=2, h_max=0.01),
+        _line_dip(0.001, 2, 0.01, 2.5, 3.75),
+    ),
+    # In a formula a sample here and there hits the dip, and the tree follows it from box to box.
+    "thin dip in a formula": (
+        BOX,
+        sizing.Expression("min(0.001 + 2*fabs(y - 0.7 - 0.01*x)/sqrt(1.0001), 0.01)"),
+        _line_dip(0.001, 2, 0.01, 2.5 * math.sqrt(1.0001), 3.75),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", INTEGRALS)
+def test_count_of_known_integrals(case):
+    domain, field, expected = INTEGRALS[case]
+    # The oblique dip, with dh/dx = 2, ends at the bound of the work.
+    relative = 1e-3 if case == "thin dip in a formula" else 1.5e-4
+    assert count_cells(field, domain) == pytest.approx(expected, rel=relative)
+
+
+def test_small_spot_of_a_raster_is_found():
+    """Nine low values among 1000 x 600: their landmark shows them."""
+    values = np.full((601, 1001), 0.1)
+    values[232:235, 776:779] = 1e-3
+    field = sizing.Raster(values, BOX.lower, BOX.upper)
+    side = 0.0025  # of a pixel
+    t = (np.arange(2000) + 0.5) / 2000  # the four corner pixels by the midpoint rule
+    corner = 0.1 - (0.1 - 1e-3) * np.outer(t, t)
+    spot = 4 * side**2 / 1e-3**2 + 8 * side**2 / (1e-3 * 0.1) + 4 * side**2 * (corner**-2).mean()
+    expected = spot + (3.75 - 16 * side**2) / 0.1**2
+    assert spot > 20
+    assert count_cells(field, BOX) == pytest.approx(expected, rel=1.5e-4)
+
+
+def test_tolerance_is_met():
+    errors = [abs(count_cells(F2, BOX, t) / 22972.2421613 - 1) for t in (1e-2, 1e-3, 1e-5)]
+    assert errors[0] < 1e-2
+    assert errors[1] < 1e-3
+    assert errors[2] < 1e-5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "hypot(x-0.7771, y-0.3111)",  # the integral diverges, no sample is zero
+        "fabs(x - 0.7771) + 1e-9",
+        "0.01 + 0.0099*sin(1e5*x)*cos(1e5*y)",
+        "0.001 + 10*fabs(hypot(x-0.9, y-0.75)-0.3)",
+    ],
+)
+def test_hard_fields_end_in_bounded_work(text):
+    samples = 0
+
+    def counting(points):
+        nonlocal samples
+        samples += len(points)
+        return sizing.Expression(text)(points)
+
+    tree = DensityTree(counting, BOX)
+    assert np.isfinite(tree.integral)
+    assert len(tree.boxes) <= 1 << 17
+    assert samples < 9 * 1.4 * (1 << 17)  # each split box is looked at once, its children too
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("1.25 - x", r"\(1\.\d+, \d"),
+        ("sqrt(x - 1)", r"is nan at \(0\."),
+        ("x > 2.49 ? 1/0 : 1", r"is inf at \(2\.49|is inf at \(2\.5"),
+        ("hypot(x, y)", r"is 0 at \(0, 0\)"),  # on a corner, where no Gauss point lies
+        ("fabs(x - 1.25)", r"is 0 at \(1.25, 0\)"),
+        ("1e-200", "overflows"),
+    ],
+)
+def test_bad_fields_are_refused_with_the_place(text, place):
+    with pytest.raises(SizeFieldError, match=place):
+        count_cells(sizing.Expression(text), BOX)
+    with pytest.raises(SizeFieldError, match=place):
+        sample_density(sizing.Expression(text), BOX, 10, 77)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: count_cells(F1, BOX, 0), InputError, "tolerance"),
+        (lambda: count_cells(F1, BOX, "1"), InputError, "tolerance"),
+        (lambda: count_cells("x", BOX), InputTypeError, "size"),
+        (lambda: count_cells(F1, CUBE), InputError, "dimensions"),
+        (lambda: sample_density(F1, BOX, 0, 3), InputError, "n is 0"),
+        (lambda: sample_density(F1, BOX, 2.5, 3), InputTypeError, "n is 2.5"),
+        (lambda: sample_density(F1, BOX, 5, -3), InputError, "seed is -3"),
+        (lambda: sample_uniform(BOX, -1, 3), InputError, "n is -1"),
+        (lambda: sample_uniform(BOX, 5, None), InputTypeError, "seed is None"),
+    ],
+)
+def test_bad_input(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_hilbert_curve_is_continuous(dim):
+    """In a uniform tree each box shares a face with the one before, roots included."""
+    boxes = Boxes(Box((0,) * dim, (2.9, 1.9, 1.0)[:dim]))
+    for level in range(1, 4):
+        boxes.split(np.ones(len(boxes), bool))
+        step = 0.5**level
+        root = np.floor(boxes.corner)
+        moves = np.abs(np.diff(boxes.corner, axis=0)).sum(axis=1)
+        inside = (np.diff(root, axis=0) == 0).all(axis=1)
+        assert (moves[inside] == step).all()
+        assert len(np.unique(boxes.corner, axis=0)) == len(boxes)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_hilbert_tables_are_permutations(dim):
+    place, after, rank = hilbert_tables(dim)
+    code = place @ (1 << np.arange(dim))
+    assert (np.sort(code, axis=1) == np.arange(1 << dim)).all()
+    assert (np.take_along_axis(rank, code, axis=1) == np.arange(1 << dim)).all()
+    assert after.min() >= 0
+    assert after.max() < len(place)
+
+
+@pytest.fixture(scope="module", params=["F2", "3D"])
+def tree(request):
+    if request.param == "F2":
+        return DensityTree(F2, BOX, 1e-3)
+    field = sizing.Distance(sizing.Sphere((1.5, 1.5, 1.4), 0.25), 0.04, slope=0.3)
+    return DensityTree(field, CUBE, 1e-2)
+
+
+def test_boxes_tile_the_domain(tree):
+    boxes = tree.boxes
+    domain = BOX if boxes.dim == 2 else CUBE
+    assert np.prod(boxes.edges(), axis=1).sum() == pytest.approx(domain.measure, rel=1e-12)
+    rng = np.random.default_rng(909)
+    places = rng.uniform(0, domain.extent / boxes.root, (200, boxes.dim))
+    low, high = boxes.corner, boxes.corner + 0.5 ** boxes.level.astype(float)[:, None]
+    holds = ((places[:, None] >= low) & (places[:, None] < high)).all(axis=2)
+    assert (holds.sum(axis=1) == 1).all()
+    assert np.array_equal(tree.boxes.find(places), holds.argmax(axis=1))
+
+
+def test_neighbors_differ_by_one_level(tree):
+    boxes = tree.boxes
+    edge = 0.5 ** boxes.level.astype(float)[:, None]
+    end = np.rint((boxes.upper - boxes.origin) / boxes.root)
+    for axis in range(boxes.dim):
+        for side in (-1, 1):
+            places = boxes.corner + 0.5 * edge
+            places[:, axis] += side * edge[:, 0] * 0.75
+            inside = ((places > 0) & (places < end)).all(axis=1)
+            there = tree.boxes.find(places[inside])
+            assert (boxes.level[there] >= boxes.level[inside] - 1).all()
+
+
+def test_known_sizes_are_bounds(tree):
+    """The least and greatest known h of a box hold those of its landmarks, wherever these went."""
+    box = tree.boxes.find(tree._landmarks)
+    assert np.array_equal(box, tree._landmark_box)
+    assert (tree._low[box] <= tree._landmark_sizes).all()
+    assert (tree._high[box] >= tree._landmark_sizes).all()
+
+
+@pytest.mark.parametrize(("n", "seed"), [(1, 11), (7, 12), (588, 13), (22972, 14)])
+def test_each_box_gets_its_share(tree, n, seed):
+    """Every box of the tree holds its expectation rounded up or down."""
+    field, boxes = tree.field, tree.boxes
+    domain = BOX if boxes.dim == 2 else CUBE
+    points = sample_density(field, domain, n, seed)
+    assert points.shape == (n, boxes.dim)
+    reference = DensityTree(field, domain, 1e-3)
+    found = reference.boxes.find((points - reference.boxes.origin) / reference.boxes.root)
+    counts = np.bincount(found, minlength=len(reference.boxes))
+    expected = reference.cells * (n / reference.integral)
+    assert np.abs(counts - expected).max() < 1 + 1e-6
+
+
+def test_samples_follow_the_density_along_an_axis():
+    """The empirical distribution of x against the exact one, for h^-2 proportional to exp(4 x)."""
+    n = 4000
+    points = sample_density(sizing.Expression("exp(-2*x)"), BOX, n, 3141)
+    x = np.sort(points[:, 0])
+    exact = np.expm1(4 * x) / math.expm1(10)
+    # Independent samples would stay within 1.36 / sqrt(n) = 0.021 (95 %); dealt-out ones do better.
+    assert np.abs(exact - (np.arange(n) + 0.5) / n).max() < 0.007
+    y = np.sort(points[:, 1]) / 1.5
+    assert np.abs(y - (np.arange(n) + 0.5) / n).max() < 0.015
+
+
+def test_position_inside_a_box_follows_the_slope():
+    """One point per sampling: its box is the whole domain, and only the slope in it can tell."""
+    domain = Box((0, 0), (1, 1))
+    field = sizing.Expression("exp(-x)")
+    x = np.array([sample_density(field, domain, 1, seed)[0, 0] for seed in range(100, 250)])
+    mean = (1 + 1 / math.tanh(1)) / 2 - 0.5  # of the density 2 exp(2 x) / (e^2 - 1)
+    assert mean == pytest.approx(0.6565, abs=1e-4)
+    # Standard deviation 0.26 / sqrt(150) = 0.021; uniform positions would give 0.5.
+    assert x.mean() == pytest.approx(mean, abs=0.07)
+
+
+def test_starts_repeat_bit_by_bit():
+    for sample in (
+        lambda s: sample_density(F1, BOX, 588, s),
+        lambda s: sample_uniform(BOX, 588, s),
+    ):
+        first = sample(2718)
+        assert np.array_equal(first, sample(2718))
+        assert not np.array_equal(first, sample(2719))
+
+
+def test_uniform_is_plain_uniform():
+    points = sample_uniform(BOX, 20000, 515)
+    counts, _, _ = np.histogram2d(*points.T, bins=(5, 3), range=[(0, 2.5), (0, 1.5)])
+    # 15 bins of 1333 each, standard deviation 35: plain random points scatter, but not by 4 of it.
+    assert np.abs(counts - 20000 / 15).max() < 4 * 35.3
+    assert np.std(counts) > 10
+
+
+@pytest.mark.parametrize("real", [np.float64, np.float32, np.float16])
+@pytest.mark.parametrize("start", ["density", "uniform"])
+def test_points_are_distinct_and_inside(real, start):
+    """Also where rounding makes many coincide: 4000 points in float16 have thousands of twins."""
+    domain = Box((-3, 5), (-1.9, 5.7))
+    n = 4000 if real is np.float16 else 30000
+    field = sizing.Expression("0.001 + 0.2*hypot(x+2.2, y-5.1)")
+    if start == "density":
+        points = sample_density(field, domain, n, 161, real)
+    else:
+        points = sample_uniform(domain, n, 161, real)
+    origin, scale = domain.frame
+    working = ((points - origin) / scale).astype(real)
+    assert len(np.unique(working, axis=0)) == n
+    assert (working > 0).all()
+    assert (working < (domain.extent / scale).astype(real)).all()
+    assert (points > domain.lower).all()
+    assert (points < domain.upper).all()
+
+
+def test_more_points_than_the_precision_can_tell_apart():
+    """Of h = 1e-10 + 0.3 r two fifths of the cells lie within one float32 rounding of the tip."""
+    field = sizing.Distance(sizing.Circle((0.7, 0.7), 0), 1e-10, slope=0.3)
+    box = Box((0, 0), (1, 1))
+    assert len(sample_density(field, box, 1500, 99)) == 1500
+    with pytest.raises(InputError, match=r"n is 1500.* do not fit .*float32; use dtype='float64'"):
+        sample_density(field, box, 1500, 99, np.float32)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_device_and_host_agree(ctx, dtype):
+    import pyopencl as cl
+
+    queue = cl.CommandQueue(ctx)
+    engine = Engine(queue.context, queue, 2, np.dtype(dtype))
+    stage = sizing.Sizing(engine, BOX, F1)
+    assert count_cells(stage, BOX) == pytest.approx(587.8113, rel=1.5e-4)
+    points = sample_density(stage, BOX, 588, 4711)
+    assert np.array_equal(points, sample_density(stage, BOX, 588, 4711))
+    working = (points / BOX.frame[1]).astype(dtype)
+    assert len(np.unique(working, axis=0)) == 588
+    if dtype == "float64":
+        # The same boxes and shares but for rounding: the points agree but for a rare swap.
+        host = sample_density(F1, BOX, 588, 4711)
+        assert np.mean(np.abs(host - points).max(axis=1) < 1e-6) > 0.9
+
+
+def test_callable_and_number_as_field():
+    def cone(points):
+        assert BOX.contains(points).all()
+        return F1(points)
+
+    assert count_cells(cone, BOX) == pytest.approx(587.8113, rel=1.5e-4)
+    assert np.array_equal(sample_density(cone, BOX, 60, 5), sample_density(F1, BOX, 60, 5))
+    assert sample_density(0.1, BOX, 375, 5).shape == (375, 2)

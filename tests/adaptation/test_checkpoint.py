@@ -1,0 +1,409 @@
+"""A run goes on from a checkpoint to the same end, bit for bit; what is not its checkpoint is refused by name."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.adaptation import checkpoint
+from clvoro.adaptation.fingerprint import identity
+from clvoro.adaptation.loop import STALLED
+from clvoro.adaptation.resume import Saved
+from clvoro.cli import command as cli
+from clvoro.errors import InputError, UnusedOptionWarning
+from clvoro.solvers import poisson
+
+BOX = clvoro.Box((0, 0), (2.5, 1.5))
+SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")
+RUNS = {
+    "coupled": {"method": "coupled", "max_steps": 9},
+    "adaptive": {"method": "adaptive", "effort": "fast", "levels": 1},
+    "count held": {"method": "exact", "effort": "fast", "n_cells": 250},
+    "in 3D": {"method": "exact", "effort": "fast", "levels": 1},
+}
+BOX_3D = clvoro.Box((0, 0, 0), (1, 1.5, 1))
+SIZE_3D = clvoro.sizing.Expression("0.16 + 0.2*fabs(hypot(x-0.4, y-0.7)-0.3)")
+
+
+def stop_after(rows):
+    seen = []
+
+    def callback(row):
+        seen.append(row)
+        return len(seen) > rows
+
+    return callback
+
+
+def assert_same(a, b):
+    for name in ("points", "size", "error", "quality", "origin"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    corners = "cell_vertices" if a.diagram.domain.dim == 2 else "face_vertices"
+    for name in ("volumes", "neighbors", "vertices", corners, "face_measures", "centroids"):
+        assert np.array_equal(getattr(a.diagram, name), getattr(b.diagram, name)), name
+    for name in set(a.history.dtype.names) - {"seconds"}:
+        assert np.array_equal(a.history[name], b.history[name]), name
+    for part in ("initial", "final"):
+        for name in ("points", "lloyd", "poisson"):
+            one, other = (getattr(getattr(r, part), name) for r in (a, b))
+            assert np.array_equal(one, other), (part, name)
+    assert (a.converged, a.stop_reason, a.size_factor) == (
+        b.converged,
+        b.stop_reason,
+        b.size_factor,
+    )
+    assert a.settings == b.settings
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("kind", list(RUNS))
+def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
+    box, size = (BOX_3D, SIZE_3D) if kind == "in 3D" else (BOX, SIZE)
+    whole = clvoro.Adapter(ctx, dtype).run(box, size, seed=5, **RUNS[kind])
+    rows = len(whole.history)
+    for stop in (1, 2 * rows // 3):
+        path = tmp_path / "state"
+        stopped = clvoro.Adapter(ctx, dtype).run(
+            box, size, seed=5, callback=stop_after(stop), checkpoint=path, checkpoint_every=1e9,
+            **RUNS[kind],
+        )  # fmt: skip
+        assert stopped.stop_reason == "stopped by the callback"
+        resumed = clvoro.Adapter(ctx, dtype).run(box, size, seed=5, resume=path, **RUNS[kind])
+        assert_same(resumed, whole)
+        assert (np.diff(resumed.history["seconds"]) >= 0).all()
+
+
+LONG_LIVED = {
+    "coupled": (BOX, SIZE, {"method": "coupled", "max_steps": 7}),
+    "weighted": (BOX, SIZE, {"method": "weighted", "max_steps": 7, "tol": 0.0}),
+    "adaptive": (BOX, SIZE, {"method": "adaptive", "effort": "fast", "levels": 1}),
+    "coupled in 3D": (BOX_3D, SIZE_3D, {"method": "coupled", "max_steps": 5}),
+    "weighted in 3D": (BOX_3D, SIZE_3D, {"method": "weighted", "max_steps": 5, "tol": 0.0}),
+    "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
+}
+
+
+# Every kind has one of the two by default.
+@pytest.mark.parametrize(
+    ("kind", "solver"),
+    [
+        pytest.param(kind, solver, marks=() if (k + s) % 2 == 0 else pytest.mark.slow)
+        for k, kind in enumerate(LONG_LIVED)
+        for s, solver in enumerate(("multigrid", "jacobi"))
+    ],
+)
+def test_resumed_runs_go_on_with_the_same_solver(ctx, tmp_path, monkeypatch, kind, solver):
+    """Multigrid's levels last for several steps: here also on meshes for which Jacobi's method is faster."""
+    monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 1.5 - (solver == "multigrid")))
+    box, size, options = LONG_LIVED[kind]
+    whole = clvoro.Adapter(ctx).run(box, size, seed=5, **options)
+    rows, path = len(whole.history), tmp_path / "state"
+    for stop in sorted({1, 2, rows // 3, rows - 2}):
+        clvoro.Adapter(ctx).run(
+            box, size, seed=5, callback=stop_after(stop), checkpoint=path, checkpoint_every=1e9, **options
+        )  # fmt: skip
+        levels = [name for name in Saved(path).arrays if name.startswith("multigrid.")]
+        assert bool(levels) or solver == "jacobi" or kind.startswith("adaptive")
+        assert not levels or solver == "multigrid"
+        assert_same(clvoro.Adapter(ctx).run(box, size, seed=5, resume=path, **options), whole)
+
+
+def test_writing_checkpoints_changes_nothing(ctx, tmp_path):
+    options = {"method": "adaptive", "effort": "fast", "seed": 8}
+    path = tmp_path / "state"
+    plain = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
+    written = clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=0, **options)
+    assert_same(plain, written)
+    # The last one is the end of the plan: nothing is left to do but to fetch.
+    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **options), plain)
+    assert os.listdir(tmp_path) == ["state"]
+
+
+def test_own_points_and_callables(ctx, tmp_path):
+    points = np.random.default_rng(12).random((200, 2)) * BOX.extent
+    path = tmp_path / "state"
+    options = {"points": points, "method": "weighted", "max_steps": 8, "tol": 0.0}
+
+    def size(x):
+        return 0.1 + 0.02 * x[:, 0]
+
+    whole = clvoro.Adapter(ctx).run(BOX, size, **options)
+    stop = {"callback": stop_after(4), "checkpoint": path}
+    clvoro.Adapter(ctx).run(BOX, size, **stop, **options)
+    assert_same(clvoro.Adapter(ctx).run(BOX, size, resume=path, **options), whole)
+
+
+def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
+    """Rows keep the room that the first mesh took."""
+    points, path = np.random.default_rng(12).random((3000, 2)), tmp_path / "state"
+    square, options = clvoro.Box((0, 0), (1, 1)), {"points": points, "effort": "fast"}
+    whole = clvoro.Adapter(ctx).run(square, 0.25, **options)
+    stop = {"callback": stop_after(3), "checkpoint": path}
+    stopped = clvoro.Adapter(ctx).run(square, 0.25, **stop, **options)
+    assert len(stopped.points) < 30
+    assert_same(clvoro.Adapter(ctx).run(square, 0.25, resume=path, **options), whole)
+
+
+@pytest.mark.parametrize("kind", ["adaptive", "in 3D"])
+def test_stopped_before_the_first_step(ctx, tmp_path, kind):
+    box, size = (BOX_3D, SIZE_3D) if kind == "in 3D" else (BOX, SIZE)
+    path, options = tmp_path / "state", RUNS[kind]
+    clvoro.Adapter(ctx).run(box, size, callback=stop_after(0), checkpoint=path, **options)
+    resumed = clvoro.Adapter(ctx).run(box, size, resume=path, **options)
+    assert_same(resumed, clvoro.Adapter(ctx).run(box, size, **options))
+
+
+def test_stopped_just_where_the_run_would_have_ended(ctx, tmp_path):
+    """By the callback, in the row that ends a run whose error no longer improves: it ends there, resumed, too."""
+    path, options = tmp_path / "state", {"method": "coupled", "tol": 0.5}
+    whole = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
+    assert whole.stop_reason == STALLED
+    rows = len(whole.history) - 1
+    assert rows < 100
+    clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(rows), checkpoint=path, **options)
+    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **options), whole)
+
+
+@pytest.mark.parametrize("before", ["diagram", "failed run"])
+@pytest.mark.parametrize("square", [clvoro.Box((0, 0), (1, 1)), clvoro.Box((0,) * 3, (1,) * 3)])
+def test_after_something_larger(ctx, tmp_path, square, before):
+    """What an adapter has done before is no part of a run's state."""
+    path, size = tmp_path / "state", 0.29 if square.dim == 2 else 0.4
+    options = {"method": "coupled", "max_steps": 6, "tol": 0.0}
+    adapter = clvoro.Adapter(ctx)
+
+    def fail(row):
+        raise LookupError
+
+    if before == "diagram":
+        adapter.diagram(square, np.random.default_rng(0).random((8000, square.dim)))
+    else:
+        with pytest.raises(LookupError):
+            adapter.run(square, 8000 ** (-1 / square.dim), method="lloyd", callback=fail)
+    adapter.run(square, size, callback=stop_after(3), checkpoint=path, **options)
+    whole = clvoro.Adapter(ctx).run(square, size, **options)
+    assert_same(clvoro.Adapter(ctx).run(square, size, resume=path, **options), whole)
+
+
+@pytest.fixture(scope="module")
+def saved(ctx, tmp_path_factory):
+    path = tmp_path_factory.mktemp("checkpoint") / "state"
+    options = {"method": "coupled", "max_steps": 6, "seed": 5}
+    clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(2), checkpoint=path, **options)
+    return path, options
+
+
+OTHERS = {
+    "seed": {"seed": 6},
+    "method": {"method": "lloyd"},
+    "max_steps": {"max_steps": 7},
+    "k": {"k": 0.25},
+    "n_cells": {"n_cells": 300},
+    "points": {"points": np.random.default_rng(4).random((50, 2))},
+}
+
+
+@pytest.mark.parametrize("name", list(OTHERS))
+def test_other_settings_are_refused_by_name(ctx, saved, name):
+    path, options = saved
+    with pytest.raises(InputError, match=rf"cannot resume.*{name} = "):
+        clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **{**options, **OTHERS[name]})
+
+
+def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
+    path, options = saved
+    with pytest.raises(InputError, match="domain = "):
+        clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (2.5, 1.6)), SIZE, resume=path, **options)
+    with pytest.raises(InputError, match="dtype = float64"):
+        clvoro.Adapter(ctx, "float32").run(BOX, SIZE, resume=path, **options)
+    with pytest.raises(InputError, match=r"size field is another.*this field's is [0-9]"):
+        clvoro.Adapter(ctx).run(BOX, 1.0001 * SIZE, resume=path, **options)
+    with pytest.raises(InputError, match="checkpoint_every is -1"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=-1, **options)
+    with pytest.warns(UnusedOptionWarning, match="checkpoint_every is 5, and no file"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint_every=5, **options)
+    with pytest.raises(InputError, match=r"checkpoint is .*, a folder"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path.parent, **options)
+    with pytest.raises(InputError, match="no folder"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path / "none" / "state", **options)
+
+
+RECTANGLE = [(0, 0), (2.5, 0), (2.5, 1.5), (0, 1.5)]
+ALIKE = {
+    "box": BOX,
+    "periodic": clvoro.Box((0, 0), (2.5, 1.5), periodic=True),
+    "channel": clvoro.Box((0, 0), (2.5, 1.5), periodic=(True, False)),
+    "polygon": clvoro.Polygon(RECTANGLE),
+    "from another corner": clvoro.Polygon(RECTANGLE[1:] + RECTANGLE[:1]),
+    "turned round": clvoro.Polygon(RECTANGLE[::-1]),
+    "with a hole": clvoro.Polygon(RECTANGLE, [[(1, 1), (1.1, 1), (1, 1.1)]]),
+}
+
+
+def test_domains_of_the_same_extent_are_told_apart(saved):
+    """By what files hold of them."""
+    told = {name: identity(domain) for name, domain in ALIKE.items()}
+    assert len({json.dumps(t, sort_keys=True) for t in told.values()}) == len(ALIKE)
+    assert identity(clvoro.Polygon(RECTANGLE)) == told["polygon"]
+    for name in set(ALIKE) - {"box"}:
+        with pytest.raises(InputError, match=r"domain = Box\(.*'walls': 4.* has domain = "):
+            Saved(saved[0]).fit({**Saved(saved[0]).made_by, "domain": told[name]})
+
+
+def test_checkpoints_of_other_versions_are_refused(saved, tmp_path):
+    def older(name, array):
+        return np.array(checkpoint.VERSION - 1) if name == "version" else array
+
+    rewrite(saved[0], tmp_path / "state", older)
+    with pytest.raises(InputError, match=rf"of version {checkpoint.VERSION - 1}.*begin anew"):
+        Saved(tmp_path / "state")
+
+
+def rewrite(path, target, change):
+    """Copy a checkpoint with some of its arrays changed, all checksums right."""
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(target, "w") as new:
+        for info in old.infolist():
+            with old.open(info) as stream:
+                array = np.lib.format.read_array(stream)
+            name = info.filename.removesuffix(".npy")
+            with new.open(info.filename, "w") as stream:
+                np.lib.format.write_array(stream, np.asanyarray(change(name, array)))
+
+
+def with_state(**values):
+    def change(name, array):
+        if name != "about":
+            return array
+        about = json.loads(array.item())
+        about["state"] |= values
+        return np.array(json.dumps(about))
+
+    return change
+
+
+def spoil(which, index, value):
+    def change(name, array):
+        if name == which:
+            array[index] = value
+        return array
+
+    return change
+
+
+DAMAGED = {
+    "neighbor too high": spoil("diagram.neighbors", 7, 10**6),
+    "neighbor too low": spoil("diagram.neighbors", 7, -9),
+    "starts": spoil("diagram.starts", 4, 10**6),
+    "labels": spoil("mesh.labels", 0, 10**6),
+    "labels twice": lambda name, a: np.where(a == 3, 4, a) if name == "mesh.labels" else a,
+    "points": spoil("mesh.points", (0, 0), np.nan),
+    "outside": spoil("mesh.points", (0, 0), 1.5),
+    "sizes": spoil("mesh.h", 3, 0.0),
+    "position": with_state(position=-1),
+    "far position": with_state(position=10**9),
+    "spare": with_state(spare=10**12),
+    "text": with_state(steps="3"),
+    "coarsening": with_state(coarsening="nan"),
+    "shape": lambda name, array: array[:-1] if name == "mesh.velocity" else array,
+    "type": lambda name, array: array.astype(np.float32) if name == "mesh.h" else array,
+}
+
+
+DAMAGED_LEVELS = {
+    "groups": spoil("multigrid.0.group", 5, 10**6),
+    "members": spoil("multigrid.0.members", 5, -1),
+    "rows": spoil("multigrid.1.graph.starts", 3, 10**6),
+    "columns": spoil("multigrid.1.graph.columns", 3, -1),
+    "weights": spoil("multigrid.1.graph.weights", 3, np.nan),
+    "pairs": spoil("multigrid.0.partner", 2, 10**6),
+    "elimination": lambda name, a: a[:-1] if name == "multigrid.factor" else a,
+}
+
+
+@pytest.mark.parametrize("name", list(DAMAGED_LEVELS))
+def test_damaged_levels_are_refused(ctx, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 0.0))
+    options = {"method": "coupled", "max_steps": 6, "seed": 5}
+    path, bad = tmp_path / "state", tmp_path / "bad"
+    clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(2), checkpoint=path, **options)
+    rewrite(path, bad, DAMAGED_LEVELS[name])
+    with pytest.raises(InputError, match="cannot resume"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, resume=bad, **options)
+
+
+@pytest.mark.parametrize("name", list(DAMAGED))
+def test_damaged_checkpoints_are_refused(ctx, saved, tmp_path, name):
+    path, options = saved
+    rewrite(path, tmp_path / "state", DAMAGED[name])
+    with pytest.raises(InputError, match="cannot resume"):
+        clvoro.Adapter(ctx).run(BOX, SIZE, resume=tmp_path / "state", **options)
+
+
+def flipped(data):
+    """One bit of the middle, where an array is."""
+    place = len(data) // 2
+    return data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :]
+
+
+def test_cut_off_and_foreign_files_are_refused(saved, tmp_path):
+    data = saved[0].read_bytes()
+    for content in (
+        data[:-100],
+        data[: len(data) // 2],
+        b"",
+        b"PK\x03\x04",
+        flipped(data),
+    ):
+        (tmp_path / "state").write_bytes(content)
+        with pytest.raises(InputError, match="cannot load"):
+            Saved(tmp_path / "state")
+    with pytest.raises(InputError, match="cannot load"):
+        Saved(tmp_path / "none")
+    clvoro.Adapter().run(BOX, 0.3, method="lloyd", max_steps=0).save(tmp_path / "m.npz")
+    with pytest.raises(InputError, match="its format is"):
+        Saved(tmp_path / "m.npz")
+
+
+CASE = """[domain]
+lower = [0, 0]
+upper = [2.5, 1.5]
+[size]
+kind = "expression"
+expression = "0.02 + 0.1*fabs(hypot(x-0.9, y-0.75)-0.3)"
+[run]
+method = "coupled"
+max_steps = 400
+tol = 0
+"""
+
+
+def test_command_line_stops_at_sigterm_and_resumes(tmp_path, capsys):
+    case, state, out = tmp_path / "c.toml", tmp_path / "state", tmp_path / "out"
+    case.write_text(CASE)
+    command = ["run", str(case), "--out", str(out), "--no-report", "--quiet", "--checkpoint"]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "clvoro", *command, str(state), "--checkpoint-every", "0.2"],
+        cwd=Path(__file__).parents[2],
+    )
+    until = time.monotonic() + 120
+    while not state.exists() and time.monotonic() < until and child.poll() is None:
+        time.sleep(0.05)
+    child.send_signal(signal.SIGTERM)
+    assert child.wait(60) == 130
+    stopped = clvoro.load(out / "mesh.npz")
+    assert stopped.stop_reason == "interrupted"
+    # The checkpoint is where it stopped.
+    assert Saved(state).state["steps"] == stopped.history["step"][-1]
+    again = [*command, str(state), "--resume", str(state)]
+    assert cli.main([*again, "--seed", "9"]) == 2
+    assert "seed = 0" in capsys.readouterr().err
+    assert cli.main([*again, "--method", "coupled,lloyd"]) == 2
+    assert "--method" in capsys.readouterr().err

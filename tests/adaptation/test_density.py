@@ -1,0 +1,145 @@
+"""The size field as a density: excess, gradient and weighted centroids against sums and quadrature."""
+
+import numpy as np
+import pytest
+
+from clvoro.adaptation.density import Density
+from clvoro.tessellation.device_diagram import Tessellation
+from tests.reference import diagrams as reference
+from tests.reference import graphs, patch
+
+N = 250
+
+
+@pytest.fixture(
+    scope="module",
+    params=[("float64", None), ("float32", None), ("float64", 16)],
+    ids=["float64", "float32", "gpu"],
+)
+def engine(ctx, request):
+    real, group_size = request.param
+    return patch.make_engine(ctx, real, group_size=group_size)
+
+
+def test_excess(engine):
+    t = patch.tessellate(engine, patch.random_points(N, 111))
+    h = np.random.default_rng(5).uniform(0.01, 0.2, N)
+    density = Density(engine)
+    w = density.evaluate(t, engine.upload(h))
+    volumes, rel = t.volumes.get().astype(float), 64 * float(np.finfo(engine.real).eps)
+    assert w.density.get() == pytest.approx(h**-2, rel=rel)
+    assert w.weight.get() == pytest.approx(volumes / h**2, rel=rel)
+    assert w.excess.get() == pytest.approx(2 * np.log(np.sqrt(volumes) / h), abs=rel)
+    density.remove_mean(w)
+    excess = np.log(volumes / h**2)
+    mean = np.average(excess, weights=volumes / h**2)
+    assert w.excess.get() == pytest.approx(excess - mean, abs=rel)
+
+
+def test_gradient_of_an_exponential(engine):
+    """log h linear is fitted exactly, at walls and in corners too, wherever there are two neighbors to tell."""
+    points = patch.random_points(N, 112)
+    slope = np.array([-1.1, 2.3])
+    h = 0.03 * np.exp(points @ slope)
+    t = patch.tessellate(engine, points)
+    gradient = Density(engine).evaluate(t, engine.upload(h)).gradient.get()
+    host = patch.fetch(t)
+    told = np.bincount(host.owners[host.neighbors >= 0], minlength=N) > 1
+    assert told.sum() == N - 1, "one cell fills a corner alone"
+    # log h rounds by a few eps of its size, 5, over distances of 0.003 and more.
+    assert np.abs(gradient[told] - slope).max() < 8000 * np.finfo(engine.real).eps
+    assert not gradient[~told].any()
+
+
+def test_gradient_is_that_of_least_squares(engine):
+    """Of any values, each neighbor counts, by 1 / distance^2, and walls do not."""
+    points = patch.random_points(N, 114)
+    h = np.random.default_rng(7).uniform(0.02, 0.2, N)
+    t = patch.tessellate(engine, points)
+    gradient = Density(engine).evaluate(t, engine.upload(h)).gradient.get()
+    host, eps = patch.fetch(t), float(np.finfo(engine.real).eps)
+    for i in range(N):
+        row = host.neighbors[host.starts[i] : host.starts[i + 1]]
+        j = row[row >= 0]
+        d = points[j] - points[i]
+        m = (d.T / (d**2).sum(axis=1)) @ d
+        expected = np.linalg.solve(m, (d.T / (d**2).sum(axis=1)) @ np.log(h[j] / h[i]))
+        # Positions round by eps of the domain: that over the distance of the nearest is what it is off by, in parts of
+        # its rise over that distance; the matrix enlarges it.
+        nearest = np.sqrt((d**2).sum(axis=1).min())
+        rounding = 4 * eps * np.linalg.cond(m) / nearest**2
+        assert gradient[i] == pytest.approx(expected, rel=0, abs=rounding)
+
+
+def test_gradient_in_three_dimensions(ctx):
+    engine = patch.make_engine(ctx, dim=3)
+    points, starts, neighbors, measures, volumes = graphs.random_graph(150, 3, seed=23)
+    slope = np.array([0.4, -1.7, 0.9])
+    zeros = engine.zeros((150, 6))
+    t = Tessellation(
+        n=150, points=engine.upload(points), starts=engine.upload(starts, np.int32),
+        neighbors=engine.upload(neighbors, np.int32), face_measures=engine.upload(measures),
+        face_centroids=zeros, volumes=engine.upload(volumes), offsets=engine.zeros((150, 3)), covariances=zeros,
+    )  # fmt: skip
+    h = 0.1 * np.exp(points @ slope)
+    w = Density(engine).evaluate(t, engine.upload(h))
+    assert np.abs(w.gradient.get() - slope).max() < 1e-9
+    assert w.excess.get() == pytest.approx(np.log(volumes / h**3), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[0.3, 0.4]],
+        [[0.3, 0.4], [0.8, 0.1]],
+        np.stack([np.linspace(0.1, 0.9, 12), np.full(12, 0.3)], axis=1),
+        np.stack([np.linspace(0.1, 0.7, 9)] * 2, axis=1),
+    ],
+)
+def test_gradient_that_the_neighbors_do_not_tell(engine, points):
+    """One cell, two cells, collinear ones: none is taken, rather than one of any size."""
+    points = np.array(points)
+    w = Density(engine).evaluate(
+        patch.tessellate(engine, points), engine.upload(0.1 + 0.3 * points[:, 0])
+    )
+    assert not w.gradient.get().any()
+    assert np.isfinite(w.lloyd.get()).all()
+
+
+def weighted_centroid(polygon, slope, power):
+    """Centroid of a polygon weighted by exp(power slope . y): Gauss quadrature over its triangles."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    nodes, weights = (nodes + 1) / 2, weights / 2
+    u, v = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
+    w = np.outer(weights, weights).ravel() * u  # the square folded onto the triangle
+    origin = polygon.mean(axis=0)
+    mass, moment = 0.0, np.zeros(2)
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        y = origin + u[:, None] * ((1 - v)[:, None] * (a - origin) + v[:, None] * (b - origin))
+        twice = (a - origin)[0] * (b - origin)[1] - (a - origin)[1] * (b - origin)[0]
+        share = twice * w * np.exp(power * (y - origin) @ slope)
+        mass += share.sum()
+        moment += share @ y
+    return moment / mass
+
+
+def test_weighted_centroids(ctx):
+    """Against quadrature of h^-(d + 2), h exponential: right to first order in the change of h across the cell."""
+    engine = patch.make_engine(ctx)
+    points = patch.relaxed_points(120, 113)
+    cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
+    t = patch.tessellate(engine, points)
+    offsets = t.offsets.get()
+    worst = []
+    for factor in (1.0, 0.5):
+        slope = factor * np.array([0.8, -0.5])
+        h = 0.1 * np.exp(points @ slope)
+        lloyd = Density(engine).evaluate(t, engine.upload(h)).lloyd.get()
+        exact = np.array([weighted_centroid(c.polygon, slope, -4) for c in cells]) - points
+        size = np.sqrt([c.area for c in cells])
+        off = np.linalg.norm(lloyd - exact, axis=1) / size
+        shift = np.linalg.norm(exact - offsets, axis=1) / size
+        assert off.max() < 0.1 * shift.max()
+        worst.append(off.max())
+    # What is left is of second order: a quarter at half the slope.
+    assert worst[1] < 0.3 * worst[0]

@@ -1,0 +1,237 @@
+"""Units and places that do not agree are told of, and what is right beside them is not."""
+
+import json
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro import sizing
+from clvoro.adaptation.diagnostics import misfits_of_layer
+from clvoro.cli import command as cli
+from clvoro.errors import CoarseSizeWarning, InputError, MisfitWarning, SizeErrorWarning
+
+BOX = clvoro.Box((0, 0), (2, 1))
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
+SHORE = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (0, 1)])
+
+
+def near(shapes, **options):
+    return sizing.Distance(shapes, **{"h_min": 0.05, "growth": 1.2, "h_max": 0.2, **options})
+
+
+def body(scale, at=(0.4, 0.4, 0.4)):
+    corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1.0)]) * scale + at
+    return sizing.Surface(corners, [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+
+
+VALUES = np.full((9, 9), 0.1)
+SPREAD = np.random.default_rng(3).random((50, 2))
+FIELDS = {
+    # name: (domain, the mistake, what it says, the right use beside it)
+    "circle in millimeters": (
+        BOX, near(sizing.Circle((900, 400), 200)), "change nothing", near(sizing.Circle((0.9, 0.4), 0.2))),
+    "segment beside the domain": (
+        BOX, near(sizing.Segment((0, 2), (2, 2))), "change nothing", near(sizing.Segment((0, 1.7), (2, 1.7)))),
+    "no upper bound, but far": (
+        BOX, near(sizing.Circle((900, 400), 200), growth=1.0001, h_max=np.inf), "times its diagonal",
+        near(sizing.Circle((9, 4), 2), growth=1.0001, h_max=np.inf)),
+    "circle all around": (
+        BOX, near(sizing.Circle((1, 0.5), 9)), "change nothing", near(sizing.Circle((1, 0.5), 1.5))),
+    "one shape of two": (
+        BOX, near([sizing.Circle((900, 400), 200), sizing.Circle((800, 400), 2)]), "change nothing",
+        near([sizing.Circle((900, 400), 200), sizing.Circle((0.9, 0.4), 0.2)])),
+    "within others": (
+        BOX, sizing.Graded(2 * sizing.minimum(near(sizing.Circle((900, 400), 200)), 0.1), growth=1.2), "change nothing",
+        sizing.Graded(2 * sizing.minimum(near(sizing.Circle((0.9, 0.4), 0.2)), 0.1), growth=1.2)),
+    "part in millimeters": (CUBE, near(body(200, (400, 400, 400))), "change nothing", near(body(0.2))),
+    "part in kilometers": (CUBE, near(body(2e-4)), "less than a cell", near(body(0.06))),
+    "raster of another place": (
+        BOX, sizing.Raster(VALUES, (-9, -9), (0.2, 0.9)), "covers 0.09 of",
+        sizing.Raster(VALUES, (-9, -9), (1.2, 0.9))),
+    "raster in millimeters": (
+        BOX, sizing.Raster(VALUES, (0, 0), (2000, 1000)), "lies between two values",
+        sizing.Raster(VALUES, (0, 0), (20, 10))),
+    "raster that is meant so": (
+        BOX, sizing.Raster(VALUES, (0, 0), (0.2, 0.1)), "covers 0.01 of",
+        sizing.Raster(VALUES, (0, 0), (0.2, 0.1), outside="nearest")),
+    "raster of a polygon": (
+        SHORE, sizing.Raster(VALUES, (0, 0), (0.9, 1)), "covers 0.45 of", sizing.Raster(VALUES, (0, 0), (1.1, 1))),
+    "few values": (
+        BOX, sizing.Raster(VALUES, (0, 0), (0.2, 0.1)), "covers", sizing.Raster([[0.1, 0.2]], (0, 0), (2000, 1000))),
+    "growth limited elsewhere": (
+        BOX, sizing.Graded(0.2, growth=1.2, box=clvoro.Box((0, 0), (0.5, 1))), "covers 0.25 of",
+        sizing.Graded(0.2, growth=1.2, box=clvoro.Box((0, 0), (1.5, 1)))),
+    "data in a corner": (
+        BOX, sizing.Scattered(0.3 * SPREAD, SPREAD[:, 0] + 1, BOX.lower, BOX.upper), "Scattered of 50 points covers",
+        sizing.Scattered(SPREAD * (2, 1), SPREAD[:, 0] + 1, BOX.lower, BOX.upper)),
+    "a profile": (
+        BOX, sizing.Scattered(0.3 * SPREAD, SPREAD[:, 0] + 1), "covers",
+        sizing.Scattered(np.column_stack([2 * SPREAD[:, 0], np.full(50, 0.5)]), SPREAD[:, 0] + 1, BOX.lower, BOX.upper,
+                         method="nearest")),
+    "features of another domain": (
+        clvoro.Polygon([(5, 0), (6, 0), (6, 1)]), sizing.FeatureSize(SHORE), "lies beside", sizing.FeatureSize(
+            clvoro.Polygon([(5, 0), (6, 0), (6, 1)]))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(FIELDS))
+def test_fields_that_hardly_meet_the_domain(name):
+    domain, wrong, message, right = FIELDS[name]
+    (found,) = wrong.misfits(domain)
+    assert message in found
+    assert right.misfits(domain) == []
+    # What is said is so: the sizes are those of the whole field without the part in question.
+    if "change nothing" in message and domain.dim == 2 and not isinstance(wrong, sizing.Graded):
+        x = np.random.default_rng(5).uniform(domain.lower, domain.upper, (500, 2))
+        assert np.ptp(wrong(x)) == 0 < np.ptp(right(x))
+
+
+def test_far_shapes_are_so_by_a_bound():
+    """Never farther than they are: of random shapes none is said to change nothing where it does."""
+    rng = np.random.default_rng(11)
+    said = 0
+    for _ in range(300):
+        corners = rng.uniform(-4, 4, (3, 2))
+        shape = [sizing.Circle(corners[0], rng.uniform(0, 6)), sizing.Polyline(corners)][
+            rng.integers(2)
+        ]
+        field = near(shape, growth=rng.uniform(1.02, 2))
+        x = np.concatenate(
+            [rng.uniform(BOX.lower, BOX.upper, (3000, 2)), [(0, 0), (2, 0), (2, 1), (0, 1)]]
+        )
+        if field.misfits(BOX):
+            said += 1
+            assert (field(x) == field.h_max).all()
+    assert 20 < said < 280
+
+
+def test_data_beside_their_box_are_refused():
+    with pytest.raises(InputError, match="all beside the box"):
+        sizing.Scattered(SPREAD * 1000 + 5, SPREAD[:, 0] + 1, BOX.lower, BOX.upper)
+
+
+@pytest.mark.parametrize(
+    ("layer", "size", "message"),
+    [
+        ({"height": 0.1, "count": 2}, 0.02, "sizes jump"),
+        ({"height": 1e-5, "count": 3}, 0.2, "is the last layer's height"),
+        ({"height": 0.01, "count": 9, "growth": 1.5, "spacing": 0.1}, 0.02, "wide and 0.256 high"),
+        ({"height": 0.02, "count": 3}, 0.02, None),
+        ({"height": 1e-5, "count": 3, "spacing": 0.02}, 0.02, None),
+        ({"height": 1e-3, "count": 3}, 0.2, None),
+        ({"height": 0.05, "spacing": 0.1, "count": 1}, 0.05, None),
+    ],
+)
+@pytest.mark.parametrize("domain", [BOX, SHORE], ids=["box", "polygon"])
+def test_layers_of_other_sizes_than_the_field(layer, size, message, domain):
+    # The field is coarse far away: what counts is beside the layers.
+    field = sizing.Distance(sizing.Segment((0, 0), (2, 0)), h_min=size, slope=0.05)
+    edges = (2,) if domain is BOX else (0,)
+    found = misfits_of_layer("layers[0]", clvoro.Layers(**layer, edges=edges), field, domain)
+    assert len(found) == (message is not None)
+    assert message is None or message in found[0]
+
+
+def test_runs_warn(ctx):
+    adapter, options = clvoro.Adapter(ctx), {"method": "lloyd", "max_steps": 0}
+    with pytest.warns(MisfitWarning, match="change nothing") as given:
+        adapter.run(BOX, near(sizing.Circle((900, 400), 200)), **options)
+    assert given[0].filename == __file__
+    with pytest.warns(MisfitWarning, match="sizes jump"):
+        adapter.run(BOX, 0.05, layers=clvoro.Layers(0.2, edges=[2]), **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        adapter.run(BOX, near(sizing.Circle((0.9, 0.4), 0.2)), **options)
+        adapter.run(BOX, 0.1, layers=clvoro.Layers(0.05, edges=[2]), **options)
+
+
+def lake(latitude, crs):
+    ring = [[8.0, latitude], [8.2, latitude], [8.2, latitude + 0.1], [8.0, latitude]]
+    named = {} if crs is None else {"crs": {"type": "name", "properties": {"name": crs}}}
+    return {"type": "Polygon", "coordinates": [ring], **named}
+
+
+@pytest.mark.parametrize(
+    "crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326"]
+)
+def test_longitudes_and_latitudes(tmp_path, crs):
+    path = tmp_path / "lake.geojson"
+    path.write_text(json.dumps(lake(46.2, crs)))
+    with pytest.warns(
+        MisfitWarning, match=r"lake\.geojson is in longitudes and latitudes.* 0\.69 times"
+    ):
+        clvoro.Polygon.from_geojson(path)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "crs"),
+    [(46.2, None), (46.2, "urn:ogc:def:crs:EPSG::25832"), (460.2, "EPSG:4326"), (3.0, "EPSG:4326")],
+)
+def test_what_is_not_longitudes_and_latitudes(latitude, crs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        clvoro.Polygon.from_geojson(lake(latitude, crs))
+
+
+def test_degrees_with_sizes_in_meters(ctx):
+    domain = clvoro.Polygon.from_geojson(lake(46.2, None))
+    with pytest.warns(CoarseSizeWarning, match="longitudes and latitudes"):
+        clvoro.Adapter(ctx).run(domain, 100.0, max_steps=0)
+
+
+CASE = """[domain]
+lower = [0, 0]
+upper = [2, 1]
+[size]
+kind = "distance"
+shapes = [{ kind = "circle", center = [CENTER], radius = 0.2 }]
+h_min = 0.1
+growth = 1.3
+h_max = 0.3
+[run]
+effort = "fast"
+"""
+
+
+@pytest.mark.parametrize(("center", "said"), [("900, 400", True), ("0.9, 0.4", False)])
+def test_the_command_line_warns(tmp_path, capfd, center, said):
+    (tmp_path / "c.toml").write_text(CASE.replace("CENTER", center))
+    code = cli.main(
+        ["run", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out"), "--no-report", "--quiet"]
+    )
+    errors = capfd.readouterr().err
+    assert code == 0
+    assert ("warning: the shapes of Distance" in errors) == said
+
+
+JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
+"""Of a twentieth of a cell at the wall: the cells beside it ask for what no neighbor of theirs can be."""
+
+
+@pytest.mark.parametrize(("method", "effort"), [("adaptive", "fast"), ("exact", "default")])
+def test_mesh_that_does_not_meet_its_sizes(ctx, method, effort):
+    """It ends (the count that "exact" wants to have exactly would swing for ever there), and says where it is worst."""
+    square, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)
+    with pytest.warns(SizeErrorWarning, match="mean .e. is .*sizing.Graded") as told:
+        result = adapter.run(square, JUMP, method=method, effort=effort, seed=1)
+    assert result.converged
+    worst = np.abs(result.error).argmax()
+    x, y = (float(v) for v in re.search(r"\(([^)]*)\)", str(told[0].message))[1].split(","))
+    assert result.points[worst] == pytest.approx((x, y), rel=1e-5)
+    assert told[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SizeErrorWarning)
+        adapter.run(square, sizing.Graded(JUMP, growth=1.2), method=method, effort=effort, seed=1)
+        # Of what is not finished, and of methods that do not promise it, one is not told.
+        adapter.run(
+            square,
+            JUMP,
+            method=method,
+            effort="fast",
+            seed=1,
+            callback=lambda row: row["step"] == 9,
+        )
+        adapter.run(square, JUMP, method="lloyd", max_steps=2, seed=1)

@@ -1,0 +1,461 @@
+"""Insertion and deletion: who is chosen, what becomes of it, and that nothing is lost, on lattices made by hand."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from clvoro.adaptation.insertion_deletion import (
+    EXCESS_RINGS,
+    LARGEST_CHANGE,
+    MENDED_SHARE,
+    NUCLEUS_RINGS,
+    PAIR_RINGS,
+    SPLIT_DISTANCE,
+    THETA,
+    Population,
+    PopulationControl,
+)
+from clvoro.geometry.box import Box
+from tests.reference import patch
+
+QUIET = THETA + 0.001  # above THETA pairs at walls are left alone
+
+
+@pytest.fixture(scope="module")
+def engine(ctx):
+    return patch.make_engine(ctx)
+
+
+class Sweep:
+    """One call of `reorganize`, or of `mend` where the quality is given, and what it has done, by labels."""
+
+    def __init__(self, engine, points, h, total, control=None, **options):
+        n, rng = len(points), np.random.default_rng(808)
+        self.n, self.points, self.h = n, points, np.broadcast_to(h, n)
+        self.labels = rng.permutation(3 * n)[:n].astype(np.int32)
+        self.velocity = rng.normal(size=(n, 2)).astype(engine.real)
+        self.ever = (rng.random(n) < 0.5).astype(engine.real)
+        self.signatures = rng.integers(1, 2**63, n).astype(np.uint64)
+        self.t = patch.tessellate(engine, points)
+        self.host = patch.fetch(self.t)
+        reach = np.minimum(self.h, np.sqrt(self.host.volumes))
+        self.excess = np.log(self.host.volumes / self.h**2)
+        rows = Population(
+            self.t.points, engine.upload(self.labels, np.int32), engine.upload(self.velocity),
+            engine.upload(self.signatures, np.uint64), engine.upload(self.ever),
+        )  # fmt: skip
+        self.first_new = 5 * n
+        control = control or PopulationControl(engine)
+        if "quality" in options:
+            quality = engine.upload(options.pop("quality"))
+            self.new = control.mend(patch.BOX, self.t, quality, rows, self.first_new, **options)
+        else:
+            self.new = control.reorganize(
+                patch.BOX, self.t, engine.upload(self.h), engine.upload(reach), engine.upload(self.excess), rows,
+                total, self.first_new, **options,
+            )  # fmt: skip
+        if self.new is not None:
+            self.account()
+
+    def account(self):
+        """Every generator that was is there, but those that are counted as deleted; the new ones are counted too."""
+        new = self.new
+        self.new_points, labels = new.points.get(), new.labels.get()
+        assert len(labels) == self.n + new.inserted - new.deleted
+        assert len(np.unique(labels)) == len(labels), "a label is given twice"
+        old = np.isin(labels, self.labels)
+        assert (~old).sum() == new.inserted
+        born = np.sort(labels[~old])
+        assert np.array_equal(born, self.first_new + np.arange(new.inserted))
+        assert patch.BOX.contains(self.new_points).all()
+        row = {label: i for i, label in enumerate(self.labels)}
+        self.rows = np.array(
+            [row[label] for label in labels[old]], int
+        )  # the row before, of each that was
+        self.deleted = np.setdiff1d(np.arange(self.n), self.rows)
+        assert len(self.deleted) == new.deleted
+        moved = (self.new_points[old] != self.points[self.rows]).any(axis=1)
+        self.moved, self.moved_to = self.rows[moved], self.new_points[old][moved]
+        assert np.array_equal(new.velocity.get()[old][~moved], self.velocity[self.rows[~moved]])
+        assert not new.velocity.get()[old][moved].any()
+        assert np.array_equal(new.signatures.get()[old], self.signatures[self.rows])
+        assert np.array_equal(new.ever.get()[old], self.ever[self.rows])
+        assert not new.velocity.get()[~old].any()
+        assert (new.ever.get()[~old] == 1).all()
+        self.born = self.new_points[~old]
+
+    def neighbors(self, i):
+        return self.host.neighbors[self.host.starts[i] : self.host.starts[i + 1]]
+
+    def rings_between(self, sites):
+        """Least number of rings from one of `sites` to the next."""
+        least = self.n
+        for site in sites:
+            ring, seen, distance = {site}, {site}, 0
+            while ring and not (distance and ring & set(sites)):
+                ring = {j for i in ring for j in self.neighbors(i) if j >= 0} - seen
+                seen |= ring
+                distance += 1
+            if ring:
+                least = min(least, distance)
+        return least
+
+
+def dislocated(a, stretch):
+    """A hexagonal lattice, one dislocation (a 7-sided cell under a 5-sided) in it, stretched along x."""
+    points = patch.hexagons(a, Box((0, 0), (1.4, 1.15))) - 0.2
+    center = np.array([0.5, 0.375]) + a * np.array([0.25, 0.2])
+    d = points - center
+    angle = np.arctan2(d[:, 1], d[:, 0])
+    # The displacement around an edge dislocation in an isotropic plate, Poisson's ratio 1/3.
+    u = a / (2 * np.pi) * (angle + np.sin(2 * angle) * 3 / 8)
+    v = -a / (2 * np.pi) * (np.log((d**2).sum(axis=1) / a**2) / 8 + np.cos(2 * angle) * 3 / 8)
+    points = center + (d + np.stack([u, v], axis=1)) * [1 + stretch, 1 - stretch]
+    return points[patch.BOX.contains(points)]
+
+
+def the_pair(sweep):
+    """The 5-sided and the 7-sided cell in the middle."""
+    sides = np.diff(sweep.host.starts)
+    middle = (np.abs(sweep.points - [0.5, 0.375]) < 0.2).all(axis=1)
+    (five,), (seven,) = (np.flatnonzero(middle & (sides == n)) for n in (5, 7))
+    assert seven in sweep.neighbors(five)
+    return five, seven
+
+
+def test_kinds_and_strain(engine):
+    """Charges, walls, and the strain over one ring and over two, of cells of all sorts: sums over neighbors."""
+    n = 80
+    points, h = patch.random_points(n, 41), np.random.default_rng(42).uniform(0.05, 0.2, n)
+    t = patch.tessellate(engine, points)
+    host, control = patch.fetch(t), PopulationControl(engine)
+    found = [array.get().reshape(n, -1) for array in control._measure(t, engine.upload(h))]
+    rows = [host.neighbors[a:b] for a, b in itertools.pairwise(host.starts)]
+    walls = np.array([(row < 0).sum() for row in rows])
+    sides = np.array([len(row) for row in rows])
+    assert np.array_equal(found[0], np.stack([sides - 6 + np.minimum(walls, 2), walls], axis=1))
+    strain = np.zeros((n, 4))
+    for i, row in enumerate(rows):
+        j = row[row >= 0]
+        d = points[j] - points[i]
+        # 1 in a hexagonal lattice: neighbors are at sqrt(2 / sqrt 3) h.
+        terms = 2 * np.array([d[:, 0] ** 2, d[:, 0] * d[:, 1], d[:, 1] ** 2]) / (h[i] * h[j])
+        strain[i, :3] = terms.mean(axis=1) / (2 / np.sqrt(3))
+        strain[i, 3] = walls[i] == 0 and sides[i] == 6
+    assert 3 < strain[:, 3].sum() < n / 2
+    for expected in found[1:]:
+        mean = np.zeros((n, 4))
+        for i, row in enumerate(rows):
+            own = strain[[i, *row[row >= 0]]]
+            weight = own[:, 3].sum()
+            mean[i, :3] = own[:, :3].T @ own[:, 3] / weight if weight > 0 else [1, 0, 1]
+            mean[i, 3] = weight
+        strain = mean
+        # In single precision, sums of a few terms.
+        assert expected == pytest.approx(strain, rel=1e-5, abs=1e-5)
+
+
+A = 0.05
+H = A * np.sqrt(np.sqrt(3) / 2)
+
+
+def test_stretched_pair_is_split_at_the_seven(engine):
+    """Into two across the pair: the extra half row grows."""
+    sweep = Sweep(engine, dislocated(A, 0.06), H, 1.0, theta=QUIET)
+    five, seven = the_pair(sweep)
+    assert (sweep.new.inserted, sweep.new.deleted) == (1, 0)
+    assert sweep.moved.tolist() == [seven]
+    across = sweep.born[0] - sweep.moved_to[0]
+    d = sweep.points[seven] - sweep.points[five]
+    assert abs(across @ d) < 1e-9 * A**2
+    reach = min(H, np.sqrt(sweep.host.volumes[seven]))
+    assert np.linalg.norm(across) == pytest.approx(2 * SPLIT_DISTANCE * reach)
+    assert (sweep.born[0] + sweep.moved_to[0]) / 2 == pytest.approx(sweep.points[seven])
+
+
+def test_compressed_pair_goes_at_the_five(engine):
+    sweep = Sweep(engine, dislocated(A, -0.06), H, -1.0, theta=QUIET)
+    five, _ = the_pair(sweep)
+    assert (sweep.new.inserted, sweep.new.deleted) == (0, 1)
+    assert sweep.deleted.tolist() == [five]
+    assert len(sweep.moved) == 0
+
+
+def test_unstrained_pair_stays(engine):
+    """Without strain, and with the count right, there is nothing to do."""
+    assert Sweep(engine, dislocated(A, 0.0), H, 0.0, theta=QUIET).new is None
+
+
+def test_count_overrules_strain(engine):
+    """One pair cannot climb where the count is right; where it is not, the pair gives way first."""
+    assert Sweep(engine, dislocated(A, 0.06), H, 0.0, theta=QUIET).new is None
+    against = Sweep(engine, dislocated(A, 0.0), H, 1.0, theta=QUIET)
+    assert against.moved.tolist() == [the_pair(against)[1]]
+
+
+def test_two_pairs_of_opposite_strain_both_climb(engine):
+    """The left half is stretched along x, the right half compressed; the count stays."""
+    a = 0.03
+    points = patch.hexagons(a, Box((0, 0), (1.6, 1.35))) - 0.3
+    shift = np.zeros_like(points)
+    for x, sign in ((0.25, 1), (0.75, -1)):
+        d = points - [x + 0.25 * a, 0.375 + 0.2 * a]
+        angle = np.arctan2(d[:, 1], d[:, 0])
+        shift[:, 0] += sign * a / (2 * np.pi) * (angle + np.sin(2 * angle) * 3 / 8)
+        shift[:, 1] -= (
+            sign
+            * a
+            / (2 * np.pi)
+            * (np.log((d**2).sum(axis=1) / a**2) / 8 + np.cos(2 * angle) * 3 / 8)
+        )
+    points = points + shift
+    wide = 1 + 0.06 * np.sin(2 * np.pi * points[:, 0])
+    points[:, 0] -= 0.06 / (2 * np.pi) * np.cos(2 * np.pi * points[:, 0])
+    points[:, 1] = 0.375 + (points[:, 1] - 0.375) / wide
+    points = points[patch.BOX.contains(points)]
+    sweep = Sweep(engine, points, a * H / A, 0.0, theta=QUIET)
+    assert (sweep.new.inserted, sweep.new.deleted) == (1, 1)
+    sides = np.diff(sweep.host.starts)
+    assert sides[sweep.moved].tolist() == [7]
+    assert sides[sweep.deleted].tolist() == [5]
+    assert sweep.points[sweep.moved[0], 0] < 0.5 < sweep.points[sweep.deleted[0], 0]
+
+
+@pytest.mark.parametrize("total", [-30.0, -9.4, -1.0, 1.0, 6.0, 30.0])
+def test_count_to_the_last(engine, total):
+    """Without climbing: exactly so many, the strongest first, far enough apart, at most a share in one call."""
+    n = 500
+    points = patch.relaxed_points(n, 61, steps=2)
+    sweep = Sweep(engine, points, np.sqrt(0.75 / n), total, climb=False)
+    expected = int(np.trunc(total + np.copysign(0.3, total)))
+    expected = int(np.clip(expected, -LARGEST_CHANGE * n, LARGEST_CHANGE * n))
+    change = sweep.new.inserted - sweep.new.deleted
+    # Sites three rings apart take up to 37 cells each: some of 500 may find no place.
+    assert change == expected if abs(expected) < 10 else 10 <= abs(change) <= abs(expected)
+    assert change * expected > 0
+    assert min(sweep.new.inserted, sweep.new.deleted) == 0
+    sites = (sweep.moved if total > 0 else sweep.deleted).tolist()
+    assert len(sites) == abs(change)
+    assert len(sites) == 1 or sweep.rings_between(sites) > EXCESS_RINGS
+    score = np.sign(total) * (sweep.excess + 0.2 * (np.diff(sweep.host.starts) - 6))
+    assert score.argmax() in sites
+
+
+def test_split_cells_part_along_their_longest_axis(engine):
+    points = patch.relaxed_points(300, 67, steps=1)
+    sweep = Sweep(engine, points, 0.04, 5.0, climb=False)
+    assert len(sweep.moved) == 5
+    for i, there in zip(sweep.moved, sweep.moved_to, strict=True):
+        xx, xy, yy = sweep.host.covariances[i]
+        axis = np.linalg.eigh([[xx, xy], [xy, yy]])[1][:, 1]
+        centroid = points[i] + sweep.host.offsets[i]
+        part = np.sqrt(sweep.host.volumes[i]) / 4
+        assert abs((there - centroid) @ axis) == pytest.approx(part, rel=1e-6)
+        assert np.linalg.norm(there - centroid) == pytest.approx(part, rel=1e-6)
+        other = 2 * centroid - there
+        assert np.abs(sweep.born - other).max(axis=1).min() < 1e-12
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+@pytest.mark.parametrize("total", [-50.0, 50.0])
+@pytest.mark.parametrize("climb", [True, False])
+def test_few_cells(engine, n, total, climb):
+    """The last generator stays."""
+    sweep = Sweep(engine, patch.random_points(n, n), 0.3, total, climb=climb)
+    if n == 1 and total < 0:
+        assert sweep.new is None
+    else:
+        assert (sweep.new.inserted - sweep.new.deleted) * total > 0
+        assert len(sweep.new_points) >= 1
+
+
+def test_alike_cells_are_told_apart(engine):
+    """Cells of a lattice have the same excess, far beyond all scores: still as many are split as asked."""
+    xy = np.stack(np.meshgrid(np.arange(16), np.arange(12), indexing="ij"), -1).reshape(-1, 2)
+    sweep = Sweep(engine, (xy + 0.5) / 16, 1e-3, 3.0, climb=False)
+    assert sweep.new.inserted == 3
+
+
+def test_limit_keeps_the_strongest(engine):
+    """Keys from far apart to an ulp apart and equal but for the index."""
+    control, rng = PopulationControl(engine), np.random.default_rng(3)
+    spans = [10**6, 300, 40, 1]
+    for trial in range(24):
+        n = int(rng.integers(1, 400))
+        bits = np.float32(rng.uniform(0.1, 4)).view(np.uint32) + rng.integers(
+            0, spans[trial % 4], n
+        )
+        keys = (bits.astype(np.uint64) << np.uint64(32)) | (0x7FFFFFFF - np.arange(n)).astype(
+            np.uint64
+        )
+        keys[rng.random(n) < 0.3] = 0
+        most = int(rng.integers(0, n + 3))
+        chosen = engine.upload(keys, np.uint64)
+        control._limit(chosen, n, most)
+        kept = np.sort(chosen.get())[::-1]
+        kept = kept[kept > 0]
+        expected = np.sort(keys[keys > 0])[::-1][:most]
+        assert np.array_equal(kept, expected)
+
+
+def strained(a=0.04, stretch=0.15):
+    points = patch.hexagons(a, Box((-1, -1), (2, 2))) + 0.1
+    points = points * [1 + stretch, 1 / (1 + stretch)]
+    return points[patch.BOX.contains(points)]
+
+
+def test_pairs_are_made_where_the_lattice_is_strained(engine):
+    """In turn: a generator in the longest edge, and two merged in their middle."""
+    h = 0.04 * H / A
+    sweep = Sweep(engine, strained(), h, 0.0, nuclei=2, theta=QUIET)
+    assert 2 <= sweep.new.inserted + sweep.new.deleted <= 4
+    assert abs(sweep.new.inserted - sweep.new.deleted) <= 1
+    edges = [
+        (sweep.points[i], sweep.points[j])
+        for i in range(sweep.n)
+        for j in sweep.neighbors(i)
+        if j > i
+    ]
+    middles = np.array([(p + q) / 2 for p, q in edges])
+    lengths = np.array([np.linalg.norm(p - q) for p, q in edges])
+    sites = []
+    for place, longest in [*((p, True) for p in sweep.born), *((p, False) for p in sweep.moved_to)]:
+        k = np.linalg.norm(middles - place, axis=1).argmin()
+        assert middles[k] == pytest.approx(place, abs=1e-12)
+        # Its site is one of its ends, all of whose edges are shorter (longer).
+        ends = [np.flatnonzero((sweep.points == p).all(axis=1))[0] for p in edges[k]]
+        around = [
+            lengths[
+                [
+                    np.array_equal(p, sweep.points[e]) or np.array_equal(q, sweep.points[e])
+                    for p, q in edges
+                ]
+            ]
+            for e in ends
+        ]
+        best = [(own.max() if longest else own.min()) for own in around]
+        assert any(lengths[k] == pytest.approx(b) for b in best)
+        sites.append(ends[0])
+    assert all((np.diff(sweep.host.starts)[s] == 6) for s in sites)
+    # The ends found here may be one ring off the sites.
+    assert sweep.rings_between(sites) > NUCLEUS_RINGS - 2
+    for i in sweep.deleted:
+        assert np.linalg.norm(sweep.moved_to - sweep.points[i], axis=1).min() < 0.04
+
+
+def test_no_pairs_in_an_unstrained_lattice(engine):
+    assert (
+        Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, theta=QUIET).new is None
+    )
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_repeats_bit_by_bit(ctx, real):
+    engine = patch.make_engine(ctx, real)
+    points = patch.random_points(700, 12).astype(real).astype(float)
+    used = PopulationControl(engine)
+    sweeps = [
+        Sweep(engine, points, 0.033, 20.0, control, nuclei=3) for control in (None, used, used)
+    ]
+    for sweep in sweeps[1:]:
+        assert sweep.new.inserted == sweeps[0].new.inserted > 3
+        assert np.array_equal(sweep.new.points.get(), sweeps[0].new.points.get())
+        assert np.array_equal(sweep.new.labels.get(), sweeps[0].new.labels.get())
+
+
+SPOTS = {(0.2, 0.2): 0.9, (0.8, 0.2): 0.8, (0.2, 0.6): 0.93, (0.8, 0.6): 0.95}
+
+
+class TestMend:
+    """Cells of poor quality are deleted or split, the worst first."""
+
+    def lattice(self, spots):
+        """A lattice with a dislocation, of quality 1 but at the inner cells nearest to `spots` {place: quality}."""
+        points = dislocated(0.025, 0.0)
+        quality, sites = np.ones(len(points)), []
+        for place, q in spots.items():
+            i = np.linalg.norm(points - place, axis=1).argmin()
+            quality[i] = q
+            sites.append(i)
+        return points, quality, sites
+
+    @pytest.mark.parametrize("split", [False, True])
+    def test_those_below_the_bound_are_mended(self, engine, split):
+        points, quality, sites = self.lattice(SPOTS)
+        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, split=split, share=0.1)
+        changed, others = (sweep.moved, sweep.deleted) if split else (sweep.deleted, sweep.moved)
+        assert sorted(changed) == sorted(sites[:3])
+        assert len(others) == 0
+        for i, there in zip(sweep.moved, sweep.moved_to, strict=True):
+            part = np.sqrt(sweep.host.volumes[i]) / 4
+            centroid = points[i] + sweep.host.offsets[i]
+            assert np.linalg.norm(there - centroid) == pytest.approx(part, rel=1e-6)
+
+    @pytest.mark.parametrize("split", [False, True])
+    def test_five_go_and_seven_are_split_either_way(self, engine, split):
+        points, quality, _ = self.lattice({})
+        five, seven = the_pair(Sweep(engine, points, 0.02, 0.0, theta=QUIET))
+        for i in (five, seven):
+            poor = quality.copy()
+            poor[i] = 0.9
+            sweep = Sweep(
+                engine, points, 0.02, 0.0, quality=poor, flaw=0.06, split=split, share=0.1
+            )
+            assert (sweep.deleted.tolist(), sweep.moved.tolist()) == (
+                ([five], []) if i == five else ([], [seven])
+            )
+
+    def test_the_worst_come_first_and_no_more_than_a_share(self, engine):
+        points, quality, sites = self.lattice(SPOTS)
+        n = len(points)
+        for most in (1, 2):
+            sweep = Sweep(
+                engine, points, 0.02, 0.0, quality=quality, flaw=0.01, share=(most + 0.5) / n
+            )
+            assert sorted(sweep.deleted) == sorted([sites[1], sites[0]][:most])
+        assert n * MENDED_SHARE > 1
+        assert (
+            Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.01, share=0.9 / n).new is None
+        )
+
+    def test_good_meshes_and_walls_are_left_alone(self, engine):
+        points, quality, _ = self.lattice({})
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0).new is None
+        host = patch.fetch(patch.tessellate(engine, points))
+        quality[host.owners[host.neighbors < 0]] = 0.5
+        assert Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0).new is None
+
+    def test_four_sides_go_and_eight_are_split_whatever_their_quality(self, engine):
+        """Those that are far from all others; every other one has such a one within a few rings."""
+        points = patch.relaxed_points(600, 71, steps=1)
+        sweep = Sweep(engine, points, 0.04, 0.0, quality=np.ones(600), flaw=0.5, share=1.0)
+        sides = np.diff(sweep.host.starts)
+        inner = np.ones(600, bool)
+        inner[sweep.host.owners[sweep.host.neighbors < 0]] = False
+        few, many = (set(np.flatnonzero(inner & odd)) for odd in (sides < 5, sides > 7))
+        assert set(sweep.deleted) <= few
+        assert set(sweep.moved) <= many
+        assert len(sweep.deleted) > 2 < len(sweep.moved)
+        sites = {*sweep.deleted, *sweep.moved}
+        assert {4, 8} <= set(sides[list(sites)].tolist())
+        assert sweep.rings_between(list(sites)) > PAIR_RINGS
+
+    def test_generators_that_stay(self, engine):
+        """Neither they nor their neighbors are touched."""
+        points, quality, sites = self.lattice(SPOTS)
+        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0)
+        beside = min(j for j in sweep.neighbors(sites[1]) if j >= 0)
+        for held in (sites[1], beside):
+            fixed = int(sweep.labels[held]) + 1
+            again = Sweep(
+                engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0, fixed=fixed
+            )
+            still = again.labels < fixed
+            free = [
+                i
+                for i in sites[:3]
+                if not still[[i, *(j for j in again.neighbors(i) if j >= 0)]].any()
+            ]
+            assert sites[1] not in free
+            assert sorted([] if again.new is None else again.deleted) == sorted(free)

@@ -1,0 +1,247 @@
+"""What one step does, against the same formulas in dense NumPy algebra."""
+
+import numpy as np
+import pytest
+
+from clvoro import sizing
+from clvoro.adaptation.methods import (
+    PUBLISHED,
+    ProjectedMethod,
+    PublishedMethod,
+    Relaxation,
+    WeightedMethod,
+    make_method,
+)
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import Mesh
+from clvoro.errors import SizeFieldError
+from clvoro.sizing import Sizing
+from tests.reference import graphs, patch
+
+N = 150
+FIELD = sizing.Distance(sizing.Circle((0.4, 0.35), 0.12), 0.03, slope=0.3)
+
+
+@pytest.fixture(scope="module")
+def stages(ctx):
+    return Stages(patch.make_engine(ctx))
+
+
+def make_mesh(stages, points=None, field=FIELD):
+    points = patch.relaxed_points(N, 5005, steps=2) if points is None else points
+    engine = stages.engine
+    mesh = Mesh(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points))
+    return mesh, patch.fetch(mesh.t)
+
+
+def gradient(host, psi):
+    """grad psi as the sum over faces, walls without flux."""
+    out = np.zeros((host.n, 2))
+    inner = host.neighbors >= 0
+    i, j = host.owners[inner], host.neighbors[inner]
+    distance = np.linalg.norm(host.points[j] - host.points[i], axis=1)
+    flux = host.face_measures[inner] / distance * (psi[j] - psi[i]) / host.volumes[i]
+    np.add.at(out, i, flux[:, None] * host.face_centroids[inner])
+    return out
+
+
+def solve(host, rhs, density=None):
+    A = graphs.laplacian_matrix(
+        host.points, host.starts, host.neighbors, host.face_measures, density
+    )
+    return np.linalg.lstsq(A.toarray(), rhs, rcond=None)[0]
+
+
+def test_published_displacements(stages):
+    """Lloyd: centroid - x. Poisson: -div grad psi = e, its volume-weighted mean removed, u = alpha grad psi."""
+    mesh, host = make_mesh(stages)
+    method = PublishedMethod(
+        Relaxation(alpha=1.7, k=0.4, tolerance=1e-12), lloyd=True, poisson=True
+    )
+    solution = method.displace(mesh)
+    assert solution.converged
+    assert mesh.lloyd.get() == pytest.approx(host.offsets)
+    h = FIELD(host.points)
+    length = np.sqrt(host.volumes)
+    e = (length - h) / np.minimum(length, h)
+    psi = solve(host, host.volumes * (e - np.average(e, weights=host.volumes)))
+    u = gradient(host, psi)
+    speed = np.linalg.norm(u, axis=1) / h
+    alpha = min(1.7, 0.4 / speed.max())
+    assert alpha < 1.7
+    assert mesh.correction.get() == pytest.approx(alpha * u, rel=1e-7, abs=1e-10)
+    assert mesh.correction_speed.get() == pytest.approx(alpha * speed, rel=1e-7)
+    assert mesh.correction_speed.get().max() == pytest.approx(0.4)
+    assert mesh.lloyd_speed.get() == pytest.approx(np.linalg.norm(host.offsets, axis=1) / h)
+
+
+def test_alpha_is_the_dimension_by_default(stages):
+    """k so large that it does not bind."""
+    mesh, _ = make_mesh(stages)
+    free = PublishedMethod(Relaxation(alpha=1.0, k=1e9), lloyd=False, poisson=True)
+    free.displace(mesh)
+    one = mesh.correction.get()
+    make_method("poisson", Relaxation(k=1e9)).displace(mesh)
+    # The second solve starts from the first one's potential.
+    assert mesh.correction.get() == pytest.approx(2 * one, rel=1e-2, abs=1e-3 * np.abs(one).max())
+
+
+@pytest.mark.parametrize(
+    ("name", "a", "b"), [("lloyd", 1, 0), ("poisson", 0, 1), ("coupled", 1, 1)]
+)
+def test_published_moves(stages, name, a, b):
+    mesh, host = make_mesh(stages)
+    method = make_method(name, Relaxation(k=0.3))
+    method.displace(mesh)
+    expected = host.points + a * mesh.lloyd.get() + b * mesh.correction.get()
+    inside = patch.BOX.contains(expected)
+    assert inside.sum() > N - 10
+    method.move(mesh)
+    assert mesh.points.get()[inside] == pytest.approx(expected[inside], abs=1e-15)
+    assert patch.BOX.contains(mesh.points.get()).all()
+
+
+def test_weighted_displacements(stages):
+    """-div(rho grad psi) = rho (r - mean r), r = log(V / h^2), u = grad psi, rho = h^-2."""
+    mesh, host = make_mesh(stages)
+    solution = WeightedMethod(tolerance=1e-12).displace(mesh)
+    assert solution.converged
+    h = FIELD(host.points)
+    rho, r = h**-2, np.log(host.volumes / h**2)
+    weight = host.volumes * rho
+    psi = solve(host, weight * (r - np.average(r, weights=weight)), rho)
+    assert mesh.correction.get() == pytest.approx(gradient(host, psi), rel=1e-7, abs=1e-9)
+    w = stages.density.evaluate(mesh.t, mesh.h)
+    assert np.array_equal(mesh.lloyd.get(), w.lloyd.get())
+
+
+@pytest.mark.parametrize("cautious", [True, False])
+@pytest.mark.parametrize("poisson", [True, False])
+def test_weighted_moves_at_most_k(stages, poisson, cautious):
+    """Each generator is clipped on its own, at k h or, if cautious, at k times the lesser of h and L."""
+    mesh, host = make_mesh(stages, patch.random_points(N, 11))
+    method = WeightedMethod(k=0.25, poisson=poisson, cautious=cautious)
+    method.displace(mesh)
+    d = mesh.lloyd.get() + poisson * mesh.correction.get()
+    h = FIELD(host.points)
+    longest = 0.25 * (np.minimum(h, np.sqrt(host.volumes)) if cautious else h)
+    length = np.linalg.norm(d, axis=1)
+    assert 3 < (length > longest).sum() < N
+    expected = host.points + d * np.minimum(1, longest / length)[:, None]
+    inside = patch.BOX.contains(expected)
+    assert inside.sum() > N - 10
+    method.move(mesh)
+    assert mesh.points.get()[inside] == pytest.approx(expected[inside], abs=1e-13)
+
+
+@pytest.mark.parametrize("name", [*PUBLISHED, "glide", "polish"])
+def test_a_mesh_that_is_right_stays(stages, name):
+    """Squares of the size asked for: centroids, sizes and shapes leave nothing to do, walls included."""
+    xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    points = (xy + 0.5) / 8
+    mesh, host = make_mesh(stages, points, sizing.Constant(0.125))
+    method = {
+        "glide": ProjectedMethod("lloyd", 1.3, 0.7),
+        "polish": ProjectedMethod("shape", 0.0, eps=0.3, lenience=0.03, bound=0.02, aim=0.002),
+    }.get(name) or make_method(name, Relaxation())
+    for _ in range(5):
+        method.displace(mesh)
+        method.move(mesh)
+        mesh.update()
+    assert np.abs(mesh.points.get() - host.points).max() < 1e-12
+
+
+def test_projected_displacements(stages):
+    """Lloyd's displacement times the relaxation, with a share of the last one, is what gets projected."""
+    mesh, _ = make_mesh(stages)
+    velocity = np.random.default_rng(9).normal(0, 0.003, (N, 2))
+    mesh.velocity.set(velocity)
+    w = stages.density.evaluate(mesh.t, mesh.h)
+    lloyd, r = w.lloyd.get(), w.excess.get()
+    stages.density.remove_mean(w)
+    expected = 1.3 * lloyd + 0.6 * velocity
+    correction = stages.engine.empty((N, 2))
+    stages.projection.project(
+        mesh.t, mesh.reach, w.gradient, w.excess, stages.engine.upload(expected), correction, mesh.quality,
+        eps=0.2, lenience=0.1, bound=0.3, max_iterations=25, tolerance=1e-2,
+    )  # fmt: skip
+    ProjectedMethod("lloyd", 1.3, 0.6, eps=0.2, lenience=0.1, bound=0.3, iterations=25).displace(
+        mesh
+    )
+    assert mesh.lloyd.get() == pytest.approx(expected, abs=1e-15)
+    assert np.array_equal(mesh.correction.get(), correction.get())
+    assert np.abs(r).max() > 0.1
+
+
+def test_penalty_is_steered_to_the_error_aimed_at(stages):
+    """Lower while the error is above the aim, higher below it, by a bounded factor, within bounds."""
+    mesh, host = make_mesh(stages)
+    h = FIELD(host.points)
+    error = np.abs(np.log(np.sqrt(host.volumes) / h)).mean()
+    assert mesh.mean_log_error(stages.density.weigh(mesh.t, mesh.h)) == pytest.approx(
+        error, rel=1e-9
+    )
+    for aim, factor in (
+        (error / 1.2, 1 / 1.2),
+        (error / 50, 0.75),
+        (1.1 * error, 1.1),
+        (50 * error, 1.33),
+    ):
+        method = ProjectedMethod(eps=0.1, aim=aim)
+        for _ in range(3):
+            method.displace(mesh)
+        assert method.eps == 0.1, "the first steps only settle in"
+        method.displace(mesh)
+        assert method.eps == pytest.approx(0.1 * factor, rel=1e-6)
+        for _ in range(40):
+            method.displace(mesh)
+        assert method.eps == pytest.approx({True: 3.0, False: 1e-3}[aim > error])
+
+
+def test_mean_log_error_of_cells_that_are_right(stages):
+    """No division by an error of nothing."""
+    mesh, _ = make_mesh(stages, np.array([[0.5, 0.375]]), sizing.Constant(np.sqrt(0.75)))
+    method = ProjectedMethod("shape", aim=0.002)
+    for _ in range(6):
+        method.displace(mesh)
+    assert np.isfinite(method.eps)
+
+
+@pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
+def test_a_bad_size_is_named_as_the_field_has_it(stages, value):
+    """Also on a coarse level, where h is a multiple of the field's."""
+    field = sizing.Expression(f"x > 0.7 && y > 0.5 ? {value} : 0.05")
+    points = np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]])
+    engine = stages.engine
+    printed = {"0.0": "0", "0.0/0.0": "nan"}.get(value, value)
+    with pytest.raises(SizeFieldError, match=rf"is -?{printed} at \(0\.8, 0\.6\)"):
+        Mesh(
+            stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points), coarsening=8
+        )
+
+
+def test_a_bad_size_that_no_update_looked_at_is_found_by_the_next_assessment(stages):
+    engine, good = stages.engine, np.array([[0.2, 0.3], [0.6, 0.6], [0.5, 0.1]])
+    size = Sizing(engine, patch.BOX, sizing.Expression("x > 0.7 ? 0.0/0.0 : 0.05"))
+    mesh = Mesh(stages, patch.BOX, size, engine.upload(good), coarsening=4)
+    assert mesh.assess()["error"].magnitude > 0
+    mesh.points.set(np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]]))
+    with pytest.raises(SizeFieldError, match=r"nan at \(0\.8, 0\.6\)"):
+        mesh.update()
+    mesh.update(check=False)
+    with pytest.raises(SizeFieldError, match=r"nan at \(0\.8, 0\.6\)"):
+        mesh.assess()
+    mesh.points.set(good)
+    mesh.update(check=False)
+    assert mesh.assess()["error"].magnitude > 0
+
+
+def test_names():
+    for name in PUBLISHED:
+        method = make_method(name, Relaxation(k=0.7))
+        if name.startswith("weighted"):
+            assert isinstance(method, WeightedMethod)
+            assert (method.k, method.poisson) == (0.7, name == "weighted")
+        else:
+            assert isinstance(method, PublishedMethod)
+            assert (method.lloyd, method.poisson) == (name != "poisson", name != "lloyd")

@@ -1,0 +1,163 @@
+"""Error, quality, energy and changed neighbors against what their definitions say of reference cells."""
+
+import numpy as np
+import pytest
+
+from clvoro.adaptation.metric import Metric
+from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.device_diagram import Tessellation
+from tests.reference import diagrams as reference
+from tests.reference import patch
+
+N = 300
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def engine(ctx, request):
+    return patch.make_engine(ctx, request.param)
+
+
+def evaluate(engine, t, h):
+    out = [engine.empty(t.n) for _ in range(4)]
+    Metric(engine).evaluate(t, engine.upload(h), *out)
+    return [a.get() for a in out]
+
+
+def second_moment(polygon, x):
+    """Integral of |y - x|^2 over a polygon: exact over triangles by the middles of their sides."""
+    total = 0.0
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        area = ((a - x)[0] * (b - x)[1] - (a - x)[1] * (b - x)[0]) / 2
+        middles = np.array([(a + b) / 2, (a + x) / 2, (b + x) / 2])
+        total += area / 3 * ((middles - x) ** 2).sum()
+    return total
+
+
+def test_definitions(engine):
+    points = patch.random_points(N, 618).astype(engine.real).astype(float)
+    rng = np.random.default_rng(55)
+    h = np.exp(rng.uniform(np.log(0.01), np.log(0.3), N)).astype(engine.real).astype(float)
+    t = patch.tessellate(engine, points)
+    _, rough, *_ = evaluate(engine, t, h)
+    t = Cells(engine).measure_faces(patch.BOX, t)
+    error, quality, energy, reach = evaluate(engine, t, h)
+    # The sum of faces in single precision is right to half an eps, at work.
+    assert rough == pytest.approx(quality, rel=2 * float(np.finfo(np.float32).eps))
+    cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
+    # Areas and lengths of cells of 0.05 carry eps of the unit box, and relative errors so 20 to 400 eps.
+    close = {"rel": 2000 * float(np.finfo(engine.real).eps)}
+    both = set()
+    for i, cell in enumerate(cells):
+        length = np.sqrt(cell.area)
+        smaller = min(length, h[i])
+        both.add(length < h[i])
+        assert error[i] == pytest.approx(
+            (length - h[i]) / smaller, abs=close["rel"] * length / smaller
+        )
+        assert reach[i] == pytest.approx(smaller, **close)
+        perimeter = np.hypot(*(np.roll(cell.polygon, -1, axis=0) - cell.polygon).T).sum()
+        n = len(cell.neighbors)
+        expected = 4 * cell.area * n * np.tan(np.pi / n) / perimeter**2
+        assert quality[i] == pytest.approx(expected, **close)
+        assert energy[i] == pytest.approx(second_moment(cell.polygon, points[i]), **close)
+    assert both == {True, False}, "both branches of the error"
+
+
+def test_squares(engine):
+    """A square is as good as four sides allow, Q = 1; its energy is h^4 / 6."""
+    a = 0.125
+    xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    error, quality, energy, _ = evaluate(
+        engine, patch.tessellate(engine, (xy + 0.5) * a), np.full(48, a)
+    )
+    eps = float(np.finfo(engine.real).eps)
+    assert np.abs(error).max() < 16 * eps
+    assert np.abs(quality - 1).max() < 16 * eps
+    assert energy == pytest.approx(np.full(48, a**4 / 6), rel=64 * eps)
+
+
+def test_three_dimensions(ctx):
+    """Cuboids made by hand: kernels of one code base serve both dimensions."""
+    engine = patch.make_engine(ctx, dim=3)
+    rng = np.random.default_rng(12)
+    sides = rng.uniform(0.1, 0.4, (5, 3))
+    offsets = rng.uniform(-0.05, 0.05, (5, 3))
+    volumes = sides.prod(axis=1)
+    covariances = np.zeros((5, 6))  # xx, xy, xz, yy, yz, zz
+    covariances[:, [0, 3, 5]] = sides**2 / 12
+    faces = np.repeat(volumes[:, None] / sides, 2, axis=1)
+    h = np.array([0.1, 0.2, 0.3, 0.2, 0.5])
+    empty = engine.zeros(1)
+    t = Tessellation(
+        n=5, points=empty, starts=engine.upload(np.arange(6) * 6, np.int32), neighbors=empty,
+        face_measures=engine.upload(faces.ravel()), face_centroids=empty, volumes=engine.upload(volumes),
+        offsets=engine.upload(offsets), covariances=engine.upload(covariances),
+    )  # fmt: skip
+    error, quality, energy, _ = evaluate(engine, t, h)
+    length = np.cbrt(volumes)
+    assert error == pytest.approx((length - h) / np.minimum(length, h), rel=1e-13)
+    assert quality == pytest.approx(36 * np.pi * volumes**2 / faces.sum(axis=1) ** 3, rel=1e-13)
+    square = (offsets**2).sum(axis=1) + (sides**2).sum(axis=1) / 12
+    assert energy == pytest.approx(volumes * square, rel=1e-13)
+
+
+def neighbor_sets(t, labels):
+    host = patch.fetch(t)
+    return {
+        labels[i]: {
+            labels[j] if j >= 0 else j for j in host.neighbors[host.starts[i] : host.starts[i + 1]]
+        }
+        for i in range(t.n)
+    }
+
+
+def test_compare_neighbors(ctx):
+    engine = patch.make_engine(ctx)
+    metric, rng = Metric(engine), np.random.default_rng(717)
+    labels = rng.permutation(5 * N)[:N].astype(np.int32)  # any distinct names
+    points = patch.random_points(N, 31)
+    signatures, changed = engine.zeros(N, np.uint64), engine.empty(N)
+    ever = engine.upload(np.full(N, 0.25))
+
+    def compare(points, labels, first):
+        t = patch.tessellate(engine, points)
+        metric.compare_neighbors(
+            t, engine.upload(labels, np.int32), first, signatures, changed, ever
+        )
+        return neighbor_sets(t, labels), changed.get(), ever.get()
+
+    before, now, so_far = compare(points, labels, True)
+    assert not now.any()
+    assert not so_far.any(), "the first call starts anew"
+    past = np.zeros(N)
+    for amount in (0.0, 1e-3, 3e-3, 1e-2):
+        points = np.clip(points + rng.normal(0, amount, points.shape), 0.001, [0.999, 0.749])
+        after, now, so_far = compare(points, labels, False)
+        expected = np.array([before[name] != after[name] for name in labels])
+        assert np.array_equal(now, expected)
+        assert amount == 0 or 0 < expected.sum() < N
+        past = np.maximum(past, expected)
+        assert np.array_equal(so_far, past)
+        before = after
+
+
+def test_order_and_numbering_are_no_change(ctx):
+    """The same cells in another order, and so with other indices, keep their names and so their neighbors."""
+    engine = patch.make_engine(ctx)
+    metric, order = Metric(engine), np.random.default_rng(3).permutation(N)
+    points, labels = patch.random_points(N, 31), np.arange(N) + 7
+    signatures, changed, ever = engine.zeros(N, np.uint64), engine.empty(N), engine.zeros(N)
+    t = patch.tessellate(engine, points)
+    metric.compare_neighbors(t, engine.upload(labels, np.int32), True, signatures, changed, ever)
+    moved = engine.upload(signatures.get()[order], np.uint64)
+    t = patch.tessellate(engine, points[order])
+    metric.compare_neighbors(t, engine.upload(labels[order], np.int32), False, moved, changed, ever)
+    assert not changed.get().any()
+    metric.compare_neighbors(t, engine.upload(labels, np.int32), False, moved, changed, ever)
+    assert changed.get().all(), "other names are other neighbors"
+
+
+def test_scale_sizes(engine):
+    h = engine.upload(np.arange(1, 200) / 64)
+    Metric(engine).scale_sizes(0.5, h)
+    assert np.array_equal(h.get(), np.arange(1, 200).astype(engine.real) / 128)

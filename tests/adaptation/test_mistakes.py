@@ -1,0 +1,439 @@
+"""What a newcomer may pass by mistake: each ends right, or in an error that says what to write instead."""
+
+import copy
+import dataclasses
+import json
+import pickle
+import re
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+import shapely
+from scipy.spatial import KDTree
+
+import clvoro
+from clvoro import sizing
+from clvoro.adaptation.sampling.quadrature import DensityTree
+from clvoro.adaptation.sampling.start import count_cells
+from clvoro.cli import command as cli
+from clvoro.errors import ClvoroError, InputError, InputTypeError, SizeFieldError
+
+BOX = clvoro.Box((0, 0), (1, 1))
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+TRIANGLE = [(0.2, 0.2), (0.3, 0.2), (0.3, 0.3)]
+POINTS = np.random.default_rng(5).random((30, 2))
+
+
+class Foreign:
+    """An array of another library: it can be converted, or says why not."""
+
+    def __init__(self, values, refuses=False):
+        self.values, self.refuses = np.asarray(values), refuses
+
+    def __array__(self, dtype=None, copy=None):
+        if self.refuses:
+            raise RuntimeError("call detach() first")
+        return np.asarray(self.values, dtype)
+
+
+class Geographic:
+    """What can be written as GeoJSON, as geopandas and its kin have it."""
+
+    @property
+    def __geo_interface__(self):
+        return {"type": "Polygon", "coordinates": [[*SQUARE, SQUARE[0]]]}
+
+
+@pytest.fixture(scope="module")
+def adapter(ctx):
+    return clvoro.Adapter(ctx)
+
+
+@pytest.fixture(scope="module")
+def result(adapter):
+    return adapter.run(BOX, 0.2, points=POINTS, method="lloyd", max_steps=0)
+
+
+def refused(call, *parts, kind=ClvoroError):
+    with pytest.raises(kind) as caught:
+        call()
+    for part in parts:
+        assert part in str(caught.value)
+
+
+# Size fields.
+
+
+@pytest.mark.parametrize(
+    ("size", "kind", "parts"),
+    [
+        (lambda x, y: 0.1 + x * y, InputTypeError, ("(x, y)", "lambda points: h(points[:, 0]")),
+        (sizing.Distance, InputTypeError, ("class Distance", "one argument")),
+        (lambda p: 0.1 if p[:, 0] < 0.5 else 0.2, InputError, ("vectorized", "numpy.where")),
+        (lambda p: float(p[:, 0]), InputTypeError, ("vectorized", "numpy.sqrt")),
+        (lambda p: 0.1, InputError, ("shape ()", "the number itself")),
+        (lambda p: 0.1 + p[:, :1], InputError, ("sizes[:, 0]",)),
+        (lambda p: 0.1 + p[0], InputError, ("points[:, 0] are all x",)),
+        (lambda p: None, InputTypeError, ("returned None",)),
+        (lambda p: np.ma.masked_less(p[:, 0], 0.5), SizeFieldError, ("masked sizes", "filled")),
+        (lambda p: Foreign(p[:, 0], refuses=True), InputTypeError, ("Foreign", "call detach()")),
+        (POINTS, InputTypeError, ("points=",)),
+        (sizing.Circle((0.5, 0.5), 0.1), InputTypeError, ("sizing.Distance(shape",)),
+        (BOX, InputTypeError, ("sizing.Distance(shape",)),
+    ],
+)  # fmt: skip
+def test_sizes(adapter, size, kind, parts):
+    refused(lambda: adapter.run(BOX, size), *parts, kind=kind)
+
+
+BAD_SIZES = {
+    "negative": lambda p: p[:, 0] - 0.5,
+    "zero": lambda p: 0 * p[:, 0],
+    "tiny": lambda p: 1e-200 + 0 * p[:, 0],
+    "inf": lambda p: np.full(len(p), np.inf),
+    "huge": lambda p: np.full(len(p), 1e30),
+}
+
+
+@pytest.mark.parametrize("edges", [(1e6, 1e6, 1e6), (1e6, 1), (2e-3, 3e-3)])
+@pytest.mark.parametrize("what", list(BAD_SIZES))
+def test_bounds_that_errors_propose_fit_the_domain(adapter, what, edges):
+    box, field = clvoro.Box((0,) * len(edges), edges), sizing.Function(BAD_SIZES[what])
+    by_run = partial(adapter.run, box, field)
+    for call in (by_run,) if what == "huge" else (by_run, partial(DensityTree, field, box)):
+        with pytest.raises(SizeFieldError) as caught:
+            call()
+        bound = re.search(r"clvoro\.sizing\.(m\w+)\(field, ([^)]+)\)", str(caught.value))
+        assert bound, caught.value
+        bounded = getattr(sizing, bound[1])(field, float(bound[2]))
+        assert 0 < count_cells(bounded, box) <= 1e6 * (1 + 1e-9)  # so says the message; sums round
+
+
+def test_sizes_that_are_no_numbers(adapter):
+    """Of which the larger and the smaller one with a bound are none."""
+    for field, remedy in (
+        (lambda p: np.nan * p[:, 0], "numpy.nan_to_num"),
+        (sizing.Expression("sqrt(x - 1)"), "fmax(x, 0)"),
+    ):
+        for call in (
+            partial(adapter.run, BOX, field),
+            partial(DensityTree, sizing.as_field(field), BOX),
+        ):
+            with pytest.raises(SizeFieldError, match="is nan at") as caught:
+                call()
+            assert remedy in str(caught.value)
+            assert "mum(field" not in str(caught.value)
+
+
+def test_arguments_in_the_wrong_order(adapter):
+    refused(lambda: adapter.run(0.1, BOX), "exchange them", kind=InputTypeError)
+    refused(lambda: sizing.Distance(0.1, sizing.Circle((0, 0), 1), growth=1.2), "Distance(Circle(")
+    refused(lambda: clvoro.Box((0, 2.5), (0, 1.5)), "Box((0, 0), (2.5, 1.5))")
+
+
+def test_errors_of_size_functions_are_told_with_their_cause(adapter):
+    with pytest.raises(InputTypeError) as caught:
+        adapter.run(BOX, lambda p: float(p[:, 0]))
+    assert isinstance(caught.value.__cause__, TypeError)
+    # What says nothing of shapes is not ours to judge.
+    with pytest.raises(KeyError):
+        adapter.run(BOX, lambda p: {}["h"])
+
+
+def test_a_size_function_may_change_its_argument(adapter):
+    def spoils(points):
+        points *= 2
+        return 0.1 + 0.05 * points[:, 0]
+
+    options = {"points": POINTS, "method": "weighted", "max_steps": 3, "tol": 0}
+    spoilt = adapter.run(BOX, spoils, **options)
+    clean = adapter.run(BOX, lambda p: 0.1 + 0.05 * (2 * p)[:, 0], **options)
+    assert np.array_equal(spoilt.points, clean.points)
+
+
+def test_functions_of_other_kinds_are_taken(adapter):
+    def given(points, scale=0.2):
+        return scale + 0 * points[:, 0]
+
+    for size in (given, lambda *points: given(*points), lambda p: Foreign(given(p)), np.vectorize(
+        lambda p: 0.2, signature="(d)->()"
+    )):  # fmt: skip
+        made = adapter.run(BOX, size, points=POINTS, method="lloyd", max_steps=0)
+        assert (made.size == 0.2).all()
+
+
+@pytest.mark.parametrize(
+    ("combine", "part"),
+    [
+        (lambda f: f - f, "no -"), (lambda f: 1 - f, "no -"), (lambda f: f - 0.1, "no -"), (lambda f: -f, "no -"),
+        (lambda f: f**2, "no **"), (lambda f: min(f, 0.1), "minimum("), (lambda f: max(0.1, f), "minimum("),
+        (lambda f: np.array([0.1]) - f, "no -"),
+    ],
+)  # fmt: skip
+def test_arithmetic_that_size_fields_do_not_have(combine, part):
+    for field in (sizing.Constant(0.1), sizing.Expression("0.1 + x"), sizing.Function(np.sum)):
+        refused(lambda f=field: combine(f), repr(field), part, kind=InputTypeError)
+
+
+def test_resolutions_of_graded_fields(adapter):
+    field = sizing.Graded(lambda p: 0.1 + p[:, 0], 1.2, resolution=2**20)
+    refused(lambda: adapter.run(BOX, field), "1048576", "2^31", kind=InputError)
+
+
+# Generators and other arguments of a run.
+
+
+@pytest.mark.parametrize(
+    ("points", "kind", "parts"),
+    [
+        (POINTS.T, InputError, ("array.T",)),
+        (np.hstack([POINTS, POINTS]), InputError, ("array[:, :2]",)),
+        (POINTS[:, :1], InputError, ("2 coordinates",)),
+        (POINTS[:, 0], InputError, ("column_stack",)),
+        (POINTS @ (1, 1j), InputTypeError, ("z.real, z.imag",)),
+        (np.array([(1, 2)], dtype=[("x", float), ("y", float)]), InputTypeError, ("structured_to_",)),
+        ([], InputError, ("at least one generator",)),
+        (iter(POINTS), InputTypeError, ("expected an array",)),
+        ({"x": 1, "y": 2}, InputTypeError, ("points is a dict",)),
+        (None, InputTypeError, ("points is a NoneType",)),
+        (Foreign(POINTS, refuses=True), InputTypeError, ("call detach() first",)),
+    ],
+)  # fmt: skip
+def test_points(adapter, points, kind, parts):
+    refused(lambda: adapter.diagram(BOX, points), *parts, kind=kind)
+
+
+def test_meshes_in_the_place_of_points(adapter, result):
+    for mesh in (result, result.diagram):
+        refused(lambda mesh=mesh: adapter.run(BOX, 0.2, points=mesh), "points.points")
+
+
+@pytest.mark.parametrize("make", [np.ndarray.tolist, Foreign, np.asfortranarray, np.ma.array])
+def test_points_of_other_kinds_are_taken(adapter, make):
+    assert np.array_equal(adapter.diagram(BOX, make(POINTS)).points, POINTS)
+
+
+def test_other_arguments(adapter):
+    refused(lambda: adapter.run(BOX, 0.2, callback=lambda a, b: None), "one argument, a row")
+    refused(lambda: adapter.run(BOX, 0.2, layers=0.01), "clvoro.Layers(0.01)")
+    layers = clvoro.Layers(0.02, edges=[2])
+    refused(lambda: adapter.run(BOX, 0.1, layers=layers, n_cells=20), "layers take", "n_cells out")
+
+
+# Domains.
+
+
+@pytest.mark.parametrize(
+    ("make", "parts"),
+    [
+        (lambda: clvoro.Polygon("POLYGON ((0 0, 1 0, 1 1, 0 0))"), ("from_wkt",)),
+        (lambda: clvoro.Polygon("lake.geojson"), ("from_geojson",)),
+        (lambda: clvoro.Polygon(shapely.Polygon(SQUARE)), ("from_shapely",)),
+        (lambda: clvoro.Polygon({"type": "Polygon"}), ("from_geojson",)),
+        (lambda: clvoro.Polygon(Geographic()), ("from_geojson",)),
+        (lambda: clvoro.Polygon(np.array([*SQUARE, (0, 0.5)], float).T), ("array.T",)),
+        (lambda: clvoro.Polygon([(*p, 1) for p in SQUARE]), ("array[:, :2]",)),
+        (lambda: clvoro.Polygon([0, 1, 1, 0], [0, 0, 1, 1]), ("column_stack",)),
+        (lambda: clvoro.Polygon([SQUARE, TRIANGLE]), ("rings[0], rings[1:]",)),
+        (lambda: clvoro.Polygon([SQUARE, SQUARE]), ("rings[0], rings[1:]",)),
+        (lambda: clvoro.Polygon(SQUARE, TRIANGLE), ("[ring]",)),
+        (lambda: clvoro.Polygon(np.ma.masked_equal(np.array(SQUARE), 1)), ("masked",)),
+        (lambda: clvoro.Polygon.from_shapely([shapely.Polygon(SQUARE)]), ("union_all",)),
+        (lambda: clvoro.Polygon.from_pieces([[SQUARE], [SQUARE]]), ("piece 1", "once more")),
+        (lambda: clvoro.Polygon(SQUARE).boundary([]), ("at least one",)),
+        (lambda: clvoro.Polygon.from_geojson({"type": "Point"}), ("leave others out",)),
+    ],
+)  # fmt: skip
+def test_polygons(make, parts):
+    refused(make, *parts)
+
+
+@pytest.mark.parametrize("domain", [BOX, clvoro.Polygon(SQUARE)])
+def test_places_in_domains(domain):
+    for points in (
+        [(0.5, 0.5), (2, 0)],
+        Foreign([(0.5, 0.5), (2, 0)]),
+        np.array([(0.5, 0.5), (2, 0)], np.float32),
+    ):
+        assert domain.contains(points).tolist() == [True, False]
+    assert domain.contains([(np.nan, 0)]).tolist() == [False]
+    assert domain.contains([]).shape == (0,)
+    refused(
+        lambda: domain.contains((0.5, 0.5)), "points has shape (2,)", "[point]", kind=InputError
+    )
+    refused(lambda: domain.contains(np.zeros((3, 4, 2))), "shape (3, 4, 2)", kind=InputError)
+    refused(lambda: domain.contains("in"), "points is a str", kind=InputTypeError)
+
+
+def test_polygons_of_other_kinds_are_taken(tmp_path):
+    square = clvoro.Polygon(SQUARE)
+    assert clvoro.Polygon.from_geojson(Geographic()) == square
+    assert clvoro.Polygon.from_geojson(shapely.Polygon(SQUARE)) == square
+    assert clvoro.Polygon(Foreign(SQUARE)) == square
+    marked = tmp_path / "marked.geojson"  # by a byte order mark
+    marked.write_text(json.dumps(Geographic().__geo_interface__), "utf-8-sig")
+    assert clvoro.Polygon.from_geojson(marked) == square
+
+
+# Files and pictures.
+
+
+@pytest.mark.parametrize("path", [3, None, object(), "a\0.vtu"])
+def test_paths(adapter, result, path):
+    refused(lambda: result.save(path), "name of a file")
+    refused(lambda: clvoro.load(path), "name of a file")
+    if path is not None:
+        refused(lambda: adapter.run(BOX, 0.2, checkpoint=path), "name of a file")
+        refused(lambda: adapter.run(BOX, 0.2, resume=path), "name of a file")
+
+
+def test_versions_of_files(result, tmp_path):
+    result.save(tmp_path / "a.npz")
+    members = dict(np.load(tmp_path / "a.npz"))
+    for version, remedy in ((99, "newer clvoro"), (0, "expected 1 to 1")):
+        np.savez(tmp_path / "b.npz", **{**members, "version": np.array(version)})
+        refused(lambda: clvoro.load(tmp_path / "b.npz"), remedy, kind=InputError)
+
+
+def test_names_of_arrays(adapter, result):
+    with pytest.raises(AttributeError, match="a Diagram has no 'areas'; it has points, volumes, "):
+        _ = result.diagram.areas
+    with pytest.raises(
+        AttributeError, match=r"face_vertices: a diagram in 2D has none; it has .*cell_vertices$"
+    ):
+        _ = result.diagram.face_vertices
+    solid = adapter.diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), [(0.5, 0.5, 0.5)])
+    with pytest.raises(
+        AttributeError, match=r"cell_vertices: a diagram in 3D has none; it has .*face_vertices$"
+    ):
+        _ = solid.cell_vertices
+    assert not hasattr(copy.copy(result.diagram), "_cells")
+
+
+def test_arrays_are_read_only(result, tmp_path):
+    """One assignment would spoil the points of result and diagram, beside which the others stay as they were."""
+    result.save(tmp_path / "a.npz")
+    result.save(tmp_path / "a.vtu")
+    assert result.points is result.diagram.points
+    again = pickle.loads(pickle.dumps(result))
+    assert again.points is again.diagram.points
+    loaded = clvoro.load(tmp_path / "a.npz"), clvoro.load(tmp_path / "a.vtu")
+    replaced = dataclasses.replace(result, error=np.zeros(len(POINTS)))
+    for mesh in (result, again, copy.deepcopy(result), copy.copy(result), replaced, *loaded):
+        diagram = mesh.diagram
+        arrays = {name: getattr(diagram, name) for name in dir(diagram) if name in diagram._NAMES}
+        arrays |= {k: a for k, a in vars(mesh).items() if isinstance(a, np.ndarray)}
+        arrays |= {} if mesh.final is None else vars(mesh.final)
+        assert {"points", "volumes", "shifts", "error", "history"} <= set(arrays)
+        for name, array in arrays.items():
+            assert not array.flags.writeable, name
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = 0
+    given = POINTS.copy()
+    diagram = clvoro.Diagram(BOX, {"points": given})
+    given[0] = 0.5  # the caller's own is left alone
+    assert not diagram.points.flags.writeable
+    assert result.error.copy().flags.writeable
+
+
+def test_colors(result):
+    refused(lambda: result.plot(result.error), "expected one of error", kind=InputError)
+
+
+def test_pictures_without_matplotlib(result, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in [name for name in sys.modules if name.startswith("clvoro.plotting")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr(clvoro, "report", raising=False)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    refused(result.plot, "pip install 'clvoro[plot]'")
+
+
+# Cases.
+
+CASE = """
+[domain]
+lower = [0, 0]
+upper = [1, 1]
+[size]
+kind = "constant"
+value = 0.3
+[run]
+effort = "fast"
+max_steps = 1
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (CASE + "[layers]\nheight = 0.01\n", ("layers", "double brackets")),
+        (CASE.replace("constant", "expression").replace("value = 0.3", 'expression = "0.1 + x^2"'), ("pow(a, b)",)),
+    ],
+)  # fmt: skip
+def test_cases(tmp_path, monkeypatch, capsys, text, parts):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(text)
+    assert cli.main(["run", "mine.toml"]) == cli.BAD_INPUT
+    error = capsys.readouterr().err
+    for part in parts:
+        assert part in error
+
+
+def test_cases_from_other_editors(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(CASE, "utf-8-sig")
+    assert cli.main(["run", "mine.toml", "--no-report", "--quiet"]) == cli.OK
+
+
+def test_no_method(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(CASE)
+    assert cli.main(["run", "mine.toml", "--method", ""]) == cli.BAD_INPUT
+    assert "method is ''" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
+def test_generators_that_are_too_close_are_named_by_their_place(ctx, periodic, real):
+    """In the domain's units; two roundings apart they have the same bisector with those far away. In the plane they are
+    told apart all the same."""
+    box = clvoro.Box((0,) * 3, (4,) * 3, periodic=periodic)
+    points = np.random.default_rng(4).random((300, 3)) * 4
+    step = 2 * float(np.spacing(np.asarray(2.75, real)))
+    points[100:125] = 2.75
+    points[100:125, :2] += step * np.stack(np.meshgrid(range(5), range(5)), axis=-1).reshape(-1, 2)
+    with pytest.raises(InputError) as refused:
+        clvoro.Adapter(ctx, real).diagram(box, points)
+    said = str(refused.value)
+    place = re.search(r"generators at \[(.*)\], (\S+) apart, are too close", said)
+    assert place, said
+    # Printed with eight digits after the point.
+    assert np.array(place[1].split(), float) == pytest.approx(np.full(3, 2.75), abs=4 * step + 1e-8)
+    assert place[2] == f"{step:.3g}"
+    assert ("or use dtype='float64'" in said) == (real == "float32")
+
+
+def test_the_closest_generators_are_named_whichever_cell_shows_it(ctx):
+    """In space a cell far from a lattice of some roundings' width may be the first that cannot be cut by it."""
+    lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
+    cluster = 0.6875 + 2.0**-52 * lattice
+    points = np.concatenate([cluster, np.random.default_rng(4).random((40, 3))])
+    least = KDTree(points).query(points, k=2)[0][:, 1].min()
+    with pytest.raises(InputError, match="too close") as refused:
+        clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), points)
+    assert f", {least:.3g} apart" in str(refused.value)
+
+
+def test_slab_too_thin_for_the_precision_is_said_to_be_thin(ctx):
+    """Its generators are far from each other, seen from outside: they were told to be too close."""
+    slab = clvoro.Box((0, 0, 0), (1e-6, 1, 1))
+    points = np.random.default_rng(1).random((200, 3)) * slab.extent
+    with pytest.raises(
+        InputError, match=r"1e-06 thin.*use dtype='float64', or give it a thickness"
+    ):
+        clvoro.Adapter(ctx, "float32").diagram(slab, points)
+    assert clvoro.Adapter(ctx).diagram(slab, points).check()

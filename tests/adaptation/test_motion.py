@@ -1,0 +1,154 @@
+"""The correction's displacement, its relaxation and the move itself against their formulas in NumPy."""
+
+import numpy as np
+import pytest
+
+from clvoro.adaptation.motion import Motion
+from clvoro.geometry.box import Box
+from clvoro.opencl.primitives import Summaries
+from tests.reference import patch
+
+N = 250
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def engine(ctx, request):
+    return patch.make_engine(ctx, request.param)
+
+
+@pytest.fixture(scope="module")
+def t(engine):
+    return patch.tessellate(engine, patch.random_points(N, 904))
+
+
+def follow(engine, t, psi):
+    u = engine.empty((t.n, 2))
+    Motion(engine).follow_potential(t, engine.upload(psi), u)
+    return u.get()
+
+
+def at_walls(host):
+    wall = np.zeros(host.n, bool)
+    wall[host.owners[host.neighbors < 0]] = True
+    return wall
+
+
+def test_gradient_of_a_linear_potential(engine, t):
+    host, slope = patch.fetch(t), np.array([0.7, -1.3])
+    u = follow(engine, t, 5 + host.points.astype(float) @ slope)
+    closed = ~at_walls(host)
+    assert 100 < closed.sum() < N
+    # Differences of psi (about 5) over distances that go down to 0.003; what a face adds, a few times the gradient in a
+    # cell that is not round, rounds as measures and centroids do.
+    rounding = 4000 * np.finfo(engine.real).eps + 8 * np.finfo(engine.face).eps
+    assert np.abs(u[closed] - slope).max() < rounding
+    assert np.abs(u[~closed] - slope).max() > 0.1, "a wall lets no flux through"
+
+
+def test_gradient_is_the_sum_over_faces(ctx):
+    engine = patch.make_engine(ctx)
+    t = patch.tessellate(engine, patch.random_points(N, 905))
+    host, rng = patch.fetch(t), np.random.default_rng(41)
+    psi = rng.normal(size=N)
+    u = follow(engine, t, psi)
+    expected = np.zeros((N, 2))
+    for i, j, length, m in zip(
+        host.owners, host.neighbors, host.face_measures, host.face_centroids, strict=True
+    ):
+        if j >= 0:
+            distance = np.linalg.norm(host.points[j] - host.points[i])
+            expected[i] += length / distance * (psi[j] - psi[i]) * m / host.volumes[i]
+    assert u == pytest.approx(expected, rel=1e-11, abs=1e-11)
+
+
+@pytest.mark.parametrize(("limit", "k"), [(2.0, 0.5), (2.0, 1e3), (0.25, 0.5), (7.0, 1e-3)])
+def test_relax_globally(engine, limit, k):
+    """One alpha for all, alpha = min(limit, k / max(|u| / h))."""
+    rng = np.random.default_rng(19)
+    u, speed = rng.normal(size=(N, 2)), rng.uniform(0, 3, N)
+    summaries = Summaries(engine, ("other", "speed"))
+    summaries.collect("other", engine.upload(10 * speed), N)
+    on_device = engine.upload(u), engine.upload(speed)
+    summaries.collect("speed", on_device[1], N)
+    Motion(engine).relax_globally(summaries, "speed", limit, k, *on_device)
+    alpha = min(limit, k / speed.max())
+    eps = float(np.finfo(engine.real).eps)
+    assert on_device[0].get() == pytest.approx(alpha * u, rel=8 * eps)
+    assert on_device[1].get() == pytest.approx(alpha * speed, rel=8 * eps)
+
+
+def test_relax_nothing(engine):
+    """All displacements zero: alpha is the limit, and no 0 / 0 arises."""
+    summaries = Summaries(engine, ("speed",))
+    u, speed = engine.zeros((N, 2)), engine.zeros(N)
+    summaries.collect("speed", speed, N)
+    Motion(engine).relax_globally(summaries, "speed", 2.0, 0.5, u, speed)
+    assert not u.get().any()
+    assert not speed.get().any()
+
+
+def test_measure_displacements(engine):
+    rng = np.random.default_rng(23)
+    both, h, speeds = (
+        rng.normal(size=(2, N, 2)),
+        rng.uniform(0.1, 2, N),
+        [engine.empty(N), engine.empty(N)],
+    )
+    Motion(engine).measure_displacements(*map(engine.upload, both), engine.upload(h), *speeds)
+    for u, speed in zip(both, speeds, strict=True):
+        expected = np.linalg.norm(u, axis=1) / h
+        assert speed.get() == pytest.approx(expected, rel=8 * float(np.finfo(engine.real).eps))
+
+
+def move(engine, box, points, lloyd, a, correction, b, h, clip):
+    on_device = engine.upload(points)
+    velocity = engine.empty(points.shape)
+    Motion(engine).move_generators(
+        box, on_device, engine.upload(lloyd), a, engine.upload(correction), b, engine.upload(h), velocity,
+        clip=clip,
+    )  # fmt: skip
+    return on_device.get(), velocity.get()
+
+
+@pytest.mark.parametrize("clip", [0.0, 0.3])
+@pytest.mark.parametrize(("a", "b"), [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.7, -2.0)])
+def test_move(engine, clip, a, b):
+    box = Box((-0.5, 2), (0.5, 2.75))  # in the device's coordinates (0, 0) to (1, 0.75)
+    rng = np.random.default_rng(29)
+    points = rng.random((N, 2)) * [1, 0.75]
+    lloyd, correction = rng.normal(0, 0.05, (2, N, 2))
+    h = rng.uniform(0.02, 0.3, N)
+    new, velocity = move(engine, box, points, lloyd, a, correction, b, h, clip)
+    d = a * lloyd + b * correction
+    if clip:
+        length = np.linalg.norm(d, axis=1)
+        assert 20 < (length > clip * h).sum() < N - 20
+        d *= np.minimum(1, clip * h / length)[:, None]
+    expected = points + d
+    outside = (expected < 0) | (expected > [1, 0.75])
+    assert outside.any()
+    expected = np.where(expected < 0, -expected, expected)
+    expected = np.where(expected > [1, 0.75], 2 * np.array([1, 0.75]) - expected, expected)
+    eps = float(np.finfo(engine.real).eps)
+    assert new == pytest.approx(expected, abs=8 * eps)
+    assert velocity == pytest.approx(expected - points, abs=8 * eps)
+
+
+def test_move_keeps_everything_inside(engine):
+    """Displacements across the whole box and beyond, from walls and corners."""
+    box = Box((0, 0), (1, 0.75))
+    corners = np.array([[0, 0], [1, 0], [1, 0.75], [0, 0.75], [0.5, 0], [0, 0.3]])
+    points = np.repeat(corners, 40, axis=0)
+    d = np.random.default_rng(37).normal(0, 3, points.shape)
+    new, velocity = move(engine, box, points, d, 1.0, 0 * d, 0.0, np.ones(len(d)), 0.0)
+    assert box.contains(new).all()
+    assert np.abs(points.astype(engine.real) + velocity - new).max() < 1e-6
+
+
+def test_add_momentum(engine):
+    rng = np.random.default_rng(43)
+    lloyd, velocity = rng.normal(size=(2, N, 2))
+    on_device = engine.upload(lloyd)
+    Motion(engine).add_momentum(1.3, on_device, engine.upload(velocity), 0.7)
+    expected = 1.3 * lloyd + 0.7 * velocity
+    assert on_device.get() == pytest.approx(expected, abs=16 * float(np.finfo(engine.real).eps))

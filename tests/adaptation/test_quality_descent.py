@@ -1,0 +1,186 @@
+"""The gradient of quality against finite differences of the energy, by diagrams from Qhull."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.adaptation.quality_descent import Shape
+from clvoro.adaptation.stages import Stages
+from clvoro.opencl.program import Engine
+from clvoro.tessellation.tessellator import Tessellator
+from tests.reference import diagrams as reference
+from tests.reference import patch
+from tests.reference.polygon_diagrams import polygon_voronoi
+
+N = 40
+
+
+def qualities(points):
+    """Q, perimeter and area of each cell, (n, 3)."""
+    rows = []
+    for cell in reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points):
+        n = len(cell.neighbors)
+        perimeter = np.hypot(*(np.roll(cell.polygon, -1, axis=0) - cell.polygon).T).sum()
+        rows.append((4 * cell.area * n * np.tan(np.pi / n) / perimeter**2, perimeter, cell.area))
+    return np.array(rows)
+
+
+def energy(points, omega):
+    """E = sum omega (2 log P - log A); omega stays that of the start."""
+    _, perimeter, area = qualities(points).T
+    return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
+
+
+def descend(engine, points, h, emphasis, rate=0.1, longest=0.2, quality=None):
+    t = patch.tessellate(engine, points)
+    quality = engine.upload(qualities(points)[:, 0] if quality is None else quality)
+    out = engine.empty((len(points), 2))
+    Shape(engine).descend(
+        t, engine.upload(h), quality, out, emphasis=emphasis, rate=rate, longest=longest
+    )
+    return out.get()
+
+
+def gradient_of(energy, points, some=None, step=1e-5):
+    """Return dE/dx (n, 2) of generators, of `some` or all, by central differences."""
+    gradient = np.zeros(points.shape)
+    for i in range(len(points)) if some is None else some:
+        for a in range(2):
+            by = np.zeros(points.shape)
+            by[i, a] = step
+            gradient[i, a] = (energy(points + by) - energy(points - by)) / (2 * step)
+    return gradient
+
+
+@pytest.mark.parametrize("emphasis", [0.0, 20.0])
+def test_gradient(ctx, emphasis):
+    """Every generator, those at walls and in corners included, moves by -rate h^2 dE/dx."""
+    points = patch.relaxed_points(N, 2112, steps=3)
+    h = np.random.default_rng(6).uniform(0.05, 0.2, N)
+    u = descend(patch.make_engine(ctx), points, h, emphasis, rate=0.3, longest=1e9)
+    omega = 1 - emphasis * np.log(qualities(points)[:, 0])
+    gradient = gradient_of(lambda x: energy(x, omega), points)
+    expected = -0.3 * h[:, None] ** 2 * gradient
+    # Central differences: rounding of E (about 100 (1 + emphasis)) over the step, curvature times its square.
+    assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+
+
+def test_gradient_in_a_polygon(ctx):
+    """Cells at slanted edges, in concave corners, around a hole that lies in one of them, and beside a larger one."""
+    domain = clvoro.Polygon(
+        [(0, 0), (2, 0.1), (1.9, 1.2), (1.2, 1), (0.9, 1.5), (0.1, 1.1)],
+        [[(0.25, 0.4), (0.3, 0.47), (0.33, 0.38)], [(1.2, 0.4), (1.7, 0.4), (1.4, 0.65)]],
+    )
+    rng = np.random.default_rng(2115)
+    grid = np.stack(np.meshgrid(np.arange(0.2, 2, 0.42), np.arange(0.15, 1.5, 0.35)), -1)
+    points = grid.reshape(-1, 2) + rng.uniform(-0.05, 0.05, (grid.size // 2, 2))
+    points = points[domain.contains_well(points, 0.02)]
+    n, cells = len(points), polygon_voronoi(domain, points)
+    assert any({(i, -7), (i, -8), (i, -9)} <= set(cells.lengths) for i in range(n))
+    # Where a piece changes cells, where it goes is no smooth function.
+    assert all(piece.root == piece.home for piece in cells.pieces)
+    real = np.dtype("float64")
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.defines(real))
+    placed = domain.place(points, real)
+    t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
+    q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)
+    out = engine.empty((n, 2))
+    Shape(engine).descend(
+        t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
+    )
+    # E is the same in any unit.
+    unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
+    omega = 1 - 5 * np.log(q)
+
+    def energy(points):
+        cells = polygon_voronoi(domain, points)
+        perimeter = np.zeros(n)
+        for (i, _), length in cells.lengths.items():
+            perimeter[i] += length
+        return float((omega * (2 * np.log(perimeter) - np.log(cells.areas))).sum())
+
+    expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points) * unit
+    # As above.
+    assert out.get() == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("periodic", [True, (False, True)])
+def test_gradient_across_seams(ctx, periodic):
+    """Generators at a seam look at the nearest images of their neighbors; diagrams are the device's own."""
+    box, adapter = clvoro.Box((0, 0), (1, 0.75), periodic=periodic), clvoro.Adapter(ctx)
+    rng = np.random.default_rng(2116)
+    grid = np.stack(np.meshgrid(np.arange(7) / 7, np.arange(6) / 8, indexing="ij"), -1)
+    points = box.wrap(grid.reshape(-1, 2) + rng.uniform(0, 0.06, (42, 2)))
+    n, q, h = len(points), rng.uniform(0.5, 1, 42), rng.uniform(0.05, 0.2, 42)
+    some = np.flatnonzero((points < 0.1).any(axis=1))[:10]
+    assert (points[some] < 0.1).any(axis=0).all()
+    engine = patch.make_engine(ctx, box=box)
+    placed = engine.upload(box.place(points, engine.real))
+    t, out = Tessellator(Stages(engine), box).tessellate(placed, n), engine.empty((n, 2))
+    Shape(engine).descend(
+        t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
+    )
+    omega = 1 - 5 * np.log(q)
+
+    def energy(points):
+        d = adapter.diagram(box, points)
+        perimeter = np.add.reduceat(d.face_measures, d.neighbor_starts[:-1])
+        return float((omega * (2 * np.log(perimeter) - np.log(d.volumes))).sum())
+
+    expected = -0.3 * h[:, None] ** 2 * gradient_of(energy, points, some)
+    # As above; what is known of faces while generators move is in single precision.
+    scale = np.abs(expected).max()
+    assert out.get()[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
+
+
+def test_descends(ctx):
+    """A step of the real size lowers E."""
+    points = patch.relaxed_points(N, 2113, steps=3)
+    h = np.full(N, np.sqrt(0.75 / N))
+    u = descend(patch.make_engine(ctx), points, h, 5.0)
+    omega = 1 - 5 * np.log(qualities(points)[:, 0])
+    before, after = energy(points, omega), energy(points + u, omega)
+    slope = -((u / (0.1 * h[:, None])) ** 2).sum() * 0.1
+    assert after - before == pytest.approx(slope, rel=0.5)
+
+
+def test_longest(ctx):
+    points = patch.relaxed_points(N, 2114, steps=0)
+    h = np.full(N, 0.1)
+    engine = patch.make_engine(ctx)
+    free = descend(engine, points, h, 5.0, longest=1e9)
+    u = descend(engine, points, h, 5.0, longest=0.03)
+    length = np.linalg.norm(free, axis=1)
+    assert 3 < (length > 0.003).sum() < N
+    assert u == pytest.approx(free * np.minimum(1, 0.003 / length)[:, None], rel=1e-9, abs=1e-15)
+
+
+def test_a_regular_mesh_stays(ctx):
+    """Squares are at rest, though four meet in each corner; at walls that corner has a kink and no gradient."""
+    xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
+    u = descend(patch.make_engine(ctx), (xy + 0.5) / 8, np.full(48, 0.125), 5.0)
+    inside = ((xy > 0) & (xy < [7, 5])).all(axis=1)
+    assert np.abs(u[inside]).max() < 1e-12
+    assert np.linalg.norm(u, axis=1).max() < 0.1 * 0.125
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[0.3, 0.4]],
+        [[0.3, 0.4], [0.6, 0.2]],
+        [[0, 0], [1, 0.75], [0, 0.75], [1, 0]],
+        np.stack([np.linspace(0.05, 0.95, 10), np.full(10, 0.375)], axis=1),
+        [[0.5, 0.375], [0.5, 0.375 + 1e-6], [0.1, 0.1], [0.9, 0.7]],
+    ],
+)
+def test_degenerate(ctx, real, points):
+    n = len(points)
+    some = np.full(n, 0.5)
+    u = descend(
+        patch.make_engine(ctx, real), np.array(points, float), np.full(n, 0.3), 5.0, quality=some
+    )
+    assert np.isfinite(u).all()
+    assert np.linalg.norm(u, axis=1).max() <= 0.2 * 0.3 * 1.001

@@ -1,0 +1,116 @@
+"""From one mesh to the next: a field that has moved a little takes a few steps, anything else the whole way."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro import Box, sizing
+from clvoro.adaptation.schedule import EFFORTS, is_near, plan_adaptive
+
+BOXES = {2: Box((0, 0), (1, 0.8)), 3: Box((0, 0, 0), (1, 0.8, 0.7))}
+SHORT = {dim: len(plan_adaptive(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)}
+
+
+@pytest.fixture(scope="module")
+def adapter(ctx):
+    return clvoro.Adapter(ctx)
+
+
+def field(dim, moved=0.0, factor=1.0):
+    if dim == 2:
+        return (
+            sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=0.006, slope=0.1) * factor
+        )
+    return (
+        sizing.Distance(sizing.Sphere((0.4 + moved, 0.4, 0.35), 0.2), h_min=0.05, slope=0.15)
+        * factor
+    )
+
+
+@pytest.fixture(scope="module")
+def first(adapter):
+    return {dim: adapter.run(BOXES[dim], field(dim), seed=3319) for dim in (2, 3)}
+
+
+def steps_to_tolerance(history):
+    within = (history["mean_error"] <= 0.004) & (history["max_error"] <= 0.04)
+    return int(history["step"][np.argmax(within)]) if within.any() else None
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_moved_by_two_cells(adapter, first, dim):
+    before = first[dim]
+    smallest = {2: 0.006, 3: 0.05}[dim]
+    after = adapter.run(BOXES[dim], field(dim, 2 * smallest), before.points)
+    assert after.history["mean_error"][0] > 0.02
+    assert steps_to_tolerance(after.history) <= 5
+    assert after.history["step"][-1] < SHORT[dim]
+    assert np.abs(after.error).mean() <= 0.004
+    assert np.abs(after.error).max() <= 0.04
+    assert after.quality.mean() > before.quality.mean() - 0.005
+    assert after.converged
+
+
+@pytest.mark.parametrize("method", ["adaptive", "exact"])
+def test_moved_again_and_again(adapter, first, method):
+    points = first[2].points
+    for k in range(1, 5):
+        result = adapter.run(BOXES[2], field(2, 0.012 * k), points, method=method)
+        points = result.points
+        assert steps_to_tolerance(result.history) <= 5
+    # The exact projection costs some 0.002 in itself (default and exact in bench/convergence.py).
+    lost = 0.004 if method == "adaptive" else 0.006
+    assert result.quality.mean() > first[2].quality.mean() - lost
+    if method == "exact":
+        assert np.abs(result.error).max() < 0.002
+
+
+def test_same_field_again_keeps_the_mesh(adapter, first):
+    result = adapter.run(BOXES[2], field(2), first[2].points)
+    moved = np.linalg.norm(result.points - first[2].points, axis=1) / first[2].size
+    assert np.median(moved) < 0.1
+    assert (result.origin >= 0).all()
+    assert np.abs(result.error).mean() <= 0.004
+
+
+def test_other_points_take_the_whole_way(adapter, first):
+    """Random ones, and a good mesh of another count."""
+    n = len(first[2].points)
+    box = BOXES[2]
+    random = box.lower + box.extent * np.random.default_rng(553).random((n, 2))
+    for points, size in ((random, field(2)), (first[2].points, field(2, factor=0.9))):
+        result = adapter.run(box, size, points, max_steps=SHORT[2] + 5)
+        assert result.history["step"][-1] == SHORT[2] + 5
+
+
+def test_held_count(adapter, first):
+    n = len(first[2].points) + 6
+    result = adapter.run(BOXES[2], field(2, 0.012), first[2].points, n_cells=n)
+    assert len(result.points) == n
+    assert result.history["step"][-1] < SHORT[2]
+    assert steps_to_tolerance(result.history) <= 6
+
+
+def test_resumes_bit_for_bit(adapter, first, tmp_path):
+    path, size = tmp_path / "state", field(2, 0.012)
+    whole = adapter.run(BOXES[2], size, first[2].points)
+    adapter.run(
+        BOXES[2], size, first[2].points, checkpoint=path, checkpoint_every=0,
+        callback=lambda row: row["step"] == 6,
+    )  # fmt: skip
+    rest = adapter.run(BOXES[2], size, first[2].points, resume=path)
+    np.testing.assert_array_equal(rest.points, whole.points)
+    np.testing.assert_array_equal(rest.history["mean_error"], whole.history["mean_error"])
+
+
+def test_near_by_every_measure():
+    near = {"n": 10_000, "missing": 50.0, "mean_error": 0.1, "mean_quality": 0.99}
+    assert is_near(2, "default", **near)
+    assert is_near(3, "default", **{**near, "mean_quality": 0.68})
+    for name, value in (("missing", -300.0), ("mean_error", 0.2), ("mean_quality", 0.95)):
+        assert not is_near(2, "default", **{**near, name: value})
+    assert not is_near(3, "default", **{**near, "mean_quality": 0.55})
+    # A mesh of the least effort is near for that, not for the best.
+    assert is_near(2, "fast", **{**near, "mean_quality": 0.98})
+    assert not is_near(2, "best", **{**near, "mean_quality": 0.98})
+    assert set(EFFORTS) == {"fast", "default", "best"}

@@ -1,0 +1,711 @@
+"""`Adapter.run` as a user meets it: its promises, its figures on the test field, bad input and nasty size fields."""
+
+import warnings
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro import sizing
+from clvoro.adaptation.options import METHODS
+from clvoro.adaptation.schedule import EFFORTS
+from clvoro.errors import (
+    ClvoroError,
+    CoarseSizeWarning,
+    InputError,
+    InputTypeError,
+    MemoryLimitError,
+    SizeFieldError,
+)
+from tests.reference import diagrams as reference
+
+BOX = clvoro.Box((0, 0), (2.5, 1.5))
+F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)
+"""The test field: 588 cells."""
+REPEATING = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
+
+
+@pytest.fixture(scope="module")
+def adapter():
+    return clvoro.Adapter()
+
+
+@pytest.fixture(scope="module")
+def adapter32():
+    return clvoro.Adapter(dtype="float32")
+
+
+def random_points(n, seed, box=BOX):
+    return np.random.default_rng(seed).random((n, 2)) * box.extent + box.lower
+
+
+def polygons(diagram):
+    corners = diagram.vertices[diagram.cell_vertices]
+    return np.split(corners, diagram.cell_vertex_starts[1:-1])
+
+
+def check(result, field, box=BOX, real="float64"):
+    """A mesh, whatever led to it: it tiles the box, its numbers are those of its cells, the history ends with it."""
+    n, eps = len(result.points), float(np.finfo(real).eps)
+    d, h = result.diagram, result.history
+    assert np.isfinite(result.points).all()
+    assert box.contains(result.points).all()
+    assert np.array_equal(d.points, result.points)
+    assert (d.volumes > 0).all()
+    assert d.volumes.sum() == pytest.approx(box.measure, rel=64 * eps)
+    assert [len(a) for a in (result.size, result.error, result.quality, d.volumes)] == [n] * 4
+    size = field(result.points) * result.size_factor
+    if field.on_device:  # a jump of h may lie within a rounding of a generator
+        close = np.isclose(result.size, size, rtol=1e4 * eps)
+        assert close.mean() > 0.99
+    length = np.sqrt(d.volumes)
+    error = (length - result.size) / np.minimum(length, result.size)
+    assert np.abs(result.error - error).max() <= 1e4 * eps * max(1, np.abs(error).max())
+    areas, perimeters = np.empty(n), np.empty(n)
+    for i, polygon in enumerate(polygons(d)):
+        areas[i], _ = reference.measures(polygon)
+        perimeters[i] = np.hypot(*(np.roll(polygon, -1, axis=0) - polygon).T).sum()
+    sides = np.diff(d.neighbor_starts)
+    quality = 4 * areas * sides * np.tan(np.pi / sides) / perimeters**2
+    # Corners round by eps of the domain, areas of cells of length L so by about eps / L.
+    assert np.abs(result.quality - quality).max() < 2e3 * eps * box.extent.max() / length.min()
+    assert ((result.quality > 0) & (result.quality < 1 + 16 * eps)).all()
+    # The history: nothing is lost, and its last row is the mesh.
+    assert np.array_equal(np.diff(h["cells"]), (h["inserted"] - h["deleted"])[1:])
+    assert h["inserted"][0] == h["deleted"][0] == 0
+    assert (h["cells"][-1], h["level"][-1]) == (n, 0)
+    assert h["mean_error"][-1] == pytest.approx(np.abs(result.error).mean(), rel=1e4 * eps, abs=eps)
+    assert h["max_error"][-1] == pytest.approx(np.abs(result.error).max(), rel=1e4 * eps, abs=eps)
+    # On the way the lengths of faces are in single precision.
+    close = {"rel": 2 * float(np.finfo(np.float32).eps)}
+    assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), **close)
+    assert h["min_quality"][-1] == pytest.approx(result.quality.min(), **close)
+    assert set(np.diff(h["step"])) <= {0, 1}
+    assert h["step"][0] == 0
+    assert (np.diff(h["level"]) <= 0).all()
+    assert (np.diff(h["seconds"]) >= 0).all()
+    assert (np.diff(h["progress"]) >= 0).all()
+    for name in h.dtype.names:
+        assert np.isfinite(h[name]).all(), name
+
+
+# What the rows mean.
+
+
+def test_row_i_is_the_callers_generator(adapter):
+    """One step of Lloyd's takes every generator to the centroid of its own cell."""
+    points = random_points(400, 5)
+    result = adapter.run(BOX, 0.1, points, method="lloyd", max_steps=1, tol=0)
+    cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
+    assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
+    assert np.array_equal(result.initial.points, points)
+    assert result.initial.points + result.initial.lloyd == pytest.approx(result.points, abs=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_steps(adapter, method):
+    points = random_points(300, 6)
+    result = adapter.run(BOX, F1, points, method=method, max_steps=0, levels=0)
+    assert np.array_equal(result.points, points)
+    assert len(result.history) == 1
+    assert (result.converged, result.stop_reason) == (False, "max_steps reached")
+    check(result, F1)
+
+
+@pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
+def test_warm_start(adapter, method):
+    """Five steps and five more from where they led are ten."""
+    options = {"method": method, "tol": 0}
+    points = random_points(500, 7)
+    ten = adapter.run(BOX, F1, points, max_steps=10, **options)
+    five = adapter.run(BOX, F1, points, max_steps=5, **options)
+    again = adapter.run(BOX, F1, five.points, max_steps=5, **options)
+    assert again.points == pytest.approx(ten.points, abs=1e-10)
+    assert again.history["mean_error"][0] == pytest.approx(
+        five.history["mean_error"][-1], rel=1e-10
+    )
+    assert ten.settings["start"] == "points"
+
+
+def test_origin_names_the_callers_generators(adapter):
+    """Those that stay come first, in their order and near their places; inserted ones are -1."""
+    first = adapter.run(BOX, F1, seed=31, effort="fast")
+    result = adapter.run(BOX, F1, first.points, effort="fast", n_cells=len(first.points) + 9)
+    origin = result.origin
+    kept = origin >= 0
+    inserted, deleted = (result.history[name].sum() for name in ("inserted", "deleted"))
+    assert kept.sum() >= len(first.points) - deleted
+    assert (~kept).sum() == len(result.points) - kept.sum() <= inserted
+    assert kept[: kept.sum()].all()
+    assert (np.diff(origin[kept]) > 0).all()
+    moved = np.linalg.norm(result.points[kept] - first.points[origin[kept]], axis=1)
+    assert np.median(moved / result.size[kept]) < 0.5
+    shuffled = np.random.default_rng(1).permutation(first.points)
+    far = np.linalg.norm(result.points[kept] - shuffled[origin[kept]], axis=1)
+    assert np.median(far / result.size[kept]) > 2, "the test would see a wrong order"
+    check(result, F1)
+
+
+def test_origin_of_methods_that_keep_all(adapter):
+    result = adapter.run(BOX, F1, random_points(200, 3), method="coupled", max_steps=4)
+    assert np.array_equal(result.origin, np.arange(200))
+
+
+def test_one_call_at_a_time(adapter):
+    """A callback that uses the adapter would overwrite the mesh at work."""
+    with pytest.raises(InputError, match="another Adapter"):
+        adapter.run(BOX, F1, callback=lambda row: adapter.diagram(BOX, random_points(50, 1)))
+    other = clvoro.Adapter()
+    plain = adapter.run(BOX, F1, method="coupled", max_steps=4)
+    drawn = adapter.run(
+        BOX, F1, method="coupled", max_steps=4,
+        callback=lambda row: len(other.diagram(BOX, random_points(50, 1))) == 0,
+    )  # fmt: skip
+    assert np.array_equal(plain.points, drawn.points)
+
+
+def test_threads_take_turns(adapter):
+    from concurrent.futures import ThreadPoolExecutor
+
+    def run(seed):
+        return adapter.run(BOX, F1, method="coupled", max_steps=6, seed=seed).points
+
+    expected = [run(seed) for seed in range(30, 34)]
+    with ThreadPoolExecutor(4) as pool:
+        for points, alone in zip(pool.map(run, range(30, 34)), expected, strict=True):
+            assert np.array_equal(points, alone)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"method": "coupled", "max_steps": 12},
+        {"method": "weighted", "start": "uniform", "max_steps": 12},
+        {"effort": "fast"},
+        {"method": "exact", "effort": "fast", "n_cells": 1400},
+    ],
+)
+def test_repeats_bit_by_bit(adapter, options):
+    """By the same adapter, whatever it did before, and by a new one."""
+    first = adapter.run(BOX, F1, seed=2718, **options)
+    for other in (adapter, clvoro.Adapter()):
+        again = other.run(BOX, F1, seed=2718, **options)
+        assert np.array_equal(again.points, first.points)
+        for name in set(first.history.dtype.names) - {"seconds"}:
+            assert np.array_equal(again.history[name], first.history[name]), name
+
+
+@pytest.mark.parametrize("start", ["density", "uniform"])
+def test_seed(adapter, start):
+    a, b = (
+        adapter.run(BOX, F1, start=start, method="lloyd", max_steps=0, seed=s) for s in (271, 272)
+    )
+    assert a.points.shape == b.points.shape
+    assert (a.points != b.points).all()
+
+
+@pytest.mark.parametrize(("method", "steps", "off"), [("coupled", 5, 1e-7), ("weighted", 3, 5e-6)])
+def test_units_do_not_matter(adapter, method, steps, off):
+    """A mesh in millimeters far from the origin is the same mesh."""
+    points = random_points(300, 8)
+    box = clvoro.Box((40, -7), (40 + 2.5e-3, -7 + 1.5e-3))
+    small = sizing.Distance(sizing.Circle((40 + 0.9e-3, -7 + 0.75e-3), 0.3e-3), 0.02e-3, slope=0.3)
+    options = {"method": method, "max_steps": steps, "tol": 0}
+    a = adapter.run(BOX, F1, points, **options)
+    b = adapter.run(box, small, points * 1e-3 + box.lower, **options)
+    # 40 rounds to 7e-15, 1e-10 of a cell, faces and rough solves to 6e-8; steps let differences grow, until one of the
+    # solves takes an iteration more than the other.
+    assert (b.points - box.lower) * 1e3 == pytest.approx(a.points, abs=off)
+    assert b.history["mean_error"] == pytest.approx(a.history["mean_error"], rel=1e-5)
+    assert b.history["energy"] == pytest.approx(a.history["energy"] * 1e-12, rel=1e-5)
+
+
+def test_callable_and_device_field_agree(adapter):
+    options = {"method": "coupled", "max_steps": 6, "seed": 3, "tol": 0}
+    device = adapter.run(BOX, F1, **options)
+    host = adapter.run(BOX, lambda points: F1(points), points=device.initial.points, **options)
+    assert host.points == pytest.approx(device.points, abs=1e-6)
+
+
+def second_moment(polygon, x):
+    total = 0.0
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        area = ((a - x)[0] * (b - x)[1] - (a - x)[1] * (b - x)[0]) / 2
+        total += area / 3 * ((np.array([(a + b) / 2, (a + x) / 2, (b + x) / 2]) - x) ** 2).sum()
+    return total
+
+
+def test_history_of_the_published_method(adapter):
+    result = adapter.run(BOX, F1, method="coupled", seed=77, max_steps=15, tol=0)
+    h = result.history
+    check(result, F1)
+    assert len(h) == 16
+    # Energy, the paper's 2.3, in physical units.
+    energy = sum(map(second_moment, polygons(result.diagram), result.points))
+    assert h["energy"][-1] == pytest.approx(energy, rel=1e-9)
+    # A row's displacements are those that led to it.
+    size = F1(result.initial.points)
+    for name in ("lloyd", "poisson"):
+        length = np.linalg.norm(getattr(result.initial, name), axis=1)
+        assert h[name][1] == pytest.approx((length / size).mean(), rel=1e-6)
+        assert h[name][0] == 0
+    assert (np.linalg.norm(result.initial.poisson, axis=1) / size).max() <= 0.5 * (1 + 1e-6)
+    assert (h["iterations"][1:] > 0).all()
+    assert (h["residual"][1:] <= 1e-4).all()
+    assert np.array_equal(result.final.points, result.points)
+    assert result.final.points + result.final.lloyd == pytest.approx(
+        result.diagram.centroids, abs=1e-12
+    )
+    assert h["ever_changed"][0] == h["changed"][0] == 0
+    assert (np.diff(h["ever_changed"]) >= 0).all()
+    assert (h["ever_changed"] * len(result.points) >= h["changed"] - 1e-9).all()
+    assert 0.5 < h["ever_changed"][-1] <= 1
+
+
+# How a run ends.
+
+
+def test_stops_when_it_no_longer_improves(adapter):
+    result = adapter.run(BOX, F1, method="coupled", seed=4, max_steps=400, tol=0.02)
+    assert result.converged
+    assert result.stop_reason == "error and quality no longer improve"
+    assert 20 <= result.history["step"][-1] < 200
+    h = result.history
+    old, new = (slice(-20, -10), slice(-10, None))
+    assert h["mean_error"][new].mean() > 0.98 * h["mean_error"][old].mean()
+    assert h["mean_quality"][new].mean() < 1.02 * h["mean_quality"][old].mean()
+
+
+def test_default_number_of_steps(adapter):
+    result = adapter.run(BOX, 0.2, method="coupled", tol=0)
+    assert result.history["step"][-1] == 100
+    assert (result.converged, result.stop_reason) == (False, "max_steps reached")
+
+
+def test_plan_is_the_end_of_adaptive_runs(adapter):
+    result = adapter.run(BOX, F1, effort="fast", seed=9)
+    assert (result.converged, result.stop_reason) == (True, "plan completed")
+    assert result.history["progress"][-1] == 1
+
+
+LEVELS = {"effort": "fast", "levels": 1}
+
+
+@pytest.mark.parametrize(
+    ("options", "rows"),
+    [
+        ({"method": "coupled"}, 1),
+        ({"method": "coupled"}, 6),
+        ({"method": "coupled", "max_steps": 5}, 6),
+        (LEVELS, 4),
+    ],
+)
+def test_callback(adapter, options, rows):
+    """It sees the rows of the history as they come, and stops the run, also in its last step or on a coarse level."""
+    seen = []
+
+    def callback(row):
+        seen.append(row.copy())
+        return len(seen) == rows
+
+    result = adapter.run(BOX, F1, callback=callback, seed=12, **options)
+    assert len(seen) == rows
+    assert np.array_equal(np.array(seen), result.history[:rows])
+    assert (result.converged, result.stop_reason) == (False, "stopped by the callback")
+    check(result, F1)
+    if options is LEVELS:
+        assert seen[-1]["level"] == 1
+        assert len(result.history) == rows + 1, "the refinement that follows has a row of its own"
+        assert len(result.points) == pytest.approx(588, rel=0.1)
+    else:
+        assert len(result.history) == rows
+
+
+def test_other_values_of_the_callback_do_not_stop(adapter):
+    result = adapter.run(BOX, F1, method="lloyd", max_steps=3, callback=lambda row: None)
+    assert result.history["step"][-1] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "rows"),
+    [({"method": "coupled"}, 1), ({"method": "coupled"}, 5), (LEVELS, 3), ({"effort": "fast"}, 50)],
+)
+def test_interruption_keeps_what_there_is(adapter, options, rows):
+    seen = []
+
+    def callback(row):
+        seen.append(row)
+        if len(seen) == rows:
+            raise KeyboardInterrupt
+
+    result = adapter.run(BOX, F1, callback=callback, seed=13, **options)
+    assert (result.converged, result.stop_reason) == (False, "interrupted")
+    assert result.history["step"][-1] == rows - 1
+    check(result, F1)
+
+
+def test_values_of_the_callback_that_are_neither_true_nor_false_are_refused(adapter):
+    with pytest.raises(InputTypeError, match=r"callback returned array.*expected True to stop"):
+        adapter.run(BOX, F1, callback=lambda row: np.ones(2))
+
+
+def test_errors_of_the_callback_pass_through(adapter):
+    def callback(row):
+        raise RuntimeError("mine")
+
+    with pytest.raises(RuntimeError, match="mine"):
+        adapter.run(BOX, F1, callback=callback)
+    check(adapter.run(BOX, F1, method="lloyd", max_steps=1), F1)
+
+
+def test_max_steps_of_adaptive_runs(adapter):
+    result = adapter.run(BOX, F1, max_steps=7, levels=1, seed=14)
+    assert (result.converged, result.stop_reason) == (False, "max_steps reached")
+    assert result.history["step"][-1] == 7
+    check(result, F1)
+
+
+# Counts and levels.
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 250])
+def test_n_cells_is_held(adapter, method, n):
+    result = adapter.run(
+        BOX, F1, n_cells=n, method=method, effort="fast", max_steps=None if n > 5 else 60
+    )
+    assert len(result.points) == n
+    check(result, F1)
+    if method in REPEATING:
+        assert result.size_factor == 1
+    else:
+        assert np.log(np.sqrt(result.diagram.volumes) / result.size).mean() == pytest.approx(
+            0, abs=1e-9
+        )
+
+
+@pytest.mark.parametrize("n_cells", [400, 1000])
+def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
+    """As good a mesh as with the field's own count."""
+    result = adapter.run(BOX, F1, n_cells=n_cells, method="exact", seed=15)
+    assert len(result.points) == n_cells
+    assert result.size_factor == pytest.approx(np.sqrt(588 / n_cells), rel=0.05)
+    assert np.abs(result.error).mean() < 1e-3
+    assert result.quality.mean() > 0.96
+    check(result, F1)
+
+
+@pytest.mark.parametrize(("seed", "n_cells"), [(2, None), (3, 4500)])
+def test_worst_cells_are_mended(adapter, seed, n_cells):
+    """Off the walls none is below the default's 0.92, by generators that come or go while cells are polished.
+
+    Without them the worst have 0.902 and 0.927; the count is held nevertheless.
+    """
+    size = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.008, slope=0.1)
+    result = adapter.run(BOX, size, seed=seed, n_cells=n_cells)
+    assert n_cells in (None, len(result.points))
+    diagram = result.diagram
+    at_wall = np.logical_or.reduceat(diagram.neighbors < 0, diagram.neighbor_starts[:-1])
+    assert result.quality[~at_wall].min() >= 0.92
+    late = result.history[-EFFORTS["default"].polish + 3 :]
+    assert late["deleted"].sum() > 0
+
+
+def test_n_cells_is_held_when_stopped(adapter):
+    result = adapter.run(BOX, F1, n_cells=1234, max_steps=5)
+    assert len(result.points) == 1234
+    check(result, F1)
+
+
+def test_count_comes_from_the_size_field(adapter):
+    for method in ("coupled", "adaptive"):
+        result = adapter.run(BOX, 0.1, method=method, effort="fast")
+        assert len(result.points) == pytest.approx(375, rel=0.03)
+        assert result.size_factor == 1
+
+
+@pytest.mark.parametrize("levels", [0, 1, 2])
+def test_levels(adapter, levels):
+    result = adapter.run(BOX, F1, levels=levels, effort="fast", seed=16)
+    h = result.history
+    assert h["level"][0] == levels
+    assert h["cells"][0] == round(588 / 4**levels)
+    assert len(result.points) == pytest.approx(600, rel=0.05)
+    assert np.abs(result.error).mean() < 0.03
+    check(result, F1)
+
+
+def test_levels_from_the_callers_points(adapter):
+    """A coarse mesh is refined as often as it takes, a mesh that fits is not."""
+    for n, level in ((40, 2), (150, 1), (590, 0)):
+        result = adapter.run(BOX, F1, random_points(n, 17), effort="fast")
+        assert result.history["level"][0] == level
+        assert len(result.points) == pytest.approx(600, rel=0.1)
+        check(result, F1)
+
+
+def test_far_too_many_points(adapter):
+    """They are thinned out to what the size field asks for."""
+    result = adapter.run(BOX, F1, random_points(3000, 17), effort="fast")
+    assert len(result.points) == pytest.approx(600, rel=0.1)
+
+
+# Figures on the test field.
+
+
+def figures(result):
+    e, q = np.abs(result.error), result.quality
+    return e.mean(), e.max(), q.mean(), q.min()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "quality"),
+    [
+        ({"method": "coupled", "start": "uniform", "k": 1, "max_steps": 200}, 0.030, 0.973),
+        ({"method": "coupled", "max_steps": 30}, 0.031, 0.955),
+        ({"method": "weighted", "max_steps": 8}, 0.030, 0.93),
+        ({"method": "weighted", "start": "uniform", "max_steps": 20}, 0.035, 0.93),
+    ],
+)
+def test_figures_of_repeated_steps(adapter, options, error, quality):
+    """From two random starts the better one: some have a defect more than others."""
+    results = [adapter.run(BOX, F1, tol=0, seed=seed, **options) for seed in (11, 13)]
+    for result in results:
+        check(result, F1)
+    assert min(figures(r)[0] for r in results) <= error
+    assert max(figures(r)[2] for r in results) >= quality
+
+
+def test_published_ordering(adapter):
+    """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
+    start = random_points(588, 18)
+    lloyd, poisson, coupled = (
+        figures(adapter.run(BOX, F1, start, method=method, max_steps=100, tol=0))
+        for method in ("lloyd", "poisson", "coupled")
+    )
+    assert lloyd[0] > 1
+    assert poisson[0] < 0.2
+    assert coupled[0] < 0.05
+    assert poisson[2] < coupled[2] - 0.05
+    assert coupled[2] < lloyd[2] + 0.005
+
+
+@pytest.mark.parametrize(
+    ("options", "mean", "largest", "quality", "least"),
+    [
+        ({}, 0.002, 0.02, 0.967, 0.85),
+        ({"effort": "fast"}, 0.010, 0.1, 0.967, 0.85),
+        ({"method": "exact"}, 1e-3, 1e-3, 0.965, 0.85),
+    ],
+)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_figures_of_adaptive_runs(
+    adapter, adapter32, dtype, options, mean, largest, quality, least
+):
+    """The median of five starts: the largest error of one start hangs on a cell or two, and so on rounding."""
+    run = (adapter if dtype == "float64" else adapter32).run
+    results = [run(BOX, F1, seed=seed, **options) for seed in range(1, 6)]
+    for result in results:
+        check(result, F1, real=dtype)
+    e_mean, e_max, q_mean, q_min = np.median([figures(r) for r in results], axis=0)
+    assert e_mean <= mean
+    assert e_max <= largest
+    assert q_mean >= quality
+    assert q_min >= least
+
+
+def test_last_displacements_of_a_plan_are_those_of_its_last_step(adapter):
+    """And of the step that would come next, where the run was stopped before."""
+    whole = adapter.run(BOX, F1, seed=9, effort="fast")
+    steps = whole.history["step"][-1]
+    stopped = adapter.run(
+        BOX, F1, seed=9, effort="fast", callback=lambda row: row["step"] == steps - 1
+    )
+    for result, other in ((whole, stopped), (stopped, stopped)):
+        assert np.array_equal(result.final.points, other.points)
+        size = F1(result.final.points)
+        for name in ("lloyd", "poisson"):
+            length = np.linalg.norm(getattr(result.final, name), axis=1)
+            assert whole.history[name][-1] == pytest.approx((length / size).mean(), rel=1e-6)
+    assert (np.linalg.norm(whole.points - stopped.points, axis=1) > 0).all()
+
+
+def test_error_target_moves_along_the_front(adapter):
+    """The larger the error that is allowed, the better the cells."""
+    tight, loose = (
+        figures(adapter.run(BOX, F1, seed=19, error_target=target, n_cells=588))
+        for target in (0.001, 0.01)
+    )
+    assert tight[0] < 0.5 * loose[0]
+    assert tight[2] < loose[2]
+
+
+# Nasty size fields.
+
+NASTY = {
+    "ratio 100 across a line": sizing.Expression("x < 1.25 ? 0.03 : 3.0"),
+    "ratio 100 across a slanted line": sizing.Expression("x + 0.37*y < 0.8 ? 0.02 : 2.0"),
+    "spike narrower than its own h": sizing.Expression("hypot(x-1.2, y-0.7) < 0.002 ? 0.02 : 0.1"),
+    "peak": sizing.Expression("0.05 + 5*exp(-400*((x-1.2)*(x-1.2)+(y-0.7)*(y-0.7)))"),
+    "steep": sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.01, slope=3),
+    "growth off a wall": sizing.Expression("0.02 + 0.5*y"),
+    "corner": sizing.Expression("0.01 + 0.2*hypot(x, y)"),
+    "stripes": sizing.Expression("0.08 + 0.06*sin(40*x)"),
+    "constant": sizing.Constant(0.07),
+    "about the domain": sizing.Constant(1.3),
+    "larger than the domain": sizing.Constant(100.0),
+    "just the domain": sizing.Constant(np.sqrt(3.75)),
+}
+
+
+@pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
+@pytest.mark.parametrize("name", NASTY)
+def test_nasty_fields(adapter, name):
+    result = adapter.run(BOX, NASTY[name], effort="fast", seed=20)
+    check(result, NASTY[name])
+    assert result.converged
+    # No mesh can follow h that grows by more than a cell's length within the cell.
+    infeasible = name in ("steep", "stripes") or "100" in name
+    assert result.quality.mean() > (0.4 if infeasible else 0.9 if len(result.points) > 9 else 0.6)
+    if "domain" in name:
+        assert len(result.points) == max(1, round(3.75 / NASTY[name](np.zeros((1, 2)))[0] ** 2))
+    elif not infeasible:
+        assert np.abs(result.error).mean() < 0.05
+
+
+@pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
+@pytest.mark.parametrize(
+    "name", ["ratio 100 across a line", "spike narrower than its own h", "larger than the domain"]
+)
+@pytest.mark.parametrize("method", ["coupled", "weighted", "exact"])
+def test_nasty_fields_by_other_methods(adapter, adapter32, name, method):
+    for run, real in ((adapter.run, "float64"), (adapter32.run, "float32")):
+        result = run(BOX, NASTY[name], method=method, effort="fast", max_steps=30, seed=21)
+        check(result, NASTY[name], real=real)
+
+
+def test_one_cell_of_the_right_size(adapter):
+    result = adapter.run(clvoro.Box((0, 0), (1, 1)), 1.0)
+    assert len(result.points) == 1
+    assert np.abs(result.error).max() < 1e-12
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (
+            {"method": "best"},
+            InputError,
+            "method is 'best', expected one of adaptive, exact, lloyd",
+        ),
+        ({"method": None}, InputError, "method is None"),
+        ({"start": "random"}, InputError, "start is 'random', expected one of density, uniform"),
+        ({"effort": "most"}, InputError, "effort is 'most', expected one of fast"),
+        ({"n_cells": 0}, InputError, "n_cells is 0, expected at least 1"),
+        ({"n_cells": -5}, InputError, "n_cells is -5"),
+        ({"n_cells": 10.5}, InputTypeError, "n_cells is 10.5 of type float"),
+        ({"n_cells": True}, InputTypeError, "n_cells is True of type bool"),
+        ({"max_steps": -1}, InputError, "max_steps is -1"),
+        ({"max_steps": "9"}, InputTypeError, "max_steps is '9'"),
+        ({"tol": -0.1}, InputError, "tol is -0.1"),
+        ({"tol": np.nan}, InputError, "tol is nan"),
+        ({"k": -1}, InputError, "k is -1, expected a finite number > 0"),
+        ({"k": 0}, InputError, "k is 0"),
+        ({"k": "big"}, InputTypeError, "k is 'big'"),
+        ({"alpha": 0}, InputError, "alpha is 0"),
+        ({"alpha": np.inf}, InputError, "alpha is inf"),
+        ({"seed": -1}, InputError, "seed is -1"),
+        ({"seed": 1.5}, InputTypeError, "seed is 1.5"),
+        ({"levels": -1}, InputError, "levels is -1"),
+        ({"levels": "many"}, InputTypeError, "levels is 'many'"),
+        ({"levels": 5}, InputError, "levels is 5, expected at most 4 for 588 cells"),
+        ({"levels": 40, "points": random_points(9, 1)}, MemoryLimitError, "cells"),
+        ({"error_target": 0}, InputError, "error_target is 0"),
+        ({"callback": 5}, InputTypeError, "callback is 5 of type int"),
+        (
+            {"points": random_points(9, 1), "n_cells": 8, "method": "coupled"},
+            InputError,
+            "n_cells is 8, but 9 points",
+        ),
+        ({"points": np.zeros((4, 3))}, InputError, r"points has shape \(4, 3\)"),
+        ({"points": [[0.1, 0.2], [0.1, 0.2]]}, InputError, r"points\[0\] and points\[1\] coincide"),
+        ({"points": [[0.1, 2.2]]}, InputError, r"points\[0\] is .*outside"),
+        ({"size": 0}, ClvoroError, "0"),
+        ({"size": -0.1}, ClvoroError, "-0.1"),
+        ({"size": np.nan}, ClvoroError, "nan"),
+        ({"size": "0.1"}, InputTypeError, "size"),
+        ({"size": None}, InputTypeError, "size"),
+        ({"size": sizing.Expression("0.3 - x")}, SizeFieldError, r"at \("),
+        ({"size": sizing.Expression("sqrt(x - 1)")}, SizeFieldError, r"nan at \("),
+        ({"size": lambda p: np.where(p[:, 0] > 2, np.nan, 0.1)}, SizeFieldError, r"nan at \(2"),
+        ({"size": lambda p: 0.1}, ClvoroError, "shape"),
+        ({"size": 1e-6}, MemoryLimitError, r"3\.75e\+12 cells.*GiB"),
+        ({"n_cells": 10**11}, MemoryLimitError, r"1e\+11 cells.*GiB"),
+        ({"domain": "box"}, InputTypeError, "domain is a str, expected .*Box or a clvoro.Polygon"),
+        ({"domain": shapely.box(0, 0, 1, 1)}, InputTypeError, r"Polygon\.from_shapely\(domain\)"),
+        ({"tol": "1e-3"}, InputTypeError, "tol is '1e-3' of type str"),
+        (
+            {"points": np.ma.masked_less(random_points(9, 1), 0.2)},
+            InputError,
+            r"points has \d+ masked numbers",
+        ),
+        (
+            {"size": sizing.Raster(np.ones((3, 3)), (50, 7), (58, 13))},
+            InputError,
+            r"lies beside the domain.*order of the coordinates",
+        ),
+        ({"domain": clvoro.Box((0, 0, 0), (1, 1, 1))}, ClvoroError, "dimension"),
+    ],
+)
+def test_bad_input(adapter, change, error, message):
+    arguments = {"domain": BOX, "size": F1, **change}
+    with pytest.raises(error, match=message):
+        adapter.run(**arguments)
+
+
+@pytest.mark.parametrize("corner", [("a", "b"), None, "ab"])
+def test_bad_corners(corner):
+    with pytest.raises(ClvoroError, match=r"Box got .*write Box\(\(0, 0\), \(2.5, 1.5\)\)"):
+        clvoro.Box(corner, (1, 1))
+
+
+@pytest.mark.parametrize("given", ["gpu", 0])
+def test_bad_context(given):
+    with pytest.raises(
+        InputTypeError, match=r"expected a pyopencl.Context.*create_context\(device"
+    ):
+        clvoro.Adapter(given)
+
+
+def test_sizes_in_another_unit(adapter):
+    """Metres for kilometers make one cell, with a warning at the caller's line; what fits has none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CoarseSizeWarning)
+        adapter.run(BOX, 2.7, effort="fast")  # 0.51 cells
+        adapter.run(BOX, 100, effort="fast", n_cells=2)
+    with pytest.warns(CoarseSizeWarning, match=r"0\.00038 cells in a domain of 3\.75") as caught:
+        assert len(adapter.run(BOX, 100, effort="fast").points) == 1
+    assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("dtype", ["float16", "int32", "banana", None, 8])
+def test_bad_dtype(dtype):
+    with pytest.raises(InputError, match="expected 'float64' or 'float32'"):
+        clvoro.Adapter(dtype=dtype)
+
+
+def test_a_field_that_fails_on_the_way_is_named(adapter):
+    """The start avoids the hole; a step leads into it."""
+    seen = []
+
+    def size(points):
+        seen.append(len(points))
+        return np.where(len(seen) > 40, -1.0, 0.1) * np.ones(len(points))
+
+    with pytest.raises(SizeFieldError, match=r"-1 at \("):
+        adapter.run(BOX, size, random_points(300, 3), method="lloyd", max_steps=100, tol=0)
+    check(adapter.run(BOX, F1, method="lloyd", max_steps=1), F1)

@@ -1,0 +1,448 @@
+"""`Adapter.run` in three dimensions: every method, its promises and figures, nasty domains and size fields."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro import sizing
+from clvoro.adaptation.options import METHODS
+from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
+from tests.reference import diagrams3d as reference3d
+
+BOX = clvoro.Box((0, 0, 0), (1, 1, 1))
+S1 = sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.04, slope=0.3)
+"""The test field: 1778 cells, grown away from a sphere."""
+SMALL = S1 * 2
+"""222 cells by the integral of h^-3; 269 by sums of V h^-3 at so few generators."""
+LONG = clvoro.Box((-3, 1, 0.2), (5, 1.5, 0.6))
+
+
+@pytest.fixture(scope="module")
+def adapter():
+    return clvoro.Adapter()
+
+
+@pytest.fixture(scope="module")
+def adapter32():
+    return clvoro.Adapter(dtype="float32")
+
+
+def random_points(n, seed, box=BOX):
+    return np.random.default_rng(seed).random((n, 3)) * box.extent + box.lower
+
+
+def check(result, field, box=BOX, real="float64"):
+    """A mesh, whatever led to it: it fills the box, its numbers are those of its cells, the history ends with it."""
+    n, eps = len(result.points), float(np.finfo(real).eps)
+    d, h = result.diagram, result.history
+    assert np.isfinite(result.points).all()
+    assert box.contains(result.points).all()
+    assert np.array_equal(d.points, result.points)
+    assert (d.volumes > 0).all()
+    # Each volume is a sum over faces, rounded; with n of them the roundings partly cancel.
+    assert d.volumes.sum() == pytest.approx(box.measure, rel=64 * eps)
+    if field.on_device:  # a jump of h may lie within a rounding of a generator
+        size = field(result.points) * result.size_factor
+        assert np.isclose(result.size, size, rtol=1e4 * eps).mean() > 0.99
+    length = np.cbrt(d.volumes)
+    error = (length - result.size) / np.minimum(length, result.size)
+    assert np.abs(result.error - error).max() <= 1e4 * eps * max(1, np.abs(error).max())
+    surfaces = np.add.reduceat(d.face_measures, d.neighbor_starts[:-1])
+    quality = 36 * np.pi * d.volumes**2 / surfaces**3
+    # Faces and volumes are the device's numbers, rounded to its precision when they were fetched.
+    assert result.quality == pytest.approx(quality, rel=64 * eps)
+    assert ((result.quality > 0) & (result.quality < 1)).all(), "only a ball has Q = 1"
+    # Rows of the history: nothing is lost, and the last one is the mesh.
+    assert np.array_equal(np.diff(h["cells"]), (h["inserted"] - h["deleted"])[1:])
+    assert (h["cells"][-1], h["level"][-1]) == (n, 0)
+    assert h["mean_error"][-1] == pytest.approx(np.abs(result.error).mean(), rel=1e4 * eps, abs=eps)
+    assert h["max_error"][-1] == pytest.approx(np.abs(result.error).max(), rel=1e4 * eps, abs=eps)
+    assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), rel=64 * eps)
+    assert h["min_quality"][-1] == pytest.approx(result.quality.min(), rel=64 * eps)
+    assert set(np.diff(h["step"])) <= {0, 1}
+    assert (np.diff(h["level"]) <= 0).all()
+    assert (np.diff(h["progress"]) >= 0).all()
+    for name in h.dtype.names:
+        assert np.isfinite(h[name]).all(), name
+    # Cells rebuilt from their corners, and the diagram's defining property at every one of them.
+    result.check().demand()
+
+
+def figures(result):
+    e, q = np.abs(result.error), result.quality
+    return e.mean(), e.max(), q.mean(), q.min()
+
+
+def second_moment(cell, x):
+    """Integral of |y - x|^2 over a reference cell."""
+    return cell.volume * (np.trace(cell.covariance) + ((cell.centroid - x) ** 2).sum())
+
+
+# Every method.
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_every_method(adapter, adapter32, dtype, method):
+    run = (adapter if dtype == "float64" else adapter32).run
+    planned = method in ("adaptive", "exact")
+    result = run(BOX, SMALL, method=method, seed=31, max_steps=None if planned else 12)
+    check(result, SMALL, real=dtype)
+    assert result.history["step"][-1] > 10
+    h = result.history
+    assert h["mean_quality"][-1] > h["mean_quality"][0] or method == "poisson"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_uniform_start_and_count(adapter, method):
+    result = adapter.run(
+        BOX, SMALL, method=method, start="uniform", n_cells=300, effort="fast", max_steps=15, seed=5
+    )
+    assert len(result.points) == 300
+    assert result.settings["start"] == "uniform"
+    check(result, SMALL)
+
+
+def test_figures_of_repeated_steps(adapter):
+    """Lloyd's alone never meets the sizes, Poisson's alone meets them with poor cells, coupled does both."""
+    start = random_points(500, 18)
+    field = S1 * 1.55
+    lloyd, poisson, coupled, weighted = (
+        figures(adapter.run(BOX, field, start, method=method, max_steps=60, tol=0))
+        for method in ("lloyd", "poisson", "coupled", "weighted")
+    )
+    assert lloyd[0] > 3 * coupled[0]
+    assert poisson[0] < 0.5 * lloyd[0]
+    assert poisson[2] < coupled[2] - 0.05
+    assert coupled[2] < lloyd[2] + 0.005
+    assert weighted[0] < coupled[0]
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(
+    ("options", "mean", "largest", "quality"),
+    [
+        ({}, 0.004, 0.04, 0.67),
+        ({"effort": "fast"}, 0.015, 0.12, 0.66),
+        ({"method": "exact"}, 3e-4, 5e-3, 0.67),
+    ],
+)
+def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, largest, quality):
+    run = (adapter if dtype == "float64" else adapter32).run
+    result = run(BOX, S1, seed=11, **options)
+    check(result, S1, real=dtype)
+    e_mean, e_max, q_mean, q_min = figures(result)
+    assert e_mean <= mean
+    assert e_max <= largest
+    assert q_mean >= quality
+    assert q_min >= 0.35
+    # The integral of h^-3 asks for 1778; sampled at generators, so coarse a mesh asks for a few more.
+    assert 1778 < len(result.points) < 2000
+    assert (result.converged, result.stop_reason) == (True, "plan completed")
+
+
+# What the rows mean.
+
+
+def test_row_i_is_the_callers_generator(adapter):
+    """One step of Lloyd's takes every generator to the centroid of its own cell."""
+    points = random_points(250, 5)
+    result = adapter.run(BOX, 0.2, points, method="lloyd", max_steps=1, tol=0)
+    cells = reference3d.box_voronoi(BOX.lower, BOX.upper, points)
+    assert result.points == pytest.approx(np.array([c.centroid for c in cells]), abs=1e-12)
+    assert np.array_equal(result.initial.points, points)
+    assert result.history["energy"][0] == pytest.approx(
+        sum(map(second_moment, cells, points)), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_steps(adapter, method):
+    points = random_points(200, 6)
+    result = adapter.run(BOX, SMALL, points, method=method, max_steps=0, levels=0)
+    assert np.array_equal(result.points, points)
+    assert len(result.history) == 1
+    check(result, SMALL)
+
+
+@pytest.mark.parametrize("method", ["lloyd", "weighted-lloyd"])
+def test_warm_start(adapter, method):
+    """Four steps and four more from where they led are eight."""
+    options = {"method": method, "tol": 0}
+    points = random_points(300, 7)
+    eight = adapter.run(BOX, SMALL, points, max_steps=8, **options)
+    four = adapter.run(BOX, SMALL, points, max_steps=4, **options)
+    again = adapter.run(BOX, SMALL, four.points, max_steps=4, **options)
+    assert again.points == pytest.approx(eight.points, abs=1e-10)
+    assert again.settings["start"] == "points"
+
+
+def test_origin_names_the_callers_generators(adapter):
+    """Those that stay come first, in their order and near their places; inserted ones are -1."""
+    first = adapter.run(BOX, SMALL, seed=31, effort="fast")
+    result = adapter.run(BOX, SMALL, first.points, effort="fast", n_cells=len(first.points) + 9)
+    origin = result.origin
+    kept = origin >= 0
+    assert 0 < (~kept).sum() <= result.history["inserted"].sum()
+    assert kept[: kept.sum()].all()
+    assert (np.diff(origin[kept]) > 0).all()
+    moved = np.linalg.norm(result.points[kept] - first.points[origin[kept]], axis=1)
+    assert np.median(moved / result.size[kept]) < 0.5
+    check(result, SMALL)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "options"),
+    [
+        ("float32", {"method": "coupled", "max_steps": 6}),
+        ("float64", {"effort": "fast"}),
+        ("float32", {"method": "exact", "effort": "fast", "n_cells": 333, "levels": 1}),
+    ],
+)
+def test_repeats_bit_by_bit(adapter, adapter32, dtype, options):
+    """By the same adapter, whatever it did before, and by a new one."""
+    used = adapter if dtype == "float64" else adapter32
+    first = used.run(BOX, SMALL, seed=2718, **options)
+    for other in (used, clvoro.Adapter(dtype=dtype)):
+        again = other.run(BOX, SMALL, seed=2718, **options)
+        assert np.array_equal(again.points, first.points)
+        for name in set(first.history.dtype.names) - {"seconds"}:
+            assert np.array_equal(again.history[name], first.history[name]), name
+
+
+def test_units_do_not_matter(adapter):
+    """A mesh in millimeters far from the origin is the same mesh."""
+    points = random_points(250, 8)
+    box = clvoro.Box((40, -7, 3), (40 + 1e-3, -7 + 1e-3, 3 + 1e-3))
+    small = sizing.Distance(
+        sizing.Circle((40 + 0.5e-3, -7 + 0.5e-3, 3 + 0.4e-3), 0.25e-3), 0.08e-3, slope=0.6
+    )
+    options = {"method": "weighted", "max_steps": 5, "tol": 0}
+    a = adapter.run(BOX, SMALL, points, **options)
+    b = adapter.run(box, small, points * 1e-3 + box.lower, **options)
+    # 40 rounds to 7e-15, 1e-10 of a cell; five steps let differences grow.
+    assert (b.points - box.lower) * 1e3 == pytest.approx(a.points, abs=1e-6)
+    assert b.history["mean_error"] == pytest.approx(a.history["mean_error"], rel=1e-5)
+    assert b.history["energy"] == pytest.approx(a.history["energy"] * 1e-15, rel=1e-5)
+
+
+# How a run ends; counts and levels.
+
+
+@pytest.mark.parametrize(("options", "rows"), [({"method": "coupled"}, 4), ({"levels": 1}, 6)])
+@pytest.mark.parametrize("how", ["returns True", "is interrupted", "max_steps"])
+def test_stopped(adapter, options, rows, how):
+    """On whatever level: the mesh has the size that was asked for."""
+    seen = []
+
+    def callback(row):
+        seen.append(row.copy())
+        if how == "is interrupted" and len(seen) == rows:
+            raise KeyboardInterrupt
+        return how == "returns True" and len(seen) == rows
+
+    most = {"max_steps": rows - 1} if how == "max_steps" else {}
+    result = adapter.run(BOX, S1, callback=callback, seed=12, effort="fast", **options, **most)
+    assert len(seen) == rows
+    assert not result.converged
+    reasons = {
+        "returns True": "stopped by the callback", "is interrupted": "interrupted",
+        "max_steps": "max_steps reached",
+    }  # fmt: skip
+    assert result.stop_reason == reasons[how]
+    assert len(result.points) == pytest.approx(1778, rel=0.12)
+    check(result, S1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_n_cells_is_held(adapter, method, n):
+    result = adapter.run(BOX, SMALL, n_cells=n, method=method, effort="fast", max_steps=20)
+    assert len(result.points) == n
+    check(result, SMALL)
+
+
+@pytest.mark.parametrize("n_cells", [210, 260])
+def test_n_cells_finds_the_best_common_factor(adapter, n_cells):
+    result = adapter.run(BOX, SMALL, n_cells=n_cells, method="exact", seed=15)
+    assert len(result.points) == n_cells
+    # Sizes count where generators come to lie: of twelve starts on two devices the factor is 0.990 to 1.024 times that.
+    assert result.size_factor == pytest.approx(np.cbrt(269 / n_cells), rel=0.04)
+    length = np.cbrt(result.diagram.volumes)
+    # Three steps; at so few cells h changes by a third from one to the next.
+    assert np.abs(np.log(length / result.size)).mean() < 2e-3
+    check(result, SMALL)
+
+
+@pytest.mark.parametrize("levels", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_levels(adapter, levels):
+    result = adapter.run(BOX, S1, levels=levels, effort="fast", seed=16)
+    h = result.history
+    assert h["level"][0] == levels
+    assert h["cells"][0] == round(1778 / 8**levels)
+    assert len(result.points) == pytest.approx(1900, rel=0.06)
+    check(result, S1)
+
+
+def test_levels_from_the_callers_points(adapter):
+    for n, level in ((250, 1), (1900, 0)):
+        result = adapter.run(BOX, S1, random_points(n, 17), effort="fast")
+        assert result.history["level"][0] == level
+        assert len(result.points) == pytest.approx(1900, rel=0.1)
+        check(result, S1)
+
+
+def test_refinement_meets_the_count_ahead(adapter):
+    """Few generators are left for the finest level to insert or delete."""
+    result = adapter.run(BOX, S1, levels=1, seed=3)
+    h = result.history
+    first = int(np.argmax(h["level"] == 0))
+    assert abs(h["cells"][first] / len(result.points) - 1) < 0.04
+
+
+# Domains and size fields of all kinds.
+
+
+def raster():
+    axes = [np.linspace(0, 1, n) for n in (9, 11, 13)]
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    return sizing.Raster(0.12 + 0.1 * x + 0.05 * y * z, (0, 0, 0), (1, 1, 1))
+
+
+FIELDS = {
+    "constant": lambda: sizing.Constant(0.15),
+    "expression": lambda: sizing.Expression("0.1 + 0.1*x + 0.05*z*z"),
+    "raster": raster,
+    "distance": lambda: SMALL,
+    "smaller of two": lambda: sizing.minimum(SMALL, 0.2),
+    "segment": lambda: sizing.Distance(
+        sizing.Segment((0.2, 0.2, 0.1), (0.8, 0.7, 0.9)), 0.06, slope=0.35
+    ),
+    "jump": lambda: sizing.Expression("x < 0.5 ? 0.12 : 0.4"),
+    "jump of 100": lambda: sizing.Expression("x + 0.37*y < 0.2 ? 0.06 : 6.0"),
+    "peak": lambda: sizing.Expression(
+        "0.12 + 2*exp(-60*((x-.5)*(x-.5)+(y-.4)*(y-.4)+(z-.5)*(z-.5)))"
+    ),
+    "steep": lambda: sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.06, slope=3),
+    "corner": lambda: sizing.Expression("0.03 + 0.25*sqrt(x*x + y*y + z*z)"),
+    "wall": lambda: sizing.Expression("0.06 + 0.4*z"),
+    "about the domain": lambda: sizing.Constant(0.9),
+    "larger than the domain": lambda: sizing.Constant(50.0),
+}
+INFEASIBLE = ("jump", "jump of 100", "steep", "peak")
+"""No mesh can follow h that grows by a cell's length within the cell."""
+
+
+@pytest.mark.filterwarnings(
+    "ignore::clvoro.errors.CoarseSizeWarning"
+)  # one is larger than the domain
+@pytest.mark.parametrize("name", FIELDS)
+def test_fields(adapter, name):
+    field = FIELDS[name]()
+    result = adapter.run(BOX, field, effort="fast", seed=20)
+    check(result, field)
+    assert result.converged
+    if "domain" in name:
+        assert len(result.points) == 1
+    elif name not in INFEASIBLE:
+        assert np.abs(result.error).mean() < 0.03
+        assert result.quality.mean() > 0.57
+    else:
+        assert result.quality.mean() > 0.35
+
+
+def test_callable_and_device_field_agree(adapter):
+    options = {"method": "coupled", "max_steps": 5, "seed": 3, "tol": 0}
+    device = adapter.run(BOX, SMALL, **options)
+    host = adapter.run(BOX, lambda points: SMALL(points), device.initial.points, **options)
+    assert host.points == pytest.approx(device.points, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=() if name in ("adaptive", "coupled") else pytest.mark.slow)
+        for name in METHODS
+    ],
+)
+def test_elongated_boxes(adapter, adapter32, method):
+    """A box 20 times as long as it is flat, and a plate one cell thick."""
+    plate = clvoro.Box((0, 0, 0), (1, 1, 0.02))
+    for box, field in (
+        (LONG, sizing.Expression("0.13 + 0.03*fabs(x)")),
+        (plate, sizing.Constant(0.04)),
+    ):
+        for run, real in ((adapter.run, "float64"), (adapter32.run, "float32")):
+            result = run(box, field, method=method, effort="fast", max_steps=16, seed=3)
+            check(result, field, box, real)
+
+
+def test_points_on_walls_edges_and_corners(adapter):
+    """They are generators like others; their cells are halves, quarters and eighths."""
+    line = np.linspace(0, 1, 4)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    diagram = adapter.diagram(BOX, points)
+    weights = np.where((points == 0) | (points == 1), 0.5, 1).prod(axis=1)
+    assert diagram.volumes == pytest.approx(weights / 27, rel=1e-12)
+    for method in METHODS:
+        result = adapter.run(BOX, 0.25, points, method=method, effort="fast", max_steps=12)
+        check(result, sizing.Constant(0.25))
+
+
+def test_lattices_are_left_alone(adapter):
+    """All cells alike, many vertices of degree eight: nothing pushes anything anywhere."""
+    line = (np.arange(5) + 0.5) / 5
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    for method in ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"):
+        result = adapter.run(BOX, 0.2, points, method=method, max_steps=3, tol=0)
+        assert result.points == pytest.approx(points, abs=1e-12), method
+        assert np.abs(result.error).max() < 1e-12
+
+
+def bcc(m):
+    """Generators of a body-centerd cubic lattice of m cubes along each side, that fits the unit cube."""
+    line = np.arange(m)
+    corner = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    return np.concatenate([corner + 0.25, corner + 0.75]) / m
+
+
+def test_a_lattice_keeps_its_quality(adapter):
+    """The truncated octahedron's quotient is .753; no random start comes near it."""
+    start = bcc(5)
+    size = float((1 / len(start)) ** (1 / 3))
+    lattice = adapter.run(BOX, size, start)
+    random = adapter.run(BOX, size, n_cells=len(start), seed=5)
+    for result in (lattice, random):
+        check(result, sizing.Constant(size))
+    inner = [
+        r.quality[((r.points > 0.3) & (r.points < 0.7)).all(axis=1)].mean()
+        for r in (lattice, random)
+    ]
+    assert inner[0] > 0.745  # walls disturb it a little so far inside
+    assert inner[0] > inner[1] + 0.02
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"points": np.zeros((4, 2))}, InputError, r"points has shape \(4, 2\)"),
+        ({"points": [[0.1, 0.2, 0.3]] * 2}, InputError, r"points\[0\] and points\[1\] coincide"),
+        ({"points": [[0.1, 0.2, 1.3]]}, InputError, r"points\[0\] is .*outside"),
+        ({"size": sizing.Expression("0.3 - z")}, SizeFieldError, r"at \(.*,.*,"),
+        ({"size": 1e-4}, MemoryLimitError, r"1e\+12 cells.*GiB"),
+        ({"n_cells": 10**10}, MemoryLimitError, r"1e\+10 cells.*GiB"),
+        ({"levels": 6}, InputError, "levels is 6, expected at most"),
+        ({"size": sizing.Circle((0, 0), 1)}, clvoro.ClvoroError, "size"),
+        (
+            {"size": sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), 0.1, slope=0.1)},
+            clvoro.ClvoroError,
+            "dimension|3",
+        ),
+    ],
+)
+def test_bad_input(adapter, change, error, message):
+    with pytest.raises(error, match=message):
+        adapter.run(**{"domain": BOX, "size": SMALL, **change})

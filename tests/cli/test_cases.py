@@ -1,0 +1,350 @@
+"""Case files: what they may hold, how they are refused, and that writing and reading agree."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from clvoro import Box, sizing
+from clvoro.cli.cases import Case, builtin_cases, load_case, naca4, toml
+from clvoro.errors import InputError
+
+HEAD = "[domain]\nlower = [0, 0]\nupper = [2, 1]\n"
+
+
+def case(text, folder=None):
+    return Case.from_toml(HEAD + text, "my.toml", *([folder] if folder else []))
+
+
+def field(size_text, folder=None):
+    return case(size_text, folder).size_field()
+
+
+def points(n=200):
+    return np.random.default_rng(71).random((n, 2)) * (2, 1)
+
+
+# --- NACA sections -------------------------------------------------------------------------------
+
+
+def thickness_at(outline, x):
+    """Vertical thickness of an outline at chord positions x."""
+    nose = outline[:, 0].argmin()
+    upper, lower = outline[: nose + 1][::-1], np.vstack([outline[nose:], outline[:1]])
+    return np.interp(x, *upper.T) - np.interp(x, *lower.T)
+
+
+def test_thickest_place_of_a_symmetric_section():
+    outline = naca4("0012", n_points=400)
+    x = np.linspace(0.05, 0.95, 901)
+    thickness = thickness_at(outline, x)
+    # The published section: 12 % of the chord, at 30 %.
+    assert thickness.max() == pytest.approx(0.12, abs=1e-4)
+    assert x[thickness.argmax()] == pytest.approx(0.30, abs=0.005)
+
+
+def test_section_is_closed_and_counter_clockwise():
+    outline = naca4("2412", n_points=50)
+    assert outline.shape == (100, 2)
+    assert outline[0] == pytest.approx([1, 0], abs=1e-15)
+    assert len(np.unique(outline, axis=0)) == len(outline)
+    x, y = outline.T
+    area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+    # Integral of the thickness law, 2 * 5 t * (.2969 / 1.5 - .126 / 2 - .3516 / 3 + ...), t = .12.
+    law = 0.2969 / 1.5 - 0.1260 / 2 - 0.3516 / 3 + 0.2843 / 4 - 0.1036 / 5
+    assert area == pytest.approx(10 * 0.12 * law, rel=2e-3)
+
+
+def test_camber_is_two_percent_at_forty():
+    outline = naca4("2412", n_points=2000)
+    nose = len(outline) // 2
+    upper, lower = outline[: nose + 1][::-1], outline[nose:]
+    x = np.linspace(0.2, 0.6, 401)
+    middle = 0.5 * (np.interp(x, *upper.T) + np.interp(x, *lower.T))
+    # The thickness stands on the camber line's normal: the mean height differs from it by less.
+    assert middle.max() == pytest.approx(0.02, abs=2e-4)
+    assert x[middle.argmax()] == pytest.approx(0.4, abs=0.03)
+
+
+def test_section_is_scaled_turned_and_moved():
+    plain, moved = naca4("4415"), naca4("4415", chord=2.0, leading_edge=(1.0, -3.0), angle=30.0)
+    # Nose up about the leading edge: the trailing edge goes down.
+    assert moved[0] == pytest.approx([1 + 2 * math.cos(math.pi / 6), -3 - 1.0])
+    assert np.hypot(*(moved - (1, -3)).T) == pytest.approx(2 * np.hypot(*plain.T))
+
+
+@pytest.mark.parametrize("digits", ["241", "24120", "24a2", "2400", "", "²412"])
+def test_not_a_section(digits):
+    with pytest.raises(InputError, match="four digits"):
+        naca4(digits)
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def test_paper_case_is_the_documented_field():
+    paper = load_case("paper")
+    assert paper.domain == Box((0, 0), (2.5, 1.5))
+    assert paper.methods == ("lloyd", "poisson", "coupled")
+    x = np.random.default_rng(19).random((100, 2)) * (2.5, 1.5)
+    wanted = 0.02 + 0.3 * np.abs(np.hypot(x[:, 0] - 0.9, x[:, 1] - 0.75) - 0.3)
+    assert paper.size_field()(x) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_airfoil_case_grows_by_a_tenth_from_the_outline():
+    airfoil = load_case("airfoil")
+    assert tuple(airfoil.domain.extent) == (3, 2)
+    size = airfoil.size_field()
+    trailing_edge = naca4("2412", angle=4.0)[0]
+    near = trailing_edge + np.array([[0, 0], [0.01, 0], [5, 0]])
+    assert size(near[:1]) == pytest.approx(0.002)
+    assert size(near[1:2]) == pytest.approx(0.002 + math.log(1.1) * 0.01, rel=1e-3)
+    assert size(near[2:]) == pytest.approx(airfoil.size["h_max"])
+
+
+def test_every_built_in_case_survives_being_written():
+    for name in builtin_cases():
+        read = load_case(name)
+        again = Case.from_toml(toml.write(read.table()), "case.toml")
+        assert again.table() == read.table()
+
+
+def test_kinds_of_size_fields(tmp_path):
+    x = points()
+    assert field("[size]\nkind = 'constant'\nvalue = 0.3")(x) == pytest.approx(0.3)
+    assert Case.from_toml("size = 0.3\n" + HEAD, "my.toml").size_field()(x) == pytest.approx(0.3)
+    assert field("[size]\nkind = 'expression'\nexpression = '0.1 + 0.05 * x * y'")(
+        x
+    ) == pytest.approx(0.1 + 0.05 * x[:, 0] * x[:, 1])
+    values = np.random.default_rng(5).random((4, 7)) + 0.5
+    np.save(tmp_path / "h.npy", values)
+    raster = field("[size]\nkind = 'raster'\nfile = 'h.npy'", tmp_path)
+    assert raster(x) == pytest.approx(sizing.Raster(values, (0, 0), (2, 1))(x))
+    tree = """
+[size]
+kind = "min"
+[[size.fields]]
+kind = "scale"
+factor = 2.0
+field = 0.2
+[[size.fields]]
+kind = "distance"
+h_min = 0.01
+slope = 0.5
+shapes = [
+  { kind = "segment", a = [0, 0], b = [1, 0] },
+  { kind = "circle", center = [1.5, 0.5], radius = 0.1 },
+  { kind = "polyline", points = [[0, 1], [1, 1], [1, 0.8]] },
+  { kind = "polygon", points = [[0.2, 0.2], [0.4, 0.2], [0.3, 0.4]] },
+]
+"""
+    shapes = [
+        sizing.Segment((0, 0), (1, 0)),
+        sizing.Circle((1.5, 0.5), 0.1),
+        sizing.Polyline([(0, 1), (1, 1), (1, 0.8)]),
+        sizing.Polygon([(0.2, 0.2), (0.4, 0.2), (0.3, 0.4)]),
+    ]
+    wanted = np.minimum(0.4, sizing.Distance(shapes, 0.01, slope=0.5)(x))
+    assert field(tree)(x) == pytest.approx(wanted)
+    assert field(tree.replace('"min"', '"sum"'))(x) == pytest.approx(
+        0.4 + sizing.Distance(shapes, 0.01, slope=0.5)(x)
+    )
+
+
+def test_kinds_in_space(tmp_path):
+    pytest.importorskip("trimesh")
+    (tmp_path / "roof.off").write_text("OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 1\n0 1 1\n3 0 1 2\n3 0 2 3\n")
+    read = Case.from_toml(
+        "[domain]\nlower = [0, 0, 0]\nupper = [1, 1, 1]\n[size]\nkind = 'distance'\nh_min = 0.1\n"
+        "slope = 0.5\nshapes = [{ kind = 'surface', file = 'roof.off' }, { kind = 'box' },\n"
+        "{ kind = 'sphere', center = [0.5, 0.2, 0.7], radius = 0.1 }]",
+        "my.toml",
+        tmp_path,
+    )
+    x = np.random.default_rng(404).random((300, 3))
+    roof = np.abs(x[:, 1] - x[:, 2]) / math.sqrt(2)
+    walls = np.minimum(x, 1 - x).min(axis=1)
+    ball = np.abs(np.linalg.norm(x - (0.5, 0.2, 0.7), axis=1) - 0.1)
+    wanted = 0.1 + 0.5 * np.minimum(np.minimum(roof, walls), ball)
+    assert read.size_field()(x) == pytest.approx(wanted)
+    out = tmp_path / "out"
+    out.mkdir()
+    again = load_case(read.write(out))
+    assert (out / "roof.off").is_file()
+    assert again.size_field()(x) == pytest.approx(wanted)
+
+
+def test_graded_and_products():
+    x = points()
+    text = (
+        "[size]\nkind = 'graded'\nslope = 0.2\nresolution = 201\n[size.field]\n"
+        "kind = 'expression'\nexpression = 'x < 1 ? 0.05 : 1'"
+    )
+    ramp = 0.05 + 0.2 * np.maximum(x[:, 0] - 1, 0)
+    assert field(text)(x) == pytest.approx(ramp, abs=0.2 * 0.0101)  # one spacing
+    pair = "[size]\nkind = 'product'\nfields = [0.2, {kind = 'expression', expression = '1 + x'}]"
+    assert field(pair)(x) == pytest.approx(0.2 * (1 + x[:, 0]))
+    assert field(pair.replace("product", "quotient"))(x) == pytest.approx(0.2 / (1 + x[:, 0]))
+
+
+def test_sizes_from_a_solution(tmp_path):
+    u = np.tanh(5 * np.linspace(-1, 1, 81)) + np.zeros((41, 1))
+    np.save(tmp_path / "u.npy", u)
+    text = "[size]\nkind = 'hessian'\nfile = 'u.npy'\nn_cells = 500\nh_max = 0.2"
+    wanted = sizing.hessian_size(u, (0, 0), (2, 1), n_cells=500, h_max=0.2)
+    assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
+    text = "[size]\nkind = 'gradient'\nfile = 'u.npy'\neps = 0.1\nh_max = 0.2"
+    wanted = sizing.gradient_size(u, (0, 0), (2, 1), eps=0.1, h_max=0.2)
+    assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("size = 0.1\n[run]\nmax_step = 3", ["run", "'max_step'", "did you mean 'max_steps'"]),
+        ("size = 0.1\n[run]\nk = -1", ["run.k", "-1"]),
+        ("size = 0.1\n[run]\nseed = 1.5", ["run.seed", "1.5", "whole"]),
+        ("size = 0.1\n[run]\nstart = 'densty'", ["run.start", "did you mean 'density'"]),
+        ("size = 0.1\n[run]\nmethod = 'lloyd'\nmethods = ['lloyd']", ["method and methods"]),
+        (
+            "size = 0.1\n[run]\nmethods = ['lloyd', 'lloyd']",
+            ["run.methods[1]", "'lloyd'", "each name once"],
+        ),
+        ("size = -0.1", ["size", "-0.1", "above 0"]),
+        ("size = nan", ["size", "finite"]),
+        ("sise = 0.1", ["'sise'", "did you mean 'size'"]),
+        ("seed = 3\nsize = 0.1", ["'seed'", "it belongs to [run]"]),
+        ("size = 0.1\n[run]\nperiodic = true", ["run", "'periodic'", "it belongs to [domain]"]),
+        ("size = 0.1\n[run]\nspacing = 0.1", ["run", "'spacing'", "it belongs to [[layers]]"]),
+        (
+            "[size]\nkind = 'constant'\nvalue = 0.1\nslope = 0.2",
+            ["size", "'slope'", "it is for kind = 'distance' or 'graded'"],
+        ),
+        ("", ["lacks size"]),
+        ("[size]\nkind = 'distnce'", ["size.kind", "did you mean 'distance'"]),
+        ("[size]\nkind = 'raster'", ["size", "lacks file"]),
+        (
+            "[size]\nkind = 'distance'\nhmin = 0.1\nshapes = []",
+            ["size", "'hmin'", "did you mean 'h_min'"],
+        ),
+        (
+            "[size]\nkind='distance'\nh_min=1\nslope=1\ngrowth=2\nshapes=[{kind='circle',"
+            "center=[0,0],radius=1}]",
+            ["growth, slope", "exactly one"],
+        ),
+        (
+            "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='circle',center=[0,0],radius=1}]",
+            ["size.shapes[0]", "'center'", "did you mean 'center'"],
+        ),
+        (
+            "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='segment',a=[0],b=[1,1]}]",
+            ["size.shapes[0].a", "2 or 3 numbers"],
+        ),
+        ("[size]\nkind='graded'\nfield=1", ["size", "none of growth, slope"]),
+        ("[size]\nkind='graded'\nslope=1\nfield=-1", ["size.field", "above 0"]),
+        ("[size]\nkind='hessian'\nfile='u.npy'\neps=1\nn_cells=5", ["n_cells, eps"]),
+        ("[size]\nkind='quotient'\nfields=[1]", ["size.fields", "2 or more"]),
+        (
+            "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='sphere',center=[0,0],radius=1}]",
+            ["size.shapes[0].center", "3 numbers"],
+        ),
+        ("[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='surface'}]", ["lacks file"]),
+        ("a b", ["not a TOML file", "line"]),
+    ],
+)
+def test_refusals_name_the_key(text, named):
+    # Bare keys have to stand before the first table.
+    whole = text + "\n" + HEAD if text[:1] == "s" else HEAD + text
+    with pytest.raises(InputError) as refused:
+        Case.from_toml(whole, "my.toml")
+    for part in ["my.toml", *named]:
+        assert part in str(refused.value)
+
+
+def test_unknown_case_names_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'paper'"):
+        load_case("papre")
+
+
+def test_missing_raster_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"size\.file.*absent\.npy"):
+        field("[size]\nkind = 'raster'\nfile = 'absent.npy'", tmp_path)
+
+
+# --- writing -------------------------------------------------------------------------------------
+
+
+def test_written_case_carries_its_files(tmp_path):
+    source, target = tmp_path / "source", tmp_path / "elsewhere"
+    source.mkdir(), target.mkdir()
+    values, start = np.full((3, 3), 0.25), points(12)
+    np.save(source / "h.npy", values)
+    np.save(source / "start.npy", start)
+    read = case(
+        "[size]\nkind = 'scale'\nfactor = 0.5\n[size.field]\nkind = 'raster'\nfile = 'h.npy'\n"
+        "[run]\npoints = 'start.npy'",
+        source,
+    )
+    path = read.write(target, ("a comment",))
+    for file in source.iterdir():
+        file.unlink()
+    again = load_case(path)
+    assert path.read_text().startswith("# a comment\n")
+    assert again.size_field()(start) == pytest.approx(0.125)
+    assert np.array_equal(again.run_arguments()["points"], start)
+    again.write(target)  # over itself
+    assert load_case(path).table() == again.table()
+
+
+def test_files_of_one_name_are_kept_apart(tmp_path):
+    for folder, value in (("a", 0.1), ("b", 0.2)):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "h.npy", np.full((2, 2), value))
+    read = case(
+        "[size]\nkind = 'sum'\n[[size.fields]]\nkind = 'raster'\nfile = 'a/h.npy'\n"
+        "[[size.fields]]\nkind = 'raster'\nfile = 'b/h.npy'",
+        tmp_path,
+    )
+    out = tmp_path / "out"
+    out.mkdir()
+    assert load_case(read.write(out)).size_field()(points()) == pytest.approx(0.3)
+
+
+def test_run_settings_are_checked_when_changed():
+    read = load_case("paper")
+    changed = read.with_run(method="coupled", max_steps=7, seed=None)
+    assert changed.methods == ("coupled",)
+    assert "methods" not in changed.run
+    assert (changed.run["max_steps"], changed.run["seed"]) == (7, read.run["seed"])
+    with pytest.raises(InputError, match=r"run\.max_steps"):
+        read.with_run(max_steps=-2)
+
+
+leaves = (
+    st.booleans()
+    | st.integers(-(2**63), 2**63 - 1)
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(blacklist_categories=["Cs"]), max_size=8)
+)
+keys = st.text(st.characters(blacklist_categories=["Cs"]), max_size=6)
+tables = st.recursive(
+    st.dictionaries(keys, leaves, max_size=3),
+    lambda t: st.dictionaries(
+        keys, leaves | t | st.lists(t, max_size=3) | st.lists(leaves, max_size=3), max_size=4
+    ),
+    max_leaves=10,
+)
+
+
+@given(tables)
+def test_toml_is_read_as_it_was_written(table):
+    assert toml.read(toml.write(table)) == table
+
+
+def test_toml_writes_numpy_and_leaves_out_none():
+    text = toml.write({"a": np.float64(0.1), "b": np.arange(3), "c": None}, ["note"])
+    assert toml.read(text) == {"a": 0.1, "b": [0, 1, 2]}
+    with pytest.raises(TypeError, match="no form"):
+        toml.write({"a": object()})

@@ -1,0 +1,208 @@
+"""Cases with polygonal domains: files, rings, shapes as rings, the boundary as a shape, and the built-in ones."""
+
+import json
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro import sizing
+from clvoro.cli.cases import Case, builtin_cases, load_case, naca4
+from clvoro.cli.cases.coast import fractal_ring, lake
+from clvoro.cli.cases.files import FOLDER
+from clvoro.errors import InputError
+from tests.reference.polygons import HOLE, SQUARE
+
+SIZE = "\n[size]\nkind = 'constant'\nvalue = 0.3\n"
+RINGS = f"[domain]\nouter = {SQUARE.tolist()}\nholes = [{HOLE.tolist()}]\n"
+
+
+def points(domain: clvoro.Polygon, n: int = 200) -> np.ndarray:
+    return clvoro.adaptation.sampling.start.sample_uniform(domain, n, 3)
+
+
+def test_domains_from_files_and_from_rings(tmp_path) -> None:
+    wanted = clvoro.Polygon(SQUARE, [HOLE])
+    geometry = {"type": "Polygon", "coordinates": [SQUARE.tolist(), HOLE.tolist()]}
+    (tmp_path / "a.geojson").write_text(json.dumps(geometry))
+    (tmp_path / "a.wkt").write_text(shapely.Polygon(SQUARE, [HOLE]).wkt)
+    for text in (
+        RINGS, "[domain]\npolygon = 'a.geojson'\n", "[domain]\npolygon = 'a.wkt'\n",
+        "[domain]\nkind = 'polygon'\nfile = 'a.geojson'\n", RINGS.replace("outer", "kind = 'polygon'\nouter"),
+    ):  # fmt: skip
+        case = Case.from_toml(text + SIZE, "my.toml", tmp_path)
+        assert case.domain == wanted
+        # Written somewhere else, it is the same case with the same file.
+        moved = tmp_path / "moved"
+        moved.mkdir(exist_ok=True)
+        again = load_case(case.write(moved))
+        assert again.domain == wanted
+        assert again.table() == case.table()
+
+
+def test_shapes_as_rings() -> None:
+    text = (
+        "[domain]\nouter = { kind = 'circle', center = [1, 2], radius = 3, n_points = 12 }\n"
+        "holes = [{ kind = 'naca4', digits = '2412', leading_edge = [0.5, 2], n_points = 9 },\n"
+        "  [[1, 0], [2, 0], [2, 1]]]\n"
+    )
+    case = Case.from_toml(text + SIZE, "my.toml")
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    circle = np.column_stack([1 + 3 * np.cos(turn), 2 + 3 * np.sin(turn)])
+    section = naca4("2412", leading_edge=(0.5, 2), n_points=9)
+    wanted = clvoro.Polygon(circle, [section, [(1, 0), (2, 0), (2, 1)]])
+    assert case.domain == wanted
+    again = Case.from_toml(clvoro.cli.cases.toml.write(case.table()), "case.toml")
+    assert again.domain == wanted
+
+
+def test_sizes_from_the_boundary() -> None:
+    distance = "\n[size]\nkind = 'distance'\nh_min = 0.01\nslope = 0.5\nshapes = [{ kind = 'boundary' %s }]\n"
+    domain = clvoro.Polygon(SQUARE, [HOLE])
+    x = points(domain)
+    clockwise = RINGS.replace(str(HOLE.tolist()), str(HOLE[::-1].tolist()))
+    for rings in (RINGS, clockwise):
+        size = Case.from_toml(rings + distance % "", "my.toml").size_field()
+        assert size(x) == pytest.approx(0.01 + 0.5 * domain.boundary_distance(x))
+    # Numbers are those of the rings as the case gives them: 4 to 7 are the hole's.
+    for rings, hole in ((RINGS, HOLE), (clockwise, HOLE[::-1])):
+        size = Case.from_toml(rings + distance % ", edges = [6]", "my.toml").size_field()
+        wanted = sizing.Distance(sizing.Segment(hole[2], hole[3]), 0.01, slope=0.5)
+        assert size(x) == pytest.approx(wanted(x))
+    feature = (
+        "\n[size]\nkind = 'feature'\ncells_across = 3\nh_max = 0.5\ngrowth = 1.3\ncurvature = 0\n"
+    )
+    size = Case.from_toml(RINGS + feature, "my.toml").size_field()
+    wanted = sizing.FeatureSize(domain, 3, growth=1.3, h_max=0.5, curvature=0)
+    assert size(x) == pytest.approx(wanted(x), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[domain]\npolygon = 3\n", "domain.polygon is 3"),
+        ("[domain]\npolygon = 'none.geojson'\n", "cannot read none.geojson"),
+        ("[domain]\npolygon = 'none.wkt'\n", "cannot read none.wkt"),
+        ("[domain]\npolygon = 'a.geojson'\nholes = [[[0, 0], [1, 0], [1, 1]]]\n", "both a file and holes"),
+        ("[domain]\nouter = [[0, 0], [1, 0]]\n", r"domain.outer is .*, expected a list of 3 or more"),
+        ("[domain]\nouter = [[0, 0], [1, 0], [1]]\n", r"domain.outer\[2\] is \[1\]"),
+        ("[domain]\nouter = { kind = 'sphere' }\n", "domain.outer.kind is 'sphere'"),
+        ("[domain]\nouter = [[0, 0], [2, 2], [2, 0], [0, 2]]\n", "Self-intersection"),
+        ("[domain]\nkind = 'polygon'\n", "none of file, outer"),
+        ("[domain]\nkind = 'polygon'\nlower = [0, 0]\n", "unknown key 'lower'"),
+        ("[domain]\nlower = [0, 0]\nupper = [1, 1]\nouter = [[0, 0], [1, 0], [1, 1]]\n", "both lower, of a box"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(text: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Case.from_toml(text + SIZE, "my.toml")
+
+
+def test_edges_of_a_boundary_must_be_there() -> None:
+    shape = "\n[size]\nkind = 'distance'\nh_min = 0.1\nslope = 0.5\nshapes = [{ kind = 'boundary', edges = [8] }]\n"
+    with pytest.raises(InputError, match=r"edges has 8, .* from 0 to 7"):
+        Case.from_toml(RINGS + shape, "my.toml").size_field()
+    box = "[domain]\nlower = [0, 0]\nupper = [1, 1]\n"
+    with pytest.raises(InputError, match="need a polygon as domain"):
+        Case.from_toml(box + shape, "my.toml").size_field()
+    with pytest.raises(InputError, match="needs a polygon as domain"):
+        Case.from_toml(box + "\n[size]\nkind = 'feature'\n", "my.toml").size_field()
+    sides = Case.from_toml(box + shape.replace(", edges = [8]", ""), "my.toml").size_field()
+    assert sides(np.array([(0.5, 0.3)])) == pytest.approx(0.25)
+
+
+def test_fractal_rings_do_not_cross_themselves() -> None:
+    rng = np.random.default_rng(3)
+    ring = fractal_ring(SQUARE, 7, 0.4, rng)  # rough enough for crossings, if nobody looked
+    assert len(ring) == 4 << 7
+    assert clvoro.Polygon(ring).measure > 0
+    assert (ring[:: 1 << 7] == SQUARE).all()
+
+
+def test_the_lake_is_that_of_its_script() -> None:
+    file = FOLDER / "lake.geojson"
+    assert file.stat().st_size < 100_000
+    assert json.loads(file.read_text()) == lake()
+    domain = load_case("lake").domain
+    assert domain == clvoro.Polygon.from_geojson(lake())
+    assert len(domain.piece_of_ring) == 7
+    assert 1500 < len(domain.vertices) < 2500
+    assert {"lake", "channel"} <= set(builtin_cases())
+
+
+def test_the_lake_has_cells_across_its_straits() -> None:
+    case = load_case("lake")
+    size, domain = case.size_field(), case.domain
+    # The strait between the two islands in the north: nearest points of their rings.
+    one, two = (clvoro.Polygon(domain.rings[i][::-1]).geometry for i in (2, 3))
+    a, b = shapely.get_coordinates(shapely.shortest_line(one, two))
+    across = a + np.linspace(0, 1, 101)[:, None] * (b - a)
+    cells = np.mean(1 / size(across)) * np.hypot(*(b - a))
+    assert cells >= 4 * 0.98
+    assert size(points(domain, 2000)).min() >= 0.012 * (1 - 1e-12)
+
+
+def test_the_channel_leaves_its_section_out() -> None:
+    case = load_case("channel")
+    section = clvoro.Polygon(naca4("2412", angle=4.0, n_points=100))
+    assert case.domain.measure == pytest.approx(3.5 * 1.2 - section.measure, rel=1e-12)
+    size = case.size_field()
+    assert size(np.array([(-1.0, 0.6), (2.5, -0.6)])) == pytest.approx(0.006)
+    # Around the section sizes come from the layers.
+    (layer,) = case.run_arguments()["layers"]
+    assert layer.edges == tuple(range(4, 4 + len(section.vertices)))
+    assert size(np.array([(-1.0, 0.0)])) == pytest.approx(0.06)
+
+
+def test_cases_run(ctx) -> None:
+    adapter = clvoro.Adapter(ctx)
+    case = load_case("channel")
+    result = adapter.run(case.domain, 8 * case.size_field(), effort="fast", seed=1)
+    assert result.check().ok
+    assert result.diagram.volumes.sum() == pytest.approx(case.domain.measure, rel=1e-12)
+
+
+LAYERED = """
+[domain]
+outer = [[0, 0], [2, 0], [2, 1], [0, 1]]
+holes = [{ kind = "circle", center = [1, 0.5], radius = 0.2, n_points = 16 }]
+
+[size]
+kind = "constant"
+value = 0.1
+
+[[layers]]
+height = 0.02
+count = 2
+rings = [1]
+
+[[layers]]
+height = 0.03
+edges = [0]
+"""
+
+
+def test_layers_of_a_case(tmp_path):
+    case = Case.from_toml(LAYERED, "layered")
+    around, below = case.run_arguments()["layers"]
+    assert around == clvoro.Layers(0.02, count=2, edges=range(4, 20))
+    assert below == clvoro.Layers(0.03, edges=[0])
+    again = load_case(case.write(tmp_path))
+    assert again.run_arguments()["layers"] == [around, below]
+    # Edges are numbered as the rings are given: here that one runs around the hole counter-clockwise.
+    (_, beside) = Case.from_toml(
+        LAYERED.replace("edges = [0]", "edges = [4]"), "layered"
+    ).run_arguments()["layers"]
+    (edge,) = beside.edges
+    assert case.domain.edge_numbers[edge] == 4 != edge
+    assert case.domain.vertices[edge] == pytest.approx(
+        (1 + 0.2 * np.cos(np.pi / 8), 0.5 + 0.2 * np.sin(np.pi / 8))
+    )
+    with pytest.raises(InputError, match=r"rings has \[2\], expected 0 to 1"):
+        Case.from_toml(LAYERED.replace("rings = [1]", "rings = [2]"), "layered").run_arguments()
+    boxed = LAYERED.split("[size]")[1]
+    with pytest.raises(InputError, match="polygonal domain"):
+        Case.from_toml(
+            f"[domain]\nlower = [0, 0]\nupper = [2, 1]\n[size]{boxed}", "boxed"
+        ).run_arguments()

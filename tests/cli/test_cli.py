@@ -1,0 +1,400 @@
+"""The command line: files, exit codes, progress, Ctrl-C, and that a run can be repeated."""
+
+import functools
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.cli import command as cli
+from clvoro.cli import jobs, progress
+from clvoro.errors import BuildError, DeviceError, MemoryLimitError, SolverError
+from clvoro.io import load
+from clvoro.mesh.results import HISTORY_DTYPE
+
+CASE = """
+title = "A small box"
+size = 0.11
+
+[domain]
+lower = [0, 0]
+upper = [1, 1]
+
+[run]
+methods = ["lloyd", "coupled"]
+start = "uniform"
+max_steps = 4
+tol = 0
+seed = 3141
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.toml").write_text(CASE)
+    return tmp_path
+
+
+def call(*arguments):
+    return cli.main([str(a) for a in arguments])
+
+
+def test_run_writes_everything(here, capsys):
+    assert call("run", "small.toml") == cli.OK
+    out = here / "out" / "small"
+    written = {p.name for p in out.iterdir()}
+    assert written == {
+        "mesh.vtu", "mesh.npz", "history.csv", "mesh-lloyd.npz", "history-lloyd.csv", "case.toml",
+        "report.html", "pictures",
+    }  # fmt: skip
+    printed = capsys.readouterr()
+    assert printed.err == ""  # too short a run for progress in a log
+    assert "report.html" in printed.out
+    mesh = load(out / "mesh.npz")
+    row = re.search(r"^coupled +(\d+) +(\d+) +([\d.]+)", printed.out, re.MULTILINE)
+    assert (int(row[1]), int(row[2])) == (len(mesh.points), 4)
+    assert float(row[3]) == pytest.approx(np.abs(mesh.error).mean(), abs=5e-5)
+
+
+def test_written_case_repeats_the_mesh(here):
+    assert call("run", "small.toml", "--no-report", "--quiet", "--k", "0.7", "--out", "a") == 0
+    assert call("run", "a/case.toml", "--no-report", "--quiet", "--out", "b") == 0
+    for name in ("mesh.npz", "mesh-lloyd.npz"):
+        one, two = load(here / "a" / name), load(here / "b" / name)
+        assert np.array_equal(one.points, two.points)
+    assert (here / "a" / "case.toml").read_text() == (here / "b" / "case.toml").read_text()
+    assert not (here / "a" / "report.html").exists()
+
+
+def test_json_lines(here, capsys):
+    assert call("run", "small.toml", "--json", "--no-report", "--dtype", "float32") == cli.OK
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["method"] for line in lines] == ["lloyd", "coupled"]
+    mesh = load(here / "out" / "small" / "mesh.npz")
+    assert lines[1]["cells"] == len(mesh.points)
+    assert lines[1]["mean_quality"] == pytest.approx(mesh.quality.mean())
+    assert lines[1]["settings"]["dtype"] == "float32"
+    assert lines[1]["steps"] == 4
+
+
+def test_options_override_the_case(here, capsys):
+    options = ["--method", "poisson", "--cells", 33, "--steps", 2, "--start", "density"]
+    options += ["--seed", 77, "--k", 0.25, "--tol", 0.5]
+    assert call("run", "small.toml", "--json", "--no-report", *options) == cli.OK
+    (line,) = capsys.readouterr().out.splitlines()
+    settings = json.loads(line)["settings"]
+    wanted = {
+        "method": "poisson", "n_cells": 33, "max_steps": 2, "start": "density", "seed": 77,
+        "k": 0.25, "tol": 0.5,
+    }  # fmt: skip
+    assert {key: settings[key] for key in wanted} == wanted
+    repeat = (here / "out" / "small" / "case.toml").read_text()
+    assert 'method = "poisson"' in repeat
+    assert "methods" not in repeat
+
+
+def test_methods_of_a_case_start_alike(here, capsys):
+    assert call("run", "small.toml", "--no-report", "--quiet", "--steps", 0) == cli.OK
+    lloyd, coupled = (load(here / "out/small" / f) for f in ("mesh-lloyd.npz", "mesh.npz"))
+    assert np.array_equal(lloyd.points, coupled.points)
+    assert capsys.readouterr().out == ""
+
+
+def test_start_from_points(here):
+    points = np.random.default_rng(12).random((20, 2))
+    np.save(here / "start.npy", points)
+    text = CASE.replace('start = "uniform"', 'points = "start.npy"')
+    (here / "warm.toml").write_text(text)
+    assert call("run", "warm.toml", "--no-report", "--quiet", "--steps", 0) == cli.OK
+    # The device's coordinates are scaled by a power of two: nothing is rounded here.
+    assert np.array_equal(load(here / "out/warm/mesh.npz").points, points)
+    assert (here / "out/warm/start.npy").exists()
+    assert call("run", "out/warm/case.toml", "--no-report", "--quiet", "--out", "again") == cli.OK
+
+
+@pytest.mark.parametrize("last_step", [0, 2])
+def test_interrupt_keeps_what_there_is(here, monkeypatch, capsys, last_step):
+    plain = progress.Progress.__call__
+
+    def pressing(self, row):
+        plain(self, row)
+        if row["step"] == last_step:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(progress.Progress, "__call__", pressing)
+    handler = signal.getsignal(signal.SIGINT)
+    assert call("run", "small.toml") == cli.INTERRUPTED
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert "stopping after this step" in capsys.readouterr().err
+    out = here / "out" / "small"
+    # The first method was stopped, the second not begun: its mesh is the result.
+    mesh = load(out / "mesh.npz")
+    assert mesh.history["step"].tolist() == list(range(last_step + 1))
+    assert mesh.stop_reason == "interrupted"
+    assert (out / "report.html").exists()
+    assert not list(out.glob("*-lloyd*"))
+    assert "interrupted" in (out / "case.toml").read_text().splitlines()[0]
+
+
+def test_failure_of_a_later_method_keeps_the_earlier_ones(here, monkeypatch, capsys):
+    plain = clvoro.Adapter.run
+
+    @functools.wraps(plain)
+    def run(self, *arguments, method, **options):
+        if method == "coupled":
+            raise SolverError("no convergence")
+        return plain(self, *arguments, method=method, **options)
+
+    monkeypatch.setattr(clvoro.Adapter, "run", run)
+    assert call("run", "small.toml", "--no-report") == cli.FAILED
+    assert "no convergence" in capsys.readouterr().err
+    assert len(load(here / "out" / "small" / "mesh.npz").history) == 5
+
+
+def test_an_unknown_method_is_refused_before_the_first_runs(here, capsys):
+    assert call("run", "small.toml", "--method", "lloyd,copled") == cli.BAD_INPUT
+    assert "run.methods[1] is 'copled' (did you mean 'coupled'?)" in capsys.readouterr().err
+    assert not (here / "out").exists()
+
+
+def test_warnings_are_one_line(here, capsys):
+    text = CASE.replace("size = 0.11", "size = 110")
+    assert text != CASE
+    (here / "meters.toml").write_text(text)
+    assert call("run", "meters.toml", "--no-report", "--quiet", "--method", "lloyd") == cli.OK
+    printed = capsys.readouterr().err
+    assert printed.startswith("clvoro: warning: the size field asks for")
+    assert printed.count("\n") == 1
+
+
+def test_every_file_is_checked(here, capsys):
+    call("run", "small.toml", "--no-report", "--quiet")
+    files = "small.toml", "nothing.npz", "out/small/mesh.npz"
+    assert call("check", *files) == cli.BAD_INPUT
+    printed = capsys.readouterr()
+    assert "small.toml is no mesh.npz" in printed.err
+    assert "nothing.npz" in printed.err
+    assert "out/small/mesh.npz: " in printed.out
+
+
+def test_second_interrupt_quits_at_once(here, monkeypatch, capsys):
+    monkeypatch.setattr(clvoro.Adapter, "run", pressing_run(signal.SIGINT))
+    assert call("run", "small.toml") == cli.INTERRUPTED
+    assert not list((here / "out" / "small").iterdir())
+    assert "nothing more has been written" in capsys.readouterr().err
+
+
+def pressing_run(number):
+    """Return a stand-in for Adapter.run during which the key is pressed twice."""
+
+    def run(self, domain, size, points=None, method="coupled", n_cells=None, start="density",
+            max_steps=100, tol=1e-3, alpha=None, k=0.5, seed=0, callback=None):  # fmt: skip
+        for _ in range(2):
+            signal.raise_signal(number)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "named"),
+    [
+        (["run", "papre"], cli.BAD_INPUT, "did you mean 'paper'"),
+        (["run", "small.toml", "--steps", -1], cli.BAD_INPUT, "run.max_steps is -1"),
+        (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
+        (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "no folder can be made"),
+        (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
+        (
+            ["cases", "papre"],
+            cli.BAD_INPUT,
+            "airfoil, channel, lake, paper, sphere, spots, surface",
+        ),
+    ],
+)
+def test_errors_are_one_message(here, capsys, arguments, code, named):
+    assert call(*arguments) == code
+    printed = capsys.readouterr()
+    assert named in printed.err
+    assert printed.err.startswith("clvoro: ")
+    assert "Traceback" not in printed.err
+    assert printed.out == ""
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (DeviceError("no device"), cli.NO_DEVICE),
+        (BuildError("no build"), cli.FAILED),
+        (MemoryLimitError("no room"), cli.FAILED),
+        (OSError("disk full"), cli.FAILED),
+    ],
+)
+def test_exit_codes_of_failures(here, monkeypatch, capsys, error, code):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(clvoro, "create_context", fail)
+    assert call("run", "small.toml") == code
+    assert capsys.readouterr().err == f"clvoro: {error}\n"
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
+def test_folder_without_permission(here):
+    folder = here / "locked"
+    folder.mkdir(mode=0o500)
+    with pytest.raises(clvoro.ClvoroError, match=r"can be (made|written)|cannot write"):
+        jobs.check_folder(folder / "inside")
+
+
+def test_report_without_matplotlib_is_refused_before_the_run(here, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert call("run", "small.toml") == cli.FAILED
+    assert "clvoro[plot]" in capsys.readouterr().err
+    assert call("run", "small.toml", "--no-report", "--steps", 1) == cli.OK
+
+
+@pytest.mark.parametrize("arguments", [[], ["run"], ["run", "paper", "--stps", "3"], ["fly"]])
+def test_usage(arguments, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main(arguments)
+    assert left.value.code == cli.BAD_INPUT
+    assert "usage:" in capsys.readouterr().err
+
+
+def test_cases_are_listed_and_printed(here, capsys):
+    assert call("cases") == cli.OK
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [
+        "airfoil",
+        "channel",
+        "lake",
+        "paper",
+        "sphere",
+        "spots",
+        "surface",
+    ]
+    assert call("cases", "paper") == cli.OK
+    (here / "mine.toml").write_text(capsys.readouterr().out)
+    assert call("run", "mine.toml", "--steps", 0, "--no-report", "--quiet") == cli.OK
+
+
+def test_devices(capsys):
+    assert call("devices") == cli.OK
+    assert "float64" in capsys.readouterr().out
+
+
+def test_module_and_version():
+    run = [sys.executable, "-m", "clvoro", "--version"]
+    shown = subprocess.run(run, capture_output=True, text=True, check=True)
+    assert shown.stdout == f"clvoro {clvoro.__version__}\n"
+
+
+# --- progress ------------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def row(step, seconds, cells=1000, progress=0.1):
+    values = np.zeros((), HISTORY_DTYPE)
+    values["step"], values["cells"], values["seconds"] = step, cells, seconds
+    values["progress"] = progress
+    values["mean_error"], values["max_error"] = 0.125, 1.5
+    values["mean_quality"], values["min_quality"] = 0.75, 0.5
+    return values[()]
+
+
+def test_line_holds_the_numbers():
+    shown = progress.Progress("paper lloyd", 10, io.StringIO())
+    for step in range(6):
+        shown(row(step, 0.5 * step))
+    line = shown.line(row(5, 2.5))
+    assert len(line) < 80
+    for part in ["lloyd 5/10", "|e| 0.1250", "max 1.5", "min 0.50", "2k cells/s", "2 s left"]:
+        assert part in line
+
+
+def test_line_of_a_run_of_unknown_length():
+    shown = progress.Progress("paper", None, io.StringIO())
+    for step, cells in enumerate([10, 10, 10, 40, 40, 40]):
+        shown(row(step, float(step), cells, progress=step / 8))
+    line = shown.line(row(5, 5.0, 40, progress=0.625))
+    assert line.startswith("paper 5 (62%)")
+    assert "32.5 cells/s" in line  # 10 and 40 three times in four seconds
+    assert line.endswith("3 s left")
+
+
+def test_the_time_left_is_told_by_the_pace_of_the_latter_half():
+    """Kernels are built before the first step, in it and in the next: then, four steps do not tell the pace."""
+    shown = progress.Progress("paper", None, io.StringIO())
+    seconds = [90, 100, 110, 111, 112, 113, 114, 115, *range(116, 300)]
+    lines = []
+    for step, at in enumerate(seconds):
+        values = row(step, float(at), progress=step / 400)
+        shown(values)
+        lines.append(shown.line(values))
+    assert not any("left" in line for line in lines[: progress.PACED + 1])
+    assert "cells/s" not in lines[1]
+    assert "100 cells/s" in lines[2]
+    assert all("left" in line for line in lines[progress.PACED + 1 :])
+    # 192 steps done, one a second since the third: 208 to go.
+    assert lines[-1].endswith("3 min 29 s left")
+    assert "1k cells/s" in lines[-1]
+
+
+def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rich.console", None)
+    monkeypatch.setattr(progress, "REFRESH", 0.0)
+    stream = Terminal()
+    with progress.Progress("x", 5, stream) as shown:
+        for step in range(3):
+            shown(row(step, step))
+    text = stream.getvalue()
+    assert "\n" not in text
+    # That it prepares, three steps, and the line is cleared in the end.
+    assert text.startswith("\rx: preparing")
+    assert text.count("\r") == 5
+
+
+def test_terminal_with_rich(monkeypatch):
+    pytest.importorskip("rich")
+    monkeypatch.setattr(progress, "REFRESH", 0.0)
+    stream = Terminal()
+    with progress.Progress("[x]", 5, stream) as shown:
+        shown(row(0, 0))
+        shown(row(1, 1))
+    assert "[x] 1/5" in stream.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["log", "terminal", "rich"])
+def test_a_line_that_stays(monkeypatch, kind):
+    if kind == "rich":
+        pytest.importorskip("rich")
+    else:
+        monkeypatch.setitem(sys.modules, "rich.console", None)
+    stream = io.StringIO() if kind == "log" else Terminal()
+    with progress.Progress("x", 5, stream) as shown:
+        shown.tell("takes [1] MiB")
+    text = stream.getvalue()
+    assert re.search(r"takes \[1\] MiB\S*\s*\n", text)
+    assert kind != "log" or text == "takes [1] MiB\n"
+
+
+def test_log_gets_a_line_now_and_then(monkeypatch):
+    stream = io.StringIO()
+    clock = iter(range(0, 1000, 2))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    with progress.Progress("x", 20, stream) as shown:
+        for step in range(10):  # two seconds each
+            shown(row(step, 2.0 * step))
+    lines = stream.getvalue().splitlines()
+    assert 2 <= len(lines) <= 20 / progress.EVERY
+    assert all(re.match(r"x \d+/20  ", line) for line in lines)

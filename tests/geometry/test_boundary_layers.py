@@ -1,0 +1,272 @@
+"""Layers of cells along walls: generators that stay where they are."""
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError, MemoryLimitError
+from clvoro.geometry.boundary_layers import (
+    Layers,
+    chosen_segments,
+    count_rows,
+    free_domain,
+    place_layers,
+)
+from tests.reference import shores
+
+BOX = clvoro.Box((0, 0), (2, 1))
+HOLE = 0.2 * np.stack(
+    [np.cos(np.arange(80) * np.pi / 40), np.sin(np.arange(80) * np.pi / 40)], axis=1
+)
+CHANNEL = clvoro.Polygon([(-1, -0.5), (2, -0.5), (2, 0.5), (-1, 0.5)], [HOLE])
+
+
+@pytest.fixture(scope="module")
+def adapter():
+    return clvoro.Adapter()
+
+
+def test_bisectors_lie_where_layers_meet():
+    layers = Layers(0.01, count=4, growth=1.3)
+    tops = np.cumsum(layers.heights)
+    assert layers.heights == pytest.approx(0.01 * 1.3 ** np.arange(4))
+    assert (layers.rows[1:] + layers.rows[:-1]) / 2 == pytest.approx(tops)
+    assert layers.thickness == pytest.approx(tops[-1])
+    # Every generator lies at the same share of its layer.
+    assert (tops - layers.rows[:-1]) / layers.heights == pytest.approx(1.3 / 2.3)
+
+
+def test_layers_of_a_straight_wall_are_rectangles(adapter):
+    layers = Layers(0.02, count=2, growth=1.5, edges=[2])
+    result = adapter.run(BOX, 0.1, layers=layers, effort="fast")
+    rows = place_layers(BOX, [layers])
+    n, d = len(rows), result.diagram
+    # They are the first, and have not moved (to the rounding of the device's coordinates).
+    assert np.abs(result.points[:n] - rows).max() < 1e-14
+    first = np.flatnonzero(np.isclose(rows[:, 1], layers.rows[0]))
+    columns = round(2 / layers.width)
+    assert len(first) == columns
+    assert d.volumes[first] == pytest.approx(0.02 * 2 / columns, rel=1e-12)
+    second = np.flatnonzero(np.isclose(rows[:, 1], layers.rows[1]))
+    assert d.volumes[second] == pytest.approx(0.03 * 2 / columns, rel=1e-12)
+    for i in first:
+        assert d.neighbor_starts[i + 1] - d.neighbor_starts[i] == 4
+    # The others are what a run without layers gives: of twelve starts between 0.010 and 0.021.
+    error = np.abs(result.error)
+    assert error[:n].max() == 0
+    assert error[n:].mean() < 0.025
+    assert result.check()
+
+
+RAMP = clvoro.Polygon([(0, 0), (0.93, 0), (1.4, 0.12), (2, 0.2), (2, 1), (0, 1)])
+UNEVEN = np.radians([0, 38, 80, 121, 160, 200, 243, 281, 320])  # turns of less than 50 degrees
+RAGGED = clvoro.Polygon(
+    [(-1, -0.7), (1, -0.7), (1, 0.7), (-1, 0.7)],
+    [0.45 * np.column_stack([np.cos(UNEVEN), np.sin(UNEVEN)])],
+)
+
+
+@pytest.mark.parametrize(
+    ("domain", "edges", "spacing"),
+    [(RAMP, range(3), 0.05), (CHANNEL, range(4, 84), 0.0075), (CHANNEL, range(4, 84), 0.014),
+     (CHANNEL, range(4, 84), 0.034), (RAGGED, range(4, 13), 0.06)],
+    ids=["ramp", "circle, two to an edge", "circle, one to an edge", "circle, two edges each", "loop"],
+)  # fmt: skip
+def test_cells_have_their_corners_at_those_of_the_wall(adapter, domain, edges, spacing):
+    """Where there is room for it: no wall's face is a sliver, cut off by a corner of the wall."""
+    layers = Layers(0.4 * spacing, count=2, spacing=spacing, edges=edges)
+    rows = place_layers(domain, [layers])
+    diagram = adapter.diagram(domain, rows)
+    owners = np.repeat(np.arange(len(rows)), np.diff(diagram.neighbor_starts))
+    walls = -1 - diagram.neighbors
+    mine = np.isin(walls, np.flatnonzero(np.isin(domain.edge_numbers, edges)))
+    lengths = diagram.face_measures[mine]
+    ends = domain.boundary_distance(rows[owners[mine]]) < 1.01 * layers.rows[0]
+    assert ends.all()  # the first row has all of the wall
+    each = np.unique(owners[mine], return_counts=True)[1]
+    two_edges = spacing > 0.03 and domain is CHANNEL
+    assert (each == (2 if two_edges else 1)).all()
+    # Half an edge of two, to rounding, or a column whose edge is not a multiple of the spacing.
+    assert lengths.min() > (0.4 if two_edges else 0.7) * spacing
+    assert lengths.max() < 1.3 * spacing
+    assert lengths.sum() == pytest.approx(
+        sum(np.linalg.norm(b - a) for a, b in chosen_segments(domain, layers)), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
+    """On both walls, rectangles all around: those at the seam are like the others."""
+    shape = (2.0, 1.0) if axis == 0 else (1.0, 2.0)
+    channel = clvoro.Box((0, 0), shape, periodic=(axis == 0, axis == 1))
+    layers = Layers(0.02, count=3, growth=1.2)
+    result = adapter.run(channel, 0.1, layers=layers, effort="fast")
+    rows, d = place_layers(channel, [layers]), result.diagram
+    columns = round(2 / layers.width)
+    assert len(rows) == 2 * 4 * columns
+    moved = result.points[: len(rows)] - rows
+    assert np.abs(moved - np.rint(moved / channel.extent) * channel.extent).max() < 1e-14
+    heights = np.minimum(rows[:, 1 - axis], 1 - rows[:, 1 - axis])
+    for row, height in zip(layers.rows[:-1], layers.heights, strict=True):
+        layer = np.flatnonzero(np.isclose(heights, row))
+        assert len(layer) == 2 * columns
+        assert d.volumes[layer] == pytest.approx(height * 2 / columns, rel=1e-12)
+        assert (np.diff(d.neighbor_starts)[layer] == 4).all()
+    assert d.volumes.sum() == pytest.approx(2, rel=1e-12)
+    # The others are what a run without layers gives, as in a box; none has come between the rows.
+    assert np.abs(result.error[len(rows) :]).mean() < 0.025
+    others = result.points[len(rows) :, 1 - axis]
+    assert np.minimum(others, 1 - others).min() > layers.rows[-1]
+    result.check().demand()
+    with pytest.raises(
+        InputError, match=r"expected some of \[" + ("2, 3" if axis == 0 else "0, 1")
+    ):
+        adapter.run(channel, 0.1, layers=Layers(0.02, edges=[0, 2]))
+
+
+def test_sizes_grow_from_the_layers(adapter):
+    layers = Layers(0.02, count=3, growth=1.2, edges=range(4, 84))
+    result = adapter.run(CHANNEL, 0.2, layers=layers, effort="fast")
+    distance = np.hypot(*result.points.T) - 0.2
+    beyond = np.flatnonzero((distance > layers.rows[-1] * 1.01) & (distance < 0.25))
+    # Sizes by the distance from the edges; the middles of edges lie a little within the circle.
+    expected = layers.width + np.log(1.2) * distance[beyond]
+    assert result.size[beyond] == pytest.approx(expected, abs=1e-3)
+    n = len(place_layers(CHANNEL, [layers]))
+    assert np.abs(result.error[n:]).mean() < 0.02
+    assert CHANNEL.contains(result.points).all()
+    assert result.diagram.volumes.sum() == pytest.approx(CHANNEL.measure, rel=1e-12)
+
+
+@pytest.mark.parametrize("method", ["lloyd", "coupled", "weighted", "exact"])
+def test_every_method_leaves_them_where_they_are(adapter, method):
+    layers = Layers(0.04, count=2, edges=range(4, 84))
+    options = {"max_steps": 8} if method != "exact" else {"effort": "fast", "levels": 1}
+    result = adapter.run(CHANNEL, 0.1, layers=layers, method=method, **options)
+    rows, free = place_layers(CHANNEL, [layers]), free_domain(CHANNEL, [layers])
+    assert np.abs(result.points[: len(rows)] - rows).max() < 1e-14
+    assert free.contains(result.points[len(rows) :]).all()
+
+
+def test_walls_share_corners_and_gaps():
+    comb = clvoro.Polygon([(0, 0), (3, 0), (3, 1), (2, 1), (2, 0.15), (1, 0.15), (1, 1), (0, 1)])
+    layers = Layers(0.02, count=3, growth=1.2)
+    rows = place_layers(comb, [layers])
+    assert comb.contains(rows).all()
+    near = comb.boundary_distance(rows)
+    # On one of the rows each, counted from the wall that is nearest.
+    off = np.abs(near[:, None] - layers.rows).min(axis=1)
+    assert off.max() < 0.1 * layers.rows[-1] + 1e-12
+    gaps = np.hypot(*(rows[:, None] - rows).T) + np.eye(len(rows))
+    assert gaps.min() >= 0.6 * 0.02 - 1e-12
+
+
+def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
+    layers = Layers(0.04, count=2, edges=range(4, 84))
+    options = {"layers": layers, "effort": "fast", "levels": 1}
+    whole = adapter.run(CHANNEL, 0.1, **options)
+    steps = []
+    adapter.run(
+        CHANNEL, 0.1, checkpoint=tmp_path / "half", checkpoint_every=0,
+        callback=lambda row: steps.append(row) or len(steps) == 9, **options,
+    )  # fmt: skip
+    resumed = adapter.run(CHANNEL, 0.1, resume=tmp_path / "half", **options)
+    assert np.array_equal(whole.points, resumed.points)
+    with pytest.raises(InputError, match="layers"):
+        adapter.run(CHANNEL, 0.1, resume=tmp_path / "half", effort="fast", levels=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Layers(0), "height"),
+        (lambda: Layers(0.1, count=0), "count"),
+        (lambda: Layers(0.1, growth=0.9), "growth"),
+        (lambda: place_layers(BOX, [Layers(0.1, edges=[4])]), r"\[4\]"),
+        (lambda: place_layers(BOX, [Layers(0.1, edges=[])]), "none"),
+        (lambda: free_domain(BOX, [Layers(0.4, edges=[2, 3])]), "no room"),
+        (lambda: free_domain(CHANNEL, [Layers(0.4)]), "no room"),
+    ],
+)
+def test_what_cannot_be_is_refused(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("layers", "expected"),
+    [
+        # Refused in no time: what they would take is known before any generator is made.
+        (lambda: Layers(1e-9), MemoryLimitError),
+        (lambda: Layers(5e-324), MemoryLimitError),
+        (lambda: Layers(1e-3, spacing=1e-9), MemoryLimitError),
+        (lambda: Layers(1e-5, count=1000, growth=1), MemoryLimitError),
+        (lambda: Layers(1e300), InputError),
+        (lambda: Layers(0.01, count=10**7, growth=1), InputError),
+        (lambda: Layers(0.01, count=10**18), InputError),
+        (lambda: Layers(0.01, count=10**400), InputError),
+        (lambda: Layers(10**400), InputError),
+        (lambda: Layers(0.01, count=3, growth=1e200), InputError),
+        (lambda: Layers(1e308, count=2, growth=1e308), InputError),
+        (lambda: Layers(0.01, spacing=1e308), InputError),
+        (lambda: Layers(0.1, edges=3), InputTypeError),
+        (lambda: 5, InputTypeError),
+        (lambda: None, InputTypeError),
+        (lambda: ["thin"], InputTypeError),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_layers_out_of_all_proportion_are_refused(adapter, layers, expected):
+    for domain in (BOX, CHANNEL):
+        with pytest.raises(expected):
+            adapter.run(domain, 0.2, layers=layers(), effort="fast")
+
+
+@pytest.mark.parametrize("growth", [1, 1 + 1e-15, 1.2, 3])
+def test_thickness_is_that_of_all_heights(growth):
+    layers = Layers(0.01, count=7, growth=growth)
+    assert layers.thickness == pytest.approx(layers.heights.sum(), rel=1e-14)
+    assert layers.width == pytest.approx(layers.heights[-1], rel=1e-14)
+
+
+@pytest.mark.parametrize(("domain", "edges"), [(BOX, None), (CHANNEL, None), (CHANNEL, range(4))])
+def test_no_more_are_placed_than_are_counted(domain, edges):
+    layers = Layers(0.02, count=3, edges=edges)
+    count, placed = count_rows(domain, [layers]), len(place_layers(domain, [layers]))
+    assert 0.8 * count < placed <= count
+
+
+@pytest.mark.parametrize("beside", [-1e-13, -1e-14, 0, 1e-14, 1e-13, 1e-10])
+def test_strips_may_end_beside_corners(adapter, beside):
+    """What they leave has no edge there that is as short as a rounding."""
+    layer = clvoro.Layers(0.05, count=1, spacing=0.1, edges=[0])
+    reach = layer.rows[-1] + 0.03
+    shore = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1), (0, reach + beside)])
+    assert free_domain(shore, [layer]).lower[1] == pytest.approx(reach, abs=1e-9)
+    assert adapter.run(shore, 0.1, layers=layer, method="lloyd", max_steps=1).check()
+
+
+def test_domains_without_walls_in_2d_are_refused():
+    for domain in (clvoro.Box((0, 0, 0), (1, 1, 1)), clvoro.Box((0, 0), (1, 1), periodic=True)):
+        with pytest.raises(InputTypeError, match="walls"):
+            place_layers(domain, [Layers(0.1)])
+    with pytest.raises(InputTypeError, match="Layers"):
+        place_layers(BOX, [0.1])
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
+    """Cells of narrow tips reach around corners, into the layers on the other side: these were given generators."""
+    for seed in (4, 6, 15):
+        tips = int(np.random.default_rng(seed).integers(12, 40))
+        star = clvoro.Polygon(shores.star(tips, seed, (0.5, 0.5), 0.5))
+        layer = clvoro.Layers(0.004, count=2, growth=2.0, spacing=0.03, edges=range(0, tips, 2))
+        result = clvoro.Adapter(ctx, dtype).run(
+            star, 0.03, layers=layer, levels=1, effort="fast", max_steps=20, seed=1
+        )
+        result.check().demand()
+        others = result.points[len(place_layers(star, [layer])) :]
+        away = shapely.distance(free_domain(star, [layer]).geometry, shapely.points(others))
+        assert away.max() <= 16 * np.finfo(dtype).eps
+        assert (result.history["inserted"] > 0).sum() >= 2, "by refinement, and to meet the count"

@@ -1,0 +1,290 @@
+"""Polygonal domains: rings as they are given, as they are kept, and what is refused."""
+
+import json
+import pickle
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError
+from clvoro.geometry.box import LARGEST_EDGE
+from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
+
+
+def test_rings_are_kept_with_the_interior_on_the_left() -> None:
+    for outer in (SQUARE, SQUARE[::-1]):
+        for hole in (HOLE, HOLE[::-1]):
+            domain = clvoro.Polygon(outer, [hole])
+            assert domain.ring_starts.tolist() == [0, 4, 8]
+            assert domain.next_vertex.tolist() == [1, 2, 3, 0, 5, 6, 7, 4]
+            start, end = domain.vertices, domain.vertices[domain.next_vertex]
+            along = end - start
+            left = (start + end) / 2 + 1e-3 * np.column_stack([-along[:, 1], along[:, 0]])
+            assert domain.contains(left).all()
+            right = (start + end) / 2 - 1e-3 * np.column_stack([-along[:, 1], along[:, 0]])
+            assert not domain.contains(right).any()
+            assert domain.measure == 11
+            assert (domain.lower, domain.upper) == ((0, 0), (4, 3))
+    assert domain.vertices.dtype == np.float64
+    for name in ("ring_starts", "next_vertex", "piece_of_ring", "edge_numbers"):
+        assert getattr(domain, name).dtype == np.int32
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(domain, name)[0] = 1
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("turned", [False, True])
+def test_edges_are_numbered_as_given(closed: bool, turned: bool) -> None:
+    # Vertices 2 and 3 are the same, 5 is on a straight line.
+    outer = np.array([(0.0, 0), (4, 0), (4, 3), (4, 3), (2, 3), (1, 3), (0, 3)])
+    rings = [outer, HOLE, OTHER]
+    if turned:
+        rings = [ring[::-1] for ring in rings]
+    given = [np.vstack([ring, ring[:1]]) if closed else ring for ring in rings]
+    domain = clvoro.Polygon(given[0], given[1:])
+    starts = np.concatenate(rings)
+    ends = np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
+    assert sorted(domain.edge_numbers.tolist()) == sorted({*range(15)} - {3 if turned else 2})
+    for e, number in enumerate(domain.edge_numbers):
+        mine = {tuple(domain.vertices[e]), tuple(domain.vertices[domain.next_vertex[e]])}
+        assert mine == {tuple(starts[number]), tuple(ends[number])}
+
+
+def test_pieces() -> None:
+    island = HOLE * 0.5 + (0.75, 0.75)  # within the hole of the first
+    domain = clvoro.Polygon.from_pieces([[SQUARE, HOLE], [island[::-1]]])
+    assert domain.n_pieces == 2
+    assert domain.piece_of_ring.tolist() == [0, 0, 1]
+    assert domain.measure == 11.25
+    assert domain.contains(np.array([(1.5, 1.5), (1.05, 1.05), (0.5, 0.5)])).tolist() == [1, 0, 1]
+    assert "2 pieces, 1 hole" in repr(domain)
+    touching = clvoro.Polygon.from_pieces(
+        [[SQUARE], [HOLE + np.array([3, 2])]]
+    )  # in the corner (4, 3)
+    assert touching.measure == 13
+
+
+def test_sources_agree(tmp_path) -> None:
+    parts = [shapely.Polygon(SQUARE, [HOLE]), shapely.Polygon(SQUARE[::-1] + 10)]
+    several = clvoro.Polygon.from_pieces([[SQUARE, HOLE], [SQUARE[::-1] + 10]])
+    whole = shapely.MultiPolygon(parts)
+    assert clvoro.Polygon.from_shapely(whole) == several
+    assert clvoro.Polygon.from_wkt(whole.wkt) == several
+    assert clvoro.Polygon.from_wkt(shapely.force_3d(whole, 7).wkt) == several
+    geometry = shapely.geometry.mapping(whole)
+    feature = {"type": "Feature", "properties": {}, "geometry": geometry}
+    features = [
+        {"type": "Feature", "geometry": shapely.geometry.mapping(part), "properties": None}
+        for part in parts
+    ]
+    collection = {"type": "FeatureCollection", "features": features}
+    group = {"type": "GeometryCollection", "geometries": [f["geometry"] for f in features]}
+    path = tmp_path / "domain.geojson"
+    path.write_text(json.dumps(collection))
+    sources = geometry, feature, collection, group, json.dumps(feature), path, str(path)
+    for source in sources:
+        assert clvoro.Polygon.from_geojson(source) == several
+    path.write_text('{"type": "Polygon", "coordinates": [[[0, 0], [2, 2], [2, 0], [0, 2]]]}')
+    with pytest.raises(
+        InputError, match=r"domain\.geojson: Polygon is not valid: Self-intersection"
+    ):
+        clvoro.Polygon.from_geojson(path)
+    assert clvoro.Polygon.from_shapely(parts[0]) == clvoro.Polygon(SQUARE, [HOLE])
+
+
+def test_equal_domains() -> None:
+    one, same = clvoro.Polygon(SQUARE, [HOLE]), clvoro.Polygon(SQUARE.tolist(), [HOLE.copy()])
+    assert one == same
+    assert hash(one) == hash(same)
+    others = [
+        clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE[::-1], [HOLE]),  # numbered otherwise
+        clvoro.Polygon(SQUARE, [HOLE + 1e-15]), clvoro.Box((0, 0), (4, 3)),
+        clvoro.Polygon.from_pieces([[SQUARE], [HOLE + 9]]),
+    ]  # fmt: skip
+    assert all(one != other for other in others)
+    twice = clvoro.Polygon(SQUARE[::-1], [HOLE])
+    for copy in (pickle.loads(pickle.dumps(twice)), clvoro.Polygon.described(**twice.describe())):
+        assert copy == twice
+        assert copy.edge_numbers.tolist() == twice.edge_numbers.tolist()
+    assert json.loads(json.dumps(twice.describe())) == twice.describe()
+
+
+def test_area_is_exact() -> None:
+    # Far from the origin the products of coordinates have 32 digits before the area's.
+    far = np.array([2.0**33, -(2.0**33)])
+    ring = (ragged(200) * 2**10).round(6) / 2**10 + far
+    x = [(Fraction(a), Fraction(b)) for a, b in ring.tolist()]
+    twice = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(x, x[1:] + x[:1], strict=True))
+    assert clvoro.Polygon(ring).measure == float(twice / 2)
+
+
+def test_places() -> None:
+    rings = [ragged(150), ragged(60, 5, (0.05, 0.0), 0.2)]
+    domain = clvoro.Polygon(rings[0], rings[1:])
+    x = np.random.default_rng(1).uniform(-1.2, 1.2, (4000, 2))
+    inside = crossings(x, rings)
+    assert 500 < inside.sum() < 3500
+    assert (domain.contains(x) == inside).all()
+    distance = distances(x, rings)
+    # Coordinates up to 1.2 round by 1.1e-16; projections have a dozen operations.
+    assert np.abs(domain.boundary_distance(x) - distance).max() < 4e-15
+    nearest = domain.nearest(x)
+    assert (nearest[inside] == x[inside]).all()
+    away = np.linalg.norm(nearest - x, axis=1)
+    assert np.abs(away - np.where(inside, 0, distance)).max() < 4e-15
+    assert domain.contains(nearest).all()
+
+
+def test_the_boundary_belongs_to_the_domain() -> None:
+    for shift in (0.0, 1e6, -1e-6):
+        domain = clvoro.Polygon(ragged(300) + shift, [ragged(50, 3, (0, 0), 0.2) + shift])
+        t = np.random.default_rng(2).random((len(domain.vertices), 20, 1))
+        a, b = domain.vertices[:, None], domain.vertices[domain.next_vertex][:, None]
+        points = (a + t * (b - a)).reshape(-1, 2)
+        assert domain.contains(points).all()
+        assert domain.contains(domain.vertices).all()
+        # Less than the rounding off, not more.
+        out = np.array([[domain.upper[0] * (1 + np.sign(domain.upper[0]) * 1e-14), points[0, 1]]])
+        assert not domain.contains(out).any()
+
+
+def test_frame_and_clip_box() -> None:
+    domain = clvoro.Polygon(SQUARE * 16, [HOLE])
+    lower, upper = domain.clip_box
+    assert lower.tolist() == [-1, -1]
+    assert upper.tolist() == [65, 49]
+    origin, scale = domain.frame
+    assert origin.tolist() == [-1, -1]
+    assert scale == 128
+    corners = domain.device_corners(np.dtype("float32"))
+    assert corners[0].tolist() == [0, 0, 0, 0]
+    assert corners[1].tolist() == [66 / 128, 50 / 128, 0, 0]
+    assert domain.dim == 2
+
+
+SQUARE_HOLES = lambda *holes: lambda: clvoro.Polygon(SQUARE, holes)  # noqa: E731
+ONE = lambda *ring: lambda: clvoro.Polygon(ring)  # noqa: E731
+PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])  # noqa: E731
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (ONE((0, 0), (2, 2), (2, 0), (0, 2)), r"Self-intersection at \(1, 1\), edge 0 of the outer ring"),
+        (ONE((0, 0), (2, 0), (1, 0), (1, 2)), r"Self-intersection"),
+        (ONE((0, 0), (4, 0), (4, 1), (6, 1), (4, 1), (4, 3), (0, 3)), r"\(6, 1\), edge \d of the outer ring"),
+        (ONE((0, 0), (4, 0), (4, 1), (2, 1), (4, 1), (4, 3), (0, 3)), r"\(4, 1\), edge \d of the outer"),
+        (ONE((0, 0), (1, 0), (float("nan"), 1)), r"outer ring has vertex 2 at \(nan, 1\), expected finite"),
+        (ONE((0, 0), (1, 0)), "outer ring has 2 distinct vertices, expected at least 3"),
+        (ONE((0, 0), (1, 0), (1, 0), (0, 0)), "outer ring has 2 distinct vertices"),
+        (ONE((0, 0), (1, 1), (3, 3)), r"on the line from \(0, 0\) to \(3, 3\): its area is zero"),
+        (ONE((0, 0), (1, 0), (1, 1), (1, 1 + 2e-13), (0, 1)), r"length \S+e-13 at vertex 2, \(1, 1\)"),
+        (ONE((0, 0), (LARGEST_EDGE * 2, 0), (0, LARGEST_EDGE)), "choose another unit of length"),
+        (ONE((0, 0), (0.5 / LARGEST_EDGE, 0), (0, 0.5 / LARGEST_EDGE)), "choose another unit"),
+        (ONE((1e12, 0), (1e12 + 0.5, 0), (1e12, 0.5)), "move it to the origin"),
+        (ONE((0, 0, 0), (1, 0, 0), (1, 1, 0)), r"outer ring has shape \(3, 3\), expected \(n, 2\)"),
+        (ONE((0, 0), (1, 0), (1,)), "outer ring is no array"),
+        (ONE(("a", "b"), ("c", "d"), ("e", "f")), "outer ring has dtype"),
+        (ONE(), "outer ring has 0 distinct vertices"),
+        (SQUARE_HOLES(HOLE + 9), r"Hole lies outside shell at \(10, 10\), edge 0 of the hole 0"),
+        (SQUARE_HOLES(HOLE, HOLE + 0.5), r"edge \d of the hole 0 and edge \d of the hole 1"),
+        (SQUARE_HOLES(HOLE, HOLE / 2 + 0.75), r"Holes are nested at \S+ \S+, edge \d of the hole 1"),
+        (SQUARE_HOLES(HOLE + np.array([2, 0])), r"edge 1 of the outer ring and edge \d of the hole 0"),
+        (SQUARE_HOLES([(0, 1), (2, 1), (4, 1), (2, 2)]), "Interior is disconnected"),
+        (SQUARE_HOLES(HOLE, [(1, 1), (2, 3), (1, 2)]), "hole 1"),
+        (PIECES(SQUARE, SQUARE + 1), r"edge \d of the outer ring of piece 0 and edge \d of the outer ring of piece 1"),
+        (PIECES(SQUARE, HOLE), "Nested shells"),
+        (PIECES(SQUARE, SQUARE + np.array([4, 0])), "Self-intersection at"),
+        (lambda: clvoro.Polygon.from_pieces([]), "no rings"),
+        (lambda: clvoro.Polygon.from_pieces([[]]), "no rings for piece 0"),
+        (lambda: clvoro.Polygon(SQUARE, 3), "holes is a int"),
+        (lambda: clvoro.Polygon.from_wkt("POLYGON ((0 0, 1"), "no well-known text"),
+        (lambda: clvoro.Polygon.from_wkt("POLYGON EMPTY"), "empty Polygon"),
+        (lambda: clvoro.Polygon.from_wkt("POINT (1 1)"), "geometry is a Point"),
+        (lambda: clvoro.Polygon.from_wkt(3), "text is a int"),
+        (lambda: clvoro.Polygon.from_shapely(SQUARE), "geometry is a ndarray"),
+        (lambda: clvoro.Polygon.from_geojson(3), "source is a int"),
+        (lambda: clvoro.Polygon.from_geojson("missing.geojson"), "cannot read missing.geojson"),
+        (lambda: clvoro.Polygon.from_geojson("{"), "no JSON"),
+        (lambda: clvoro.Polygon.from_geojson({}), "expected an object with a type"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "Point", "coordinates": [1, 2]}), "holds a 'Point'"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "Feature", "geometry": None}), "without geometry"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "FeatureCollection", "features": []}), "no Polygon"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": 3}), "coordinates 3"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [3]}), "the ring 3"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [[3, 4]]}), "shape"),
+        (lambda: clvoro.Polygon.from_geojson({"type": "MultiPolygon", "coordinates": [3]}), "MultiPolygon of 3"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(make, says: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=says):
+        make()
+
+
+def test_holes_may_touch_in_points() -> None:
+    touching = [(0, 1), (1, 1), (1, 2)]  # the wall, in a vertex of the hole's
+    corner = [(4, 3), (3, 2), (3.5, 2)]  # a corner
+    domain = clvoro.Polygon(SQUARE, [touching, corner])
+    assert domain.measure == 12 - 0.5 - 0.25
+    assert domain.contains(np.array([(0.0, 1), (4, 3), (0.9, 1.5), (0.1, 1.2)])).tolist() == [
+        1,
+        1,
+        0,
+        1,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("edge_numbers", [1, 2]), ("edge_numbers", [10**12] * 8), ("ring_starts", [0, 3, 8]),
+        ("ring_starts", [0, 4, 9]), ("ring_starts", [0, -4, 8]), ("ring_starts", "a"),
+        ("piece_of_ring", [0, 10**9]), ("piece_of_ring", [0, -1]), ("piece_of_ring", []),
+        ("vertices", None), ("vertices", [[0, 0, 0]] * 8), ("vertices", SQUARE.tolist() + HOLE.tolist()),
+    ],
+)  # fmt: skip
+def test_damaged_descriptions_are_refused(name: str, value: object) -> None:
+    good = clvoro.Polygon(SQUARE, [HOLE]).describe()
+    assert clvoro.Polygon.described(**good).describe() == good
+    with pytest.raises(InputError):
+        clvoro.Polygon.described(**{**good, name: value})
+
+
+def result_of(domain: clvoro.Polygon) -> clvoro.Result:
+    """A result with a single cell, whatever it holds."""
+    from clvoro.mesh.results import HISTORY_DTYPE, Diagram
+
+    ones, starts = np.ones(1), np.array([0, 1], np.int32)
+    arrays = {
+        "points": np.ones((1, 2)), "volumes": ones, "centroids": np.ones((1, 2)), "neighbor_starts": starts,
+        "neighbors": np.array([-8], np.int32), "face_measures": ones, "face_centroids": np.ones((1, 2)),
+        "vertices": np.ones((1, 2)), "cell_vertex_starts": starts, "cell_vertices": np.array([0], np.int32),
+        "face_vertex_starts": np.array([0, 2], np.int32), "face_vertices": np.zeros(2, np.int32),
+    }  # fmt: skip
+    return clvoro.Result(
+        points=arrays["points"], diagram=Diagram(domain, arrays), size=ones, error=ones, quality=ones,
+        history=np.zeros(1, HISTORY_DTYPE), converged=True, stop_reason="none",
+    )  # fmt: skip
+
+
+def test_files_hold_the_domain(tmp_path) -> None:
+    domain = clvoro.Polygon.from_pieces(
+        [[ragged(40)[::-1], ragged(9, radius=0.1)], [SQUARE + np.pi]]
+    )
+    path = tmp_path / "mesh.npz"
+    result_of(domain).save(path)
+    assert clvoro.load(path).diagram.domain == domain
+
+
+def test_checkpoints_tell_domains_apart() -> None:
+    from clvoro.adaptation.fingerprint import describe
+
+    domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
+    options: dict = {"layers": []}
+    described = [json.dumps(describe(d, options, np.dtype(float), None)) for d in domains]
+    assert len(set(described)) == 3
+    again = describe(clvoro.Polygon(SQUARE.copy()), options, np.dtype(float), None)
+    assert json.dumps(again) == described[0]

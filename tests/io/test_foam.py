@@ -1,0 +1,253 @@
+"""OpenFOAM's polyMesh, read back as its documentation describes it and checked as checkMesh does."""
+
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from clvoro import io
+from clvoro.errors import InputError
+from clvoro.io import foam
+from tests.io.test_io import make_result
+from tests.reference import solids
+
+LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
+
+
+@pytest.fixture(scope="module")
+def solid():
+    points = np.random.default_rng(61403).uniform(LOWER, UPPER, (80, 3))
+    return solids.solid_result(solids.solid_diagram(LOWER, UPPER, points))
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return make_result(60, 31733)
+
+
+@pytest.fixture(params=["solid", "plane"])
+def result(request):
+    return request.getfixturevalue(request.param)
+
+
+def entries(path):
+    """Number and text of the list in one of OpenFOAM's files."""
+    text = path.read_text()
+    head, body = text.split("}", 1)
+    assert f"object      {path.name};" in head
+    count, _, rest = body.strip().partition("\n(\n")
+    return int(count), rest.rsplit("\n)", 1)[0]
+
+
+def read(folder):
+    """The mesh in `folder`: points, loops, owner, neighbor, patches (name: type, faces, start)."""
+    count, text = entries(folder / "points")
+    points = np.array([row.strip("()").split() for row in text.splitlines()], float)
+    assert points.shape == (count, 3)
+    count, text = entries(folder / "faces")
+    faces = []
+    for row in text.splitlines():
+        number, corners = re.fullmatch(r"(\d+)\(([\d ]+)\)", row).groups()
+        faces.append([int(v) for v in corners.split()])
+        assert len(faces[-1]) == int(number)
+    assert len(faces) == count
+    lists = []
+    for name in ("owner", "neighbor"):
+        count, text = entries(folder / name)
+        lists.append(np.array(text.split(), int))
+        assert len(lists[-1]) == count
+    count, text = entries(folder / "boundary")
+    found = re.findall(r"([\w-]+)\s*\{(.*?)\}", text, re.DOTALL)
+    assert len(found) == count
+    patches = {}
+    for name, body in found:
+        about = dict(re.findall(r"(\w+) +([^;]+);", body))
+        patches[name] = about.pop("type"), int(about.pop("nFaces")), int(about.pop("startFace"))
+        patches[name] += (about,) if about else ()
+    return points, faces, *lists, patches
+
+
+@pytest.fixture
+def mesh(result, tmp_path):
+    folder = tmp_path / "constant" / "polyMesh"
+    io.save(result, folder)
+    assert {p.name for p in folder.iterdir()} == {
+        "points", "faces", "owner", "neighbor", "boundary",
+    }  # fmt: skip
+    return read(folder)
+
+
+def prism_volumes(result, points):
+    d = result.diagram
+    return d.volumes if d.domain.dim == 3 else d.volumes * points[:, 2].max()
+
+
+def test_order_is_upper_triangular(mesh):
+    _, _, owner, neighbor, _ = mesh
+    inner = list(zip(owner[: len(neighbor)].tolist(), neighbor.tolist(), strict=True))
+    assert inner == sorted(set(inner))
+    assert all(i < j for i, j in inner)
+
+
+def test_cells_are_closed_and_faces_look_away_from_their_owners(result, mesh):
+    points, faces, owner, neighbor, _ = mesh
+    n, inner = len(result.points), len(neighbor)
+    areas = np.array([solids.loop_area(points[f]) for f in faces])
+    middles = np.array([points[f].mean(axis=0) for f in faces])
+    openness, volumes = np.zeros((n, 3)), np.zeros(n)
+    for k, i in enumerate(owner):
+        openness[i] += areas[k]
+        volumes[i] += areas[k] @ middles[k] / 3
+        if k < inner:
+            openness[neighbor[k]] -= areas[k]
+            volumes[neighbor[k]] -= areas[k] @ middles[k] / 3
+    # Sums of some 20 products of coordinates below 4, each rounded.
+    assert np.abs(openness).max() < 1e-12
+    np.testing.assert_allclose(volumes, prism_volumes(result, points), rtol=0, atol=1e-11)
+    generators = np.pad(result.points, ((0, 0), (0, 3 - result.points.shape[1])))
+    away = generators[neighbor] - generators[owner[:inner]]
+    assert (np.einsum("ij,ij->i", areas[:inner], away) > 0).all()
+
+
+def test_every_edge_of_a_cell_is_in_two_faces(result, mesh):
+    _, faces, owner, neighbor, _ = mesh
+    count = {}
+    for k, face in enumerate(faces):
+        for cell in [owner[k], *([neighbor[k]] if k < len(neighbor) else [])]:
+            for a, b in zip(face, face[1:] + face[:1], strict=True):
+                count[cell, min(a, b), max(a, b)] = count.get((cell, min(a, b), max(a, b)), 0) + 1
+    assert set(count.values()) == {2}
+
+
+def test_patches_are_the_walls(result, mesh):
+    points, faces, owner, neighbor, patches = mesh
+    box = result.diagram.domain
+    depth = points[:, 2].max() if box.dim == 2 else 1.0
+    after = len(neighbor)
+    for number, (name, (kind, count, start)) in enumerate(patches.items()):
+        assert start == after
+        after += count
+        part = faces[start : start + count]
+        assert sorted(owner[start : start + count]) == list(owner[start : start + count])
+        area = sum(solids.loop_area(points[f]) for f in part)
+        if name in ("front", "back"):
+            assert kind == "empty"
+            assert owner[start : start + count].tolist() == list(range(len(result.points)))
+            assert area == pytest.approx([0, 0, (1 if name == "front" else -1) * box.measure])
+        else:
+            axis, upper = divmod(number, 2)
+            assert name == "xyz"[axis] + ("Max" if upper else "Min")
+            assert kind == "patch"
+            plane = (box.upper if upper else box.lower)[axis]
+            on_wall = points[sorted({v for f in part for v in f}), axis]
+            assert on_wall == pytest.approx(plane, abs=1e-14)  # Qhull's rounding
+            wanted = box.measure / box.extent[axis] * depth * (1 if upper else -1)
+            assert area == pytest.approx(wanted * np.eye(3)[axis], abs=1e-12)
+    assert after == len(faces)
+    assert len(patches) == 6
+    assert sorted({v for f in faces for v in f}) == list(range(len(points)))
+
+
+def test_texts_are_the_same_in_parts(solid, tmp_path, monkeypatch):
+    io.save(solid, tmp_path / "one" / "polyMesh")
+    monkeypatch.setattr(foam, "_CHUNK", 37)
+    io.save(solid, tmp_path / "two" / "polyMesh")
+    for path in (tmp_path / "one" / "polyMesh").iterdir():
+        assert (tmp_path / "two" / "polyMesh" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_marker_puts_the_mesh_into_its_case(solid, tmp_path):
+    tmp_path = tmp_path / "made" / "as needed"
+    io.save(solid, tmp_path / "case.foam")
+    assert (tmp_path / "case.foam").read_bytes() == b""
+    io.save(solid, tmp_path / "polyMesh")
+    for path in (tmp_path / "polyMesh").iterdir():
+        twin = tmp_path / "constant" / "polyMesh" / path.name
+        assert twin.read_bytes() == path.read_bytes()
+
+
+def test_as_vtk_reads_it(result, tmp_path):
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    io.save(result, tmp_path / "case.foam")
+    (tmp_path / "system").mkdir()
+    (tmp_path / "system" / "controlDict").write_text(
+        "FoamFile { version 2.0; format ascii; class dictionary; object controlDict; }\n"
+        "startTime 0; endTime 1; deltaT 1; writeInterval 1;\n"
+    )
+    reader = vtk.vtkOpenFOAMReader()
+    reader.SetFileName(str(tmp_path / "case.foam"))
+    sizes = vtk.vtkCellSizeFilter()
+    sizes.SetInputConnection(reader.GetOutputPort())
+    sizes.Update()
+    found = vtk_to_numpy(sizes.GetOutput().GetBlock(0).GetCellData().GetArray("Volume"))
+    volumes = prism_volumes(result, read(tmp_path / "constant" / "polyMesh")[0])
+    # VTK keeps such points in single precision, and disagrees with itself on which way round a wedge is.
+    np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
+
+
+def check_mesh(result, folder):
+    """What OpenFOAM's checkMesh says of a result saved in `folder`."""
+    io.save(result, folder / "case.foam")
+    system = folder / "system"
+    system.mkdir()
+    times = "startTime 0; endTime 1; deltaT 1; writeInterval 1;"
+    parts = ("ddt", "grad", "div", "laplacian", "interpolation", "snGrad")
+    schemes = " ".join(f"{part}Schemes {{ default none; }}" for part in parts)
+    for name, text in {"controlDict": times, "fvSchemes": schemes, "fvSolution": ""}.items():
+        head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {name}; }}\n"
+        (system / name).write_text(head + text)
+    # Where Debian's package has its settings; others set it themselves.
+    env = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
+    done = subprocess.run(
+        ["checkMesh", "-case", str(folder)], env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+needs_openfoam = pytest.mark.skipif(
+    shutil.which("checkMesh") is None, reason="OpenFOAM is not installed"
+)
+
+
+@needs_openfoam
+def test_as_openfoam_checks_it(result, tmp_path):
+    said = check_mesh(result, tmp_path)
+    topology = said.split("Checking topology...")[1].split("Checking geometry...")
+    assert "***" not in topology[0]
+    for line in ("Boundary openness", "Max cell openness", "Cell volumes", "Face pyramids"):
+        assert re.search(f"{line}.*OK", topology[1]), line
+
+
+def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):
+    folder = tmp_path / "polyMesh"
+    folder.mkdir()
+    for name in ("points", "faces", "cellZones"):
+        (folder / name).write_text("old")
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(InputError, match="No space left"):
+            io.save(solid, folder)
+    assert {p.name: p.read_text() for p in folder.iterdir()} == {
+        "points": "old", "faces": "old", "cellZones": "old",
+    }  # fmt: skip
+    io.save(solid, folder)
+    assert len(read(folder)[2]) > 0
+    assert (folder / "cellZones").read_text() == "old"
+
+
+def test_places_without_a_folder_are_named(solid, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"cannot write .*file.*polyMesh: no folder"):
+        io.save(solid, tmp_path / "file" / "polyMesh")
+    with pytest.raises(InputError, match="no folder can be made"):
+        io.save(solid, tmp_path / "file" / "case.foam")

@@ -1,0 +1,308 @@
+"""netCDF files by the UGRID conventions, and what all netCDF files have in common."""
+
+import json
+import os
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+from scipy.io import netcdf_file
+
+import clvoro
+from clvoro import io
+from clvoro.errors import InputError, InputTypeError
+from clvoro.io import netcdf
+from clvoro.mesh.outlines import next_faces
+from tests.reference import netcdf_files, solids
+from tests.reference.netcdf_files import MESHES, made, read, result_of, shoelace
+
+BOTH = ("ugrid", "mpas")
+
+
+@pytest.fixture(scope="module")
+def room(ctx):
+    return made(ctx, "room")
+
+
+@pytest.fixture(scope="module", params=MESHES)
+def result(request, ctx):
+    return made(ctx, request.param)
+
+
+@pytest.fixture
+def mesh(result, tmp_path):
+    result.save(tmp_path / "mesh.nc")
+    return read(tmp_path / "mesh.nc")
+
+
+def rows(mesh, name):
+    """Rows of a table without what is not there."""
+    table = mesh[f"mesh_{name}s"]
+    missing = mesh.about[f"mesh_{name}s"].get("_FillValue", -1)
+    assert missing == -1
+    lengths = (table != -1).sum(axis=1)
+    assert all((row[k:] == -1).all() for row, k in zip(table, lengths, strict=True))
+    return [row[:k].tolist() for row, k in zip(table, lengths, strict=True)]
+
+
+def places(mesh, location):
+    return np.stack([mesh[f"mesh_{location}_{axis}"] for axis in "xy"], axis=1)
+
+
+def sides(corners):
+    return list(zip(corners, corners[1:] + corners[:1], strict=True))
+
+
+# --- UGRID ---
+
+
+def test_topology_names_what_is_there(mesh):
+    assert b"UGRID-1.0" in mesh.attributes["Conventions"]
+    topology = mesh.about["mesh"]
+    assert topology["cf_role"] == b"mesh_topology"
+    assert topology["topology_dimension"] == 2
+    assert mesh["mesh"].shape == ()
+    for place in ("node", "edge", "face"):
+        for name in topology[f"{place}_coordinates"].decode().split():
+            assert mesh.dimensions_of[name] == (f"mesh_{place}s",)
+    tables = [k for k in topology if k.endswith("_connectivity")]
+    assert {"face_node_connectivity", "edge_node_connectivity", "edge_face_connectivity"} < {
+        *tables
+    }
+    for role in tables:
+        name = topology[role].decode()
+        assert mesh.about[name]["cf_role"] == role.encode()
+        assert mesh.about[name]["start_index"] == 0
+        assert mesh.dimensions_of[name][0] == f"mesh_{role[:4]}s"
+        assert mesh[name].dtype == np.int32
+
+
+def test_faces_are_the_cells(result, mesh):
+    d = result.diagram
+    nodes, faces = places(mesh, "node"), rows(mesh, "face_node")
+    assert np.array_equal(nodes, d.vertices)
+    assert np.array_equal(places(mesh, "face"), result.points)
+    starts = d.cell_vertex_starts
+    for i, corners in enumerate(faces):
+        expected = d.cell_vertices[starts[i] : starts[i + 1]].tolist()
+        expected = [a for a, b in sides(expected) if a != b]
+        assert sorted(corners) == sorted(expected)
+        assert len(corners) >= 3
+        # A dozen products of coordinates below 4 relative to a corner.
+        assert shoelace(nodes[corners]) == pytest.approx(d.volumes[i], rel=0, abs=1e-14)
+    assert np.array_equal(mesh["area"], d.volumes)
+    for name in ("size", "error", "quality"):
+        assert np.array_equal(mesh[name], getattr(result, name))
+        assert mesh.about[name]["mesh"] == b"mesh"
+        assert mesh.about[name]["location"] == b"face"
+
+
+def test_edges_have_their_faces_on_both_sides(result, mesh):
+    """Against all sides of all faces: an edge is two of them in opposite directions, or one."""
+    faces, face_edges = rows(mesh, "face_node"), rows(mesh, "face_edge")
+    ends, beside = mesh["mesh_edge_nodes"], mesh["mesh_edge_faces"]
+    directed = Counter((a, b, i) for i, corners in enumerate(faces) for a, b in sides(corners))
+    assert set(directed.values()) == {1}
+    found = set()
+    for (a, b), (left, right) in zip(ends.tolist(), beside.tolist(), strict=True):
+        found.add((a, b, left))
+        if right >= 0:
+            found.add((b, a, right))
+    assert found == set(directed)
+    assert len(found) == len(ends) + (beside >= 0).all(axis=1).sum()
+    for i, corners in enumerate(faces):
+        assert [set(ends[e]) for e in face_edges[i]] == [set(side) for side in sides(corners)]
+    middles = places(mesh, "node")[ends].mean(axis=1)
+    assert np.array_equal(places(mesh, "edge"), middles)
+
+
+def test_neighbors_are_the_diagrams(result, mesh):
+    d = result.diagram
+    face_edges, table = rows(mesh, "face_edge"), mesh["mesh_face_faces"]
+    starts, straight = d.neighbor_starts, ~d.shifts.any(axis=1)
+    for i, edges in enumerate(face_edges):
+        across = table[i, : len(edges)].tolist()
+        assert (table[i, len(edges) :] == -1).all()
+        for e, j in zip(edges, across, strict=True):
+            assert sorted(mesh["mesh_edge_faces"][e].tolist()) == sorted([i, j])
+        row = slice(starts[i], starts[i + 1])
+        inner = straight[row] & (d.neighbors[row] >= 0) & (d.face_measures[row] > 0)
+        assert sorted(j for j in across if j >= 0) == sorted(d.neighbors[row][inner].tolist())
+
+
+def test_walls_are_numbered(result, mesh):
+    domain, wall = result.diagram.domain, mesh["wall"]
+    assert mesh.about["wall"]["location"] == b"edge"
+    ends = places(mesh, "node")[mesh["mesh_edge_nodes"]]
+    lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
+    single = (mesh["mesh_edge_faces"] < 0).any(axis=1)
+    assert (wall[~single] == -1).all()
+    if any(domain.periodic):
+        # Edges at seams have one face, and no wall.
+        assert (single & (wall == -1)).sum() == result.diagram.shifts.any(axis=1).sum()
+    else:
+        assert (wall[single] >= 0).all()
+    for number in np.unique(wall[wall >= 0]):
+        these = wall == number
+        if isinstance(domain, clvoro.Polygon):
+            (e,) = np.flatnonzero(domain.edge_numbers == number)
+            a, b = domain.vertices[[e, domain.next_vertex[e]]]
+        else:
+            axis, upper = divmod(int(number), 2)
+            assert not domain.periodic[axis]
+            a, b = np.array([domain.lower, domain.upper])
+            (a if upper else b)[axis] = (b if upper else a)[axis]
+        along = (b - a) / np.hypot(*(b - a))
+        off = (ends[these] - a) @ (-along[1], along[0])
+        assert np.abs(off).max() < 8e-15  # coordinates are below 4, each rounded a few times
+        assert lengths[these].sum() == pytest.approx(np.hypot(*(b - a)), rel=1e-12)
+
+
+def test_a_face_around_an_island_has_its_loops_joined(ctx, tmp_path):
+    diagram = clvoro.Adapter(ctx).diagram(*netcdf_files.around_an_island())
+    onward = next_faces(diagram)
+    assert len(onward) > 0
+    last = onward <= np.arange(len(onward))
+    assert last.sum() == len(diagram) + 1  # one cell has two loops
+    result_of(diagram).save(tmp_path / "mesh.nc")
+    mesh = read(tmp_path / "mesh.nc")
+    nodes, faces = places(mesh, "node"), rows(mesh, "face_node")
+    areas = [shoelace(nodes[corners]) for corners in faces]
+    assert areas == pytest.approx(diagram.volumes.tolist(), rel=1e-12)
+    assert sum(areas) == pytest.approx(diagram.domain.measure, rel=1e-12)
+    bridges = [len(f) - len(e) for f, e in zip(faces, rows(mesh, "face_edge"), strict=True)]
+    assert sorted(bridges) == [0] * (len(diagram) - 1) + [2]
+
+
+# --- other readers ---
+
+
+def test_as_ugrids_checker_reads_it(result, tmp_path):
+    checks = pytest.importorskip("ugrid_checks.check")
+    result.save(tmp_path / "mesh.nc")
+    said = checks.check_dataset(tmp_path / "mesh.nc", print_summary=False).checking_report()
+    # Coordinates have no units: those of the domain are the caller's.
+    assert set(re.findall(r"(?:WARN|FAIL) (\w+)", said)) == {"A204"}, said
+
+
+def test_as_xarray_reads_it(room, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    for convention in BOTH:
+        room.save(tmp_path / "mesh.nc", convention=convention)
+        expected = read(tmp_path / "mesh.nc")
+        for engine in ("scipy", "netcdf4"):
+            if engine == "netcdf4":
+                pytest.importorskip("netCDF4")
+            with xarray.open_dataset(
+                tmp_path / "mesh.nc", engine=engine, mask_and_scale=False
+            ) as found:
+                assert {*found.variables} == {*expected.values}
+                for name, values in expected.values.items():
+                    assert np.array_equal(found[name].values, values)
+
+
+@pytest.mark.filterwarnings("ignore:Projected")  # of areas on a sphere, which are not asked for
+def test_as_uxarray_reads_it(result, tmp_path):
+    uxarray = pytest.importorskip("uxarray")
+    result.save(tmp_path / "mesh.nc")
+    grid = uxarray.open_grid(tmp_path / "mesh.nc")
+    d = result.diagram
+    assert (grid.n_face, grid.n_node) == (len(d), len(d.vertices))
+    x, y = grid.node_lon.values, grid.node_lat.values
+    counts, table = grid.n_nodes_per_face.values, grid.face_node_connectivity.values
+    for i, k in enumerate(counts):
+        corners = np.stack([x[table[i, :k]], y[table[i, :k]]], axis=1)
+        assert shoelace(corners) == pytest.approx(d.volumes[i], rel=0, abs=1e-14)
+    data = uxarray.open_dataset(tmp_path / "mesh.nc", tmp_path / "mesh.nc")
+    assert np.array_equal(data["quality"].values, result.quality)
+
+
+# --- both conventions ---
+
+
+@pytest.mark.parametrize("convention", BOTH)
+def test_the_same_mesh_gives_the_same_bytes(room, tmp_path, convention):
+    for name in ("a.nc", "b.NC"):
+        room.save(tmp_path / name, convention=convention)
+    data = (tmp_path / "a.nc").read_bytes()
+    assert data == (tmp_path / "b.NC").read_bytes()
+    assert data[:4] == b"CDF\2"
+    settings = json.loads(read(tmp_path / "a.nc").attributes["clvoro_settings"])
+    assert settings == room.settings
+
+
+def test_ugrid_is_the_default(room, tmp_path):
+    room.save(tmp_path / "a.nc")
+    room.save(tmp_path / "b.nc", convention="ugrid")
+    assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
+
+
+@pytest.mark.parametrize("convention", ["MPAS", "", 3, ["mpas"]])
+def test_other_conventions_are_refused(room, tmp_path, convention):
+    with pytest.raises(InputError, match=r"convention is .*expected 'ugrid' or 'mpas'"):
+        room.save(tmp_path / "mesh.nc", convention=convention)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["mesh.vtu", "mesh.npz", "mesh.vtk", "case.foam", "polyMesh"])
+def test_conventions_are_for_netcdf_alone(room, tmp_path, name):
+    with pytest.raises(InputError, match=rf"{name}.*netCDF; save as \.nc"):
+        room.save(tmp_path / name, convention="mpas")
+    with pytest.raises(InputError, match="patches"):
+        room.save(tmp_path / "mesh.nc", patches={"a": [0]})
+    assert not list(tmp_path.iterdir())
+
+
+def test_space_is_refused(tmp_path):
+    points = np.random.default_rng(1).random((20, 3))
+    solid = solids.solid_result(solids.solid_diagram((0, 0, 0), (1, 1, 1), points))
+    for convention in (None, *BOTH):
+        with pytest.raises(InputError, match=r"3 dimensions.*\.vtu, \.foam or \.npz"):
+            solid.save(tmp_path / "mesh.nc", convention=convention)
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_are_not_read_back(room, tmp_path):
+    room.save(tmp_path / "mesh.nc")
+    with pytest.raises(InputError, match=r"cannot load .*mesh\.nc: .*not read; load a \.npz"):
+        clvoro.load(tmp_path / "mesh.nc")
+    with pytest.raises(InputTypeError):
+        io.save(room.diagram, tmp_path / "mesh.nc")
+
+
+@pytest.mark.parametrize("convention", BOTH)
+def test_what_the_format_has_no_room_for_is_refused(room, tmp_path, monkeypatch, convention):
+    largest = {"ugrid": "mesh_face_nodes", "mpas": "edgesOnEdge"}[convention]
+    room.save(tmp_path / "mesh.nc", convention=convention)
+    size = read(tmp_path / "mesh.nc")[largest].nbytes
+    (tmp_path / "mesh.nc").unlink()
+    monkeypatch.setattr(netcdf, "_MOST", size - 1)
+    named = rf"mesh\.nc: {largest} \(\d+ x \d+\) takes {size} bytes"
+    with pytest.raises(InputError, match=named):
+        room.save(tmp_path / "mesh.nc", convention=convention)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("convention", BOTH)
+@pytest.mark.parametrize("where", ["write", "sync"])
+def test_a_full_disk_leaves_the_old_file(room, tmp_path, monkeypatch, convention, where):
+    path = tmp_path / "mesh.nc"
+    path.write_text("the old one")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        if where == "sync":
+            patched.setattr(os, "fsync", full)
+        else:
+            patched.setattr(netcdf_file, "_write_var_data", full)
+        with pytest.raises(InputError, match=r"mesh\.nc: No space left"):
+            room.save(path, convention=convention)
+    assert path.read_text() == "the old one"
+    assert [p.name for p in tmp_path.iterdir()] == ["mesh.nc"]
+    with pytest.raises(InputError, match="create it first"):
+        room.save(tmp_path / "absent" / "mesh.nc", convention=convention)
+    room.save(path, convention=convention)
+    assert len(read(path).values) > 10

@@ -1,0 +1,720 @@
+"""Polygonal domains on the host: checks, measures, files, pictures, transfer."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.cli import command as cli
+from clvoro.errors import InputError, InputTypeError
+from clvoro.geometry.boundary import surface, wall_groups, wall_planes
+from clvoro.geometry.polygon import Polygon
+from clvoro.io import vtu
+from clvoro.io.vtu_read import load_vtu
+from clvoro.mesh.outlines import count_sides, face_ends, next_faces
+from tests.io import test_foam
+from tests.mesh.test_check import add, put, spoilt, swap
+from tests.reference import solids
+from tests.reference.shores import spit, star
+
+SQUARE = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+ROUND = np.array([(np.cos(t), np.sin(t)) for t in np.arange(12) * np.pi / 6])
+
+
+def bay() -> Polygon:
+    """A concave outline; a triangle, a slit that cuts cells apart, a speck that is an island within a cell."""
+    outer = [(0, 0), (4, 0), (4, 1), (2.5, 1.2), (2.4, 3), (0, 3)]
+    slit = [(1.5, 2.0), (1.505, 2.0), (1.505, 2.7), (1.5, 2.7)]
+    speck = [(3, 0.4), (3.03, 0.41), (3.02, 0.44)]
+    return Polygon(outer, [[(0.5, 0.5), (1.1, 0.5), (1.0, 1.3)], slit, speck])
+
+
+def ring() -> Polygon:
+    """A ragged ring around a hole whose corners turn by 30 degrees, where rounding decides what is a side."""
+    rng, k = np.random.default_rng(3), 150
+    angle = (np.arange(k) + rng.uniform(0, 0.9, k)) * 2 * np.pi / k
+    r = 1 + 0.25 * np.sin(5 * angle) + rng.uniform(-0.05, 0.05, k)
+    outer = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+    return Polygon(outer, [ROUND * (0.2, 0.1) + (0.1, 0)])
+
+
+def comb() -> Polygon:
+    """Narrow teeth that cut cells into many parts."""
+    teeth = [(0.06, 1.0), (0.05, 0.25), (0.04, 1.0)]
+    top = [(0.1 * k + x, y) for k in range(39, -1, -1) for x, y in teeth]
+    return Polygon([(0, 0), (4, 0), (4, 1), *top, (0, 1)])
+
+
+def three() -> Polygon:
+    """Three pieces: one with a hole, one in the hole, one that touches the first in a corner."""
+    return Polygon.from_pieces([[SQUARE, SQUARE * 0.3 + 0.3], [SQUARE * 0.1 + 0.4], [SQUARE + 1]])
+
+
+DOMAINS = {"bay": bay, "ring": ring, "comb": comb, "three": three}
+
+
+def scattered(domain: Polygon, n: int, seed: int = 1) -> np.ndarray:
+    """Return `n` places well inside, some in every piece."""
+    rng = np.random.default_rng(seed)
+    inner = np.array([domain.inner_point(p) for p in range(domain.n_pieces)])
+    x = rng.uniform(domain.lower, domain.upper, (20 * n, 2))
+    x = x[domain.contains(x) & (domain.boundary_distance(x) > 1e-3)]
+    return np.concatenate([inner, x])[:n]
+
+
+def size(x: np.ndarray) -> np.ndarray:
+    return 0.2 + 0.02 * x[:, 0] ** 2
+
+
+def mesh(ctx, domain: Polygon, n: int, dtype: str = "float64") -> clvoro.Result:
+    points, steps = scattered(domain, n), 2 if domain.n_pieces == 1 else 0
+    adapter = clvoro.Adapter(ctx, dtype)
+    return adapter.run(domain, size, points=points, method="lloyd", max_steps=steps)
+
+
+@pytest.fixture(scope="module")
+def result(ctx) -> clvoro.Result:
+    return mesh(ctx, bay(), 60)
+
+
+# Checks.
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("n", [3, 60, 900])
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_right_meshes_pass(ctx, name: str, n: int, dtype: str) -> None:
+    report = mesh(ctx, DOMAINS[name](), n, dtype).check()
+    assert report.ok, report
+    expected = {
+        "outlines", "edges covered", "generators in their cells", "volumes sum", "faces closed",
+        "nearest generators", "quality", "faces the same from both sides", "walls",
+    }  # fmt: skip
+    assert expected <= set(report.checked)
+    assert report.precision == dtype
+
+
+SPOILT = {
+    "volume": ({"volumes": add(7, 1e-9)}, "volumes"),
+    "sum": ({"volumes": lambda v: v * (1 + 1e-9)}, "volumes sum"),
+    "centroid": ({"centroids": add((4, 1), 1e-7)}, "centroids"),
+    "measure": ({"face_measures": add(11, 1e-7)}, "face measures"),
+    "middle": ({"face_centroids": add((11, 0), 1e-6)}, "face centroids"),
+    "neighbor": ({"neighbors": lambda j: np.where(j == 3, 4, j)}, "graph symmetric"),
+    "no such edge": ({"neighbors": put(5, -17)}, "neighbors exist"),
+    "other edge": ({"neighbors": lambda j: np.where(j == -1, -3, j)}, "walls"),
+    "edges": ({"neighbors": lambda j: np.where(j == -1, -3, j)}, "edges covered"),
+    "generators": ({"points": swap(8, 30)}, "nearest generators"),
+    "cells": ({"points": swap(8, 30)}, "generators in their cells"),
+    "outside": ({"points": put(8, (0.9, 0.8))}, "generators inside"),
+    "vertex": ({"vertices": add((20, 0), 1e-5)}, "face measures"),
+    "vertex outside": ({"vertices": add((20, 0), 3.0)}, "vertices inside"),
+    "ends": ({"face_vertices": swap(3, 12)}, "graph symmetric"),
+    "corners": ({"cell_vertices": swap(3, 12)}, "outlines"),
+    "starts": ({"face_vertex_starts": add(3, 1)}, "shapes"),
+}  # fmt: skip
+
+
+def test_a_generator_in_a_corner_where_pieces_touch(ctx) -> None:
+    """It belongs to one piece; in the other one, cells may be nearer to it than to their own."""
+    domain = Polygon.from_pieces([[SQUARE * 0.5], [SQUARE * 0.5 + 0.5]])
+    points = [(0, 0), (0, 0.5), (0.5, 0), (0.5, 0.5), (0.5, 1), (1, 0.5), (1, 1)]
+    report = clvoro.Adapter(ctx).diagram(domain, points).check()
+    assert report, report
+
+
+def test_a_face_of_a_rounding_is_a_side_or_none(ctx) -> None:
+    a = np.array([(0, 4), (1, 4), (1, 5), (0, 5)]) / 7
+    domain = Polygon.from_pieces([[a], [a + np.array([1, -1]) / 7]])
+    x = [(0.1369047619047619, 0.5718085607390168), (0.14247715354669752, 0.5773809523809523),
+         (0.1488095238095238, 0.571048582118126)]  # fmt: skip
+    made = clvoro.Adapter(ctx).run(domain, 0.05, points=x, method="lloyd", max_steps=0)
+    assert made.diagram.face_measures.min() < 1e-14
+    assert made.check(), made.check()
+
+
+def test_sides_in_a_corner_of_two_holes(ctx) -> None:
+    """Parts of a cell come together in the corner: where its sides end there is a matter of taste."""
+    holes = [[(0.25, 0.75), (0.5, 0.5), (0.25, 0.25)], [(0.75, 0.75), (0.75, 0.25), (0.5, 0.5)]]
+    x = [(0.5122103171985511, 0.48721031719855123), (0.48778968280144874, 0.48721031719855123),
+         (0.5135252778420708, 0.5142524999357069), (0.5113436115611626, 0.5164341662166151),
+         (0.504798612718438, 0.5229791650593397), (0.5603541682739935, 0.5785347206148953)]  # fmt: skip
+    made = clvoro.Adapter(ctx).run(
+        Polygon(SQUARE, holes), 0.05, points=x, method="lloyd", max_steps=0
+    )
+    assert made.check(), made.check()
+    # Elsewhere it is none: one side more or less is found.
+    quality = made.quality.copy()
+    quality[5] *= 6 * np.tan(np.pi / 6) / (5 * np.tan(np.pi / 5))
+    assert not dataclasses.replace(made, quality=quality).check()
+
+
+@pytest.mark.parametrize("scale", [1e-45, 1e10, 1e45])
+def test_checks_in_any_unit(ctx, scale: float) -> None:
+    domain = Polygon(SQUARE * scale, [SQUARE * 0.2 * scale + 0.3 * scale])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report = (
+            clvoro.Adapter(ctx)
+            .diagram(domain, scattered(Polygon(SQUARE, [SQUARE * 0.2 + 0.3]), 9) * scale)
+            .check()
+        )
+    assert report, report
+
+
+@pytest.mark.parametrize("case", list(SPOILT))
+def test_what_is_wrong_is_named(result, case: str) -> None:
+    changes, name = SPOILT[case]
+    report = spoilt(result, **changes).check()
+    assert name in {finding.name for finding in report.findings}, report
+
+
+def test_open_loops_are_found(result) -> None:
+    face = int(np.flatnonzero(result.diagram.neighbors < 0)[0])
+    report = spoilt(result, face_vertices=put(2 * face + 1, 0)).check()
+    assert "faces closed" in {finding.name for finding in report.findings}
+
+
+def test_diagram_of_other_generators_is_found(result) -> None:
+    # Closed, symmetric, of the right sum; only not the Voronoi diagram of these generators.
+    d = result.diagram
+    i, j = 8, int(d.neighbors[d.neighbor_starts[8] : d.neighbor_starts[9]].max())
+    x = d.points.copy()
+    x[i] += 0.2 * (x[j] - x[i])
+    names = {f.name for f in spoilt(result, points=lambda _: x).check().findings}
+    assert "nearest generators" in names
+
+
+@pytest.mark.parametrize("name", ["error", "quality", "size"])
+def test_numbers_of_a_result_are_recomputed(result, name: str) -> None:
+    values = getattr(result, name).copy()
+    values[17] *= 1.001
+    report = dataclasses.replace(result, **{name: values}).check()
+    assert ("error" if name == "size" else name) in {f.name for f in report.findings}
+
+
+# What the boundary looks like to faces.
+
+
+def test_walls_of_polygons() -> None:
+    domain = bay()
+    walls = np.arange(len(domain.vertices))
+    normals, anchors = wall_planes(domain, walls)
+    middle = (domain.vertices + domain.vertices[domain.next_vertex]) / 2
+    assert np.abs(((middle - anchors) * normals).sum(axis=1)).max() < 1e-15
+    assert not domain.contains(middle + 1e-3 * normals).any()
+    assert domain.contains(middle - 1e-3 * normals).all()
+    assert surface(domain) == pytest.approx(domain.geometry.length, rel=1e-15)
+    assert surface(clvoro.Box((0, 0, 0), (1, 2, 3))) == 22
+    names, groups = wall_groups(domain)
+    assert names == ["outer", "hole-1", "hole-2", "hole-3"]
+    assert groups.tolist() == [0] * 6 + [1] * 3 + [2] * 4 + [3] * 3
+    names, groups = wall_groups(three())
+    assert names == ["outer-1", "hole-1", "outer-2", "outer-3"]
+    assert wall_groups(clvoro.Box((0, 0), (1, 1)))[0] == ["xMin", "xMax", "yMin", "yMax"]
+
+
+def cells_of(diagram) -> list:
+    """Each cell as a shapely geometry, from the ends of its faces alone."""
+    x, ends = diagram.vertices, face_ends(diagram)
+    found = []
+    for a, b in zip(diagram.neighbor_starts[:-1], diagram.neighbor_starts[1:], strict=True):
+        lines = [shapely.LineString(x[e]) for e in ends[a:b] if (x[e[0]] != x[e[1]]).any()]
+        parts = shapely.get_parts(shapely.polygonize(lines))
+        # What is on the left of its outline is the cell; islands in it are not.
+        islands = [shapely.Polygon(hole) for part in parts for hole in part.interiors]
+        kept = [p for p in parts if not any(p.equals(island) for island in islands)]
+        found.append(shapely.union_all(kept))
+    return found
+
+
+def test_faces_are_the_outlines_of_cells(result) -> None:
+    cells = cells_of(result.diagram)
+    # Sums of a dozen products of numbers up to 4.
+    assert np.abs(shapely.area(cells) - result.diagram.volumes).max() < 1e-13
+    assert any(len(part.interiors) for cell in cells for part in shapely.get_parts(cell))
+    following = next_faces(result.diagram)
+    ends = face_ends(result.diagram)
+    assert (ends[:, 1] == ends[following, 0]).all()
+    assert sorted(following.tolist()) == list(range(len(following)))
+
+
+def corners_by_hand(diagram, i: int) -> tuple[np.ndarray, bool]:
+    """Walk around a cell, face by face; return where its sides begin, and whether nothing else belongs to it.
+
+    The boundary is one side as long as it turns by no more than 30 degrees.
+    """
+    rows = range(diagram.neighbor_starts[i], diagram.neighbor_starts[i + 1])
+    ends, x = face_ends(diagram), diagram.vertices
+    after = {f: g for f in rows for g in rows if ends[f, 1] == ends[g, 0]}
+    first = f = next(f for f in rows if diagram.neighbors[f] >= 0)
+    corners, walked, turned, before = [], 0, 0.0, None
+    while walked == 0 or f != first:
+        e = complex(*(x[ends[f, 1]] - x[ends[f, 0]]))
+        if diagram.neighbors[f] >= 0:
+            corners.append(ends[f, 0])
+            before = None
+        else:
+            turned += np.angle(e / before) if before is not None else 0.0
+            if before is None or abs(turned) > np.pi / 6:
+                corners.append(ends[f, 0])
+                turned = 0.0
+            before = e
+        f, walked = after[f], walked + 1
+    return x[corners], walked == len(rows)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_quality_is_that_of_the_cell_with_straight_sides(ctx, dtype: str) -> None:
+    eps, straightened, joined = float(np.finfo(dtype).eps), 0, 0
+    for domain in (comb(), Polygon(ring().rings[0])):
+        result = mesh(ctx, domain, 150, dtype)
+        diagram = result.diagram
+        counts, faces = count_sides(diagram), np.diff(diagram.neighbor_starts)
+        for i in range(150):
+            corners, whole = corners_by_hand(diagram, i)
+            if not whole:  # islands
+                continue
+            n = len(corners)
+            assert counts[i] == n
+            straightened += n < faces[i]
+            x, y = (corners - diagram.points[i]).T
+            area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+            perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
+            expected = 4 * max(area, 0) * n * np.tan(np.pi / n) / perimeter**2
+            # Corners round by eps of the domain, four wide at most, where cells are a tenth as wide as that.
+            assert result.quality[i] == pytest.approx(expected, abs=4096 * eps)
+            edges = diagram.neighbors[diagram.neighbor_starts[i] : diagram.neighbor_starts[i + 1]]
+            joined += len(set(edges[edges < 0].tolist())) < (edges < 0).sum()
+    assert straightened > 30
+    assert joined > 10
+
+
+def test_a_bent_side_is_no_better_than_a_straight_one(ctx) -> None:
+    """A regular pentagon, a corner of which is but the bend of a wall: as four sides it would have Q = 1.10."""
+    angle = np.arange(5) * 2 * np.pi / 5
+    pentagon = np.column_stack([np.cos(angle), np.sin(angle)])
+    # The wall's corner is made as flat as a side may be; the other corners are where they were.
+    a, b = pentagon[1], pentagon[4]
+    flat = (a + b) / 2 + (0.5 * np.linalg.norm(a - b) * np.tan(np.radians(14.9)), 0)
+    domain = Polygon([flat, a, pentagon[2], pentagon[3], b])
+    result = clvoro.Adapter(ctx).run(
+        domain, 1.0, points=np.array([(0.0, 0.0)]), method="lloyd", max_steps=0
+    )
+    corners = domain.vertices[(domain.vertices != flat).any(axis=1)]
+    x, y = corners.T
+    area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+    perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
+    assert len(corners) == 4
+    assert result.quality[0] == pytest.approx(16 * area / perimeter**2, rel=1e-14)
+    assert result.check()
+
+
+def test_a_cell_without_neighbors_has_the_sides_of_its_piece(ctx) -> None:
+    square_and_hole = Polygon(SQUARE, [SQUARE * 0.2 + 0.4])
+    diagram = clvoro.Adapter(ctx).diagram(square_and_hole, np.array([(0.3, 0.3)]))
+    assert count_sides(diagram).tolist() == [4]
+    circle = Polygon([(np.cos(t), np.sin(t)) for t in np.arange(100) * np.pi / 50])
+    diagram = clvoro.Adapter(ctx).diagram(circle, np.array([(0.0, 0.0)]))
+    # 100 turns of 3.6 degrees: after each 9 of them a new side, and the last of one edge.
+    assert count_sides(diagram).tolist() == [12]
+    begun_amid = Polygon(np.vstack([(0.5, 0), SQUARE[1:], SQUARE[:1]]))
+    diagram = clvoro.Adapter(ctx).diagram(begun_amid, np.array([(0.5, 0.5)]))
+    assert count_sides(diagram).tolist() == [4]
+
+
+def test_measures(result) -> None:
+    d, m = result.diagram, result.measures
+    assert np.abs(m.quality - result.quality).max() < 1e-13
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
+    behind = 0
+    for f in np.flatnonzero(d.neighbors < 0):
+        a = d.domain.vertices[-1 - d.neighbors[f]]
+        b = d.domain.vertices[d.domain.next_vertex[-1 - d.neighbors[f]]]
+        along = (b - a) / np.linalg.norm(b - a)
+        x = d.points[owner[f]]
+        gap = along[0] * (x - a)[1] - along[1] * (x - a)[0]
+        foot = a + along * ((x - a) @ along)
+        expected = np.linalg.norm(d.face_centroids[f] - foot) / (2 * gap) if gap > 0 else np.inf
+        assert m.skewness[f] == pytest.approx(expected, rel=1e-9)
+        behind += gap <= 0
+    assert behind
+    assert np.isfinite(list(m.summary().values())).all()
+    assert m.summary()["max_skewness"] == m.skewness[m.inner].max()
+
+
+# Files.
+
+
+def same_diagram(one, other) -> None:
+    assert one.domain == other.domain
+    for name in one._arrays:
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_npz_loses_nothing(ctx, tmp_path, name: str) -> None:
+    made = mesh(ctx, DOMAINS[name](), 40)
+    made.save(tmp_path / "mesh.npz")
+    again = clvoro.load(tmp_path / "mesh.npz")
+    same_diagram(made.diagram, again.diagram)
+    assert again.check().ok
+    made.save(tmp_path / "twice.npz")
+    assert (tmp_path / "mesh.npz").read_bytes() == (tmp_path / "twice.npz").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("diagram.neighbors", lambda j: np.where(j == -1, -17, j), "neighbors points to what"),
+        ("diagram.face_vertex_starts", lambda s: s // 2 * 3, "face_vertex_starts does not cut"),
+        ("diagram.face_vertices", lambda v: v + 10_000, "face_vertices points to what"),
+        ("diagram.face_vertices", None, "lacks diagram.face_vertices"),
+    ],
+)  # fmt: skip
+def test_damaged_npz_is_refused(result, tmp_path, name: str, change, says: str) -> None:
+    path = tmp_path / "mesh.npz"
+    result.save(path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    if change is None:
+        del arrays[name]
+    else:
+        arrays[name] = change(arrays[name]).astype(arrays[name].dtype)
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match=says):
+        clvoro.load(path)
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
+    made = mesh(ctx, DOMAINS[name](), 40)
+    path = tmp_path / "mesh.vtu"
+    made.save(path)
+    again = load_vtu(path)
+    assert again.check().ok, again.check()
+    d, e = made.diagram, again.diagram
+    assert e.domain == d.domain
+    assert np.array_equal(e.cell_vertices, d.cell_vertices)
+    assert np.array_equal(e.neighbor_starts, d.neighbor_starts)
+    rows = [[sorted(zip(m.neighbors[a:b].tolist(), face_ends(m)[a:b].tolist(), strict=True))
+             for a, b in zip(m.neighbor_starts[:-1], m.neighbor_starts[1:], strict=True)]
+            for m in (d, e)]  # fmt: skip
+    assert rows[0] == rows[1]
+    assert cli.main(["check", str(path)]) == 0
+
+
+@pytest.mark.parametrize("named", [True, False], ids=["edges named", "edges found"])
+def test_vtu_with_a_needle_of_no_width(ctx, tmp_path, monkeypatch, named) -> None:
+    """Both sides of the needle have the same corners in single precision, as a bridge between loops would."""
+    shore = np.vstack([spit(1e-12)[:-1], (0, 1), (0, 0.5)])
+    domain = Polygon(shore, [star(7, 3, (0.3, 0.3), 0.1), star(5, 4, (0.2, 0.8), 0.05)])
+    made = mesh(ctx, domain, 3, "float32")
+    ends = face_ends(made.diagram)
+    cell = np.repeat(np.arange(3), np.diff(made.diagram.neighbor_starts))
+    keys = {(c, *sorted(pair)) for c, pair in zip(cell.tolist(), ends.tolist(), strict=True)}
+    assert len(keys) < len(ends)
+    if not named:  # as in files of earlier versions
+        monkeypatch.setattr(vtu, "_polygon_graph", lambda _: {})
+    made.save(tmp_path / "mesh.vtu")
+    again = load_vtu(tmp_path / "mesh.vtu")
+    assert again.check().ok == named
+    assert np.array_equal(again.diagram.neighbors, made.diagram.neighbors) == named
+
+
+def test_a_moved_corner_in_a_vtu_is_found(result, tmp_path) -> None:
+    d = spoilt(result, vertices=add((20, 0), 1e-3))
+    path = tmp_path / "mesh.vtu"
+    dataclasses.replace(result, diagram=d).save(path)
+    assert not load_vtu(path).check()
+    assert cli.main(["check", str(path)]) == 1
+
+
+def assert_same_areas(read, d: clvoro.Diagram, slack: float) -> None:
+    """Of what meshio has read."""
+    assert sum(len(block) for block in read.cells) == len(d)
+    x = read.points[:, :2]
+    areas = [
+        ((z := x[c] @ (1, 1j)).conj() * np.roll(z, -1)).imag.sum() / 2
+        for block in read.cells for c in block.data
+    ]  # fmt: skip
+    assert np.sort(areas) == pytest.approx(np.sort(d.volumes), abs=slack)
+
+
+@pytest.mark.parametrize("name", ["mesh.vtk", "mesh.ply", "mesh.obj"])
+def test_other_programs_read_the_cells(result, tmp_path, name) -> None:
+    meshio = pytest.importorskip("meshio")
+    result.save(tmp_path / name)
+    # The others than VTK's hold fewer digits.
+    assert_same_areas(
+        meshio.read(tmp_path / name), result.diagram, 1e-13 if name == "mesh.vtk" else 1e-5
+    )
+
+
+def test_other_programs_read_a_vtu(result, tmp_path, meshio_for_vtu) -> None:
+    result.save(tmp_path / "mesh.vtu")
+    read = meshio_for_vtu.read(tmp_path / "mesh.vtu")
+    assert_same_areas(read, result.diagram, 1e-13)
+    assert np.array_equal(read.field_data["domain_vertices"][:, :2], result.diagram.domain.vertices)
+
+
+@pytest.fixture(scope="module")
+def pond(ctx) -> clvoro.Result:
+    """A mesh without islands in cells, in which some cells have two faces in common."""
+    domain = Polygon(bay().rings[0][::-1], [ring[::-1] for ring in bay().rings[1:3]])
+    return mesh(ctx, domain, 60)
+
+
+def test_openfoam_cells_are_closed(pond, tmp_path) -> None:
+    pond.save(tmp_path / "constant" / "polyMesh")
+    points, faces, owner, neighbor, _ = test_foam.read(tmp_path / "constant" / "polyMesh")
+    inner, n = len(neighbor), len(pond.points)
+    pairs = list(zip(owner[:inner].tolist(), neighbor.tolist(), strict=True))
+    assert pairs == sorted(pairs)
+    assert len(set(pairs)) < len(pairs)
+    assert all(i < j for i, j in pairs)
+    areas = np.array([solids.loop_area(points[f]) for f in faces])
+    # Of a face that is not convex the mean of its corners is not the centroid, but lies in its plane.
+    cones = (areas * np.array([points[f].mean(axis=0) for f in faces])).sum(axis=1) / 3
+    openness, volumes = np.zeros((n, 3)), np.zeros(n)
+    np.add.at(openness, owner, areas)
+    np.add.at(volumes, owner, cones)
+    np.subtract.at(openness, neighbor, areas[:inner])
+    np.subtract.at(volumes, neighbor, cones[:inner])
+    depth = points[:, 2].max()
+    assert np.abs(openness).max() < 1e-13
+    assert volumes == pytest.approx(pond.diagram.volumes * depth, abs=1e-13)
+    count: dict = {}
+    for k, face in enumerate(faces):
+        for cell in [owner[k], *([neighbor[k]] if k < inner else [])]:
+            for a, b in zip(face, face[1:] + face[:1], strict=True):
+                key = cell, min(a, b), max(a, b)
+                count[key] = count.get(key, 0) + 1
+    assert set(count.values()) == {2}
+
+
+def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
+    """Length of each patch, by its first edge's prisms."""
+    depth = points[:, 2].max()
+    area = {
+        name: sum(np.linalg.norm(solids.loop_area(points[f])) for f in faces[start : start + count])
+        for name, (kind, count, start) in patches.items() if kind == "patch"
+    }  # fmt: skip
+    return {name: a / depth for name, a in area.items()}
+
+
+def test_openfoam_patches(pond, tmp_path) -> None:
+    domain, folder = pond.diagram.domain, tmp_path / "polyMesh"
+    pond.save(folder)
+    points, faces, *_, patches = test_foam.read(folder)
+    assert list(patches) == ["outer", "hole-1", "hole-2", "back", "front"]
+    rings = [shapely.LinearRing(ring).length for ring in domain.rings]
+    assert list(lengths_of(patches, points, faces).values()) == pytest.approx(rings, rel=1e-12)
+    # By the numbers that the user gave the edges: the rings came in the other order of turning.
+    given = [*bay().rings[0][::-1], *bay().rings[1][::-1]]
+    edges = {"in": [0], "walls": [3, 7, 1]}
+    pond.save(folder, patches=edges)
+    points, faces, *_, patches = test_foam.read(folder)
+    assert list(patches) == ["in", "walls", "outer", "hole-1", "hole-2", "back", "front"]
+
+    def length(k: int) -> float:
+        first, count = (0, 6) if k < 6 else (6, 3)
+        return np.linalg.norm(given[k] - given[first + (k + 1 - first) % count])
+
+    found = lengths_of(patches, points, faces)
+    assert found["in"] == pytest.approx(length(0), rel=1e-12)
+    assert found["walls"] == pytest.approx(length(3) + length(7) + length(1), rel=1e-12)
+    assert sum(found.values()) == pytest.approx(sum(rings), rel=1e-12)
+    pond.save(folder, patches={"all": range(6)})
+    assert list(test_foam.read(folder)[-1]) == ["all", "hole-1", "hole-2", "back", "front"]
+
+
+@pytest.mark.parametrize(
+    ("patches", "says"),
+    [
+        ({"a": [99]}, r"has for a the edges \[99\]"), ({"a": []}, "has for a no edges"),
+        ({"a": [1], "b": [0, 1]}, "edge 1 both in a and in b"), ({"a b": [1]}, "the name 'a b'"),
+        ({"outer": [1]}, "the name outer, which is that of a ring"),
+        ([0, 1], r"patches is \[0, 1\] of type list.*'inlet': \[0, 1\]"), ({"a": 3}, "has for a 3, expected the numb"),
+        ({"a": [0.5]}, r"has for a \[0\.5\]"), ({"a": "01"}, "has for a '01'"),
+    ],
+)  # fmt: skip
+def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=says):
+        pond.save(tmp_path / "case.foam", patches=patches)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_openfoam_cannot_hold_is_refused(result, pond, tmp_path) -> None:
+    with pytest.raises(
+        InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"
+    ):
+        result.save(tmp_path / "case.foam")
+    with pytest.raises(InputError, match="they are for OpenFOAM"):
+        pond.save(tmp_path / "mesh.vtu", patches={"a": [1]})
+    assert not list(tmp_path.iterdir())
+
+
+# Pictures and reports.
+
+
+def pixel(figure, place) -> list:
+    """Color (red, green, blue; 0 to 255) of a figure's first axes at a place of its plane."""
+    figure.canvas.draw()
+    image = np.asarray(figure.canvas.buffer_rgba())
+    x, y = figure.axes[0].transData.transform(place)
+    return image[image.shape[0] - 1 - int(y), int(x), :3].tolist()
+
+
+OUTSIDE = [(0.85, 0.8), (3.5, 2.0), (3.017, 0.417)]  # the triangle, beyond the outline, the speck
+INSIDE = [(0.2, 2.8), (2.0, 0.3), (2.0, 1.7)]
+
+
+@pytest.mark.parametrize("color", ["error", "quality", "size", "sides", "skewness"])
+def test_cells_fill_the_domain_and_nothing_else(result, color: str) -> None:
+    pytest.importorskip("matplotlib")
+    figure = result.plot(color, edges=False)
+    figure.set_dpi(400)  # the speck is three hundredths of a unit
+    assert all(pixel(figure, place) == [255, 255, 255] for place in OUTSIDE)
+    if color not in ("error", "sides"):  # whose middle is white, or nearly
+        assert all(pixel(figure, place) != [255, 255, 255] for place in INSIDE)
+    lines = [patch for patch in figure.axes[0].patches if len(patch.get_path().vertices) == 20]
+    assert len(lines) == 1  # all four rings, closed
+
+
+def test_size_is_asked_for_inside_only(result) -> None:
+    pytest.importorskip("matplotlib")
+    from clvoro.plotting import plot_size
+
+    domain = result.diagram.domain
+
+    def asked(x: np.ndarray) -> np.ndarray:
+        assert domain.contains(x).all()
+        return size(x)
+
+    figure = plot_size(asked, domain)
+    figure.set_dpi(200)
+    assert all(pixel(figure, place) == [255, 255, 255] for place in OUTSIDE)
+    assert all(max(pixel(figure, place)) < 250 for place in INSIDE)
+    # Up to the boundary: a hundredth beside it, where a raster would end in steps.
+    beside = domain.vertices + (domain.vertices[domain.next_vertex] - domain.vertices) / 2
+    inward = beside - 0.02 * wall_planes(domain, np.arange(len(beside)))[0]
+    kept = inward[:9][domain.contains(inward[:9])]
+    assert len(kept) == 9
+    assert all(pixel(figure, place) != [255, 255, 255] for place in kept)
+
+
+def test_boundary_cells_are_reported_apart(result, tmp_path) -> None:
+    pytest.importorskip("matplotlib")
+    from clvoro.mesh.summary import boundary_line, summary
+    from clvoro.plotting import write_report
+
+    d = result.diagram
+    touching = [
+        (d.neighbors[a:b] < 0).any()
+        for a, b in zip(d.neighbor_starts[:-1], d.neighbor_starts[1:], strict=True)
+    ]
+    s = summary(result)
+    assert (s["boundary_cells"], s["inner_cells"]) == (sum(touching), 60 - sum(touching))
+    for name, which in (("boundary", np.array(touching)), ("inner", ~np.array(touching))):
+        assert s[f"{name}_mean_error"] == pytest.approx(np.abs(result.error[which]).mean())
+        assert s[f"{name}_mean_quality"] == pytest.approx(result.quality[which].mean())
+        assert s[f"{name}_min_quality"] == result.quality[which].min()
+    assert f"{sum(touching)} boundary cells: mean |e|" in boundary_line(result)
+    page = write_report(result, tmp_path, size=size)[0].read_text()
+    assert "Cells on the boundary" in page
+    assert f"<td>{sum(touching)}</td>" in page
+
+
+def test_a_piece_with_one_cell_has_no_inner_cells(ctx) -> None:
+    from clvoro.mesh.summary import boundary_line, summary
+
+    alone = mesh(ctx, Polygon(SQUARE), 1)
+    assert summary(alone)["inner_mean_error"] is None
+    assert "inner" not in boundary_line(alone)
+
+
+# Transfer.
+
+
+@pytest.fixture(scope="module")
+def pair(ctx):
+    """Two diagrams of one domain, with islands in cells and cells in parts."""
+    adapter = clvoro.Adapter(ctx)
+    return [adapter.diagram(bay(), scattered(bay(), n, seed)) for n, seed in ((60, 1), (45, 5))]
+
+
+def test_parts_are_those_of_the_cells(pair) -> None:
+    old, new = pair
+    before, after = cells_of(old), cells_of(new)
+    got = old.transfer(np.eye(60), new)
+    expected = np.array([[new_.intersection(old_).area for old_ in before] for new_ in after])
+    # Areas of sums of products of numbers up to 4; the mass that rounding leaves over is divided among all.
+    assert np.abs(got * new.volumes[:, None] - expected).max() < 1e-13
+    assert (expected > 0).sum() > 60
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+def test_transfer_is_conservative_and_exact(ctx, name: str) -> None:
+    domain = DOMAINS[name]()
+    adapter = clvoro.Adapter(ctx)
+    old, new = (adapter.diagram(domain, scattered(domain, n, n)) for n in (300, 170))
+
+    def linear(d):
+        return 1 + 2 * d.centroids[:, 0] - 3 * d.centroids[:, 1]
+
+    rough = np.random.default_rng(7).standard_normal(300)
+    for order, limited in ((1, True), (2, True), (2, False)):
+        got = old.transfer(
+            np.column_stack([rough, linear(old), np.full(300, np.pi)]), new, order, limited=limited
+        )
+        assert got.shape == (170, 3)
+        for values, column in zip((rough, linear(old)), got.T, strict=False):
+            mass = np.abs(old.volumes * values).sum()
+            assert abs(new.volumes @ column - old.volumes @ values) < 1e-12 * mass
+        assert np.abs(got[:, 2] - np.pi).max() < 1e-14
+        if limited:
+            assert (got[:, 2] == np.pi).all()
+            assert got[:, 0].min() >= rough.min()
+            assert got[:, 0].max() <= rough.max()
+    # Exact where every old cell beneath has neighbors in two directions: nearly everywhere.
+    error = np.abs(got[:, 1] - linear(new))
+    assert np.median(error) < 1e-14
+    assert name == "comb" or error.max() < 1e-13
+
+
+def test_transfer_onto_itself_changes_nothing(pair) -> None:
+    values = np.random.default_rng(3).random(60)
+    assert np.abs(pair[0].transfer(values, pair[0]) - values).max() < 1e-13
+
+
+def test_transfer_between_domains_is_refused(pair, ctx) -> None:
+    other = clvoro.Adapter(ctx).diagram(Polygon(SQUARE), SQUARE * 0.5 + 0.2)
+    with pytest.raises(InputError, match="expected the same domain"):
+        pair[0].transfer(np.zeros(60), other)
+
+
+def test_slopes_are_those_of_the_device(ctx) -> None:
+    from clvoro.remapping.overlap import fit_slopes
+
+    # In a box, described as a polygon.
+    box, points = clvoro.Box((0, 0), (1, 1)), np.random.default_rng(9).random((80, 2))
+    values = np.random.default_rng(10).standard_normal((80, 1))
+    adapter = clvoro.Adapter(ctx)
+    new = np.random.default_rng(11).random((70, 2))
+    for limited in (True, False):
+        flat, ring_ = (
+            adapter.diagram(domain, points).transfer(
+                values, adapter.diagram(domain, new), 2, limited=limited
+            )
+            for domain in (box, Polygon(SQUARE))
+        )
+        # Where the fit is ill-conditioned, as between neighbors nearly in a row, rounding grows.
+        assert np.abs(flat - ring_).max() < 1e-10
+    slopes, least, most = fit_slopes(adapter.diagram(Polygon(SQUARE), points), values, True)
+    assert (least <= values).all()
+    assert (most >= values).all()
+    assert np.abs(slopes).max() > 0

@@ -1,0 +1,341 @@
+"""Devices: the probe, the choice, the messages; and runtimes that pip installed."""
+
+import os
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clvoro.errors import DeviceError, InputTypeError
+from clvoro.opencl import devices as device
+from clvoro.opencl import probe as _probe
+from clvoro.opencl import runtimes as _runtimes
+
+ROOT = Path(__file__).parents[2]
+
+
+class FakeDevice:
+    """As much of a pyopencl.Device as the choice looks at."""
+
+    def __init__(self, key, platform, name, kind, fp64=True, vendor="Maker"):
+        self.int_ptr, self.name, self.type, self.vendor = key, name, kind, vendor
+        self.platform = type("FakePlatform", (), {"name": platform})()
+        self.double_fp_config, self.extensions = (63 if fp64 else 0), ""
+        self.version, self.global_mem_size, self.max_compute_units = "OpenCL 3.0", 2**31, 4
+
+
+CPU, GPU, EVERYTHING = cl.device_type.CPU, cl.device_type.GPU, 15
+GRIND = FakeDevice(-1, "Oclgrind", "Oclgrind Simulator", EVERYTHING)
+INTEL = FakeDevice(-2, "Intel(R) OpenCL", "Some CPU", CPU)
+POCL = FakeDevice(-3, "Portable Computing Language", "pthread-Some CPU", CPU)
+SMALL_GPU = FakeDevice(-4, "Vendor", "Graphics", GPU, fp64=False)
+BIG_GPU = FakeDevice(-5, "Vendor", "Tensor 9000", GPU)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Pretend that a machine has some devices, of which some are broken; contexts are the lists."""
+
+    def install(*devices, broken=()):
+        monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+        found = [device._describe(d, f"{i}:0") for i, d in enumerate(devices)]
+        monkeypatch.setattr(device, "_candidates", lambda **_: (found, []))
+        monkeypatch.setattr(_probe, "crashing_platforms", dict)
+        monkeypatch.setattr(_probe, "verdict", lambda d: "it cannot build" if d in broken else "")
+        monkeypatch.setattr(device.cl, "Context", lambda devices: devices)
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("devices", "broken", "expected"),
+    [
+        ([GRIND, INTEL, POCL, SMALL_GPU, BIG_GPU], [], BIG_GPU),
+        ([GRIND, INTEL, POCL, SMALL_GPU, BIG_GPU], [BIG_GPU], SMALL_GPU),
+        ([GRIND, INTEL, POCL, BIG_GPU], [BIG_GPU], POCL),
+        ([GRIND, INTEL, POCL], [POCL], INTEL),
+        ([GRIND, POCL, INTEL], [], POCL),
+    ],
+)
+def test_order_of_choice(machine, devices, broken, expected):
+    machine(*devices, broken=broken)
+    assert device.create_context() == [expected]
+    chosen = [d for d in device.list_devices() if d.default]
+    assert [d.name for d in chosen] == [expected.name]
+
+
+ON_INTEL = FakeDevice(
+    -6, "Portable Computing Language", "cpu-Intel(R) Xeon(R)", CPU, vendor="GenuineIntel"
+)
+
+
+@pytest.mark.parametrize("query", ["intel", "Intel(R)", " INTEL "])
+def test_runtime_comes_before_the_name_of_a_processor(machine, query):
+    machine(ON_INTEL, INTEL)
+    assert device.create_context(query) == [INTEL]
+    assert device.create_context("pocl") == device.create_context("xeon") == [ON_INTEL]
+    assert device.create_context("cpu") == [ON_INTEL]
+    # Not another's in the place of a runtime that does not work.
+    machine(ON_INTEL, INTEL, broken=[INTEL])
+    with pytest.raises(DeviceError, match="it cannot build"):
+        device.create_context(query)
+    # Without such a runtime it is the processor that is meant, or its maker.
+    machine(POCL, ON_INTEL, BIG_GPU)
+    assert device.create_context(query) == device.create_context("genuine") == [ON_INTEL]
+
+
+def test_simulator_is_never_taken_unasked(machine):
+    machine(GRIND)
+    with pytest.raises(DeviceError, match="pocl-opencl-icd"):
+        device.create_context()
+    with pytest.raises(DeviceError):
+        device.create_context("gpu")  # it claims to be one
+    assert device.create_context("oclgrind") == [GRIND]
+    assert device.create_context("0:0") == [GRIND]
+    assert not any(d.default for d in device.list_devices())
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("intel", INTEL),
+        ("POCL", POCL),
+        ("portable", POCL),
+        ("cpu", POCL),
+        ("gpu", BIG_GPU),
+        ("graph", SMALL_GPU),
+        ("3:0", SMALL_GPU),
+        (" 1:0 ", INTEL),
+        ("", BIG_GPU),
+    ],
+)
+def test_choice_by_name_kind_and_index(machine, query, expected):
+    machine(GRIND, INTEL, POCL, SMALL_GPU, BIG_GPU)
+    assert device.create_context(query) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("devices", "query", "remedy"),
+    [
+        ([INTEL, POCL], "nvidia", f"leave the device out to use {POCL.platform.name} / {POCL.name}, or install the "),
+        ([POCL, BIG_GPU], "amd", f"leave the device out to use {BIG_GPU.platform.name} / {BIG_GPU.name}, or install "),
+        ([POCL], "gpu", "install the OpenCL driver of the one that you want"),
+        # Indices ask one platform alone, beside which there may be better ones.
+        ([POCL, BIG_GPU], "0:7", "ask for '1:0' to use "),
+        ([GRIND], "gpu", "pocl-opencl-icd"),
+        ([POCL], "pocl", "pocl-opencl-icd"),  # and it does not work
+        ([SMALL_GPU, INTEL, POCL], "pocl", f"use {INTEL.platform.name} / "),  # the GPU has no float64
+    ],
+)  # fmt: skip
+def test_remedies_name_what_there_is(machine, monkeypatch, devices, query, remedy):
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    machine(*devices, broken=[POCL] if query == "pocl" else [])
+    with pytest.raises(DeviceError) as caught:
+        device.create_context(query, fp64=True)
+    told = str(caught.value).split("remedy: ")[1]
+    assert remedy in told
+    assert ("install a CPU runtime" in told) == ("pocl-opencl-icd" in remedy)
+
+
+def test_float64_passes_over_devices_without_it(machine):
+    machine(SMALL_GPU, POCL)
+    assert device.create_context() == [SMALL_GPU]
+    assert device.create_context(fp64=True) == [POCL]
+    with pytest.raises(DeviceError, match="dtype='float32'"):
+        device.create_context("graphics", fp64=True)
+    with pytest.raises(DeviceError, match=r"Graphics has no double.*dtype='float32'"):
+        device.require_fp64(SMALL_GPU)
+    device.require_fp64(SMALL_GPU, "float32")
+    device.require_fp64(POCL, np.float64)
+
+
+def test_messages_name_what_was_found_and_what_to_install(machine):
+    machine(INTEL, BIG_GPU, broken=[BIG_GPU])
+    with pytest.raises(DeviceError) as caught:
+        device.create_context("vendor")
+    text = str(caught.value)
+    for part in (
+        "'vendor'",
+        "Tensor 9000: it cannot build",
+        "there is 0:0 Intel(R) OpenCL / Some CPU (cpu)",
+        "leave the device out",
+    ):
+        assert part in text
+    with pytest.raises(InputTypeError, match="device got a int"):
+        device.create_context(0)
+    machine()
+    with pytest.raises(DeviceError, match=r"knows no platform\n.*pocl-opencl-icd.*\[cpu\]"):
+        device.create_context()
+    assert "pocl-opencl-icd" in device.format_devices(device.list_devices())
+
+
+def test_environment_variable_chooses(ctx, monkeypatch):
+    entry = next(d for d in device.list_devices() if d.works)
+    monkeypatch.setenv("PYOPENCL_CTX", entry.index)
+    assert device.create_context().devices[0].name.strip() == entry.name
+    monkeypatch.setenv("PYOPENCL_CTX", "987:654")
+    with pytest.raises(DeviceError, match="PYOPENCL_CTX='987:654'"):
+        device.create_context()
+    assert not any(d.default for d in device.list_devices())
+    with pytest.raises(DeviceError, match=f"there is {entry.index}"):
+        device.create_context("987:654")
+    # What the caller passes comes first.
+    assert device.create_context(entry.index).devices[0].name.strip() == entry.name
+
+
+def test_real_devices_are_listed_with_their_verdict(ctx):
+    entries = device.list_devices()
+    default = [d for d in entries if d.default]
+    assert [d.name for d in default] == [ctx.devices[0].name.strip()]
+    assert default[0].works
+    assert default[0].reason == ""
+    table = device.format_devices(entries)
+    assert all(d.name in table and d.reason[:60] in table for d in entries)
+    assert sum(line.startswith("*  ") for line in table.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "verdict"),
+    [
+        ("x * x", "x * undeclared", "cannot build and run"),
+        ("sqrt(x * x)", "0 * sqrt(x * x)", "wrong results"),
+    ],
+)
+def test_probe_sees_what_is_broken(ctx, monkeypatch, good, bad, verdict):
+    assert _probe.probe(ctx.devices[0]) == ""
+    assert good in _probe._PROBE
+    monkeypatch.setattr(_probe, "_PROBE", _probe._PROBE.replace(good, bad))
+    reason = _probe.probe(ctx.devices[0])
+    assert verdict in reason
+    assert "\n" not in reason
+    monkeypatch.setattr(_probe, "_verdicts", {})
+    with pytest.raises(DeviceError, match=verdict):
+        device.create_context(ctx.devices[0])
+
+
+def test_runtime_that_crashes_is_listed(ctx, tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "import pyopencl as cl\n"
+        "def crash(platform):\n"
+        "    print('no memory', file=sys.stderr, flush=True)\n"
+        "    os.abort()\n"
+        "cl.Platform.get_devices = crash\n"
+    )
+    assert _probe.crashing_platforms() == {}
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    entries = device.list_devices()
+    assert len(entries) == len(cl.get_platforms())
+    for entry in entries:
+        assert not entry.works
+        assert not entry.default
+        assert entry.reason == "it ends the process (SIGABRT): no memory"
+        assert entry.reason in device.format_devices(entries)
+
+
+# --- what the runtimes need ---
+
+
+class FakeFile:
+    def __init__(self, path):
+        self.name, self._path = path.name, path
+
+    def locate(self):
+        return self._path
+
+
+@pytest.fixture
+def pip_runtime(tmp_path, monkeypatch):
+    """A pretended installation of Intel's runtime, and an environment of its own."""
+    library = tmp_path / "prefix with space" / "lib" / "libintelocl.so"
+    library.parent.mkdir(parents=True)
+    library.write_bytes(b"")
+    home = tmp_path / "pyopencl"
+    (home / ".libs").mkdir(parents=True)
+    (home / ".libs" / "pocl.icd").write_text("libpocl-1.so\n")
+    (home / ".libs" / "libpocl-1.so").write_bytes(b"")
+    files = type("Distribution", (), {"files": [FakeFile(library)]})
+    monkeypatch.setattr(_runtimes.metadata, "distribution", lambda name: files)
+    (tmp_path / "vendors").mkdir()
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path / "vendors"))
+    monkeypatch.setenv("PYOPENCL_HOME", str(home))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("OCL_ICD_FILENAMES", "")  # so that it is undone
+    return library
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
+def test_pip_runtime_is_added_to_what_was_there(pip_runtime, tmp_path):
+    before = Path(os.environ["PYOPENCL_HOME"])
+    assert _runtimes.announce() == pip_runtime
+    icds = Path(os.environ["PYOPENCL_HOME"], ".libs").glob("*.icd")
+    assert sorted(icd.read_text() for icd in icds) == sorted(
+        [f"{pip_runtime}\n", f"{before / '.libs' / 'libpocl-1.so'}\n"]
+    )
+    assert os.environ["OCL_ICD_FILENAMES"] == str(pip_runtime)
+    assert os.environ["OCL_ICD_VENDORS"] == str(tmp_path / "vendors")
+    # In a child, PyOpenCL resets its variable and the other one is inherited.
+    after, os.environ["PYOPENCL_HOME"] = os.environ["PYOPENCL_HOME"], str(before)
+    assert _runtimes.announce() == pip_runtime
+    assert os.environ["PYOPENCL_HOME"] == after
+    assert os.environ["OCL_ICD_FILENAMES"] == str(pip_runtime)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
+def test_runtime_that_the_system_knows_is_not_added_twice(pip_runtime, tmp_path):
+    (tmp_path / "vendors" / "intel.icd").write_text("/removed/libintelocl.so\n")
+    assert _runtimes.announce() == pip_runtime  # its library is gone
+    (tmp_path / "vendors" / "intel.icd").write_text(f"{pip_runtime}\n")
+    assert _runtimes.announce() is None
+
+
+def test_nothing_is_touched_without_a_pip_runtime(monkeypatch):
+    def missing(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(_runtimes.metadata, "distribution", missing)
+    before = dict(os.environ)
+    assert _runtimes.announce() is None
+    assert dict(os.environ) == before
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the cache folder is Linux's")
+def test_unwritable_cache_is_replaced_for_the_process(tmp_path):
+    # A file where the folder should be stops root, too.
+    (tmp_path / "file").write_text("")
+    code = (
+        "import os; from clvoro import device; "
+        "device.create_context(); print(os.environ['XDG_CACHE_HOME'])"
+    )
+    blocked = {"XDG_CACHE_HOME": str(tmp_path / "file" / "cache"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={**os.environ, **blocked},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    folder = Path(done.stdout.strip())
+    assert folder.parent == tmp_path
+    assert not folder.exists()  # gone with the process
+
+
+def test_pip_runtime_works_on_its_own(tmp_path):
+    try:
+        metadata.distribution("intel-opencl-rt")
+    except metadata.PackageNotFoundError:
+        pytest.skip('needs `pip install "clvoro[cpu]"`')
+    code = (
+        "from clvoro import device; print(device.create_context('intel').devices[0].platform.name)"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OCL_", "OPENCL_"))}
+    environment["OCL_ICD_VENDORS"] = str(tmp_path)  # no system-wide runtime
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "Intel(R) OpenCL", done.stderr

@@ -1,0 +1,218 @@
+"""Memory that stages use in turn: arrays of a frame do not overlap, those of the next take their place."""
+
+import gc
+import weakref
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clvoro import sizing
+from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import Mesh
+from clvoro.opencl.program import Engine
+from clvoro.opencl.workspace import MOST_VIEWS
+from tests.reference import patch
+
+
+@pytest.fixture
+def engine(ctx):
+    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Sizes of the buffers that have been made."""
+    sizes, plain = [], cl.Buffer
+
+    class Counted(plain):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            sizes.append(self.size)
+
+    monkeypatch.setattr(cl, "Buffer", Counted)
+    return sizes
+
+
+SHAPES = [(5, np.int32), ((100, 2), None), (1, np.uint8), (0, None), (7000, np.float32), (3, None)]
+
+
+def take(engine):
+    """Take arrays of all kinds and fill each with a number of its own."""
+    arrays = [engine.scratch(*shape) for shape in SHAPES]
+    for k, array in enumerate(arrays):
+        if array.size:
+            array.fill(k + 1)
+    return arrays
+
+
+def check(arrays):
+    for k, (array, (shape, dtype)) in enumerate(zip(arrays, SHAPES, strict=True)):
+        assert array.shape == (shape if isinstance(shape, tuple) else (shape,))
+        assert array.dtype == (np.float64 if dtype is None else dtype)
+        assert (array.get() == k + 1).all()
+
+
+def test_arrays_of_open_frames_do_not_overlap(engine):
+    """Also those of a frame within another, when the memory grows meanwhile, and once it is in one piece."""
+    for _ in range(3):
+        with engine.workspace.frame():
+            outer = take(engine)
+            for _ in range(2):
+                with engine.workspace.frame():
+                    check([a for a, _ in zip(take(engine), outer, strict=True)])
+            check(outer)
+            again = take(engine)
+            check(outer)
+            check(again)
+
+
+def test_frames_take_the_same_memory_in_turn(engine, made):
+    """Without allocations from the third on: the first finds out how much it takes, the second makes one piece."""
+    for turn in range(5):
+        if turn == 2:
+            before = len(made)
+        with engine.workspace.frame():
+            take(engine)
+            for _ in range(3):
+                with engine.workspace.frame():
+                    take(engine)
+    assert len(made) == before
+    once = sum(
+        np.prod(shape, dtype=int) * np.dtype(dtype or float).itemsize for shape, dtype in SHAPES
+    )
+    # Two of each at a time; pieces begin at multiples of a unit.
+    unit = max(64, engine.queue.device.mem_base_addr_align // 8)
+    assert 2 * once <= made[-1] <= 2 * once + 2 * len(SHAPES) * unit
+
+
+def test_a_frame_that_fails_gives_back_what_it_took(engine, made):
+    def fail():
+        with engine.workspace.frame():
+            take(engine)
+            raise ZeroDivisionError
+
+    for _ in range(4):
+        with pytest.raises(ZeroDivisionError):
+            fail()
+        count = len(made)
+    with engine.workspace.frame():
+        check(take(engine))
+    assert len(made) == count
+
+
+def test_outside_of_frames_arrays_have_memory_of_their_own(engine):
+    arrays = take(engine)
+    with engine.workspace.frame():
+        take(engine)
+    take(engine)
+    check(arrays)
+
+
+def test_clearing_lets_go_of_the_memory_but_not_within_a_frame(engine, made):
+    with engine.workspace.frame():
+        outer = take(engine)
+        engine.workspace.clear()
+        check(take(engine))
+        check(outer)
+    engine.workspace.clear()
+    before = len(made)
+    with engine.workspace.frame():
+        check(take(engine))
+    assert len(made) > before
+
+
+def test_few_views_are_kept(engine):
+    """Of all the sizes that there have been."""
+    with engine.workspace.frame():
+        engine.scratch(10**5)
+    for n in range(3 * MOST_VIEWS // 2):
+        with engine.workspace.frame():
+            assert engine.scratch(n + 1).shape == (n + 1,)
+    assert len(engine.workspace._views) <= MOST_VIEWS
+
+
+@pytest.mark.parametrize(
+    "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("shape", 0.3)]
+)
+def test_steps_allocate_nothing(engine, made, method):
+    """Once there have been two like it: a step displaces, moves, repairs the diagram and judges it."""
+    field = sizing.Expression("0.05 + 0.02 * x")
+    points = engine.upload(patch.relaxed_points(500, 3) / patch.BOX.frame[1])
+    mesh = Mesh(Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points)
+    counts = []
+    for _ in range(7):
+        with engine.workspace.frame():
+            method.displace(mesh)
+            method.move(mesh)
+        mesh.update()
+        mesh.assess()
+        counts.append(len(made))
+    assert counts[3:] == counts[3:4] * 4
+
+
+def test_nothing_to_mend_leaves_no_memory(engine, made):
+    """What the search takes is not kept beside the next diagram."""
+    size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
+    points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
+    mesh = Mesh(Stages(engine), patch.BOX, size, points)
+    mesh.fixed, before = mesh.n, len(made)  # all stay where they are
+    assert mesh.mend(flaw=0.06, split=False) == (0, 0)
+    assert len(made) > before  # it has looked
+    assert not mesh.stages.population._room._arrays
+
+
+def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
+    """At once, not when Python looks for references in circles: a launch that refers to its stage would make one."""
+    alive, plain = weakref.WeakSet(), cl.Buffer
+
+    class Watched(plain):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            alive.add(self)
+
+    monkeypatch.setattr(cl, "Buffer", Watched)
+    stages, host = Stages(engine), patch.relaxed_points(500, 3) / patch.BOX.frame[1]
+    gc.collect()
+    gc.disable()
+    try:
+        size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
+        mesh = Mesh(stages, patch.BOX, size, engine.upload(host))
+        for method in (
+            PublishedMethod(Relaxation(), True, True),
+            WeightedMethod(),
+            ProjectedMethod(),
+        ):
+            with engine.workspace.frame():
+                method.displace(mesh)
+                method.move(mesh)
+            mesh.update()
+        mesh.reorganize()
+        stages.poisson.set_up_multigrid(
+            stages.poisson.assemble(
+                mesh.t.starts, mesh.t.neighbors, mesh.t.face_measures, mesh.points
+            )
+        )
+        assert len(alive) > 20
+        stages.release()
+        del mesh, size
+        assert len(alive) == 0
+    finally:
+        gc.enable()
+
+
+def test_a_kernel_is_in_one_hand_until_all_are_taken_back(engine):
+    first, second = engine.kernels("opencl/primitives"), engine.kernels("opencl/primitives")
+    held = {kernels.scan_few.int_ptr for kernels in (first, second)}
+    assert first.scan_few is first.scan_few
+    assert len(held) == 2
+    engine.pool.take_back()
+    third, fourth = (
+        engine.kernels("opencl/primitives"),
+        engine.single().kernels("opencl/primitives"),
+    )
+    assert third.scan_few.int_ptr in held
+    assert fourth.scan_few.int_ptr not in held  # another program
+    with pytest.raises(AttributeError, match="has no kernel nothing"):
+        _ = third.nothing

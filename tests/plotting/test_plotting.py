@@ -1,0 +1,360 @@
+"""Pictures and the report: what is drawn is what was computed, and nothing is left out."""
+
+import base64
+import dataclasses
+import itertools
+import re
+
+import numpy as np
+import pytest
+from matplotlib import pyplot
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
+
+import clvoro
+from clvoro.errors import InputError
+from clvoro.plotting import (
+    page,
+    plot_cells,
+    plot_displacements,
+    plot_history,
+    plot_size,
+    write_report,
+)
+from clvoro.plotting.curves import MOST_ARROWS, _magnifications
+from clvoro.plotting.legends import short
+from clvoro.plotting.pictures import pictures_of, render
+from clvoro.plotting.style import nice, window_around_smallest
+
+BOX = clvoro.Box((-1, 2), (1, 3))
+
+
+def size(x):
+    return 0.08 + 0.2 * np.hypot(x[:, 0], x[:, 1] - 2.5)
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays_open():
+    yield
+    pyplot.close("all")
+
+
+@pytest.fixture(scope="module")
+def adapter(ctx):
+    return clvoro.Adapter(ctx)
+
+
+@pytest.fixture(scope="module")
+def results(adapter):
+    return {
+        method: adapter.run(
+            BOX, size, method=method, start="uniform", max_steps=6, tol=0, seed=4711
+        )
+        for method in ("lloyd", "coupled")
+    }
+
+
+@pytest.fixture(scope="module")
+def result(results):
+    return results["coupled"]
+
+
+def of_kind(figure, kind):
+    return [c for c in figure.axes[0].collections if isinstance(c, kind)]
+
+
+@pytest.mark.parametrize("color", ["error", "quality", "size", "sides"])
+def test_cells_are_drawn_with_their_values(result, color):
+    (cells,) = of_kind(plot_cells(result, color), PolyCollection)
+    wanted = {
+        "error": result.error,
+        "quality": result.quality,
+        "size": result.size,
+        "sides": np.clip(np.diff(result.diagram.cell_vertex_starts), 4, 8),
+    }
+    assert np.array_equal(cells.get_array(), wanted[color])
+    starts, corners = result.diagram.cell_vertex_starts, result.diagram.cell_vertices
+    for i, path in enumerate(cells.get_paths()):
+        polygon = result.diagram.vertices[corners[starts[i] : starts[i + 1]]]
+        assert np.array_equal(path.vertices[:-1], polygon)
+
+
+def test_every_face_is_drawn_once(result):
+    figure = plot_cells(result, "quality")
+    (lines,) = of_kind(figure, LineCollection)
+    neighbors = result.diagram.neighbors
+    wanted = np.sum(neighbors < 0) + np.sum(neighbors >= 0) // 2
+    drawn = {tuple(sorted(map(tuple, s))) for s in lines.get_segments()}
+    assert len(lines.get_segments()) == len(drawn) == wanted
+    length = sum(np.hypot(*(np.subtract(*s))) for s in drawn)
+    faces = result.diagram.face_measures
+    total = faces[neighbors < 0].sum() + faces[neighbors >= 0].sum() / 2
+    assert length == pytest.approx(total)
+
+
+def test_faces_are_as_thin_as_their_cells_are_small(result):
+    small = Figure(figsize=(1.0, 0.6)).add_subplot()
+    plot_cells(result, "quality", small, key=False)
+    (lines,) = [c for c in small.collections if isinstance(c, LineCollection)]
+    widths = np.array(lines.get_linewidths())
+    sizes = np.sqrt(result.diagram.volumes)
+    assert widths.max() <= 0.7
+    assert widths.max() / widths.min() > 0.5 * sizes.max() / sizes.min()
+    # Both in the unit of the paper: a face takes a twentieth of its cell's size at most.
+    assert widths.max() <= 0.05 * sizes.max() * 72 / BOX.extent[0]
+
+
+def test_error_scale_is_the_same_on_both_sides_of_zero(result):
+    (cells,) = of_kind(plot_cells(result, "error"), PolyCollection)
+    low, high = cells.get_clim()
+    assert low == -high
+    assert high >= np.quantile(np.abs(result.error), 0.99)
+
+
+@pytest.mark.parametrize("shape", [(3.0, 1.0), (1.0, 1.0), (0.6, 2.0)])
+@pytest.mark.parametrize("color", ["error", "quality", "size"])
+def test_color_bar_is_as_high_as_the_picture_and_readable(adapter, shape, color):
+    domain = clvoro.Box((0, 0), shape)
+    result = adapter.run(domain, lambda x: 0.05 + 0.1 * x[:, 1], method="lloyd", max_steps=1)
+    figure = plot_cells(result, color)
+    figure.canvas.draw()
+    renderer = figure.canvas.get_renderer()
+    (ax,) = figure.axes
+    (bar,) = ax.child_axes
+    picture = ax.get_window_extent(renderer)
+    long_axis = bar.get_window_extent(renderer)
+    arrows = 1.2  # those at the ends belong to the bar's height, not to its axes
+    assert picture.height / arrows < long_axis.height <= picture.height * 1.001
+    assert bar.get_tightbbox(renderer).x1 <= figure.bbox.x1 + 1  # the label is not cut off
+    boxes = [
+        t.get_window_extent(renderer)
+        for t in bar.get_yticklabels()
+        if long_axis.y0 - 1 <= t.get_window_extent(renderer).y1 and t.get_text()
+    ]
+    assert len(boxes) >= 2
+    boxes.sort(key=lambda b: b.y0)
+    for lower, upper in itertools.pairwise(boxes):
+        assert lower.y1 < upper.y0  # numbers do not touch
+
+
+def test_color_bar_of_a_flat_picture_is_below_it(adapter):
+    domain = clvoro.Box((0, 0), (8, 0.8))
+    figure = adapter.run(domain, 0.2, method="lloyd", max_steps=1).plot("size")
+    figure.canvas.draw()
+    ax, bar = figure.axes
+    assert bar.get_window_extent().y1 < ax.get_window_extent().y0
+    assert ax.get_window_extent().width > 0.8 * figure.bbox.width
+    assert bar.get_tightbbox().y0 >= -1
+
+
+def test_axes_of_a_plain_figure_make_room_for_the_color_bar(result):
+    figure = Figure(figsize=(6, 4))
+    plot_cells(result, "quality", figure.add_subplot())
+    assert len(figure.axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0024, "0.0024"), (12345.0, "12000"), (3e-7, "3e−07"), (-0.05, "−0.05"), (2.0, "2")],
+)
+def test_numbers_of_a_scale_are_short(value, text):
+    assert short(value) == text
+
+
+def test_arrows_are_about_a_spacing_long(result):
+    """Long displacements are reduced, short ones magnified, and generators that are held do not count."""
+    grid = np.stack(np.meshgrid(*2 * [np.arange(10.0)]), axis=-1).reshape(-1, 2)
+    held = np.arange(100) % 4 > 0
+    arrows = np.where(held[:, None], 0, [1.0, 0.0])
+    for length, factor in ((30.0, 0.02), (0.9, 1.0), (0.013, 50.0)):
+        field = clvoro.Displacements(grid, length * arrows, length * arrows)
+        # Six nearest: between one and the root of two away, at the edge a little more.
+        assert 0.5 <= length * _magnifications(field)[0] <= 2
+        assert _magnifications(field) == (factor, factor)
+
+
+def test_limits_and_window_are_taken(result):
+    window = ((0.0, 2.4), (0.3, 2.6))
+    figure = plot_cells(result, "quality", window=window, limits=(0.25, 0.75))
+    (cells,) = of_kind(figure, PolyCollection)
+    assert cells.get_clim() == (0.25, 0.75)
+    assert figure.axes[0].get_xlim() == (0.0, 0.3)
+    shown = len(cells.get_paths())
+    inside = ((result.points > window[0]) & (result.points < window[1])).all(axis=1).sum()
+    assert inside <= shown < len(result.points)
+
+
+def test_side_shares_are_complete(result):
+    legend = plot_cells(result, "sides").axes[0].get_legend()
+    shares = [float(re.search(r"([\d.]+)%", t.get_text())[1]) for t in legend.get_texts()]
+    # Each share is rounded to 0.1.
+    assert sum(shares) == pytest.approx(100, abs=0.05 * len(shares))
+
+
+def test_infinite_values_have_the_color_beyond_the_scale(adapter):
+    # The generator on the wall is not amid its face there.
+    points = np.array([[0.3, 2.0], [-0.8, 2.2], [0.0, 2.7], [0.7, 2.5]])
+    result = adapter.run(BOX, 0.5, points=points, method="lloyd", max_steps=0)
+    assert np.isinf(result.measures.worst_of_cell("skewness")).tolist() == [True] + 3 * [False]
+    (cells,) = of_kind(plot_cells(result, "skewness"), PolyCollection)
+    cells.update_scalarmappable()
+    largest = cells.to_rgba(cells.get_clim()[1])
+    assert np.array_equal(cells.get_facecolor()[0], largest)
+    assert (cells.get_facecolor()[:, 3] == 1).all()
+
+
+def test_unknown_color_is_named(result):
+    with pytest.raises(InputError, match=r"'hue'.*error, quality, size, sides, skewness"):
+        plot_cells(result, "hue")
+
+
+def test_three_dimensions_are_refused(result):
+    arrays = {"points": np.zeros((1, 3))}
+    solid = clvoro.Diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), arrays)
+    with pytest.raises(InputError, match="ParaView"):
+        plot_cells(dataclasses.replace(result, diagram=solid))
+
+
+def test_result_plots_itself(result):
+    assert len(of_kind(result.plot("sides", title="five and seven"), PolyCollection)) == 1
+
+
+def test_size_field_is_sampled_right_way_up():
+    figure = plot_size(lambda x: 1 + x[:, 0] + 10 * (x[:, 1] - 2), BOX)
+    (image,) = figure.axes[0].images
+    values = image.get_array()
+    assert values[0, 0] == pytest.approx(0)
+    assert values[0, -1] == pytest.approx(2)
+    assert values[-1, 0] == pytest.approx(10)
+    assert tuple(image.get_extent()) == (-1, 1, 2, 3)
+    assert image.origin == "lower"
+
+
+def test_history_is_drawn_as_recorded(results):
+    figure = plot_history(results)
+    error, quality = figure.axes
+    assert error.get_yscale() == "log"
+    drawn = [line.get_ydata() for line in error.lines]
+    for number, result in enumerate(results.values()):
+        assert np.array_equal(drawn[2 * number], result.history["mean_error"])
+        assert np.array_equal(drawn[2 * number + 1], result.history["max_error"])
+    assert np.array_equal(quality.lines[3].get_ydata(), results["coupled"].history["min_quality"])
+    assert {"lloyd", "coupled"} <= {t.get_text() for t in figure.legends[0].get_texts()}
+
+
+def test_displacements_say_their_magnification(result):
+    figure = plot_displacements(result)
+    wanted = (
+        result.initial.lloyd,
+        result.initial.poisson,
+        result.final.lloyd,
+        result.final.poisson,
+    )
+    assert len(figure.axes) == 4
+    for ax, vectors in zip(figure.axes, wanted, strict=True):
+        (quiver,) = [c for c in ax.collections if isinstance(c, Quiver)]
+        found = re.search(r"× ([\d.e+]+)", ax.get_title())
+        factor = float(found[1]) if found else 1.0
+        assert np.stack([quiver.U, quiver.V], axis=1) == pytest.approx(factor * vectors)
+        assert quiver.scale == 1.0
+        assert quiver.angles == "xy"
+
+
+def test_displacements_of_a_large_mesh_are_those_in_a_window(result):
+    rng = np.random.default_rng(8)
+    n = MOST_ARROWS + 100
+    points = rng.random((n, 2)) * BOX.extent + BOX.lower
+    field = clvoro.Displacements(points, 1e-3 * rng.random((n, 2)), 1e-3 * rng.random((n, 2)))
+    large = dataclasses.replace(
+        result, points=points, size=np.full(n, 0.004), initial=None, final=field
+    )
+    lower, upper = window_around_smallest(large, 50)
+    figure = plot_displacements(large)
+    inside = ((points >= lower) & (points <= upper)).all(axis=1)
+    assert 0 < inside.sum() < n
+    assert len(figure.axes) == 2
+    assert figure.axes[0].collections[0].N == inside.sum()
+
+
+def test_window_stays_in_the_domain(result):
+    lower, upper = window_around_smallest(result, 10)
+    assert (lower >= BOX.lower).all()
+    assert (upper <= BOX.upper).all()
+    assert (upper - lower) == pytest.approx(np.array([10, 8]) * result.size.min())
+    lower, upper = window_around_smallest(result, 1e6)
+    assert lower == pytest.approx(BOX.lower)
+    assert upper == pytest.approx(BOX.upper)
+
+
+@pytest.mark.parametrize(
+    ("value", "up", "rounded"),
+    [(0.3, True, 0.5), (0.3, False, 0.2), (5.0, True, 5.0), (5.0, False, 5.0), (0.0, True, 1.0)],
+)
+def test_round_numbers(value, up, rounded):
+    assert nice(value, up) == rounded
+
+
+def test_report_holds_its_pictures(results, adapter, tmp_path):
+    first = results["coupled"].initial.points
+    initial = adapter.run(BOX, size, points=first, max_steps=0)
+    title, case = "Cells & <size>", '# a "case" <b>'
+    files = write_report(
+        results,
+        tmp_path,
+        initial=initial,
+        size=size,
+        title=title,
+        case=case,
+        formats=("png", "svg"),
+    )
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert files[0] == tmp_path / "report.html"
+    assert all(file.stat().st_size > 500 for file in files)
+    assert sorted(files) == sorted(p for p in tmp_path.rglob("*") if p.is_file())
+    sources = re.findall(r'src="([^"]*)"', page)
+    assert len(sources) == len([f for f in files if f.suffix == ".png"]) == 7
+    for source in sources:
+        kind, data = source.split(",")
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(data).startswith(b"\x89PNG")
+    assert "<title>Cells &amp; &lt;size&gt;</title>" in page
+    assert "&lt;b&gt;" in page
+    for result in results.values():
+        assert f"{np.abs(result.error).mean():.4f}" in page
+        assert f"{result.quality.min():.3f}" in page
+
+
+def test_same_run_gives_the_same_page(result, tmp_path):
+    for folder in ("a", "b"):
+        write_report(result, tmp_path / folder, size=size)
+    one, two = ((tmp_path / folder / "report.html").read_bytes() for folder in ("a", "b"))
+    assert one == two
+
+
+def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
+    drawn = pictures_of({"coupled": result})
+
+    def fail():
+        raise MemoryError("no room for it")
+
+    broken = [
+        (name, caption, fail if k == 1 else draw) for k, (name, caption, draw) in enumerate(drawn)
+    ]
+    monkeypatch.setattr(page, "pictures_of", lambda *_: broken)
+    with pytest.raises(MemoryError, match="no room"):
+        write_report(result, tmp_path)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert text.count("src=") == len(list(tmp_path.glob("pictures/*.png"))) == len(drawn) - 1
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_cells_and_no_steps(adapter, tmp_path, n):
+    tiny = adapter.run(BOX, 1.0, n_cells=n, max_steps=0, seed=99)
+    assert tiny.initial is None
+    assert (tmp_path / "report.html") == write_report(tiny, tmp_path)[0]
+
+
+def test_pdf_is_a_pdf(result):
+    figures = {name: draw for name, _, draw in pictures_of({"coupled": result})}
+    assert render(figures["cells"](), "pdf").startswith(b"%PDF")

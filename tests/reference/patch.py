@@ -1,0 +1,133 @@
+"""A diagram on the device and its copy on the host: what the tests of the stages start from."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+
+from clvoro.adaptation.refinement import SHORT_FACE
+from clvoro.adaptation.stages import Stages
+from clvoro.geometry.box import Box
+from clvoro.opencl.program import Engine
+from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.tessellator import Tessellator
+
+BOX = Box((0, 0), (1, 0.75))
+"""Its frame is the unit square's: normalized coordinates are physical ones."""
+BOXES = {
+    "plane": BOX,
+    "space": Box((0, 0, 0), (1, 0.75, 0.9)),
+    "torus": Box((0, 0), (1, 0.75), periodic=True),
+    "slab": Box((0, 0, 0), (1, 0.75, 0.9), periodic=(True, False, True)),
+}
+"""Of all kinds, each with the frame of the unit square or cube."""
+
+
+def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
+    """Return an engine for `box`; with `group_size` as on a GPU also where the device is a CPU."""
+    real = np.dtype(real)
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, real, box.defines(real))
+    if group_size is not None:
+        object.__setattr__(engine, "group_size", group_size)
+    return engine
+
+
+def tessellate(engine, points, box=BOX):
+    """Return the tessellation by `points` (n, d) in their order, in buffers of its own."""
+    n, on_device = len(points), engine.upload(points)
+    binned = Bins(engine).build(box, on_device, n)
+    return Cells(engine).tessellate(box, on_device, n, binned)
+
+
+def tessellate_box(engine, box, n, seed):
+    """Return the tessellation of any box by `n` random generators, some 250 for five across a period in space."""
+    on_device = engine.upload(box.place(random_points(n, seed, box), engine.real))
+    return Tessellator(Stages(engine), box).tessellate(on_device, n)
+
+
+def fetch(t):
+    """Return the arrays of `t` as NumPy's, faces cut to their number, and `owners` (m,) of the faces."""
+    starts = t.starts.get()
+    m = int(starts[t.n])
+    names = ("neighbors", "face_measures", "face_centroids")
+    faces = {name: getattr(t, name).get()[:m] for name in names}
+    cells = {
+        name: getattr(t, name).get() for name in ("points", "volumes", "offsets", "covariances")
+    }
+    owners = np.repeat(np.arange(t.n), np.diff(starts))
+    return SimpleNamespace(n=t.n, starts=starts, owners=owners, **faces, **cells)
+
+
+def ways(host, box):
+    """Return the way from each face's generator to the nearest image of its neighbor, (m, d); of walls nothing."""
+    across = host.points[np.maximum(host.neighbors, 0)].astype(float) - host.points[host.owners]
+    across[host.neighbors < 0] = 0
+    periods = np.where(box.periodic, box.extent, 1)
+    return across - np.rint(across / periods) * np.where(box.periodic, periods, 0)
+
+
+def room_inwards(ways, inwards, gap, most):
+    """How far a cell reaches from a wall, by the `ways` to its neighbors (k, d), up to `most`; see refinement.cl."""
+    ahead = ways @ inwards > 0
+    reach = (ways**2).sum(axis=1)[ahead] / (2 * (ways @ inwards)[ahead])
+    return (max(gap, 0) + reach).min(initial=most)
+
+
+def children(host, box, h, held=None):
+    """Middles of all edges across faces of some size, and one point between each wall and its cells; see refinement.cl.
+
+    Nothing of cells that are `held` (n,), or across their faces.
+    """
+    made, across = [], ways(host, box)
+    held = np.zeros(len(host.points), bool) if held is None else held
+    for k, (i, j) in enumerate(zip(host.owners, host.neighbors, strict=True)):
+        if held[i] or (j >= 0 and held[j]):
+            continue
+        child = host.points[i].astype(float)
+        if j < 0:
+            axis, upper = divmod(-1 - j, 2)
+            wall = (box.lower, box.upper)[upper][axis]
+            gap, most = abs(child[axis] - wall), min(h[i], box.extent[axis] / 2)
+            inwards = (1 - 2 * upper) * np.eye(box.dim)[axis]
+            room = room_inwards(across[host.owners == i], inwards, gap, most)
+            between = gap > most / 8 or room < 3 * gap
+            way = min(gap / 2, h[i] / 4) if between else room / 2
+            child[axis] = wall - way if upper else wall + way
+        elif j > i and host.face_measures[k] > SHORT_FACE * host.volumes[i] ** (1 - 1 / box.dim):
+            child = child + across[k] / 2
+            child = np.where(box.periodic, child % box.extent, child)
+        else:
+            continue
+        made.append(child)
+    return np.array(made)
+
+
+def hexagons(a, box=BOX):
+    """Return the points of a hexagonal lattice of spacing `a` that lie in the box, none near a wall."""
+    rows = np.arange(a / 4, box.upper[1] - a / 4, a * np.sqrt(3) / 2)
+    lines = [
+        np.stack(
+            [x := np.arange(a / 4 + a / 2 * (k % 2), box.upper[0] - a / 8, a), np.full_like(x, y)],
+            1,
+        )
+        for k, y in enumerate(rows)
+    ]
+    return np.concatenate(lines)
+
+
+def random_points(n, seed, box=BOX):
+    return np.random.default_rng(seed).random((n, box.dim)) * box.extent + box.lower
+
+
+def relaxed_points(n, seed, steps=8):
+    """Random points after some steps of Lloyd's: cells of all shapes, but none degenerate."""
+    from tests.reference import diagrams as reference
+
+    points = random_points(n, seed)
+    for _ in range(steps):
+        cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
+        points = np.array([c.centroid for c in cells])
+    return points

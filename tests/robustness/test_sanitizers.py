@@ -1,0 +1,136 @@
+"""Kernels under clang's sanitizers, and beside what a second compiler makes of them; see sanitized.py.
+
+    python -m pytest -n 2 -m "slow or not slow" tests/robustness/test_sanitizers.py
+
+repeats launches of every kernel, in about five minutes on two idle cores; without `slow` it only looks whether what is
+wrong on purpose is found.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.opencl import program as _program
+from clvoro.opencl.program import Engine
+from tests.robustness import sanitizers as sanitized
+from tests.robustness.gpu_like import use_groups
+from tests.robustness.oclgrind_work import WORK
+
+pytestmark = pytest.mark.skipif(sanitized.compiler() is None, reason="no clang with sanitizers")
+USEFUL = [name for name in WORK if not name.startswith("broken")]
+VARIANTS = {"float64": "float64", "float32": "float32", "work-groups": "float64"}
+
+TRAPS = {
+    "memory": {
+        "branch": "int s[4]; s[n & 1] = n; if (s[a[0] + 2]) a[i] = 1;",
+        "stored": "int s[4]; s[n & 1] = n; a[i] = s[a[0] + 2];",
+        "vector": "int4 s; s.x = n; a[i] = any(s > 7);",
+    },
+    "address": {
+        "beyond": "a[i + 1] = n;",
+        "before": "a[i - 1] = n;",
+        "private": "int s[4]; s[a[0] + n] = n; a[i] = s[n & 3];",
+        "overflow": "a[i] = (INT_MAX - a[0]) + n;",
+        "conversion": "a[i] = (int)(n * 1e30f);",
+        "alignment": "*(global int4 *)(a + 1) = n;",
+        "division": "a[i] = n / a[0];",
+    },
+}
+KERNEL = "kernel void trap(global int *a, const int n) {{ int i = get_global_id(0); {} }}"
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory):
+    """Folder of programs built with sanitizers: many pieces of work share them."""
+    return tmp_path_factory.mktemp("sanitized")
+
+
+@pytest.fixture(scope="module")
+def harmless(ctx, tmp_path_factory):
+    """A recorded launch of a kernel that is right, the source of which is then exchanged."""
+    folder = tmp_path_factory.mktemp("trap")
+    (folder / "trap.cl").write_text(KERNEL.format("a[i] = n;"))
+    with pytest.MonkeyPatch.context() as patch, sanitized.Recorder(folder) as recorder:
+        patch.setattr(_program, "kernel_folder", lambda: folder)
+        program = _program.build_program(ctx, "trap.cl", {}, "")
+        kernel = program.all_kernels()[0]
+        kernel.stage = "trap"
+        queue = cl.CommandQueue(ctx)
+        buffer = cl.Buffer(ctx, cl.mem_flags.COPY_HOST_PTR, hostbuf=np.zeros(16, np.int32))
+        kernel.set_args(buffer, np.int32(5))
+        cl.enqueue_nd_range_kernel(queue, kernel, (16,), (16,))
+    (found,) = recorder.programs.values()
+    assert len(found.jobs) == 1
+    return found
+
+
+@pytest.mark.parametrize("sanitizer", list(TRAPS))
+def test_what_is_right_passes(harmless, built, sanitizer):
+    outcomes, said = sanitized.repeat(harmless, sanitizer, built)
+    assert outcomes == [sanitized.Outcome("trap.trap", 0, 0.0, 0)]
+    assert said == ""
+
+
+@pytest.mark.parametrize(("sanitizer", "trap"), [(s, t) for s in TRAPS for t in TRAPS[s]])
+def test_what_is_wrong_is_found(harmless, built, sanitizer, trap):
+    wrong = replace(harmless, text=KERNEL.format(TRAPS[sanitizer][trap]))
+    outcomes, said = sanitized.repeat(wrong, sanitizer, built)
+    assert said or outcomes[0].unwritten
+
+
+def test_other_results_are_found(harmless, built):
+    other = replace(harmless, text=KERNEL.format("a[i] = i ? n : 0;"))
+    outcomes, said = sanitized.repeat(other, "address", built)
+    assert (outcomes[0].differing, said) == (1, "")
+
+
+FUNCTIONS = {
+    "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "population.mark_excess",
+    "population.mark_flaws", "projection.assemble", "shape.load_cells", "sizing.evaluate",
+    "sizing.evaluate_with_gradient",
+}  # fmt: skip
+"""Kernels with functions that OpenCL does not ask to be rounded correctly (log, pow, cbrt, hypot): libraries differ."""
+ROUNDINGS = 64
+"""Of the largest number of an array: errors of sizes that are met, and slopes, are differences of numbers so near."""
+IN_SINGLE = {"projection.assemble"}
+"""Of these kernels those that work in single precision whatever the generators are in."""
+ORDERED = {
+    "bins.count_root", "bins.count_children", "chords.count_chords", "polyhedra.clip_cells", "walks.wrap_cells",
+}  # fmt: skip
+"""Kernels whose work-items take places in the order in which they come; what follows sorts."""
+
+
+@pytest.fixture
+def grouped(monkeypatch):
+    """Work-groups of many work-items, with barriers, as on a GPU."""
+    monkeypatch.setattr(Engine, "__post_init__", Engine.__post_init__)
+    use_groups(16, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", list(VARIANTS))
+@pytest.mark.parametrize("name", USEFUL)
+def test_nothing_is_found(ctx, request, tmp_path, built, name, variant):
+    if variant == "work-groups":
+        request.getfixturevalue("grouped")
+    with sanitized.Recorder(tmp_path) as recorder:
+        WORK[name](clvoro.Adapter(ctx, VARIANTS[variant]))
+    programs = [program for program in recorder.programs.values() if program.jobs]
+    assert programs
+    for program in programs:
+        single = program.defines.get("REAL") == "float"
+        for sanitizer in sanitized.SANITIZERS:
+            outcomes, said = sanitized.repeat(program, sanitizer, built)
+            assert said == "", said[:3000]
+            assert len(outcomes) == len(program.jobs)
+            for outcome in outcomes:
+                assert outcome.unwritten == 0, outcome
+                if outcome.kernel in ORDERED:
+                    continue
+                assert outcome.differing == 0, outcome
+                real = np.float32 if single or outcome.kernel in IN_SINGLE else np.float64
+                allowed = ROUNDINGS * np.finfo(real).eps if outcome.kernel in FUNCTIONS else 0
+                assert outcome.difference <= allowed, outcome

@@ -1,0 +1,99 @@
+"""The projection by dense algebra on the faces of diagrams: in the plane and in space, across seams, cells held."""
+
+import numpy as np
+import pytest
+
+from clvoro.solvers import volume_projection as projection
+from clvoro.solvers.volume_projection import Projection
+from tests.reference import patch
+
+EPS, LENIENCE, BOUND = 0.2, 0.3, 0.4
+
+
+class Given:
+    """A diagram, and what is asked of its generators: random numbers, so that nothing cancels by chance."""
+
+    def __init__(self, engine, box, share):
+        self.box, self.n = box, 250 if box.dim == 3 and any(box.periodic) else 70
+        self.fixed, rng = int(share * self.n), np.random.default_rng(5501)
+        self.engine = engine
+        self.t = patch.tessellate_box(engine, box, self.n, 5502)
+        self.labels = rng.permutation(self.n)
+        self.held = self.labels < self.fixed
+        self.h = 0.1 * np.exp(rng.uniform(-1, 1, self.n))
+        self.gradient = rng.normal(size=(self.n, box.dim))
+        self.excess = rng.normal(size=self.n)
+        self.quality = rng.uniform(0.3, 1, self.n)
+        self.displacement = 0.01 * rng.normal(size=(self.n, box.dim))
+        self.displacement[self.held] = 0
+
+    def project(self, **options):
+        """Return the solution, its correction, what it leaves as the next start, and the iteration's arrays."""
+        u, start = self.engine.empty((self.n, self.box.dim)), self.engine.empty(self.n, np.float32)
+        names = ("h", "gradient", "excess", "displacement")
+        given = [self.engine.upload(getattr(self, name)) for name in names]
+        stage, taken = Projection(self.engine), []
+        reserve = stage._reserve
+        stage._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
+        solution = stage.project(
+            self.t, *given, u, self.engine.upload(self.quality), eps=EPS, lenience=LENIENCE,
+            bound=BOUND, labels=self.engine.upload(self.labels, np.int32), fixed=self.fixed,
+            start=start, **options,
+        )  # fmt: skip
+        return solution, u.get(), start.get(), taken[0]
+
+    def operator(self):
+        """J = d excess / dx (n, n, d) by the diagram's faces, and eps (n,)."""
+        host, dim = patch.fetch(self.t), self.box.dim
+        J, worst = np.zeros((self.n, self.n, dim)), self.quality.copy()
+        ways = patch.ways(host, self.box)
+        for k in np.flatnonzero(host.neighbors >= 0):
+            i, j, d = host.owners[k], host.neighbors[k], ways[k]
+            w = host.face_measures[k] / np.linalg.norm(d) / host.volumes[i]
+            J[i, j] += w * (d - host.face_centroids[k])
+            J[i, i] += w * host.face_centroids[k]
+            worst[i] = min(worst[i], self.quality[j])
+        J[np.arange(self.n), np.arange(self.n)] -= dim * self.gradient
+        J[:, self.held] = 0
+        eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / LENIENCE**2), 3)
+        return J, eps / (1 + (self.excess / BOUND) ** 2)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("plane", "float64", None), ("plane", "float32", None), ("plane", "float64", 16), ("space", "float64", None),
+        ("space", "float32", 16), ("torus", "float64", None), ("slab", "float64", None),
+    ],
+    ids=lambda p: f"{p[0]}, {p[1]}" + (", groups" if p[2] else ""),
+)  # fmt: skip
+def kind(ctx, request):
+    name, real, group_size = request.param
+    box = patch.BOXES[name]
+    return patch.make_engine(ctx, real, box.dim, group_size, box), box
+
+
+@pytest.mark.parametrize("share", [0.0, 1 / 3], ids=["", "held"])
+def test_correction(kind, share, monkeypatch):
+    """u = -W J^T y with (J W J^T + eps) y = r + J Ld, by dense algebra; in many launches and in one."""
+    given = Given(*kind, share)
+    host = patch.fetch(given.t)
+    J, eps = given.operator()
+    B = (J * given.h[None, :, None]).reshape(given.n, -1)
+    b = given.excess + np.einsum("ija,ja->i", J, given.displacement)
+    y = np.linalg.solve(B @ B.T + np.diag(eps), b)
+    expected = -(B.T @ y).reshape(given.n, -1) * given.h[:, None]
+    tolerance = 1e-6 if given.engine.real == np.float32 else 1e-11
+    for alone in (0, 1000):
+        monkeypatch.setattr(projection, "most_alone", lambda engine, most=alone: most)
+        solution, u, start, v = given.project(max_iterations=500, tolerance=tolerance)
+        assert solution.converged
+        # Derivatives in single precision, in a system whose condition number is a thousand.
+        assert u == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+        assert start == pytest.approx(y, abs=1e-5 * np.abs(y).max())
+        assert not u[given.held].any()
+        # Single precision; across a face to a held generator there is nothing.
+        assert v.inverse.get() == pytest.approx(1 / ((B**2).sum(axis=1) + eps), rel=1e-5)
+        beyond = host.neighbors >= 0
+        beyond[beyond] = given.held[host.neighbors[beyond]]
+        assert not v.rows.get()[:, : len(beyond)][:, beyond].any()

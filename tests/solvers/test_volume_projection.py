@@ -1,0 +1,329 @@
+"""The derivative of the volumes against differences of Qhull's, and the projection against NumPy."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from clvoro.adaptation.density import Density
+from clvoro.errors import SolverError
+from clvoro.opencl.program import Engine
+from clvoro.solvers import volume_projection as projection
+from clvoro.solvers.volume_projection import Projection
+from tests.reference import diagrams as reference
+from tests.reference import patch
+
+N = 60
+SLOPE = np.array([0.9, -1.4])
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(None, 0), (16, 0), (None, 1000), (16, 1000)],
+    ids=["cpu", "gpu", "cpu, one group", "gpu, one group"],
+)
+def engine(ctx, request):
+    """On a CPU and as on a GPU; in many launches and in one."""
+    group_size, alone = request.param
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(projection, "most_alone", lambda engine: alone)
+        yield patch.make_engine(ctx, group_size=group_size)
+
+
+def sizes(points):
+    return 0.1 * np.exp(points @ SLOPE)
+
+
+def excess(points, h=None):
+    """r = log(V / h^2), V by Qhull; h moves with the field unless it is given."""
+    cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
+    return np.log([c.area for c in cells]) - 2 * np.log(sizes(points) if h is None else h)
+
+
+class Assembled:
+    """The operators of a projection in NumPy, from the arrays that its assembly leaves."""
+
+    def __init__(self, engine, points, h, gradient, r=None, displacement=None, **options):
+        n = len(points)
+        t, projection = patch.tessellate(engine, points), Projection(engine)
+        given = {"r": np.zeros(n), "displacement": np.zeros((n, 2)), "quality": np.ones(n)}
+        given |= {"r": r} if r is not None else {}
+        given |= {"displacement": displacement} if displacement is not None else {}
+        given["quality"] = options.pop("quality", given["quality"])
+        taken, reserve = [], projection._reserve
+        projection._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
+        projection.project(
+            t, engine.upload(h), engine.upload(gradient), engine.upload(given["r"]),
+            engine.upload(given["displacement"]), engine.empty((n, 2)),
+            engine.upload(given["quality"]), max_iterations=0, tolerance=1e-12, **options,
+        )  # fmt: skip
+        host, (v,) = patch.fetch(t), taken
+        self.eps, self.inverse, self.rhs = v.eps.get(), v.inverse.get(), v.r.get()
+        inner = host.neighbors >= 0
+        i, j = host.owners[inner], host.neighbors[inner]
+        m = len(host.neighbors)
+        rows, columns = (a.get()[:, :m][:, inner].T for a in (v.rows, v.columns))
+        diagonal = v.own.get()
+        # In displacements over h, B = J h: B by rows, and its transpose by rows.
+        self.B, self.C = np.zeros((n, n, 2)), np.zeros((n, n, 2))
+        np.add.at(self.B, (i, j), rows)
+        np.add.at(self.C, (i, j), columns)
+        for M in (self.B, self.C):
+            M[np.arange(n), np.arange(n)] = diagonal
+        self.h = h
+
+    def derivative(self):
+        """J = dr / dx, dense (n, n, 2)."""
+        return self.B / self.h[:, None]
+
+    def correction(self, b):
+        """-W J^T (J W J^T + eps)^-1 b."""
+        B = self.B.reshape(len(self.h), -1)
+        u = -B.T @ np.linalg.solve(B @ B.T + np.diag(self.eps), b)
+        return u.reshape(-1, 2) * self.h[:, None]
+
+
+@pytest.fixture(scope="module")
+def points():
+    return patch.relaxed_points(N, 606, steps=4)
+
+
+@pytest.fixture(scope="module")
+def assembled(engine, points):
+    return Assembled(engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.3)
+
+
+@pytest.fixture(scope="module")
+def differences(points):
+    """dr/dx by central differences of diagrams made anew, (n, n, 2)."""
+    step, J = 1e-6, np.zeros((N, N, 2))
+    for j in range(N):
+        for a in range(2):
+            ahead, behind = points.copy(), points.copy()
+            ahead[j, a] += step
+            behind[j, a] -= step
+            J[:, j, a] = (excess(ahead) - excess(behind)) / (2 * step)
+    return J
+
+
+def test_derivative(assembled, differences):
+    """Every cell by every generator, walls included; the field's own gradient is on the diagonal."""
+    # Volumes of 0.01 to 1e-13 of the box over a step of 1e-6; single precision is finer.
+    assert pytest.approx(differences, abs=1e-4) == assembled.derivative()
+    assert np.abs(assembled.derivative()).max() > 5
+
+
+def test_transpose(assembled):
+    """What a cell knows of its neighbors' volumes is what they know of it, to single precision."""
+    B = assembled.B
+    assert pytest.approx(B.transpose(1, 0, 2), abs=1e-6 * np.abs(B).max()) == assembled.C
+
+
+def test_diagonal(assembled):
+    B = assembled.B.reshape(N, -1)
+    assert np.all(assembled.eps == pytest.approx(0.3))
+    # Squares in single precision.
+    assert assembled.inverse == pytest.approx(1 / ((B**2).sum(axis=1) + assembled.eps), rel=1e-6)
+
+
+def test_right_side(engine, points):
+    """r + J Ld."""
+    r, lloyd = excess(points), np.random.default_rng(17).normal(0, 0.01, (N, 2))
+    made = Assembled(
+        engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd, eps=0.3, bound=0.4
+    )
+    expected = r + np.einsum("ija,ja->i", made.derivative(), lloyd)
+    assert made.rhs == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
+
+
+def project(engine, points, h, gradient, r, displacement, **options):
+    out = engine.empty((len(points), 2))
+    quality = options.pop("quality", np.ones(len(points)))
+    solution = Projection(engine).project(
+        patch.tessellate(engine, points), engine.upload(h), engine.upload(gradient), engine.upload(r),
+        engine.upload(displacement), out, engine.upload(quality), **options,
+    )  # fmt: skip
+    return out.get(), solution
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.2])
+def test_projection(engine, points, bound):
+    """u' = -W J^T (J W J^T + eps)^-1 (r + J Ld), by dense algebra; a cell that is far off has the smaller eps."""
+    r, lloyd = excess(points), np.random.default_rng(14).normal(0, 0.01, (N, 2))
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd)
+    made = Assembled(engine, *given, eps=0.02, bound=bound)
+    eps = 0.02 / (1 + (r / bound) ** 2 if bound else np.ones(N))
+    assert made.eps == pytest.approx(eps, rel=1e-6)  # of single precision
+    expected = made.correction(made.rhs)
+    correction, solution = project(
+        engine, *given, eps=0.02, bound=bound, max_iterations=1000, tolerance=1e-12
+    )
+    assert solution.converged
+    assert solution.reason == "converged"
+    assert len(solution.residuals) == solution.iterations + 1
+    # B and its transpose differ by 1e-7 of the faces'; the condition number is a few hundred.
+    assert correction == pytest.approx(expected, abs=3e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
+def test_tolerance(engine, points, tolerance):
+    """The residual, by dense algebra, is what the recurrence says; vectors in single precision down to 1e-4."""
+    r, h, gradient = excess(points), sizes(points), np.tile(SLOPE, (N, 1))
+    made = Assembled(engine, points, h, gradient, r, eps=0.05)
+    u, solution = project(
+        engine, points, h, gradient, r, np.zeros((N, 2)), eps=0.05, max_iterations=60, tolerance=tolerance
+    )  # fmt: skip
+    assert solution.converged
+    assert solution.residual <= tolerance < solution.residuals[-2]
+    # u = -W J^T y of some y, whose residual it is: the least one that u admits comes close to it.
+    B, scaled = made.B.reshape(N, -1), (u / h[:, None]).ravel()
+    y = -np.linalg.lstsq(B.T, scaled, rcond=None)[0]
+    left = np.linalg.norm(r - (B @ B.T + np.diag(made.eps)) @ y) / np.linalg.norm(r)
+    assert left == pytest.approx(solution.residual, rel=0.05)
+
+
+def test_iterations_end_at_the_most(engine, points):
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    _, solution = project(engine, *given, eps=0.02, max_iterations=5, tolerance=1e-9)
+    assert (solution.iterations, solution.converged) == (5, False)
+    assert solution.reason == "max_iterations"
+
+
+def test_rows_that_nobody_has_written_are_no_numbers_to_warn_of(ctx, points, monkeypatch):
+    """The host reads more rows of the record than there are: fresh memory may hold NaNs that signal, as this does."""
+    engine, plain = patch.make_engine(ctx, "float32"), Engine.empty
+
+    def full_of_nan(self, shape, dtype=None):
+        array = plain(self, shape, dtype)
+        if array.dtype == np.float32 and array.size:
+            array.view(np.uint32).fill(np.uint32(0x7FA00001))
+        return array
+
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    monkeypatch.setattr(Engine, "empty", full_of_nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, solution = project(engine, *given, eps=0.1, max_iterations=40, tolerance=1e-3)
+    assert solution.converged
+
+
+def test_result_does_not_depend_on_when_the_host_looks(engine, points):
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points))
+    t, results = patch.tessellate(engine, points), []
+    for ahead in (1, 2, 7, 40):
+        projection, out = Projection(engine), engine.empty((N, 2))
+        projection._ahead = ahead
+        h, gradient, r = (engine.upload(a) for a in given[1:])
+        solution = projection.project(
+            t, h, gradient, r, engine.zeros((N, 2)), out, engine.upload(np.ones(N)), eps=0.1,
+            max_iterations=40, tolerance=1e-3,
+        )  # fmt: skip
+        results.append((out.get(), solution.residuals))
+    for u, residuals in results[1:]:
+        assert np.array_equal(u, results[0][0])
+        assert np.array_equal(residuals, results[0][1])
+
+
+@pytest.mark.parametrize("of", ["solution", "scaled", "turned", "other", "zero"])
+def test_start(engine, points, of):
+    """From any start the solution is the same, and what it leaves is the next start; a good one saves iterations."""
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    made = Assembled(engine, *given, eps=0.05)
+    B = made.B.reshape(N, -1)
+    y = np.linalg.solve(B @ B.T + np.diag(made.eps), made.rhs)
+    start = {
+        "solution": y, "scaled": 1e6 * y, "turned": -y, "zero": 0 * y,
+        "other": np.random.default_rng(31).normal(size=N),
+    }[of]  # fmt: skip
+    options = {"eps": 0.05, "max_iterations": 1000, "tolerance": 1e-12}
+    _, cold = project(engine, *given, **options)
+    on_device = engine.upload(start, np.float32)
+    u, solution = project(engine, *given, **options, start=on_device, warm=True)
+    assert solution.converged
+    assert len(solution.residuals) == solution.iterations + 1
+    # As in `test_projection`.
+    expected = made.correction(made.rhs)
+    assert u == pytest.approx(expected, abs=3e-5 * np.abs(expected).max())
+    assert on_device.get() == pytest.approx(y, abs=3e-5 * np.abs(y).max())
+    # A start in single precision leaves the residual at some 1e-7 of the right side.
+    good = of in ("solution", "scaled", "turned")
+    assert (solution.residuals[1] < 1e-5) == good
+    assert (
+        solution.iterations < cold.iterations
+        if good
+        else solution.iterations <= cold.iterations + 5
+    )
+    # A projection from a start that is at its target needs no more.
+    rough = {**options, "tolerance": 1e-5}
+    _, again = project(engine, *given, **rough, start=on_device, warm=True)
+    assert again.iterations == 1
+
+
+def test_not_finite(engine, points):
+    r = excess(points)
+    r[7] = np.nan
+    with pytest.raises(SolverError, match="not finite"):
+        project(
+            engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, np.zeros((N, 2)), eps=0.1, max_iterations=9
+        )  # fmt: skip
+
+
+def test_lenience(engine, points, assembled):
+    """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3."""
+    quality = np.random.default_rng(15).uniform(0.3, 1, N)
+    host = patch.fetch(patch.tessellate(engine, points))
+    worst = quality.copy()
+    inner = host.neighbors >= 0
+    np.minimum.at(worst, host.owners[inner], quality[host.neighbors[inner]])
+    eps = np.minimum(0.2 * (1 + (1 - worst) ** 2 / worst / 0.3**2), 3)
+    assert 5 < (eps == 3).sum() < N - 5
+    made = Assembled(
+        engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, lenience=0.3, quality=quality
+    )  # fmt: skip
+    assert made.eps == pytest.approx(eps, rel=1e-5)  # of single precision
+
+
+def test_perturbed_mesh_is_mended_quadratically(engine):
+    """Targets are a mesh's own sizes, so that excess arises by the perturbation alone; one projection squares it."""
+    points = patch.relaxed_points(N, 607)
+    h = np.exp(excess(points, np.ones(N)) / 2)
+    noise = np.random.default_rng(21).normal(size=(N, 2))
+    left = []
+    for amount in (2e-3, 1e-3, 5e-4):
+        moved = points + amount * noise
+        r = excess(moved, h)
+        weight = np.exp(r)
+        r -= np.average(r, weights=weight)
+        u, _ = project(
+            engine, moved, h, np.zeros((N, 2)), r, np.zeros((N, 2)), eps=1e-6, max_iterations=3000, tolerance=1e-8
+        )  # fmt: skip
+        after = excess(moved + u, h)
+        left.append(np.abs(after - after.mean()).max())
+        assert left[-1] < 0.1 * np.abs(r).max()
+    # Each half of the perturbation leaves a quarter.
+    assert left[1] < 0.35 * left[0]
+    assert left[2] < 0.35 * left[1]
+
+
+def test_single_precision(ctx, points):
+    engine = patch.make_engine(ctx, "float32")
+    r = excess(points)
+    gradient, nothing = np.tile(SLOPE, (N, 1)), np.zeros((N, 2))
+    options = {"eps": 0.05, "max_iterations": 60}
+    u, solution = project(engine, points, sizes(points), gradient, r, nothing, **options)
+    exact, _ = project(
+        patch.make_engine(ctx), points, sizes(points), gradient, r, nothing, **options
+    )
+    assert solution.residual < 1e-5
+    assert np.abs(u - exact).max() < 1e-4 * np.abs(exact).max()
+
+
+def test_one_cell(engine):
+    """No neighbors: nothing can be done, and nothing breaks."""
+    one = np.array([[0.4, 0.3]])
+    t = patch.tessellate(engine, one)
+    w = Density(engine).evaluate(t, engine.upload([0.2]))
+    u, _ = project(
+        engine, one, np.array([0.2]), w.gradient.get(), w.excess.get(), np.zeros((1, 2)), eps=0.1, max_iterations=40
+    )  # fmt: skip
+    assert not u.any()

@@ -1,0 +1,99 @@
+"""Generators in corners that rings share: most of the domain is hidden from them, and their cell is on one side."""
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.adaptation.insertion_deletion import Population, PopulationControl
+from clvoro.adaptation.stages import Stages
+from clvoro.solvers.components import connected_parts
+from clvoro.tessellation.tessellator import Tessellator
+from tests.reference import patch
+from tests.reference.shores import TOUCHING, scattered
+
+
+def shared_corners(domain):
+    corners, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    return corners[times > 1]
+
+
+def tessellate(ctx, domain, points):
+    engine = patch.make_engine(ctx, box=domain)
+    placed = engine.upload(domain.place(points, engine.real))
+    return engine, Tessellator(Stages(engine), domain).tessellate(placed, len(points))
+
+
+@pytest.mark.parametrize("method", ["exact", "adaptive", "coupled", "weighted"])
+@pytest.mark.parametrize("name", TOUCHING)
+def test_runs_from_shared_corners(ctx, name, method):
+    """New generators were put where those in the corners stand, and sources of one piece were taken for another's."""
+    domain = TOUCHING[name]()
+    corners = shared_corners(domain)[:3]
+    for real, others in (("float64", 0), ("float64", 20), ("float32", 3)):
+        points = np.concatenate([corners, scattered(domain, others, 1)]) if others else corners
+        counts = method in ("exact", "adaptive")
+        options = {"effort": "fast"} if counts else {"max_steps": 30}
+        result = clvoro.Adapter(ctx, real).run(
+            domain, 0.1, points=points, method=method, seed=1, **options
+        )
+        report = result.check()
+        assert report, report
+        assert len(result.points) >= len(points)
+        if method in (
+            "exact",
+            "adaptive",
+        ):  # which choose their number: some domain.measure / 0.1^2
+            assert len(result.points) * 0.01 == pytest.approx(domain.measure, rel=0.2)
+
+
+@pytest.mark.parametrize("name", TOUCHING)
+def test_what_is_split_off_is_apart(ctx, name):
+    """Both halves would come to the generator: it stays, and the new one goes to the middle of the farthest face."""
+    domain = TOUCHING[name]()
+    corner = shared_corners(domain)[:1]
+    engine, t = tessellate(ctx, domain, corner)
+    expected, origin, scale = [], *domain.frame
+    host = patch.fetch(t)
+    centers = (host.points[host.owners] + host.face_centroids) * scale + origin
+    along = domain.vertices[domain.next_vertex] - domain.vertices
+    along /= np.hypot(*along.T)[:, None]
+    way = np.sqrt(domain.measure) / 4
+    for m, label in zip(centers, host.neighbors, strict=True):
+        inwards = np.array([-along[-1 - label, 1], along[-1 - label, 0]])
+        line = shapely.LineString([m + 1e-12 * inwards, m + way * inwards])
+        inside = min(
+            shapely.get_parts(shapely.intersection(line, domain.geometry)),
+            key=shapely.Point(m).distance,
+        )
+        free = inside.length > way * (1 - 1e-9)
+        expected.append(m + (way if free else inside.length / 2) * inwards)
+    expected = np.array(expected)
+    new = reorganized(engine, domain, t, 1.0)
+    assert (new.inserted, new.deleted) == (1, 0)
+    found = new.points.get() * scale + origin
+    assert found[0] == pytest.approx(corner[0], abs=1e-15)
+    farthest = np.hypot(*(expected - corner).T)
+    at = expected[farthest >= farthest.max() - 1e-12]  # of some alike, rounding chooses
+    assert np.abs(at - found[1]).max(axis=1).min() < 1e-12
+
+
+def reorganized(engine, domain, t, total):
+    """What the population becomes when the count is to change by `total`, by cells that are as small as asked for."""
+    one = engine.upload(np.ones(t.n))
+    rows = Population(
+        t.points, engine.upload(np.arange(t.n), np.int32), engine.zeros((t.n, 2)),
+        engine.zeros(t.n, np.uint64), engine.zeros(t.n),
+    )  # fmt: skip
+    return PopulationControl(engine).reorganize(
+        domain, t, one, one, engine.zeros(t.n), rows, total, t.n, climb=False
+    )
+
+
+def test_parts_of_the_graph_are_not_told_by_places(ctx):
+    """The one in the corner has its cell in one of the two pieces; without others there, it has both."""
+    domain = TOUCHING["pieces"]()
+    corner = shared_corners(domain)
+    for others, count in (([(0.2, 0.3), (0.7, 0.6)], 2), ([(0.2, 0.3), (0.1, 0.1)], 1)):
+        _, t = tessellate(ctx, domain, np.concatenate([corner, others]))
+        assert connected_parts(t).max() + 1 == count

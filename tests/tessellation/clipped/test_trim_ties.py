@@ -1,0 +1,169 @@
+"""Corners of polygons on faces and where faces meet, many at a time: ties that any edge and any cell must settle alike.
+
+Most such polygons do not tell whether they are; of those here some do, for each rule in chords.cl.
+"""
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro.tessellation.clipped import polygonal
+from clvoro.tessellation.clipped.boundary_crossings import Boundary, BoundaryError
+from tests.reference.polygon_diagrams import faults
+from tests.reference.shores import blocks, slit, spit
+
+RING = [(x, y) for x in range(-25, 26) for y in range(-25, 26) if x * x + y * y == 625]
+"""On a circle exactly, in whole numbers: all faces between neighbors on it meet in its center."""
+
+
+@pytest.fixture(scope="module")
+def adapters(ctx):
+    return [clvoro.Adapter(ctx, real) for real in ("float64", "float32")]
+
+
+def check(adapters, shape, points):
+    domain = clvoro.Polygon.from_shapely(shape)
+    points = np.unique(points[domain.contains(points)], axis=0)
+    for adapter in adapters if len(points) else ():
+        diagram = adapter.diagram(domain, points)
+        assert faults(diagram, adapter.dtype.name) == []
+        # Some hundred corners of the unit square round.
+        eps = float(np.finfo(adapter.dtype).eps)
+        assert diagram.volumes.sum(dtype=float) == pytest.approx(domain.measure, abs=64 * eps)
+
+
+@pytest.mark.parametrize("seed", [*range(160, 190), 5215])
+def test_blocks_and_lattices(adapters, seed):
+    """Squares of a lattice, some cut in half, by generators of the same lattice or of a finer one, not all of it."""
+    rng = np.random.default_rng(seed)
+    side = int(rng.choice([2, 3, 4]))
+    shape = blocks(rng, side)
+    if seed % 3 == 1:
+        for i, j in np.argwhere(rng.random((side, side)) < 0.3) / side:
+            corner = shapely.Polygon([(i, j), (i + 1 / side, j), (i, j + 1 / side)])
+            shape = shape.difference(corner)
+    k = int(rng.choice([1, 2, 4])) * side
+    line = (np.arange(k) + 0.5) / k if rng.random() < 0.5 else np.arange(k + 1) / k
+    points = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+    check(adapters, shape, points[rng.random(len(points)) < rng.choice([0.3, 0.6, 1.0])])
+
+
+@pytest.mark.parametrize("seed", [*range(20), 111, 160, 211, 333, 385, 438, 5553])
+def test_corners_where_many_faces_meet(adapters, seed):
+    """A wedge out of the square, a hole, or a polygon, with a corner in the middle of generators on a circle."""
+    rng = np.random.default_rng(seed)
+    center, ends = np.array([0.5, 0.5]), rng.integers(0, 9, (3, 2)) / 8
+    square = shapely.box(0, 0, 1, 1)
+    if seed % 3 == 0:
+        shape = square.difference(shapely.Polygon([center, ends[0], ends[1]]))
+    elif seed % 3 == 1:
+        shape = square.difference(shapely.Polygon([center, *(center + (ends[:2] - 0.5) / 4)]))
+    else:
+        shape = shapely.Polygon([center, *ends]).buffer(0)
+    if shape.area < 0.01:
+        pytest.skip("too little is left")
+    ring = center + np.array(RING) / 64
+    points = ring[rng.random(len(ring)) < rng.choice([0.15, 0.3, 0.6])]
+    if rng.random() < 0.5:
+        points = np.concatenate([points, rng.integers(0, 9, (4, 2)) / 8])
+    check(adapters, shape, points)
+
+
+@pytest.mark.parametrize("real", [0, 1])
+def test_generators_as_close_as_a_slit_is_wide(adapters, real):
+    """Their faces with a third lie alike but for rounding, and which of them the slit's sides cross first is a matter
+    of the face between the two: on either side of it a cell ends half the slit beyond the domain.
+    """
+    adapter = adapters[real]
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        width = float(np.finfo(adapter.dtype).eps) * 10 ** rng.uniform(2, 6)
+        domain = clvoro.Polygon(slit(width))
+        near = [0.5, 1] + rng.uniform(-1, 1, (3, 2)) * (width, 0.3)
+        near[:, 1] = np.minimum(near[:, 1], 2 - near[:, 1])
+        points = np.concatenate([domain.vertices[3:6:2], near, rng.random((3, 2))])
+        points = points[domain.contains(points)]
+        placed = domain.place(points, adapter.dtype)
+        diagram = adapter.diagram(domain, points[np.unique(placed, axis=0, return_index=True)[1]])
+        assert faults(diagram, adapter.dtype.name) == []
+        report = diagram.check()
+        assert report, report
+
+
+@pytest.mark.parametrize("make", [slit, spit])
+@pytest.mark.parametrize("real", [0, 1])
+def test_faces_across_the_tip_of_a_wedge(adapters, real, make):
+    """Near it the sides cross a face closer to each other than rounding, in an order that they have all the same."""
+    adapter = adapters[real]
+    domain = clvoro.Polygon(make(100 * float(np.finfo(adapter.dtype).eps)))
+    tip = np.array([(0.5, 0.3), (2, 0.5)])[int(make is spit)]
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        points = np.concatenate([rng.random((20, 2)), tip + rng.normal(0, 0.05, (20, 2))])
+        diagram = adapter.diagram(domain, points[domain.contains(points)])
+        assert faults(diagram, adapter.dtype.name) == []
+
+
+PAIR = clvoro.Polygon.from_shapely(shapely.union(shapely.box(0, 0, 1, 1), shapely.box(1, 1, 2, 2)))
+"""Two squares that have a corner in common."""
+
+
+def crowd(seed: int, n: int) -> np.ndarray:
+    """Generators on a circle about that corner, on which their faces meet but for rounding."""
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0, 7) + 2 * np.pi * np.arange(n) / n
+    points = 1 + rng.uniform(0.05, 0.3) * np.column_stack([np.cos(angles), np.sin(angles)])
+    return points[PAIR.contains(points)]
+
+
+@pytest.mark.parametrize("real", [0, 1])
+@pytest.mark.parametrize("n", [8, 60, 200])
+def test_crowds_around_a_corner(adapters, real, n):
+    """Edges found no way from the corner through cells that are cut off there as rounding has it."""
+    for seed in range(10):
+        diagram = adapters[real].diagram(PAIR, crowd(seed, n))
+        assert faults(diagram, adapters[real].dtype.name) == []
+        report = diagram.check()
+        assert report, report
+
+
+def test_edges_may_find_no_way(adapters, monkeypatch):
+    """The boundary is put aside where it must be, and an error says so where that does not help."""
+    monkeypatch.setattr(polygonal, "SHIFTS", ())
+    with pytest.raises(BoundaryError, match="cannot be followed"):
+        adapters[0].diagram(PAIR, crowd(0, 200))
+    # Nothing of it is left.
+    diagram = adapters[0].diagram(PAIR, crowd(0, 8))
+    assert faults(diagram, "float64") == []
+
+
+@pytest.mark.parametrize("real", [0, 1])
+def test_a_boundary_that_is_put_aside(adapters, monkeypatch, real):
+    """By as much as a hole is wide, in single precision: generators at its corners stay in the domain."""
+    cut, shifts = Boundary.cut, []
+
+    def cut_aside(boundary, t, generators, shift):
+        shifts.append(any(shift))
+        if not any(shift):
+            raise BoundaryError
+        return cut(boundary, t, generators, shift)
+
+    monkeypatch.setattr(Boundary, "cut", cut_aside)
+    adapter = adapters[real]
+    eps = float(np.finfo(adapter.dtype).eps)
+    rng = np.random.default_rng(5)
+    angles = np.arange(8) * 0.8
+    radius = max(20 * eps, 4e-12)  # edges are not shorter than 1e-12
+    hole = shapely.Polygon(0.4 + radius * np.column_stack([np.cos(angles), np.sin(angles)]))
+    domain = clvoro.Polygon.from_shapely(shapely.box(0, 0, 1, 1).difference(hole))
+    points = np.concatenate([domain.vertices[4::2], rng.random((30, 2))])
+    diagram = adapter.diagram(domain, points)
+    assert domain.contains(diagram.points).all()
+    assert faults(diagram, adapter.dtype.name) == []
+    report = diagram.check()
+    assert report, report
+    # Measures are those of the boundary where it was, which is off by some roundings.
+    off = domain.boundary_distance(diagram.vertices[~domain.contains(diagram.vertices)])
+    assert 0 < off.max() <= (polygonal.SHIFTS[0] + 4) * eps * domain.frame[1]
+    assert shifts == [False, True]

@@ -1,0 +1,97 @@
+"""Repairs of folded diagrams: in lanes against one by one; what covers the torus twice."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.adaptation.stages import Stages
+from clvoro.opencl.program import Engine
+from clvoro.tessellation import incremental as repair
+from clvoro.tessellation.periodic.torus import Torus
+from tests.reference import patch
+
+UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
+CHANNEL = clvoro.Box((3, -2), (5.5, -0.5), periodic=(True, False))
+
+
+def make_stages(ctx, box, real="float64", one_by_one=False):
+    made = patch.make_engine(ctx, real)
+    engine = Engine(ctx, made.queue, 2, made.real, box.defines(made.real))
+    if one_by_one:
+        object.__setattr__(engine, "group_size", 128)  # as on a GPU
+    return Stages(engine)
+
+
+class Carried:
+    """A folded diagram that is carried along, and how it comes out anew."""
+
+    def __init__(self, stages, box, points):
+        self.stages, self.box, self.n = stages, box, len(points)
+        self.torus, self.fresh = Torus(stages, box), Torus(stages, box)
+        self.t = self.torus.tessellate(self.place(points), self.n)
+
+    def place(self, points):
+        return self.stages.engine.upload(self.box.place(points, self.stages.engine.real))
+
+    def move(self, points):
+        """Carry the diagram over to `points`; return it as NumPy arrays, None where it was not."""
+        x = self.place(points)
+        t = self.torus._repaired(x, self.n, self.t)
+        self.t = self.torus.tessellate(x, self.n) if t is None else t
+        return None if t is None else patch.fetch(t)
+
+    def reference(self, points):
+        return patch.fetch(self.fresh.tessellate(self.place(points), self.n))
+
+
+def some_points(box, n, seed):
+    rng = np.random.default_rng(seed)
+    return rng.random((n, 2)) * box.extent + box.lower
+
+
+def moved(points, box, by, rng):
+    """Every generator by up to `by` spacings; walls hold."""
+    step = by * (box.measure / len(points)) ** 0.5 * (2 * rng.random(points.shape) - 1)
+    held = ~np.array(box.periodic)
+    return np.where(held, np.clip(points + step, box.lower, box.upper), points + step)
+
+
+@pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
+def test_lanes_have_the_bits_of_one_by_one(ctx, box, monkeypatch):
+    """Rows are checked, clipped and measured eight at a time on CPUs, images found by folding whole vectors."""
+    monkeypatch.setattr(repair, "FEW", 1)
+    both = [make_stages(ctx, box, one_by_one=alone) for alone in (False, True)]
+    if both[0].engine.group_size > 1:
+        pytest.skip("lanes are for CPUs")
+    assert [stages.folded.lanes for stages in both] == [8, 1]
+    rng, points = np.random.default_rng(50101), some_points(box, 500, 50102)
+    runs = [Carried(stages, box, points) for stages in both]
+    changed = 0
+    for _ in range(5):
+        before = runs[0].t.neighbors.get()
+        points = moved(points, box, 0.03, rng)
+        a, b = (run.move(points) for run in runs)
+        changed += not np.array_equal(before[: len(a.neighbors)], a.neighbors)
+        for name, array in vars(a).items():
+            assert np.array_equal(array, getattr(b, name)), name
+        inner = a.neighbors >= 0
+        across = np.abs(a.points[a.owners[inner]] - a.points[a.neighbors[inner]])
+        assert (across.max(axis=0) > 0.25).tolist() == list(box.periodic)
+    assert changed == 5
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_cells_that_cover_the_torus_twice(ctx, real):
+    """Twice around in one step: all rows stay right, each of the other sheet's generators unknown to its own."""
+    m, stages = 8, make_stages(ctx, UNIT, real)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(2 * m), np.arange(m)))
+    points = np.column_stack([(i + j % 2 / 2) / (2 * m), j / m])
+    # The two sheets must not lie on each other.
+    apart = 0.25 / m * np.exp(2j * np.pi * points[:, 0])
+    run = Carried(stages, UNIT, points + 0.001)
+    twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
+    stages.folded.reserve(run.n)
+    covered = stages.repair.follow(stages.folded, run.torus._wide, run.place(twice), run.t)
+    assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
+    run = Carried(stages, UNIT, points + 0.001)
+    assert run.move(twice) is None

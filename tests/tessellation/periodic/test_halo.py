@@ -1,0 +1,298 @@
+"""Margins of periodic boxes: what cells tell of them against all balls around the vertices of all images."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+import clvoro
+from clvoro.tessellation.periodic.ghost_images import KEPT, OUTWARDS, SIDEWAYS, Seam
+from clvoro.tessellation.periodic.halo import (
+    BLOCKS,
+    FEWEST_BLOCKS,
+    FINENESS,
+    Margins,
+    block_counts,
+)
+from clvoro.tessellation.periodic.torus import Torus
+
+BOXES = {
+    2: clvoro.Box((0, 0), (1, 0.7), periodic=True),
+    3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=True),
+}
+WALLED = {
+    2: clvoro.Box((0, 0), (1, 0.7), periodic=(False, True)),
+    3: clvoro.Box((0, 0, 0), (1, 0.7, 0.8), periodic=(False, True, True)),
+}
+NOISE = {"float64": 1e-5, "float32": 1e-4}
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def adapter(ctx, request):
+    return clvoro.Adapter(ctx, request.param)
+
+
+def lattice(box, count, rng):
+    """Places of a body-centerd lattice, each some way off: no four nearly in a plane, or on a circle."""
+    cubes = np.indices((count,) * box.dim).reshape(box.dim, -1).T
+    points = np.concatenate([cubes, cubes + 0.5]) / count
+    points += 0.12 / count * rng.uniform(-1, 1, points.shape)
+    return np.array(box.lower) + box.extent * (points % 1)
+
+
+def balls(points, edges, periods):
+    """Centers and radii of balls with generators on them, of which one is in the box, and their shortest distance.
+
+    Where there are walls, all is mirrored in them: corners of cells on a wall are such centers, too.
+    """
+    steps = [(-1, 0, 1) if period > 0 else (0,) for period in periods]
+    shifts = sorted(itertools.product(*steps), key=any)  # the generators themselves first
+    images = np.concatenate([points + np.array(s) * periods for s in shifts])
+    mirrored = [images]
+    for a, end in itertools.product(np.flatnonzero(periods == 0), (0, 1)):
+        beyond = images.copy()
+        beyond[:, a] = 2 * end * edges[a] - images[:, a]
+        mirrored.append(beyond)
+    places = np.concatenate(mirrored)
+    simplices = Delaunay(places).simplices
+    simplices = simplices[(simplices < len(points)).any(axis=1)]
+    corners = places[simplices]
+    spans = corners[:, 1:] - corners[:, :1]
+    # About a corner on a wall lie mirror images of the same generators; some triangles of these have no center.
+    whole = np.abs(np.linalg.det(spans)) > 1e-12
+    corners, spans = corners[whole], spans[whole]
+    centers = np.linalg.solve(spans, (spans**2).sum(axis=2)[..., None] / 2)[..., 0]
+    middles, radii = corners[:, 0] + centers, np.linalg.norm(centers, axis=1)
+    # Generators are as far from a corner as their mirror images.
+    seen = simplices[whole] % len(images)
+    ways = [
+        np.where(a == b, np.inf, np.linalg.norm(images[a] - images[b], axis=1))
+        for a, b in itertools.combinations(seen.T, 2)
+    ]
+    # Centers on a wall are there to rounding; behind it they are those of others, mirrored.
+    inside = ((periods > 0) | (abs(middles - edges / 2) < edges / 2 + 1e-9)).all(axis=1)
+    return middles[inside], radii[inside], np.min(ways, axis=0)[inside]
+
+
+def outside(x, lower, upper):
+    """How far x (k,) are from blocks, (k, blocks); the outermost ones go on for ever."""
+    below, above = lower - x[:, None], x[:, None] - upper
+    below[:, 0] = above[:, -1] = 0
+    return np.maximum(np.maximum(below, above), 0)
+
+
+def needs(points, edges, periods, counts, sideways, outwards, noise):
+    """What balls need of each block of each seam, {(axis, end): (blocks, ...)}; balls may move by shares of ways."""
+    centers, radii, ways = balls(points, edges, periods)
+    radii = radii * (1 + noise)
+    found = {}
+    for axis, end in itertools.product(np.flatnonzero(periods), (0, 1)):
+        to_seam = periods[axis] - centers[:, axis] if end else centers[:, axis]
+        aside2 = 0.0
+        for a in (a for a in range(len(periods)) if a != axis):
+            ends = np.arange(counts[a] + 1) * edges[a] / counts[a]
+            away = outside(centers[:, a], ends[:-1], ends[1:])
+            aside2 = (
+                aside2 + away**2
+                if np.ndim(aside2) == 0
+                else aside2[..., None] + away[:, None, :] ** 2
+            )
+        shape = (-1,) + (1,) * (aside2.ndim - 1)
+        radius, side = radii.reshape(shape), (sideways * ways).reshape(shape)
+        out = outwards * ways + np.clip(radii + to_seam, 0, sideways * ways)
+        deep2 = radius**2 - np.maximum(np.sqrt(aside2) - side, 0) ** 2
+        depth = np.sqrt(np.maximum(deep2, 0)) + (out - to_seam).reshape(shape)
+        found[axis, end] = np.where(deep2 > 0, depth, 0).max(axis=0).clip(0)
+    return found
+
+
+def blocks_of(array, dim, counts):
+    """The same of an array of the device."""
+    whole = array.get().reshape(dim, 2, *(BLOCKS[dim],) * (dim - 1))
+    found = {}
+    for axis, end in itertools.product(range(dim), (0, 1)):
+        along = [counts[a] for a in range(dim) if a != axis]
+        found[axis, end] = whole[(axis, end, *(slice(k) for k in along))]
+    return found
+
+
+@pytest.mark.parametrize("walks", [True, False])
+@pytest.mark.parametrize(("dim", "count"), [(2, 7), (3, 4)])
+@pytest.mark.parametrize("walled", [False, True], ids=["", "walls"])
+def test_margins_follow_the_balls_around_vertices(adapter, dim, count, walled, walks):
+    box, rng = (WALLED if walled else BOXES)[dim], np.random.default_rng(2206)
+    check_margins(adapter, box, lattice(box, count, rng), walks)
+
+
+def test_balls_on_walls(adapter):
+    """Among generators at random some of them ask for more than all others."""
+    box, rng = WALLED[2], np.random.default_rng(10)
+    check_margins(adapter, box, np.array(box.lower) + box.extent * rng.random((40, 2)), True)
+
+
+def check_margins(adapter, box, points, walks):
+    """Every block of every seam has what balls need of it, and not much more."""
+    n, dim, real, stages = len(points), box.dim, adapter.dtype, adapter._stages_for(box)
+    if not walks:
+        if dim == 2 or stages.cells._wrap is None:
+            pytest.skip("cells are made in one way only")
+        stages.cells._wrap = None
+    x = stages.engine.upload(box.place(points, real))
+    torus = Torus(stages, box)
+    for _ in range(5):  # margins come near to what is needed
+        torus.tessellate(x, n)
+    stages.release()
+    periods, place = box.periods(real), x.get().astype(float)
+    edges = box.device_corners(real)[1][:dim].astype(float)
+    counts = block_counts(edges, n)[:dim]
+    noise = NOISE[real.name]
+    needed = blocks_of(torus.margins.needed, dim, counts)
+    widths = blocks_of(torus.margins.widths, dim, counts)
+    wished = needs(place, edges, periods, counts, SIDEWAYS, OUTWARDS, noise)
+    least = needs(place, edges, periods, counts, 0, 0, 0)
+    spacing, told = (np.prod(edges) / n) ** (1 / dim), 0
+    for seam, wish in wished.items():
+        kept = KEPT[dim] * np.minimum(widths[seam], periods[seam[0]])
+        excess = needed[seam] - np.maximum(wish, kept)
+        told += (wish > kept).sum()
+        # Vertices round, and a wish is by 1e-5 of itself more than is needed.
+        assert np.abs(excess).max() < 3 * noise * max(spacing, wish.max())
+        assert (widths[seam] >= least[seam] * (1 - noise)).all()
+    assert told > 30
+
+
+@pytest.mark.parametrize("short", [0.6, 0.9])
+def test_margins_that_are_too_narrow_are_found_out(adapter, short):
+    """Wherever one block of many is narrower than a ball needs it, and only there."""
+    box, rng = BOXES[3], np.random.default_rng(2207)
+    points, real = lattice(box, 4, rng), adapter.dtype
+    n, stages = len(points), adapter._stages_for(box)
+    x, seam = stages.engine.upload(box.place(points, real)), stages.seam
+    periods = box.periods(real)
+    counts = block_counts(periods, n)[:3]
+    least = needs(x.get().astype(float), periods, periods, counts, 0, 0, 0)
+    found = []
+    for factor in (1.001, short):
+        for axis, end in itertools.product(range(3), (0, 1)):
+            margins, widths = Margins(stages.engine), {}
+            whole = np.zeros((3, 2, BLOCKS[3], BLOCKS[3]), np.float32)
+            for (a, e), need in least.items():
+                widths[a, e] = 1.001 * need
+                if (a, e) == (axis, end):
+                    worst = np.unravel_index(need.argmax(), need.shape)
+                    widths[a, e][worst] = factor * need.max()
+                whole[a, e, : need.shape[0], : need.shape[1]] = widths[a, e]
+            margins.needed.set(whole.ravel())
+            margins.cells = n
+            found.append(is_enough(stages, seam, box, x, n, margins))
+    assert found == [True] * 6 + [False] * 6
+
+
+def is_enough(stages, seam: Seam, box, x, n, margins):
+    """Whether a diagram within these margins is said to be right."""
+    images = seam.extend(box, x, n, margins, 1.0, False)
+    binned = stages.bins.build(images.box, images.points, images.count)
+    args = images.box, images.points, images.count, binned
+    if box.dim == 3:
+        t = stages.cells.tessellate(*args, None, False, n, images.seams)
+    else:
+        t = stages.cells.tessellate(*args, False, n)
+    return seam.fold(images, binned, t, x, 0.5, True)[1]
+
+
+@pytest.mark.parametrize(("dim", "count"), [(2, 60), (3, 100)])
+def test_numbers_of_generators_do_not_matter(adapter, dim, count):
+    """To margins: whichever of those beside seams is number 0, the one that is most easily forgotten."""
+    box, rng = BOXES[dim], np.random.default_rng(2209)
+    points, real = np.array(box.lower) + box.extent * rng.random((count, dim)), adapter.dtype
+    n, stages = count, adapter._stages_for(box)
+    periods = box.periods(real)
+    counts, noise = block_counts(periods, n)[:dim], NOISE[real.name]
+    place = box.place(points, real).astype(float)
+    whole = np.zeros((dim, 2, *(BLOCKS[dim],) * (dim - 1)), np.float32)
+    for seam, need in needs(place, periods, periods, counts, 0, 0, 2 * noise).items():
+        whole[(*seam, *map(slice, need.shape))] = 1.0001 * need + noise / 10
+    found, beside = [], np.minimum(place, periods - place).min(axis=1).argsort()
+    for first in (n - 1, *beside[:24]):
+        margins, order = Margins(stages.engine), np.arange(n)
+        order[[0, first]] = first, 0
+        margins.needed.set(whole.ravel())
+        margins.cells = n
+        x = stages.engine.upload(box.place(points[order], real))
+        assert is_enough(stages, stages.seam, box, x, n, margins)
+        found.append(margins.needed.get())
+    assert (found[0] > whole.ravel()).mean() > 0.3 * (found[0] > 0).mean()
+    # Vertices round.
+    assert np.abs(found - found[0]).max() < noise
+
+
+def test_nearly_a_period_is_all_of_it(adapter):
+    """Images lie within the period, however their places have rounded."""
+    box, rng = BOXES[2], np.random.default_rng(2210)
+    stages, n = adapter._stages_for(box), 50
+    x = stages.engine.upload(box.place(box.extent * rng.random((n, 2)), adapter.dtype))
+    counts = block_counts(box.periods(adapter.dtype), n)[:2]
+    for share in (0.98, 0.995):
+        margins, periods = Margins(stages.engine), box.periods(adapter.dtype)
+        whole = np.zeros((2, 2, BLOCKS[2]), np.float32)
+        whole[:] = share * periods[:2, None, None]
+        margins.needed.set(whole.ravel())
+        margins.cells = n
+        stages.seam.extend(box, x, n, margins, 1.0, False)
+        for (axis, _), found in blocks_of(margins.widths, 2, counts).items():
+            wide = (
+                share * periods[axis] if share < 0.99 else 4.0
+            )  # WHOLE_PERIOD of tessellation/periodic/halo.h
+            assert found == pytest.approx(np.full(found.shape, wide), rel=1e-6)
+
+
+def test_blocks_are_twice_as_many_as_cells():
+    assert (block_counts(np.array([1.0, 0.5]), 10) == BLOCKS[2]).all()
+    for n in (1, 700, 5000, 40_000, 10**7):
+        counts = block_counts(np.array([1.0, 0.3, 2.0]), n)[:3]
+        across = FINENESS * np.array([1.0, 0.3, 2.0]) * (n / 0.6) ** (1 / 3)
+        assert (counts <= np.maximum(across, FEWEST_BLOCKS)).all()
+        assert ((2 * counts > across) | (counts == BLOCKS[3])).all()
+    assert (block_counts(np.array([1.0, 1.0, 0.0]), 100)[:2] == BLOCKS[3]).all()
+
+
+@pytest.mark.parametrize(
+    ("dim", "before", "after"),
+    [(2, 600, 900), (3, 600, 5000), (3, 5000, 600), (3, 5000, 40_000), (3, 40_000, 5000)],
+)
+def test_margins_of_other_blocks(adapter, dim, before, after):
+    """Where blocks or cells are others than before, margins are those of all that lie within their own depth."""
+    box, rng = BOXES[dim], np.random.default_rng(2208)
+    stages = adapter._stages_for(box)
+    margins, periods = Margins(stages.engine), box.periods(adapter.dtype)
+    was, counts = (block_counts(periods, n)[:dim] for n in (before, after))
+    assert dim == 2 or (was != counts).any()
+    old = np.zeros((dim, 2, *(BLOCKS[dim],) * (dim - 1)), np.float32)
+    for axis in range(dim):
+        along = tuple(slice(was[a]) for a in range(dim) if a != axis)
+        shape = [2, *(k.stop for k in along)]
+        old[(axis, slice(None), *along)] = 0.02 * (1 + rng.random(shape))
+    margins.needed.set(old.ravel())
+    margins.cells = before
+    factor = (before / after) ** (1 / dim)
+    points = np.array(box.lower) + box.extent * rng.random((after, dim))
+    x = stages.engine.upload(box.place(points, adapter.dtype))
+    stages.seam.extend(box, x, after, margins, factor, False)
+    found = blocks_of(margins.widths, dim, counts)
+    for axis, end in itertools.product(range(dim), (0, 1)):
+        across = [a for a in range(dim) if a != axis]
+        depths = factor * old[(axis, end, *(slice(was[a]) for a in across))]
+        # Of each new block from each old one: how far they are apart along either axis, squared and added.
+        apart2 = np.zeros(())
+        for a in across:
+            one, other = (periods[a] / k[a] for k in (counts, was))
+            middles = one * (np.arange(counts[a]) + 0.5), other * (np.arange(was[a]) + 0.5)
+            gaps = np.abs(middles[0][:, None] - middles[1]) - abs(one - other) / 2
+            apart2 = np.add.outer(apart2, np.maximum(gaps, 0) ** 2)
+        if dim == 3:
+            apart2 = apart2.transpose(0, 2, 1, 3)
+        nearby = np.where(apart2 < depths**2, depths, 0)
+        expected = nearby.reshape(*found[axis, end].shape, -1).max(axis=-1)
+        # Rounding may decide whether a block is as near as its margin is deep: random depths are not that near.
+        assert np.abs(found[axis, end] - expected).max() < 1e-6

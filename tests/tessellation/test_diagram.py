@@ -1,0 +1,338 @@
+"""The diagram against references, and its invariants, over point sets x precision."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import clvoro
+from clvoro.opencl.program import Engine
+from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.cells import ROW_CAPACITY, Cells
+from clvoro.tessellation.device_diagram import DOUBT
+from clvoro.tessellation.face_rows import SLOT
+from tests.reference import diagrams as reference
+
+BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
+COLLAPSED = 4  # FLAG_COLLAPSED of tessellation/face_rows.h
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def adapter(request):
+    return clvoro.Adapter(dtype=request.param)
+
+
+@pytest.fixture(scope="module")
+def adapter64():
+    return clvoro.Adapter(dtype="float64")
+
+
+def lattice(nx, ny, box=BOX):
+    lower, extent = np.array(box.lower), box.extent
+    ij = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=-1).reshape(-1, 2)
+    return lower + (ij + 0.5) / [nx, ny] * extent
+
+
+def point_sets():
+    rng = np.random.default_rng(20261)
+    square = rng.random((300, 2)) * BOX.extent
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = np.stack([1.2 + 0.5 * np.cos(angle), 0.7 + 0.5 * np.sin(angle)], axis=1)
+    walls = np.concatenate(
+        [
+            [[0, 0], [2.5, 0], [2.5, 1.5], [0, 1.5]],
+            np.stack([rng.random(20) * 2.5, np.zeros(20)], axis=1),
+            np.stack([np.full(20, 2.5), rng.random(20) * 1.5], axis=1),
+            rng.random((40, 2)) * BOX.extent,
+        ]
+    )
+    return {
+        "one": np.array([[0.3, 1.1]]),
+        "two": np.array([[0.3, 1.1], [2.0, 0.2]]),
+        "three": np.array([[0.3, 1.1], [2.0, 0.2], [1.0, 0.9]]),
+        "random": square,
+        "lattice": lattice(12, 9),
+        "sheared lattice": lattice(12, 9) + np.arange(108)[:, None] % 9 * [0.01, 0.0],
+        "cocircular": circle,
+        "cocircular with center": np.concatenate([circle, [[1.2, 0.7]]]),
+        "collinear": np.stack([np.linspace(0.1, 2.4, 31), np.full(31, 0.4)], axis=1),
+        "diagonal": np.linspace([0.1, 0.1], [2.4, 1.4], 37),
+        "walls and corners": walls,
+        "clusters": np.concatenate(
+            [c + s * rng.random((40, 2)) for c, s in [((0.4, 0.4), 1e-2), ((1.8, 1.0), 1e-4)]]
+            + [rng.random((20, 2)) * BOX.extent]
+        ),
+        "graded": rng.random((600, 2)) ** 3 * BOX.extent,
+    }
+
+
+POINTS = point_sets()
+
+
+@pytest.fixture(params=list(POINTS))
+def points(request):
+    return POINTS[request.param]
+
+
+def check_invariants(diagram, eps):
+    """Whatever the input: the cells tile the box, the graph is symmetric, cells close, Euler's formula holds."""
+    n = len(diagram.points)
+    box, starts = diagram.domain, diagram.neighbor_starts
+    # Each cell rounds by eps of the box at most; they add up like a random walk.
+    assert diagram.volumes.sum() == pytest.approx(box.measure, rel=8 * eps)
+    assert (diagram.volumes > 0).all()
+    i = np.repeat(np.arange(n), np.diff(starts))
+    j = diagram.neighbors
+    inner = j >= 0
+    pairs = set(zip(i[inner].tolist(), j[inner].tolist(), strict=True))
+    assert len(pairs) == inner.sum(), "a neighbor is listed twice"
+    assert all((b, a) in pairs for a, b in pairs), "the graph is not symmetric"
+    # A closed polygon's outward normals, weighted by length, cancel; corners repeat from cell to cell.
+    corners = diagram.vertices[diagram.cell_vertices]
+    scale = box.extent.max()
+    assert (diagram.cell_vertex_starts == starts).all()
+    following = np.arange(len(j)) + 1
+    following[starts[1:] - 1] = starts[:-1]
+    edge = corners[following] - corners
+    assert np.abs(np.hypot(*edge.T) - diagram.face_measures).max() <= 64 * eps * scale
+    assert (
+        np.abs((corners[following] + corners) / 2 - diagram.face_centroids).max()
+        <= 64 * eps * scale
+    )
+    a = corners - diagram.points[i]
+    b = corners[following] - diagram.points[i]
+    turn = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    assert turn.min() >= -64 * eps * scale**2, "corners are not counter-clockwise"
+    # Euler: V - E + F = 1 for a tiled disc.
+    edges = inner.sum() // 2 + (~inner).sum()
+    assert len(diagram.vertices) - edges + n == 1
+    assert len(np.unique(diagram.cell_vertices)) == len(diagram.vertices)
+    # Wall faces lie on their wall, and make up its length.
+    for axis in range(2):
+        for side, wall in enumerate((box.lower[axis], box.upper[axis])):
+            on = j == -1 - (2 * axis + side)
+            assert np.abs(diagram.face_centroids[on, axis] - wall).max() <= 4 * eps * scale
+            assert diagram.face_measures[on].sum() == pytest.approx(
+                box.extent[1 - axis], rel=64 * eps
+            )
+
+
+def test_invariants(adapter, points):
+    diagram = adapter.diagram(BOX, points)
+    check_invariants(diagram, float(np.finfo(adapter.dtype).eps))
+
+
+def test_against_exact_arithmetic(adapter64, points):
+    points = points[:: max(1, len(points) // 60)]
+    diagram = adapter64.diagram(BOX, points)
+    for i, cell in enumerate(reference.exact_cells(BOX.lower, BOX.upper, points)):
+        assert diagram.volumes[i] == pytest.approx(cell.area, rel=1e-9, abs=1e-12 * BOX.measure)
+        assert np.abs(diagram.centroids[i] - cell.centroid).max() < 1e-9 * np.sqrt(cell.area)
+        row = slice(*diagram.neighbor_starts[i : i + 2])
+        exact = dict(zip(cell.neighbors, face_lengths(cell.polygon), strict=True))
+        seen = dict(zip(diagram.neighbors[row].tolist(), diagram.face_measures[row], strict=True))
+        # Faces of no length (cocircular generators) may be listed by either side.
+        for j in set(exact) | set(seen):
+            assert seen.get(j, 0) == pytest.approx(exact.get(j, 0), rel=1e-9, abs=1e-13)
+
+
+def face_lengths(polygon):
+    return np.hypot(*(np.roll(polygon, -1, axis=0) - polygon).T)
+
+
+def test_against_qhull(adapter64):
+    rng = np.random.default_rng(773)
+    points = rng.random((5000, 2)) * BOX.extent
+    diagram = adapter64.diagram(BOX, points)
+    cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
+    area = np.array([c.area for c in cells])
+    # Qhull's own vertices carry about 1e-13 of the box.
+    assert np.abs(diagram.volumes - area).max() < 1e-12 * BOX.measure
+    assert np.abs(diagram.volumes / area - 1).max() < 1e-9
+    centroids = np.array([c.centroid for c in cells])
+    assert np.abs(diagram.centroids - centroids).max() < 1e-10
+    for i, cell in enumerate(cells):
+        row = diagram.neighbors[slice(*diagram.neighbor_starts[i : i + 2])].tolist()
+        start = row.index(cell.neighbors[0])
+        assert row[start:] + row[:start] == cell.neighbors
+
+
+def test_lattice_has_square_cells_of_four_faces(adapter):
+    diagram = adapter.diagram(clvoro.Box((0, 0), (7, 5)), lattice(7, 5, clvoro.Box((0, 0), (7, 5))))
+    assert (np.diff(diagram.neighbor_starts) == 4).all()
+    assert len(diagram.vertices) == 8 * 6
+    assert np.abs(diagram.volumes - 1).max() < 64 * float(np.finfo(adapter.dtype).eps)
+
+
+@pytest.mark.parametrize("scale", [1e-49, 1e-30, 1e-3, 1e6, 1e30, 1e49])
+def test_any_scale_and_place(adapter64, scale):
+    rng = np.random.default_rng(5150)
+    unit = rng.random((200, 2)) * [2.5, 1.5]
+    plain = adapter64.diagram(BOX, unit)
+    box = clvoro.Box((-scale, 3 * scale), (1.5 * scale, 4.5 * scale))
+    diagram = adapter64.diagram(box, np.clip(unit * scale + box.lower, box.lower, box.upper))
+    assert diagram.volumes.sum() == pytest.approx(box.measure, rel=1e-14)
+    # Shifting by the corner rounds positions to eps, and so areas to eps over the cell's size.
+    assert diagram.volumes / scale**2 == pytest.approx(plain.volumes, rel=1e-11)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 2e-16])
+def test_near_duplicates(adapter64, gap):
+    """Right down to gaps at which the bisectors with generators far away still differ; refused below."""
+    cluster = np.array([0.7, 0.6]) + gap * np.array([[0, 0], [1, 0], [0, 1]])
+    points = np.concatenate([cluster, POINTS["random"]])
+    refused = None
+    try:
+        diagram, few = (adapter64.diagram(BOX, some) for some in (points, points[:60]))
+    except clvoro.ClvoroError as error:
+        refused = str(error)
+    if refused is not None:
+        assert gap < 1e-12
+        assert "too close" in refused
+    else:
+        check_invariants(diagram, np.finfo(float).eps)
+        for i, cell in enumerate(reference.exact_cells(BOX.lower, BOX.upper, points[:60])[:3]):
+            assert few.volumes[i] == pytest.approx(cell.area, abs=1e-12 * BOX.measure / gap * 1e-3)
+
+
+def test_duplicates_are_named(adapter):
+    points = np.concatenate([POINTS["random"], POINTS["random"][17:18]])
+    with pytest.raises(ValueError, match=r"points\[17\] and points\[300\] coincide"):
+        adapter.diagram(BOX, points)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((2, 100)), r"shape \(2, 100\), expected \(n, 2\); pass its transpose"),
+        (np.zeros((3, 3)), r"shape \(3, 3\), expected \(n, 2\)"),
+        (np.zeros(4), r"shape \(4,\)"),
+        (np.zeros((0, 2)), "at least one"),
+        ([[0.1, np.nan]], r"points\[0\] is .*finite"),
+        ([[0.1, 0.1], [3.0, 0.1]], r"points\[1\] is .*outside"),
+        ([["a", "b"]], "dtype"),
+        ([[1j, 0.2]], "dtype"),
+        (None, "points is a NoneType"),
+    ],
+)
+def test_bad_points(adapter64, points, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        adapter64.diagram(BOX, points)
+
+
+def test_same_bits_twice(adapter):
+    points = POINTS["graded"]
+    a, b = adapter.diagram(BOX, points), adapter.diagram(BOX, points)
+    for name in (
+        "volumes",
+        "centroids",
+        "neighbors",
+        "face_measures",
+        "vertices",
+        "cell_vertices",
+    ):
+        assert (getattr(a, name) == getattr(b, name)).all(), name
+
+
+def test_order_of_points_does_not_matter(adapter64):
+    points = POINTS["graded"]
+    order = np.random.default_rng(99).permutation(len(points))
+    a, b = adapter64.diagram(BOX, points), adapter64.diagram(BOX, points[order])
+    assert b.volumes == pytest.approx(a.volumes[order], rel=1e-12)
+
+
+def test_many_cocircular_neighbors_enlarge_the_capacity(adapter64):
+    angle = np.linspace(0, 2 * np.pi, 150, endpoint=False)
+    ring = np.stack([1.25 + 0.6 * np.cos(angle), 0.75 + 0.6 * np.sin(angle)], axis=1)
+    points = np.concatenate([ring, [[1.25, 0.75]]])
+    diagram = adapter64.diagram(BOX, points)
+    assert np.diff(diagram.neighbor_starts)[-1] == 150
+    check_invariants(diagram, np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("name", ["random", "graded"])
+def test_faces_at_work_are_those_of_the_result_rounded(adapter64, name):
+    """In full precision they are measured where the corners are: what is rounded of that has the same bits."""
+    engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))
+    points = engine.upload(POINTS[name] / BOX.frame[1])
+    n, cells = len(points), Cells(engine)
+    t = cells.tessellate(BOX, points, n, Bins(engine).build(BOX, points, n))
+    exact, m = cells.measure_faces(BOX, t), int(t.starts.get()[-1])
+    for array in ("face_measures", "face_centroids"):
+        at_work, full = (getattr(d, array).get()[:m] for d in (t, exact))
+        assert at_work.dtype == np.float32
+        assert full.dtype == np.float64
+        assert np.array_equal(at_work, full.astype(np.float32))
+        assert (at_work != full).mean() > 0.9
+    assert np.array_equal(exact.neighbors.get(), t.neighbors.get())
+
+
+def test_enlarged_capacity_is_for_those_that_need_it(adapter64):
+    """A mesh with a cell of very many faces does not make every later, larger one reserve as much."""
+    engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))
+    bins, cells = Bins(engine), Cells(engine)
+
+    def tessellate(points):
+        n, x = len(points), engine.upload(points / BOX.frame[1])
+        return cells.tessellate(BOX, x, n, bins.build(BOX, x, n))
+
+    angle = np.linspace(0, 2 * np.pi, 100, endpoint=False)
+    ring = np.stack([1.25 + 0.6 * np.cos(angle), 0.75 + 0.6 * np.sin(angle)], axis=1)
+    tessellate(np.concatenate([ring, [[1.25, 0.75]]]))
+    assert cells.row_capacity >= 100
+    tessellate(POINTS["graded"])
+    assert cells.row_capacity == ROW_CAPACITY
+    with pytest.raises(clvoro.ClvoroError, match="32-bit"):
+        cells.take_rows(2**31 // SLOT + 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 12), st.integers(0, 8), st.integers(-1, 1), st.integers(-1, 1)),
+        min_size=1, max_size=40, unique_by=lambda p: p[:2],
+    )
+)  # fmt: skip
+def test_degenerate_sets(adapter64, places):
+    """Subsets of a lattice that fills the box and its walls, each point off by an ulp or not."""
+    a = np.array(places, float)
+    points = a[:, :2] / [12, 8] * BOX.extent
+    points = np.where(a[:, 2:] == 0, points, np.nextafter(points, points + a[:, 2:]))
+    points = np.clip(points, BOX.lower, BOX.upper)
+    check_invariants(adapter64.diagram(BOX, points), np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_search_that_is_repeated_widens(ctx, seed):
+    """Among generators that coincide in single precision cells shrink to a point, while others need more capacity."""
+    rng = np.random.default_rng(seed)
+    around = rng.uniform(0, 1, (40, 2))
+    cluster = 0.3 + rng.normal(size=(300, 2)) * 10.0 ** -rng.uniform(6, 8)
+    with pytest.raises(clvoro.ClvoroError, match=r"coincide|too close"):
+        clvoro.Adapter(ctx, "float32").diagram(
+            clvoro.Box((0, 0), (1, 1)), np.concatenate([around, cluster])
+        )
+
+
+@pytest.mark.parametrize("doubtful", [False, True])
+def test_what_has_two_faces_is_no_cell(ctx, doubtful):
+    """Rounding leaves such rows where generators are too close for the precision: they are refused."""
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype("float64"))
+    cells, points = Cells(engine), engine.upload([[0.2, 0.2], [0.5, 0.3], [0.4, 0.6]])
+    for two in (True, False):
+        lists = [[1, 2] if two else [1, 2, -1], [0, -3, 2], [0, 1, -4]]
+        rows, n = cells.take_rows(3), len(lists)
+        slots = np.zeros((n, SLOT), np.int32)
+        for i, labels in enumerate(lists):
+            slots[i, : len(labels)] = labels
+        rows.slots.set(slots.ravel())
+        rows.places.set(np.arange(n, dtype=np.int32))
+        # A doubt has all rows compared, and none is found wanting.
+        sign = -1 if doubtful else 1
+        rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
+        rows.flags.set(np.array([0, doubtful, 0, n, n, 0], np.int32))
+        old = rows.places, rows.places
+        flags, m = cells._match(rows, BOX, points, n, *old, exact=True)
+        assert m == 9 - two
+        assert flags == (COLLAPSED if two else 0) | (DOUBT if doubtful else 0)

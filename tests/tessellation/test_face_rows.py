@@ -1,0 +1,100 @@
+"""Rows of faces that are longer than a slot: the same diagram whatever room there is, and room for those rows alone."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.opencl.program import Engine
+from clvoro.tessellation import cells as cells_module
+from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.face_rows import SLOT, spare_slots
+from clvoro.tessellation.incremental import Repair
+from tests.reference import diagrams as reference
+from tests.reference import patch
+
+BOX = clvoro.Box((0, 0), (1, 1))
+SPOKES = 45
+"""Neighbors of each cell in the middle of a ring: three slots of them, and kernels built anew twice."""
+
+
+def wheels(rings=2, others=400):
+    """A point in the middle of each ring, and many others between the rings."""
+    rng = np.random.default_rng(5)
+    middles = (np.stack(np.meshgrid(*[np.arange(rings)] * 2), axis=-1).reshape(-1, 2) + 0.5) / rings
+    turn = 2 * np.pi * (np.arange(SPOKES) + 0.1 * rng.random((len(middles), SPOKES))) / SPOKES
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * 0.4 / rings
+    around = rng.random((others, 2))
+    apart = np.linalg.norm(around[:, None] - middles, axis=-1).min(axis=1) > 0.42 / rings
+    return np.concatenate([middles, (middles[:, None] + ring).reshape(-1, 2), around[apart]])
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def engine(request, ctx):
+    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(request.param))
+
+
+def make(engine, points):
+    x, n = engine.upload(points), len(points)
+    cells = Cells(engine)
+    binned = Bins(engine).build(BOX, x, n)
+    return cells, x, cells.tessellate(BOX, x, n, binned)
+
+
+def compare(a, b):
+    a, b = vars(patch.fetch(a)), vars(patch.fetch(b))
+    for name in a:
+        assert np.array_equal(a[name], b[name]), name
+
+
+def test_wheels_are_right(engine):
+    points = wheels().astype(engine.real)
+    diagram = clvoro.Adapter(engine.ctx, engine.real).diagram(BOX, points)
+    sides = np.diff(diagram.neighbor_starts)
+    assert (sides[:4] == SPOKES).all()
+    assert (sides[4:] <= SLOT).all()
+    expected = reference.box_voronoi(BOX.lower, BOX.upper, np.asarray(points, float))
+    areas = np.array([cell.area for cell in expected])
+    # A corner is known as well as positions, and there are some ten to a cell; cells are 0.03 wide.
+    assert diagram.volumes == pytest.approx(areas, abs=0.3 * float(np.finfo(engine.real).eps))
+
+
+def test_without_slots_to_spare_all_is_made_again(engine, monkeypatch):
+    points = wheels()
+    _, _, there = make(engine, points)
+    monkeypatch.setattr(cells_module, "spare_slots", lambda _: 1)
+    _, _, again = make(engine, points)
+    compare(there, again)
+
+
+def test_room_is_taken_for_long_rows_alone(engine):
+    """A workspace of what all cells take in a slot each, and of the spare ones."""
+    points = wheels()
+    n = len(points)
+    engine.workspace.clear()
+    make(engine, points)
+    # Of a slot also its count and bits; of a cell its place, where its row starts, and its faces, if any is doubtful.
+    expected = 4 * ((n + spare_slots(n)) * (SLOT + 2) + 2 * n + 6 * n)
+    # A unit at most lies between arrays.
+    assert engine.workspace._most <= expected + 10 * engine.workspace._unit
+    engine.workspace.clear()
+
+
+def test_repair_has_room_for_long_rows(engine, monkeypatch):
+    """And gives up where it has none, as for whatever else it cannot do."""
+    points = wheels()
+    cells, _, t = make(engine, points)
+    moved = engine.upload(points + np.random.default_rng(6).uniform(-1, 1, points.shape) * 1e-5)
+    repaired = Repair(engine).follow(cells, BOX, moved, t)
+    assert repaired is not None
+    repaired = patch.fetch(repaired)
+    n = len(points)
+    anew = patch.fetch(Cells(engine).tessellate(BOX, moved, n, Bins(engine).build(BOX, moved, n)))
+    assert np.array_equal(np.diff(repaired.starts)[:4], [SPOKES] * 4)
+    assert np.array_equal(repaired.starts, anew.starts)
+    assert np.array_equal(repaired.neighbors, anew.neighbors)
+    assert np.array_equal(repaired.volumes, anew.volumes)
+    monkeypatch.setattr("clvoro.tessellation.incremental.spare_slots", lambda _: 1)
+    cells, _, t = make(engine, points)
+    assert Repair(engine).follow(cells, BOX, moved, t) is None

@@ -1,0 +1,53 @@
+"""What a repair withdraws of what it knows, on rows that are made up."""
+
+import numpy as np
+import pytest
+
+from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.cells import Cells
+from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.incremental import Repair
+from tests.reference import patch
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["at first", "again"])
+def test_who_is_left_by_a_cell_that_is_clipped_again_is_doubted(ctx, again):
+    """A row that names too many: the one who is no neighbor may have been found to fit, by the row as it was.
+
+    The row from before is told of who leaves it elsewhere, when all cells of a round have been clipped.
+    """
+    engine, n, i = patch.make_engine(ctx), 40, 17
+    points = patch.relaxed_points(n, 2501)
+    x, cells, repair = engine.upload(points), Cells(engine), Repair(engine)
+    t = cells.tessellate(patch.BOX, x, n, Bins(engine).build(patch.BOX, x, n), exact=False)
+    repair.follow(cells, patch.BOX, x, t)  # has the kernels made
+    (kernels,) = repair._kernels.values()
+    host = patch.fetch(t)
+    rows = np.split(host.neighbors, host.starts[1:-1])
+    # All inside, so that nobody is a wall; the stranger is the farthest.
+    stranger = int(np.linalg.norm(points - points[i], axis=1).argmax())
+    assert stranger not in rows[i]
+    wrong = np.append(rows[i], stranger).astype(np.int32)
+    places, slots = np.full(n, -1, np.int32), np.zeros(2 * SLOT, np.int32)
+    if again:
+        places[i], slots[: len(wrong)] = 0, wrong
+        old = t.starts, t.neighbors
+    else:
+        lengths = np.diff(host.starts) + (np.arange(n) == i)
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        listed = np.concatenate([wrong if k == i else row for k, row in enumerate(rows)])
+        old = engine.upload(starts, np.int32), engine.upload(listed, np.int32)
+    fits = engine.upload(np.ones(n), np.int32)
+    slots = engine.upload(slots, np.int32)
+    counts = engine.upload([len(wrong), 0], np.int32)
+    flags = engine.upload([0, 0, 0, 2, 2], np.int32)
+    engine.run_each(
+        kernels.clip_marked, 1, engine.upload([i], np.int32), np.int32(1), np.int32(0),
+        engine.upload(places, np.int32), slots, counts, *old, x, *patch.BOX.device_corners(engine.real), fits, flags,
+    )  # fmt: skip
+    assert np.array_equal(slots.get()[SLOT:][: len(rows[i])], rows[i])
+    assert counts.get()[1] == len(rows[i])
+    expected = np.ones(n)
+    if again:
+        expected[stranger] = 0
+    assert np.array_equal(fits.get(), expected)

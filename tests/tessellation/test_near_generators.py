@@ -1,0 +1,382 @@
+"""Generators near each other, seen from far away: products of distances lose the digits in which they differ.
+
+A cell at the other end of the domain and those near each other have to see the same faces between them; where they did
+not, such sets were refused, or a corner was wrong.
+"""
+
+from contextlib import suppress
+from fractions import Fraction
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.opencl.program import Engine, source_text
+from clvoro.tessellation.cells import Cells
+
+UNIT = clvoro.Box((0, 0), (1, 1))
+
+
+def pairs(diagram):
+    """What is beside what, by places: the order of generators is the device's."""
+    first = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
+    places = [tuple(x) for x in diagram.points.tolist()]
+    return {
+        (places[i], places[j] if j >= 0 else j)
+        for i, j in zip(first.tolist(), diagram.neighbors.tolist(), strict=True)
+    }
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 5, 11, 20])
+def test_a_line_among_others(ctx, seed):
+    """In single precision; all but 5 were refused once. The positions are the same in both, and so is the diagram."""
+    rng = np.random.default_rng(seed)
+    n, step = int(rng.integers(20, 150)), rng.choice([1e-4, 2.5e-4, 5e-4])
+    way = rng.uniform(0, 6.28)
+    middle = 0.5 + 0.2 * rng.uniform(-1, 1, 2)
+    line = middle + np.outer((np.arange(n) - n / 2) * step, [np.cos(way), np.sin(way)])
+    points = np.vstack([line, rng.random((40, 2))]).astype(np.float32).astype(float)
+    single = clvoro.Adapter(ctx, "float32").diagram(UNIT, points)
+    report = single.check()
+    assert report, report
+    assert pairs(single) == pairs(clvoro.Adapter(ctx, "float64").diagram(UNIT, points))
+
+
+def cluster(seed, real):
+    """A few generators near each other (at random, on a line, on a circle), and fewer anywhere."""
+    rng = np.random.default_rng(seed)
+    k, size = int(rng.integers(3, 40)), 10 ** rng.uniform(-5 if real == "float32" else -13, -3)
+    center = rng.random(2)
+    if seed % 3 == 0:
+        x = center + size * rng.standard_normal((k, 2))
+    elif seed % 3 == 1:
+        x = center + np.outer(rng.uniform(-1, 1, k) * size * 10, [np.cos(seed), np.sin(seed)])
+    else:
+        t = rng.uniform(0, 6.28, k)
+        x = center + size * np.column_stack([np.cos(t), np.sin(t)])
+    others = rng.random((int(rng.integers(1, 10)), 2))
+    return np.unique(np.clip(np.vstack([x, others]), 0, 1).astype(real), axis=0).astype(float)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_clusters_among_few(ctx, real):
+    adapter = clvoro.Adapter(ctx, real)
+    for seed in [*range(60), 134, 269, 666]:
+        report = adapter.diagram(UNIT, cluster(seed, real)).check()
+        assert report, report
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
+def test_one_rounding_apart(ctx, periodic, real):
+    """As near as two places may be, whatever is around them: few or many, at random in a square of nine by nine."""
+    box, adapter = clvoro.Box((0, 0), (1, 1), periodic=periodic), clvoro.Adapter(ctx, real)
+    # In a periodic box places are whole multiples of the rounding beside 1.
+    step = float(np.spacing(np.asarray(0.6875, real))) * (2 if periodic else 1)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        square = np.stack(np.meshgrid(range(9), range(9)), axis=-1).reshape(-1, 2)
+        few = square[rng.permutation(81)[: [3, 10, 40, 81][seed % 4]]]
+        diagram = adapter.diagram(box, np.vstack([rng.random((300, 2)), 0.6875 + step * few]))
+        report = diagram.check()
+        assert report, report
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("seed", [20, 39, 55, 135])
+def test_a_cluster_alone_in_a_periodic_box(ctx, seed, real):
+    """All were refused once in single precision. Rows of bins about images are as far off as neighbors are away, and
+    some were left out (135); of four cells that meet in a point each pair of sides of a seam may see another two share
+    a face, as long as a corner of cells so long and narrow rounds."""
+    rng, step = np.random.default_rng(seed), float(np.finfo(real).eps)
+    count, across = int(rng.integers(50, 300)), int(rng.integers(15, 60))
+    lattice = np.unique(rng.integers(0, across, (count, 2)), axis=0)
+    box = clvoro.Box((0, 0), (1, 1), periodic=True)
+    points = box.wrap(np.floor(rng.random(2) / step) * step + step * lattice)
+    report = clvoro.Adapter(ctx, real).diagram(box, points).check()
+    assert report, report
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("size", [1e-44, 1e-60, 1e-160, 1e-300])
+def test_nearer_than_the_domain_rounds(ctx, dim, size, real):
+    """Beside 0 places may be as near as that: a mesh or an error; the search for neighbors went on for ever once."""
+    rng = np.random.default_rng(dim)
+    points = np.vstack([size * rng.random((10, dim)), rng.random((100, dim))])
+    points[0] = 0
+    with suppress(clvoro.ClvoroError):
+        diagram = clvoro.Adapter(ctx, real).diagram(clvoro.Box((0,) * dim, (1,) * dim), points)
+        assert diagram.check()
+
+
+def arc(seed, n, real):
+    """On an arc of a circle, at random: all cells meet near its middle, at angles as small as one wishes."""
+    rng = np.random.default_rng(seed)
+    radius, middle = 10 ** rng.uniform(-3, -0.5), 0.5 + 0.3 * rng.uniform(-1, 1, 2)
+    t = rng.uniform(0, rng.uniform(0.1, 2 * np.pi), n)
+    x = np.clip(middle + radius * np.column_stack([np.cos(t), np.sin(t)]), 0, 1)
+    return np.unique(x.astype(real), axis=0).astype(float)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("n", [100, 400])
+def test_arcs(ctx, n, real, monkeypatch):
+    """Some need faces to stay that are no longer than rounding: too many are left out together otherwise."""
+    adapter, tried = clvoro.Adapter(ctx, real), []
+    take = Cells.take_rows
+
+    def take_rows(self, n, **options):
+        tried.append(options["whole"])
+        return take(self, n, **options)
+
+    monkeypatch.setattr(Cells, "take_rows", take_rows)
+    for seed in range(30):
+        report = adapter.diagram(UNIT, arc(seed, n, np.float32)).check()
+        assert report, report
+    assert not all(tried)
+    assert any(tried) or real == "float64"
+
+
+def test_cells_around_a_vertex_take_one_place_for_it(ctx):
+    """Faces of no length left out one after the other had moved it by 600 roundings."""
+    report = clvoro.Adapter(ctx).diagram(UNIT, arc(305, 400, float)).check()
+    assert report, report
+
+
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
+
+
+def few_roundings_apart(seed, real):
+    """Two groups of a few places, each within 40 roundings of another, and others anywhere in space."""
+    rng = np.random.default_rng(seed)
+    step = 2 * float(np.spacing(np.asarray(0.6875, real)))
+    groups = [
+        at + step * rng.integers(0, 40, (int(rng.integers(2, 9)), 3)) for at in (0.6875, 0.25)
+    ]
+    points = np.vstack([*groups, rng.random((int(rng.choice([0, 5, 60])), 3))])
+    return np.unique(points.astype(real), axis=0).astype(float)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_few_roundings_apart_in_space(ctx, real):
+    """Cells at the other end of the domain see their bisectors as one plane; all but one in a hundred were refused."""
+    adapter = clvoro.Adapter(ctx, real)
+    for seed in range(12):
+        report = adapter.diagram(CUBE, few_roundings_apart(seed, real)).check()
+        assert report, report
+
+
+@pytest.mark.parametrize(("real", "seed"), [("float64", 3), ("float32", 3), ("float32", 44)])
+def test_lattices_of_roundings_in_space(ctx, real, seed):
+    """A mesh or an error: that of the last one had cells whose faces did not close, without a word."""
+    rng = np.random.default_rng(seed)
+    step = 2 * float(np.spacing(np.asarray(0.6875, real)))
+    lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
+    chosen = lattice[rng.permutation(125)[: int(rng.integers(3, 61))]]
+    points = np.vstack([0.6875 + step * chosen, rng.random((200, 3))]).astype(real)
+    with suppress(clvoro.ClvoroError):
+        report = clvoro.Adapter(ctx, real).diagram(CUBE, np.unique(points, axis=0)).check()
+        assert report, report
+
+
+@pytest.mark.parametrize("seed", [18, 26, 29, 35, 37])
+def test_faces_that_are_left_out_are_next_to_nothing(ctx, seed):
+    """A mesh or an error: a cell of each lacked some 1e-3 of its volume."""
+    rng = np.random.default_rng(seed)
+    points = (0.39 + 5e-7 * rng.standard_normal((200, 3))).astype(np.float32)
+    with suppress(clvoro.ClvoroError):
+        report = clvoro.Adapter(ctx, "float32").diagram(CUBE, np.unique(points, axis=0)).check()
+        assert report, report
+
+
+def test_the_same_in_both_precisions(ctx):
+    """In double precision generators a rounding of single precision apart are far from each other."""
+    for seed in range(6):
+        points = few_roundings_apart(seed, "float32")
+        single, double = (
+            clvoro.Adapter(ctx, r).diagram(CUBE, points) for r in ("float32", "float64")
+        )
+        assert np.allclose(single.volumes, double.volumes, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_few_roundings_apart_beyond_seams(ctx, real):
+    """Some on either side of a seam."""
+    box, adapter = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), clvoro.Adapter(ctx, real)
+    others = np.random.default_rng(7).random((150, 3))
+    to_seam = np.array([0, 0.3125 - 40 * float(np.spacing(np.asarray(0.6875, real))), 0])
+    for seed in range(4):
+        near = (few_roundings_apart(seed, real) + to_seam) % 1
+        assert near[:, 1].min() < 1e-3
+        assert near[:, 1].max() > 1 - 1e-3
+        points = np.unique(np.vstack([near, others]).astype(real), axis=0).astype(float)
+        report = adapter.diagram(box, points).check()
+        assert report, report
+
+
+def exactly_beyond(x, a, b, j):
+    """What `beyond_corner` is, and whether the corner is one of a cell, by fractions; a negative number is a wall."""
+
+    def line(label):
+        if isinstance(label, int):
+            axis, sign = (-1 - label) // 2, 2 * ((-1 - label) % 2) - 1
+            n = [sign * (axis == 0), sign * (axis == 1)]
+            return [*n, sign * ((sign > 0) - x[axis])]
+        n = [Fraction(float(label[0])) - x[0], Fraction(float(label[1])) - x[1]]
+        return [*n, (n[0] ** 2 + n[1] ** 2) / 2]
+
+    def cross(p, q):
+        return p[0] * q[1] - p[1] * q[0]
+
+    x = [Fraction(float(v)) for v in x]
+    u, v, w = line(a), line(b), line(j)
+    top = u[2] * cross(w, v) + v[2] * cross(u, w) - w[2] * cross(u, v)
+    turn = cross(u, v)
+    return (top / turn if turn > 0 else 0), turn > 0
+
+
+def pitch_of(kind, real):
+    """Of a lattice whose points no precision rounds; four odd pitches have more than twice the digits."""
+    digits = 32 if real == "float64" else 16
+    return np.rint(0.1 * 2**digits) / 2**digits if kind == "odd lattice" else 1 / 8
+
+
+PROBE = """
+kernel void probe(const int size, global const REAL *points, global const int4 *four, global REAL *found)
+{
+    WORK_ITEM(k);
+    const int4 f = four[k];
+    const REAL x[2] = {points[2 * f.s0], points[2 * f.s0 + 1]}, lower[2] = {0, 0}, upper[2] = {1, 1};
+    found[k] = beyond_corner(x, f.s1, f.s2, f.s3, points, lower, upper);
+}
+"""
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("kind", ["far", "near", "circle", "lattice", "odd lattice"])
+def test_the_side_of_a_corner(ctx, kind, real):
+    """By fractions: the sign is right, and 0 is where all meet in a point."""
+    rng, n = np.random.default_rng(5), 500
+    if kind == "far":
+        x = rng.random((4 * n, 2))
+    elif kind == "near":  # some of the four within roundings of each other
+        near = 0.625 + float(np.spacing(np.asarray(0.5, real))) * rng.integers(-9, 9, (4 * n, 2))
+        x = np.where(rng.random((4 * n, 1)) < 0.6, near, rng.random((4 * n, 2)))
+    elif kind == "circle":
+        t = rng.uniform(0, 2 * np.pi, 4 * n)
+        x = 0.5 + 0.4 * np.column_stack([np.cos(t), np.sin(t)])
+    else:
+        x = rng.integers(0, 5, (4 * n, 2)) * pitch_of(kind, real) + 0.25
+    x = x.astype(real)
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real))
+    four = np.arange(4 * n, dtype=np.int32).reshape(n, 4)
+    # Walls, one across each axis.
+    four[rng.random(n) < 0.3, 1] = -1 - rng.integers(0, 2)
+    four[rng.random(n) < 0.3, 2] = -1 - rng.integers(2, 4)
+    program = cl.Program(ctx, source_text("tessellation/half_planes.h") + PROBE).build(
+        ["-DDIM=2", f"-DREAL={'double' if real == 'float64' else 'float'}"]
+    )
+    places, numbers, found = engine.upload(x), engine.upload(four, np.int32), engine.empty(n)
+    kernel = cl.Kernel(program, "probe")
+    kernel(engine.queue, (n,), None, np.int32(n), places.data, numbers.data, found.data)
+    zeros = 0
+    for (i, a, b, j), side in zip(four.tolist(), found.get().tolist(), strict=True):
+        truth, is_corner = exactly_beyond(
+            x[i], *(label if label < 0 else x[label] for label in (a, b)), x[j]
+        )
+        zeros += truth == 0
+        assert np.sign(side) == np.sign(float(truth)) or (not is_corner and side == 0)
+        # Twice the digits, less those that cancel.
+        assert abs(Fraction(side) - truth) <= Fraction(0.01) * abs(truth)
+    assert zeros < n
+    assert zeros > 0 or "lattice" not in kind
+
+
+def exactly_later(x, a, b, begin, way):
+    """What `leaves_later` is, by fractions, and the sum of its terms; 0 if the line does not lead out of both."""
+    x, begin, way = ([Fraction(float(v)) for v in pair] for pair in (x, begin, way))
+    found = []
+    for label in (a, b):
+        n = [Fraction(float(q)) - p for q, p in zip(label, x, strict=True)]
+        level = (n[0] ** 2 + n[1] ** 2) / 2
+        ahead = [m * (q - p) for m, q, p in zip(n, begin, x, strict=True)]
+        along = n[0] * way[0] + n[1] * way[1]
+        found.append((level - sum(ahead), along, level + sum(map(abs, ahead))))
+    (u_left, u_along, u_terms), (v_left, v_along, v_terms) = found
+    if u_along <= 0 or v_along <= 0:
+        return 0, 0
+    return u_left * v_along - v_left * u_along, u_terms * v_along + v_terms * u_along
+
+
+LATER = """
+kernel void probe(const int size, global const REAL *points, global REAL *found)
+{
+    WORK_ITEM(k);
+    const REAL lower[2] = {0, 0}, upper[2] = {1, 1};
+    global const REAL *own = points + 10 * k;
+    const REAL x[2] = {own[0], own[1]};
+    found[k] = leaves_later(half_plane_of(x, 5 * k + 1, points, lower, upper),
+                            half_plane_of(x, 5 * k + 2, points, lower, upper), wide_sum(own[6], -x[0]),
+                            wide_sum(own[7], -x[1]), (REAL2)(own[8], own[9]));
+}
+"""
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+@pytest.mark.parametrize("kind", ["far", "near", "tie", "lattice", "odd lattice"])
+def test_the_face_that_a_line_leaves_by(ctx, kind, real):
+    """By fractions: of places x, a, b, where a line begins and its way, which may be off by half its last digit."""
+    rng, n = np.random.default_rng(6), 500
+    step = float(np.spacing(np.asarray(0.5, real)))
+    x = rng.random((n, 5, 2))
+    if kind == "near":  # some within roundings of each other
+        x = np.where(rng.random((n, 5, 1)) < 0.6, 0.625 + step * rng.integers(-9, 9, x.shape), x)
+    elif "lattice" in kind:
+        x = rng.integers(0, 5, x.shape) * pitch_of(kind, real) + 0.25
+    if kind == "tie":  # a and b are mirror images of each other, or nearly so, by a line through x
+        angle, length = rng.uniform(0, 1.5, n), rng.uniform(0.01, 0.3, n)
+        ends = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * length[:, None]
+        x[:, 0] = x[:, 3] = 0.5
+        x[:, 1], x[:, 2] = 0.5 + ends, 0.5 + ends * [1, -1]
+        x[:, 1] += step * rng.integers(-2, 3, (n, 2))
+        x[:, 4] = rng.uniform(0.1, 1, (n, 1)) * [1, 0]
+    else:
+        x[:, 4] -= x[:, 3]
+    x = x.astype(real)
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real))
+    program = cl.Program(ctx, source_text("tessellation/half_planes.h") + LATER).build(
+        ["-DDIM=2", f"-DREAL={'double' if real == 'float64' else 'float'}"]
+    )
+    places, found = engine.upload(x), engine.empty(n)
+    kernel = cl.Kernel(program, "probe")
+    kernel(engine.queue, (n,), None, np.int32(n), places.data, found.data)
+    eps2 = Fraction(float(np.finfo(real).eps)) ** 2
+    signs = []
+    for places, later in zip(x, found.get().tolist(), strict=True):
+        truth, terms = exactly_later(*places)
+        if later == 0:  # below what is taken for noise, and what that may be off by
+            assert abs(truth) <= 80 * eps2 * terms
+        else:  # a few eps^2 for each of eight operations, and one rounding of the sum
+            assert abs(Fraction(later) - truth) <= 16 * eps2 * terms + abs(truth) / 2**20
+            assert np.sign(later) == np.sign(float(truth))
+        signs.append(np.sign(later))
+    assert {-1, 0, 1} == set(signs)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_a_cell_of_a_thousand_faces(ctx, real):
+    """The middle of a circle; without it a thousand cells meet there, but for rounding."""
+    t = np.arange(1000) * 2 * np.pi / 1000
+    circle = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t)])
+    adapter = clvoro.Adapter(ctx, real)
+    adapter.diagram(UNIT, circle).check().demand()
+    points = np.vstack([circle, [[0.5, 0.5]]])
+    if not ctx.devices[0].type & cl.device_type.CPU:
+        with pytest.raises(clvoro.ClvoroError, match="more than 640 faces"):
+            adapter.diagram(UNIT, points)
+        return
+    diagram = adapter.diagram(UNIT, points)
+    diagram.check().demand()
+    assert np.diff(diagram.neighbor_starts).max() == 1000

@@ -1,0 +1,418 @@
+"""The diagram in 3D against references, and its invariants, over point sets x precision."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.opencl.program import Engine
+from clvoro.tessellation.bins import Bins
+from clvoro.tessellation.polyhedra import Polyhedra
+from tests.reference import diagrams3d as reference3d
+
+BOX = clvoro.Box((0.0, 0.0, 0.0), (2.0, 1.5, 1.0))
+LATTICES = {
+    "cubic": [[0, 0, 0]],
+    "bcc": [[0, 0, 0], [0.5, 0.5, 0.5]],
+    "fcc": [[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]],
+}
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def adapter(request):
+    return clvoro.Adapter(dtype=request.param)
+
+
+@pytest.fixture(scope="module")
+def adapter64():
+    return clvoro.Adapter(dtype="float64")
+
+
+def lattice(kind, k):
+    ijk = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    return (ijk + np.array(LATTICES[kind]) + 0.25).reshape(-1, 3) / k * BOX.extent
+
+
+def hexagonal(k, close_packed):
+    j, i, layer = np.meshgrid(*[np.arange(k)] * 3, indexing="ij")
+    if close_packed:
+        x, y = 2 * i + (j + layer) % 2, np.sqrt(3) * (j + layer % 2 / 3)
+        points = np.stack([x, y, 2 * np.sqrt(6) / 3 * layer], axis=-1)
+    else:
+        points = np.stack([i + j % 2 / 2, np.sqrt(0.75) * j, layer], axis=-1)
+    points = points.reshape(-1, 3) + 0.4
+    return points / (points.max() + 0.4) * BOX.extent.min()
+
+
+def directions(n, rng):
+    v = rng.standard_normal((n, 3))
+    return v / np.linalg.norm(v, axis=1)[:, None]
+
+
+def point_sets():
+    rng = np.random.default_rng(20261)
+    extent, middle = BOX.extent, np.array([1.0, 0.75, 0.5])
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = np.stack([1 + 0.4 * np.cos(angle), 0.7 + 0.4 * np.sin(angle)], axis=1)
+    corners = np.array(list(np.ndindex(2, 2, 2))) * extent
+    sphere = middle + 0.4 * directions(60, rng)
+    spread = rng.random((30, 3)) * extent
+    few = np.array([[0.3, 1.1, 0.2], [1.7, 0.2, 0.9], [1.0, 0.9, 0.4]])
+    return {
+        "one": few[:1],
+        "two": few[:2],
+        "three": few,
+        "random": rng.random((300, 3)) * extent,
+        # Images in the walls, in the reference, must be apart from their points.
+        "graded": (0.02 + 0.96 * rng.random((400, 3)) ** 3) * extent,
+        "cubic": lattice("cubic", 5),
+        "bcc": lattice("bcc", 4),
+        "fcc": lattice("fcc", 4),
+        "hexagonal": hexagonal(5, close_packed=False),
+        "close-packed": hexagonal(5, close_packed=True),
+        "sphere": sphere,
+        "sphere with center": np.concatenate([sphere, [middle]]),
+        "coplanar": np.column_stack([rng.random((70, 2)) * extent[:2], np.full(70, 0.3)]),
+        "collinear": np.column_stack([np.linspace(0.1, 1.9, 31), np.full(31, 0.4), np.full(31, 0.6)]),
+        "diagonal": np.linspace([0.1, 0.1, 0.1], [1.9, 1.4, 0.9], 37),
+        "circle": np.column_stack([circle, np.full(24, 0.5)]),
+        "prism": np.concatenate([np.column_stack([circle, np.full(24, z)]) for z in (0.2, 0.5, 0.8)]),
+        "walls, edges and corners": np.concatenate(
+            [
+                corners,
+                np.column_stack([rng.random(15) * extent[0], np.zeros((15, 2))]),
+                np.column_stack([np.full(15, extent[0]), rng.random((15, 2)) * extent[1:]]),
+                spread,
+            ]
+        ),
+        "lattice on walls": np.array(list(np.ndindex(4, 4, 4))) / 3 * extent,
+        "clusters": np.concatenate(
+            [np.array(c) + s * rng.random((30, 3)) for c, s in
+             [((0.4, 0.4, 0.4), 1e-2), ((1.8, 1.0, 0.7), 1e-3)]] + [spread]
+        ),
+    }  # fmt: skip
+
+
+CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
+POINTS = point_sets()
+FINE = [name for name in POINTS if name not in ("walls, edges and corners", "lattice on walls")]
+
+
+def rows(diagram):
+    """Cell i of each face, and a dictionary of faces by (i, neighbor)."""
+    i = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
+    return i, {
+        pair: k for k, pair in enumerate(zip(i.tolist(), diagram.neighbors.tolist(), strict=True))
+    }
+
+
+def normals(diagram, i):
+    """Outward unit normals of the faces (m, 3)."""
+    j = diagram.neighbors
+    inner = j >= 0
+    out = np.zeros((len(j), 3))
+    out[inner] = diagram.points[j[inner]] - diagram.points[i[inner]]
+    wall = -1 - j[~inner]
+    out[~inner, wall // 2] = np.where(wall % 2, 1.0, -1.0)
+    return out / np.linalg.norm(out, axis=1)[:, None]
+
+
+def check_invariants(diagram, eps, crowding=1.0):
+    """Whatever the input: the cells tile the box, the graph is symmetric, faces fit and close the cells.
+
+    `crowding` is how much the sharpest cells enlarge roundings: extent over the distance of generators.
+    """
+    box, area = diagram.domain, diagram.face_measures
+    scale = box.extent.max()
+    assert diagram.volumes.sum() == pytest.approx(box.measure, rel=8 * eps)
+    assert (diagram.volumes > 0).all()
+    i, faces = rows(diagram)
+    assert len(faces) == len(i), "a neighbor is listed twice"
+    inner = np.flatnonzero(diagram.neighbors >= 0)
+    twin = np.array(
+        [faces.get((diagram.neighbors[k], i[k]), -1) for k in inner.tolist()], dtype=int
+    )
+    assert (twin >= 0).all(), "the graph is not symmetric"
+    tolerance = 64 * eps * scale**2 * crowding
+    assert np.abs(area[inner] - area[twin]).max(initial=0) <= tolerance
+    moment = area[:, None] * diagram.face_centroids
+    assert np.abs(moment[inner] - moment[twin]).max(initial=0) <= tolerance * scale
+    closed = np.zeros((len(diagram), 3))
+    np.add.at(closed, i, area[:, None] * normals(diagram, i))
+    assert np.abs(closed).max() <= tolerance
+    # Wall faces lie on their wall, and make up its area.
+    for axis in range(3):
+        for side, wall in enumerate((box.lower[axis], box.upper[axis])):
+            on = diagram.neighbors == -1 - (2 * axis + side)
+            assert np.abs(diagram.face_centroids[on, axis] - wall).max() <= 8 * eps * scale
+            rest = box.measure / box.extent[axis]
+            assert area[on].sum() == pytest.approx(rest, rel=64 * eps)
+
+
+def loop_of(diagram, k):
+    return diagram.face_vertices[slice(*diagram.face_vertex_starts[k : k + 2])]
+
+
+def check_loops(diagram, eps, crowding=1.0):
+    """Loops are polygons with the areas of their faces, the same from both cells; they close every cell."""
+    i, faces = rows(diagram)
+    normal, tolerance = normals(diagram, i), 256 * eps * crowding * diagram.domain.extent.max() ** 2
+    edges = [dict() for _ in range(len(diagram))]
+    for (cell, j), k in faces.items():
+        loop = loop_of(diagram, k)
+        assert len(loop) >= 3
+        assert len(set(loop.tolist())) == len(loop)
+        corners = diagram.vertices[loop] - diagram.vertices[loop[0]]
+        vector = np.cross(corners[1:-1], corners[2:]).sum(axis=0) / 2
+        assert np.abs(vector - normal[k] * diagram.face_measures[k]).max() <= tolerance
+        if j >= 0:
+            other = loop_of(diagram, faces[j, cell])[::-1]
+            turn = np.flatnonzero(other == loop[0])
+            assert np.array_equal(np.roll(other, -turn[0]), loop)
+        for edge in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
+            assert edge not in edges[cell], "an edge is passed twice in the same direction"
+            edges[cell][edge] = k
+    for cell, own in enumerate(edges):
+        assert all((b, a) in own for a, b in own), "a cell is not closed"
+        vertices = {a for a, _ in own}
+        count = np.diff(diagram.neighbor_starts)[cell]
+        assert len(vertices) - len(own) // 2 + count == 2, "Euler's formula"
+    assert np.array_equal(np.unique(diagram.face_vertices), np.arange(len(diagram.vertices)))
+
+
+CROWDING = {"circle": 4, "prism": 4, "sphere": 4, "sphere with center": 4, "clusters": 1e4}
+
+
+@pytest.mark.parametrize("name", list(POINTS))
+def test_invariants(adapter, name):
+    diagram = adapter.diagram(BOX, POINTS[name])
+    eps = float(np.finfo(adapter.dtype).eps)
+    check_invariants(diagram, eps, CROWDING.get(name, 1))
+    check_loops(diagram, eps, CROWDING.get(name, 1))
+
+
+@pytest.mark.parametrize("kind", list(LATTICES))
+@pytest.mark.parametrize("roundings", [1, 50, 500, 5000])
+def test_lattices_off_by_roundings(adapter, kind, roundings):
+    """Up to eight cells nearly meet in a point, four at an edge: from ties to faces hundreds of roundings wide."""
+    rng = np.random.default_rng(8231)
+    cube, eps = clvoro.Box((0, 0, 0), (1, 1, 1)), float(np.finfo(adapter.dtype).eps)
+    straight = lattice(kind, 5 if kind == "cubic" else 3) / BOX.extent
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    for points in (straight, 0.5 + 0.55 * (straight - 0.5) @ turn):
+        diagram = adapter.diagram(
+            cube, points + roundings * eps * rng.standard_normal(points.shape)
+        )
+        # Faces that are left out, as they are no polygons, are up to some ten roundings wide.
+        check_invariants(diagram, eps, 2)
+        check_loops(diagram, eps, 2)
+
+
+@pytest.mark.parametrize("n", [40, 90, 160])
+def test_cells_of_points_on_spheres(adapter, n):
+    """All cells of a sphere meet in its center, or nearly so: what each sees there differs by rounding."""
+    rng = np.random.default_rng(n)
+    center, eps = np.array([1.0, 0.75, 0.5]), float(np.finfo(adapter.dtype).eps)
+    for radii in ([0.4], [0.4, 0.2]):
+        points = np.concatenate([center + r * directions(n // len(radii), rng) for r in radii])
+        diagram = adapter.diagram(BOX, points)
+        check_invariants(diagram, eps, 8)
+        check_loops(diagram, eps, 8)
+
+
+@pytest.mark.parametrize("n", [80, 100, 300])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_cells_of_points_around_an_axis(adapter, n, layers):
+    """As in a mesh of a pipe: all of them meet along a line, where faces are slits as long as the cells."""
+    turn = 2 * np.pi * np.arange(n) / n + 0.1
+    ring = 0.5 + 0.4 * np.column_stack([np.cos(turn), np.sin(turn)])
+    heights = np.repeat((np.arange(layers) + 0.5) / layers, n)
+    diagram = adapter.diagram(CUBE, np.column_stack([np.tile(ring, (layers, 1)), heights]))
+    assert diagram.check()
+    assert diagram.volumes.sum() == pytest.approx(1, rel=1e-6)
+
+
+@pytest.mark.parametrize("n", [300, 1000, 2000])
+def test_very_many_points_on_a_sphere(adapter, n):
+    """In single precision a mesh or an error: vertices are not brought together over a share of the cells."""
+    u = np.random.default_rng(61301).standard_normal((n, 3))
+    points = 0.5 + 0.4 * u / np.linalg.norm(u, axis=1)[:, None]
+    said = ""
+    try:
+        assert adapter.diagram(CUBE, points).check()
+    except clvoro.ClvoroError as error:
+        said = str(error)
+    if said:
+        assert adapter.dtype == np.float32, said
+        assert n > 300
+        assert "do not come together" in said
+        assert "float64" in said
+
+
+@pytest.mark.parametrize("n", [60, 300])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_cells_of_points_anywhere_on_a_ring(adapter, n, seed):
+    """All meet along a line that is parallel to no wall, from one to another; slits beside it end anywhere on it."""
+    rng = np.random.default_rng(seed)
+    radius, turn = 10 ** rng.uniform(-3, -0.5), rng.uniform(0, 2 * np.pi, n)
+    plane = np.linalg.qr(rng.standard_normal((3, 3)))[0][:2]
+    ring = 0.5 + radius * np.column_stack([np.cos(turn), np.sin(turn)]) @ plane
+    diagram = adapter.diagram(CUBE, ring)
+    assert diagram.check()
+    assert diagram.volumes.sum() == pytest.approx(1, rel=1e-6)
+    # No cell has dozens of vertices on the line.
+    assert len(diagram.vertices) < 6 * n
+
+
+@pytest.mark.parametrize("name", FINE)
+def test_against_qhull(adapter64, name):
+    points = POINTS[name]
+    diagram = adapter64.diagram(BOX, points)
+    # Qhull's own vertices carry about 1e-13 of the box, more where cells are thin.
+    rel = 1e-9 if name == "clusters" else 1e-10
+    for i, cell in enumerate(reference3d.box_voronoi(BOX.lower, BOX.upper, points)):
+        assert diagram.volumes[i] == pytest.approx(cell.volume, rel=rel)
+        size = cell.volume ** (1 / 3)
+        assert np.abs(diagram.centroids[i] - cell.centroid).max() < rel * max(size, 0.1)
+        row = slice(*diagram.neighbor_starts[i : i + 2])
+        seen = dict(zip(diagram.neighbors[row].tolist(), diagram.face_measures[row], strict=True))
+        # Faces of no area (where many cells meet) may be listed by either side.
+        for j in set(cell.faces) | set(seen):
+            assert seen.get(j, 0) == pytest.approx(cell.faces.get(j, 0), rel=1e-8, abs=1e-11)
+
+
+def test_faces_and_moments_against_qhull(adapter64):
+    points = POINTS["random"]
+    engine = Engine(adapter64.ctx, adapter64.queue, 3, np.dtype(float))
+    t = tessellation(engine, Bins(engine), Polyhedra(engine), points)
+    starts, neighbors = t.starts.get(), t.neighbors.get()
+    centroids = t.face_centroids.get() * BOX.frame[1]
+    covariances = t.covariances.get() * BOX.frame[1] ** 2
+    for i, cell in enumerate(reference3d.box_voronoi(BOX.lower, BOX.upper, points)):
+        for k in range(starts[i], starts[i + 1]):
+            if cell.faces.get(neighbors[k], 0) > 1e-6:
+                expected = cell.face_centroids[neighbors[k]] - points[i]
+                assert centroids[k] == pytest.approx(expected, abs=1e-9)
+        expected = cell.covariance[np.triu_indices(3)]
+        assert covariances[i] == pytest.approx(expected, rel=1e-10, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["walls, edges and corners", "lattice on walls"])
+def test_volumes_of_points_on_walls(adapter64, name):
+    """Where mirrored points coincide: against an intersection of half-spaces."""
+    points = POINTS[name]
+    diagram = adapter64.diagram(BOX, points)
+    for i in range(0, len(points), 3):
+        volume = reference3d.half_space_volume(np.array(BOX.lower), np.array(BOX.upper), points, i)
+        assert diagram.volumes[i] == pytest.approx(volume, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"), [("cubic", 6), ("bcc", 14), ("fcc", 12)]
+)  # cube, truncated octahedron, rhombic dodecahedron
+def test_cells_of_a_lattice(adapter, kind, count):
+    cube = clvoro.Box((0, 0, 0), (1, 1, 1))
+    diagram = adapter.diagram(cube, lattice(kind, 5) / BOX.extent)
+    # Cells two layers off the walls know nothing of them.
+    inner = (np.abs(diagram.points - 0.5) < 0.27).all(axis=1)
+    assert inner.sum() >= 8
+    assert (np.diff(diagram.neighbor_starts)[inner] == count).all()
+
+
+def tessellation(engine, bins, cells, points, previous=None):
+    n, x = len(points), engine.upload((points - np.array(BOX.lower)) / BOX.frame[1])
+    return cells.tessellate(BOX, x, n, bins.build(BOX, x, n), previous)
+
+
+def test_warm_start_sees_the_same_cells(adapter64):
+    engine = Engine(adapter64.ctx, adapter64.queue, 3, np.dtype(float))
+    bins, cells = Bins(engine), Polyhedra(engine)
+    rng = np.random.default_rng(515)
+    points = POINTS["random"]
+    moved = np.clip(points + 0.02 * (rng.random(points.shape) - 0.5), 0, BOX.extent)
+    before = tessellation(engine, bins, cells, points)
+    warm = tessellation(engine, bins, cells, moved, before)
+    starts, neighbors, volumes = warm.starts.get(), warm.neighbors.get(), warm.volumes.get()
+    again = tessellation(engine, bins, cells, moved, tessellation(engine, bins, cells, points))
+    assert (again.volumes.get() == volumes).all()
+    assert (again.neighbors.get()[: starts[-1]] == neighbors[: starts[-1]]).all()
+    cold = tessellation(engine, Bins(engine), Polyhedra(engine), moved)
+    assert volumes == pytest.approx(cold.volumes.get(), rel=1e-12)
+    assert (starts == cold.starts.get()).all()
+    other = cold.neighbors.get()
+    for a, b in itertools.pairwise(starts.tolist()):
+        assert set(neighbors[a:b].tolist()) == set(other[a:b].tolist())
+
+
+@pytest.mark.parametrize("n", [100, 300])
+def test_many_neighbors_enlarge_the_capacity(adapter64, n):
+    """A generator amid a sphere of others has a face with each of them, and only its cell needs the room."""
+    center = np.array([1.0, 0.75, 0.5])
+    points = np.concatenate([center + 0.4 * directions(n, np.random.default_rng(31)), [center]])
+    diagram = adapter64.diagram(BOX, points)
+    assert np.diff(diagram.neighbor_starts)[-1] == n
+    check_invariants(diagram, np.finfo(float).eps, 64)
+
+
+def test_too_many_neighbors_are_refused(adapter64):
+    center = np.array([1.0, 0.75, 0.5])
+    points = np.concatenate([center + 0.4 * directions(900, np.random.default_rng(31)), [center]])
+    with pytest.raises(clvoro.ClvoroError, match="more than 512 faces"):
+        adapter64.diagram(BOX, points)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 2e-16])
+def test_near_duplicates(adapter64, gap):
+    """Right down to gaps at which the bisectors with generators far away still differ; refused below."""
+    cluster = np.array([0.7, 0.6, 0.3]) + gap * np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    )
+    refused = None
+    try:
+        diagram = adapter64.diagram(BOX, np.concatenate([cluster, POINTS["random"]]))
+    except clvoro.ClvoroError as error:
+        refused = str(error)
+    if refused is not None:
+        assert gap < 1e-11
+        assert "too close" in refused
+    else:
+        check_invariants(diagram, np.finfo(float).eps, 1 / gap)
+
+
+def test_duplicates_are_named(adapter):
+    points = np.concatenate([POINTS["random"], POINTS["random"][17:18]])
+    with pytest.raises(ValueError, match=r"points\[17\] and points\[300\] coincide"):
+        adapter.diagram(BOX, points)
+
+
+@pytest.mark.parametrize("name", ["random", "fcc", "sphere"])
+def test_same_bits_twice(adapter, name):
+    a, b = adapter.diagram(BOX, POINTS[name]), adapter.diagram(BOX, POINTS[name])
+    for array in (
+        "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures",
+        "face_centroids", "vertices", "face_vertex_starts", "face_vertices",
+    ):  # fmt: skip
+        assert np.array_equal(getattr(a, array), getattr(b, array)), array
+
+
+def test_arrays_of_the_plane_are_missing(adapter64):
+    diagram = adapter64.diagram(BOX, POINTS["three"])
+    assert not hasattr(diagram, "cell_vertices")
+    plane = adapter64.diagram(clvoro.Box((0, 0), (1, 1)), POINTS["three"][:, :2] / 2)
+    assert not hasattr(plane, "face_vertices")
+
+
+def test_degenerate_sets(adapter64):
+    """Subsets of a lattice that fills the box and its walls, straight or turned, each point off by an ulp or not."""
+    rng = np.random.default_rng(4099)
+    for _ in range(25):
+        chosen = rng.permutation(7 * 5 * 4)[: rng.integers(1, 50)]
+        places = np.stack(np.unravel_index(chosen, (7, 5, 4)), axis=-1)
+        points = places / [6, 4, 3] * BOX.extent
+        towards = points + rng.integers(-1, 2, points.shape)
+        points = np.clip(np.nextafter(points, towards), BOX.lower, BOX.upper)
+        check_invariants(adapter64.diagram(BOX, points), np.finfo(float).eps)
+        turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        turned = (places - [3, 2, 1.5]) / 14 @ turn + BOX.extent / 2
+        check_invariants(adapter64.diagram(BOX, turned), np.finfo(float).eps, 4)
