@@ -5,7 +5,7 @@ starts, and prints for each claim of the paper what was measured and whether it 
 
     python bench/paper_case.py [--seeds 3] [--steps 100] [--k 1] [--device NAME] [--dtype float32] [--json]
 
-Exits with 1 if a claim does not hold. `--markdown` prints the tables of README.md, and
+Exits with 1 if a claim does not hold. `--markdown` prints the tables of RESULTS.md, and
 `--pictures DIR` writes the pictures of the first start.
 """
 
@@ -250,7 +250,7 @@ def print_table(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
 
 
 def print_markdown(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
-    """Print the README's tables: ranges over the starts."""
+    """Print the tables of RESULTS.md: ranges over the starts."""
 
     def span(values: list[float], form: str = ".3g") -> str:
         low, high = format(min(values), form), format(max(values), form)
@@ -278,7 +278,7 @@ def main() -> int:
     options.add_argument("--seeds", type=int, default=3, metavar="N", help="random starts (3)")
     options.add_argument("--steps", type=int, default=100, help="steps per run (100)")
     options.add_argument("--k", type=float, default=1.0, help="the paper's k (1)")
-    options.add_argument("--markdown", action="store_true", help="print the README's tables")
+    options.add_argument("--markdown", action="store_true", help="print the tables of RESULTS.md")
     options.add_argument("--pictures", type=Path, metavar="DIR", help="write the report here")
     arguments = options.parse_args()
 

@@ -1,0 +1,134 @@
+"""Configuration of the documentation: ``python -m sphinx -W -b html docs build/docs``."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import warnings
+from pathlib import Path
+
+from docutils.utils.math import latex2mathml
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+sys.path.insert(0, str(ROOT))
+# The gallery runs in the folder of each example; a first build of kernels prints nothing there.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import matplotlib  # noqa: E402
+
+import clvoro  # noqa: E402
+
+matplotlib.use("Agg")
+warnings.filterwarnings("ignore", message=".*non-interactive.*")
+
+project = "clvoro"
+author = "the clvoro authors"
+project_copyright = author
+release = version = clvoro.__version__
+
+extensions = [
+    "myst_parser",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["examples", "_build"]
+nitpicky = False
+default_role = "code"
+
+myst_enable_extensions = ["colon_fence", "dollarmath", "amsmath", "deflist", "smartquotes"]
+myst_heading_anchors = 3
+
+autosummary_generate = True
+templates_path = ["_templates"]
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+numpydoc_show_class_members = False
+numpydoc_xref_param_type = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": str(DOCS / "examples"),
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"\.py$",
+    "ignore_pattern": r"__init__",
+    "subsection_order": [
+        str(Path("examples") / name) for name in ("flow", "water", "moving", "space", "method")
+    ],
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "download_all_examples": False,
+    "min_reported_time": 10_000,
+    "plot_gallery": True,
+    "image_srcset": ["2x"],
+    "thumbnail_size": (480, 320),
+    "nested_sections": True,
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "clvoro"
+html_static_path = ["_static"]
+html_css_files = ["clvoro.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "logo": {"text": "clvoro"},
+    "navbar_align": "left",
+    "navbar_end": ["theme-switcher"],
+    "header_links_before_dropdown": 7,
+    "show_toc_level": 2,
+    "show_prev_next": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "pygments_light_style": "a11y-high-contrast-light",
+    "pygments_dark_style": "a11y-high-contrast-dark",
+}
+html_sidebars = {"index": []}
+
+
+def _mathml(tex: str, *, block: bool) -> str:
+    """Return a formula as MathML, which browsers show without a script or a font from elsewhere."""
+    return latex2mathml.tex2mathml(tex, as_block=block)
+
+
+def _inline_math(translator, node):
+    from docutils import nodes
+
+    translator.body.append(_mathml(node.astext(), block=False))
+    raise nodes.SkipNode
+
+
+def _block_math(translator, node):
+    from docutils import nodes
+
+    number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+    translator.body.append(f'<div class="math">{number}{_mathml(node.astext(), block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def _escape_bars(app, what, name, obj, options, lines):
+    """Let ``|e|`` in a docstring stand for itself: reStructuredText would look for a substitution."""
+    literal = None  # indentation of the line that opens a literal block
+    for k, line in enumerate(lines):
+        indent = len(line) - len(line.lstrip())
+        if literal is not None and line.strip() and indent <= literal:
+            literal = None
+        if literal is None:
+            lines[k] = re.sub(r"(?<![`\w])\|([^|\s`][^|`]*)\|", r"\|\1\|", line)
+            if line.rstrip().endswith("::"):
+                literal = indent
+
+
+def setup(app):
+    """Register the renderer of formulas, and what is done to docstrings."""
+    app.connect("autodoc-process-docstring", _escape_bars, priority=100)
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
+
+
+html_math_renderer = "mathml"
