@@ -682,7 +682,7 @@ def test_bad_context(given):
 
 
 def test_sizes_in_another_unit(adapter):
-    """Metres for kilometers make one cell, with a warning at the caller's line; what fits has none."""
+    """Meters for kilometers make one cell, with a warning at the caller's line; what fits has none."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", CoarseSizeWarning)
         adapter.run(BOX, 2.7, effort="fast")  # 0.51 cells
