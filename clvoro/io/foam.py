@@ -14,7 +14,7 @@ from .polymesh import PolyMesh, poly_mesh
 _FILES = {
     "points": "vectorField",
     "owner": "labelList",
-    "neighbor": "labelList",
+    "neighbour": "labelList",
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
@@ -53,14 +53,14 @@ def write_foam(
         "points": (len(mesh.points), _vectors(mesh.points)),
         "faces": (len(mesh.owner), _faces(mesh.starts, mesh.corners)),
         "owner": (len(mesh.owner), _labels(mesh.owner)),
-        "neighbor": (len(mesh.neighbor), _labels(mesh.neighbor)),
+        "neighbour": (len(mesh.neighbor), _labels(mesh.neighbor)),
         "boundary": (len(mesh.patches), [_boundary(mesh)]),
     }
     # `faces` is put in place last: a case without it is plainly incomplete.
     with atomic_folder(folder / "faces") as target:
         for name, kind in _FILES.items():
             count, body = bodies[name]
-            head = _header(name, kind, note if name in ("owner", "neighbor") else "")
+            head = _header(name, kind, note if name in ("owner", "neighbour") else "")
             with open(target.with_name(name), "w", encoding="ascii", newline="\n") as file:
                 file.write(f"{head}{count}\n(\n")
                 file.writelines(body)
@@ -109,7 +109,7 @@ def _boundary(mesh: PolyMesh) -> str:
         if patch.across:
             vector = " ".join(repr(x) for x in patch.separation)
             body += (
-                f"        neighborPatch  {patch.across};\n        transform       translational;\n"
+                f"        neighbourPatch  {patch.across};\n        transform       translational;\n"
                 f"        separationVector ({vector});\n        matchTolerance  0.0001;\n"
             )
         body += f"        nFaces          {patch.size};\n        startFace       {start};\n    }}\n"

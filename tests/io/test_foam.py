@@ -55,7 +55,7 @@ def read(folder):
         assert len(faces[-1]) == int(number)
     assert len(faces) == count
     lists = []
-    for name in ("owner", "neighbor"):
+    for name in ("owner", "neighbour"):
         count, text = entries(folder / name)
         lists.append(np.array(text.split(), int))
         assert len(lists[-1]) == count
@@ -75,7 +75,7 @@ def mesh(result, tmp_path):
     folder = tmp_path / "constant" / "polyMesh"
     io.save(result, folder)
     assert {p.name for p in folder.iterdir()} == {
-        "points", "faces", "owner", "neighbor", "boundary",
+        "points", "faces", "owner", "neighbour", "boundary",
     }  # fmt: skip
     return read(folder)
 

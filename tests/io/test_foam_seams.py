@@ -59,9 +59,9 @@ def test_both_sides_of_a_seam_are_images_in_the_same_order(result, mesh):
     joined = 0
     for name, (_, size, start, about) in cyclic(patches).items():
         assert about["transform"] == "translational"
-        _, twins, there, back = cyclic(patches)[about["neighborPatch"]]
+        _, twins, there, back = cyclic(patches)[about["neighbourPatch"]]
         assert twins == size
-        assert back["neighborPatch"] == name
+        assert back["neighbourPatch"] == name
         away = np.array(about["separationVector"].strip("()").split(), float)
         assert (away == -np.array(back["separationVector"].strip("()").split(), float)).all()
         periods = away[: box.dim] / box.extent
