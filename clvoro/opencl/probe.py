@@ -114,7 +114,7 @@ def crashing_platforms(timeout: float = 300.0) -> dict[int, str]:
         skip = [str(p) for p in crashed]
         try:
             child = subprocess.run(
-                [sys.executable, "-c", "from clvoro import _probe; _probe.survey()", *skip],
+                [sys.executable, "-c", "from clvoro.opencl import probe; probe.survey()", *skip],
                 env={**os.environ, "PYTHONPATH": search.rstrip(os.pathsep)},
                 stdin=subprocess.DEVNULL,
                 capture_output=True,

@@ -235,8 +235,8 @@ def test_sizes_from_a_solution(tmp_path):
             ["growth, slope", "exactly one"],
         ),
         (
-            "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='circle',center=[0,0],radius=1}]",
-            ["size.shapes[0]", "'center'", "did you mean 'center'"],
+            "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='circle',centre=[0,0],radius=1}]",
+            ["size.shapes[0]", "'centre'", "did you mean 'center'"],
         ),
         (
             "[size]\nkind='distance'\nh_min=1\nslope=1\nshapes=[{kind='segment',a=[0],b=[1,1]}]",

@@ -308,7 +308,7 @@ def test_unwritable_cache_is_replaced_for_the_process(tmp_path):
     # A file where the folder should be stops root, too.
     (tmp_path / "file").write_text("")
     code = (
-        "import os; from clvoro import device; "
+        "import os; from clvoro.opencl import devices as device; "
         "device.create_context(); print(os.environ['XDG_CACHE_HOME'])"
     )
     blocked = {"XDG_CACHE_HOME": str(tmp_path / "file" / "cache"), "TMPDIR": str(tmp_path)}
@@ -330,9 +330,7 @@ def test_pip_runtime_works_on_its_own(tmp_path):
         metadata.distribution("intel-opencl-rt")
     except metadata.PackageNotFoundError:
         pytest.skip('needs `pip install "clvoro[cpu]"`')
-    code = (
-        "from clvoro import device; print(device.create_context('intel').devices[0].platform.name)"
-    )
+    code = "from clvoro.opencl import devices as device; print(device.create_context('intel').devices[0].platform.name)"
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OCL_", "OPENCL_"))}
     environment["OCL_ICD_VENDORS"] = str(tmp_path)  # no system-wide runtime
     done = subprocess.run(

@@ -68,7 +68,13 @@ def test_steps_are_those_of_the_history(run):
     assert taken.spans[-1].step is None
     assert [s.step for s in taken.steps] == [1, 2, 3, 4, 5]
     for span in taken.steps:  # each step solves, moves, and tessellates
-        assert min(span.stages[name] for name in ("repair", "cells", "krylov", "motion")) > 0
+        assert (
+            min(
+                span.stages[name]
+                for name in ("incremental", "cells", "conjugate_gradient", "motion")
+            )
+            > 0
+        )
 
 
 def test_launches_of_every_kind_are_seen(run):
@@ -78,7 +84,7 @@ def test_launches_of_every_kind_are_seen(run):
     assert calls["cells", "measure_cells"] >= tessellations
     assert calls["motion", "move_generators"] == 5
     # The solver enqueues its kernels itself: one a solve, or two, where cells are so few.
-    assert tessellations <= calls["krylov", "solve_alone"] <= 2 * tessellations
+    assert tessellations <= calls["conjugate_gradient", "solve_alone"] <= 2 * tessellations
     assert ("poisson", "apply") not in calls
     assert calls[_hooks.MEMORY, "read"] > 0
     assert calls[_hooks.MEMORY, "write"] > 0
@@ -105,7 +111,7 @@ def test_launches_bound_once_are_seen(engine):
     cost = taken.stages()["multigrid"]
     assert cost.calls >= 2 * second > 0
     assert cost.seconds_known == cost.seconds
-    assert taken.stages()["coarsening"].calls > 0
+    assert taken.stages()["aggregation"].calls > 0
 
 
 def test_calls_and_bytes_of_known_launches(engine):

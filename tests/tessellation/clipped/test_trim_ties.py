@@ -130,7 +130,7 @@ def test_crowds_around_a_corner(adapters, real, n):
 
 def test_edges_may_find_no_way(adapters, monkeypatch):
     """The boundary is put aside where it must be, and an error says so where that does not help."""
-    monkeypatch.setattr(polygonal, "SHIFTS", ())
+    monkeypatch.setattr(polygonal, "BOUNDARY_SHIFTS", ())
     with pytest.raises(BoundaryError, match="cannot be followed"):
         adapters[0].diagram(PAIR, crowd(0, 200))
     # Nothing of it is left.
@@ -165,5 +165,5 @@ def test_a_boundary_that_is_put_aside(adapters, monkeypatch, real):
     assert report, report
     # Measures are those of the boundary where it was, which is off by some roundings.
     off = domain.boundary_distance(diagram.vertices[~domain.contains(diagram.vertices)])
-    assert 0 < off.max() <= (polygonal.SHIFTS[0] + 4) * eps * domain.frame[1]
+    assert 0 < off.max() <= (polygonal.BOUNDARY_SHIFTS[0] + 4) * eps * domain.frame[1]
     assert shifts == [False, True]
