@@ -9,10 +9,10 @@ Every buffer that is made meanwhile is counted until it is freed, by the module 
 asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in turn; `fetch` and
 `loops`: the finished diagram). Each field is scaled to the count. The figures are bytes per cell of
 the finished mesh; "output" is the peak while all arrays of the diagram are fetched, which comes
-after the run's own; "told" is what `Adapter.memory_needed` says before, and "held" the larger of the
-two over that. In the fields of the second line sizes change several-fold from one cell to the next.
+after the run's own; "estimate" is that of `Adapter.memory_needed`, and "held" the larger of the
+two over it. In the fields of the second line sizes change several-fold from one cell to the next.
 The third line has all kinds of runs (`_kinds.py`, or some of them by their first word), one that is
-resumed and a transfer: shares of what is told that are held while the run is prepared, by the run,
+resumed and a transfer: shares of the estimate that are in use while the run is prepared, in the run,
 and while its diagram is read.
 `clvoro.adaptation.estimates.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
 """
@@ -151,7 +151,7 @@ def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[s
     told = make_adapter(options).memory_needed(domain, field, method=method)
     return {
         "field": name, "dim": domain.dim, "cells": cells, "method": method, "effort": effort,
-        "run": run_peak / cells, "output": output / cells, "told": told / cells,
+        "run": run_peak / cells, "output": output / cells, "estimate": told / cells,
         "held": max(run_peak, output) / told,
         "stages": {stage: size / cells for stage, size in Counter(run).most_common()},
     }  # fmt: skip
@@ -178,7 +178,7 @@ def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
     parts = {"preparation": before[0], "run": run, "output": ledger.peak}
     shares = {name: part / told[0] for name, part in parts.items()}
     cells = len(diagram)
-    return {"cells": cells, "told": told[0] / cells, **shares, "held": max(shares.values())}
+    return {"cells": cells, "estimate": told[0] / cells, **shares, "held": max(shares.values())}
 
 
 def resumed(options: Any, n: int) -> dict[str, Any]:
@@ -206,7 +206,7 @@ def transferred(options: Any, n: int) -> dict[str, Any]:
     held = ledger.peak / told
     return {
         "cells": n,
-        "told": told / n,
+        "estimate": told / n,
         "preparation": 0.0,
         "run": held,
         "output": 0.0,
@@ -223,7 +223,7 @@ def show_kinds(options: Any) -> None:
     columns = {
         "kind": lambda r: r["kind"],
         "cells": lambda r: r["cells"],
-        "told": lambda r: f"{r['told']:.0f}",
+        "estimate": lambda r: f"{r['estimate']:.0f}",
         **{
             name: lambda r, name=name: f"{r[name]:.2f}"
             for name in ("preparation", "run", "output", "held")
@@ -242,7 +242,10 @@ def show_kinds(options: Any) -> None:
                 continue
             report.add({"kind": name, **found}, name)
     report.finish(
-        heading(make_adapter(options), "Device memory told, bytes per cell, and held over told")
+        heading(
+            make_adapter(options),
+            "Estimate of the device memory, bytes per cell, and its share in use",
+        )
     )
 
 
@@ -271,7 +274,7 @@ def main() -> int:
         "method": lambda r: f"{r['method']}, {r['effort']}",
         "run": lambda r: f"{r['run']:.0f}",
         "output": lambda r: f"{r['output']:.0f}",
-        "told": lambda r: f"{r['told']:.0f}",
+        "estimate": lambda r: f"{r['estimate']:.0f}",
         "held": lambda r: f"{r['held']:.2f}",
         **{f"`{s}`": lambda r, s=s: f"{r['stages'].get(s, 0):.0f}" for s in stages},
     }

@@ -94,7 +94,8 @@ html_sidebars = {"index": []}
 
 def _mathml(tex: str, *, block: bool) -> str:
     """Return a formula as MathML, which browsers show without a script or a font from elsewhere."""
-    return latex2mathml.tex2mathml(tex, as_block=block)
+    text = latex2mathml.tex2mathml(tex, as_block=block)
+    return re.sub(r"<mo[^>]*>([‖∥|])</mo>", r'<mo stretchy="false">\1</mo>', text)
 
 
 def _inline_math(translator, node):
@@ -108,7 +109,9 @@ def _block_math(translator, node):
     from docutils import nodes
 
     number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    translator.body.append(f'<div class="math">{number}{_mathml(node.astext(), block=True)}</div>')
+    translator.body.append(
+        f'<div class="formula">{number}{_mathml(node.astext(), block=True)}</div>'
+    )
     raise nodes.SkipNode
 
 

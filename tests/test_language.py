@@ -33,6 +33,7 @@ WORDS_OF_OTHERS = {
 }
 """British words, and parts of paths where others have chosen them."""
 PLAIN = (
+    "bench/RESULTS.md",
     "docs/",
     "README.md",
     "CONTRIBUTING.md",
