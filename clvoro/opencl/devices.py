@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pyopencl as cl
@@ -110,7 +111,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     Returns
     -------
     pyopencl.Context
-        Of one device.
+        Of one device. The same object in every call that chooses this device, so that kernels are built once.
 
     Raises
     ------
@@ -143,7 +144,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     for candidate in sorted(wanted, key=lambda c: c.rank):
         reason = _reason_against(candidate.device, fp64)
         if not reason:
-            return cl.Context([candidate.device])
+            return _context_on(candidate.device)
         failures.append(f"{candidate.index} {candidate.title}: {reason}")
     chosen = index is not None or "PYOPENCL_CTX" in os.environ
     raise DeviceError(_complaint(subject, found, failures, broken, chosen, fp64))
@@ -322,6 +323,12 @@ def _from_environment() -> _Candidate:
     return _describe(device, f"PYOPENCL_CTX={value!r}")
 
 
+@cache
+def _context_on(device: cl.Device) -> cl.Context:
+    """Return the context on `device` that all of this process shares: kernels are built once per context."""
+    return cl.Context([device])
+
+
 def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
     """Return a context on exactly this device, or say why it is of no use."""
     reason = _reason_against(candidate.device, fp64)
@@ -330,7 +337,7 @@ def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
             f"the device {candidate.title} ({candidate.index}) cannot be used: {reason}; "
             "choose another (`clvoro devices` lists them)"
         )
-    return cl.Context([candidate.device])
+    return _context_on(candidate.device)
 
 
 def _reason_against(device: cl.Device, fp64: bool) -> str:

@@ -14,7 +14,6 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.opencl.devices import create_context
 from clvoro.opencl.program import Engine
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
@@ -67,7 +66,7 @@ def test_threads_do_not_disturb_each_other(ctx, alone, shared):
         if shared == "adapter":  # one call waits for the other
             mine = adapter
         else:
-            mine = clvoro.Adapter(ctx if shared == "context" else create_context())
+            mine = clvoro.Adapter(ctx if shared == "context" else cl.Context(ctx.devices))
         return run(mine, WORK[k % len(WORK)])
 
     with ThreadPoolExecutor(4) as pool:
