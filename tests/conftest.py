@@ -8,6 +8,8 @@ import signal
 import pytest
 from hypothesis import settings
 
+from tests.grids import points_to_leave
+
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 # Examples are the same in every run, and the first build of a kernel may take its time.
@@ -42,3 +44,10 @@ if "CLVORO_TEST_GROUPS" in os.environ:
     from tests.robustness.gpu_like import use_groups
 
     use_groups(int(os.environ["CLVORO_TEST_GROUPS"]))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark before pytest selects by marks."""
+    for item in points_to_leave(items):
+        item.add_marker(pytest.mark.slow)

@@ -63,6 +63,7 @@ def assert_same(a, b):
     assert a.settings == b.settings
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("kind", list(RUNS))
 def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):

@@ -263,6 +263,7 @@ def held_and_told(bench, domain, size, real="float64", **given):
     return ledger.peak, told[0]
 
 
+@pytest.mark.sparse
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("n", [1, 30, 1000])

@@ -369,6 +369,7 @@ def test_max_steps_of_adaptive_runs(adapter):
 # Counts and levels.
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 250])
 def test_n_cells_is_held(adapter, method, n):
@@ -491,6 +492,7 @@ def test_published_ordering(adapter):
     assert coupled[2] < lloyd[2] + 0.005
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize(
     ("options", "mean", "largest", "quality", "least"),
     [
@@ -574,6 +576,7 @@ def test_nasty_fields(adapter, name):
         assert np.abs(result.error).mean() < 0.05
 
 
+@pytest.mark.sparse
 @pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize(
     "name", ["ratio 100 across a line", "spike narrower than its own h", "larger than the domain"]

@@ -81,6 +81,7 @@ def second_moment(cell, x):
 # Every method.
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_every_method(adapter, adapter32, dtype, method):
@@ -118,6 +119,7 @@ def test_figures_of_repeated_steps(adapter):
     assert weighted[0] < coupled[0]
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize(
     ("options", "mean", "largest", "quality"),
@@ -229,6 +231,7 @@ def test_units_do_not_matter(adapter):
 # How a run ends; counts and levels.
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize(("options", "rows"), [({"method": "coupled"}, 4), ({"levels": 1}, 6)])
 @pytest.mark.parametrize("how", ["returns True", "is interrupted", "max_steps"])
 def test_stopped(adapter, options, rows, how):
@@ -254,6 +257,7 @@ def test_stopped(adapter, options, rows, how):
     check(result, S1)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_n_cells_is_held(adapter, method, n):

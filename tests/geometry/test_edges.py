@@ -156,6 +156,7 @@ def test_bins_hold_their_edges(name):
             assert e in held[row * shape[0] + column]
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("method", ["lloyd", "poisson", "coupled", "weighted", "exact", "adaptive"])
 def test_runs_stay_inside(ctx, method, real):

@@ -99,6 +99,7 @@ def near_and_far(vertices, triangles, n, seed):
     return np.clip(points, DOMAIN.lower, DOMAIN.upper)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("name", MESHES)
 def test_distance_on_the_device_is_that_of_brute_force(engine, name):
     vertices, triangles = MESHES[name]

@@ -83,6 +83,7 @@ def result(ctx) -> clvoro.Result:
 # Checks.
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("n", [3, 60, 900])
 @pytest.mark.parametrize("name", list(DOMAINS))

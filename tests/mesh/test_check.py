@@ -245,6 +245,7 @@ COMMON = {
 }  # fmt: skip
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True])
 def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):

@@ -153,6 +153,7 @@ def corners(diagram, i):
     return diagram.vertices[np.unique(rows)]
 
 
+@pytest.mark.sparse
 @DIMS
 @pytest.mark.parametrize("way", ["first", "second", "limited"])
 def test_matches_plain_clipping(mesh, adapter, dim, way):

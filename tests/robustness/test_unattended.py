@@ -87,6 +87,7 @@ class Breaking(io.StringIO):
             raise OSError(self.number, os.strerror(self.number))
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize(
     ("number", "code"), [(errno.EPIPE, cli.OK), (errno.ENOSPC, cli.FAILED), (errno.EIO, cli.FAILED)]

@@ -75,6 +75,7 @@ def limit(engine, values, spacing, slope):
 SHAPES = [(45, 37), (16, 16), (3, 70), (1, 40), (1, 1), (11, 9, 18), (8, 8, 8), (2, 1, 30)]
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("shape", SHAPES)
 def test_scheme_is_solved(make_engine, shape):
     engine = make_engine(len(shape))
@@ -107,6 +108,7 @@ def test_least_of_each_tile(make_engine, shape):
     assert np.array_equal(lowest.get(), expected.ravel())
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("shape", [(61, 41), (17, 13, 15)])
 @pytest.mark.parametrize("seeds", [1, 5, 400])
 def test_first_order_close_to_the_least_cone(make_engine, shape, seeds):

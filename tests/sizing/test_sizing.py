@@ -128,6 +128,7 @@ def _device_points(engine, domain, points):
     return engine.upload((points - origin) / scale)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize(("domain", "field"), CASES)
 def test_device_agrees_with_numpy(make_engine, domain, field):
     engine = make_engine(domain.dim)
@@ -149,6 +150,7 @@ def test_device_agrees_with_numpy(make_engine, domain, field):
     assert not h.get()[N:].any()
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize(("domain", "field"), CASES)
 def test_gradient(make_engine, domain, field):
     """Against the host's own central differences over the same stretch."""
@@ -512,6 +514,7 @@ def test_sizes_times_a_factor(make_engine, field):
     assert np.array_equal(scaled.get(), engine.real.type(1.7) * h.get())
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("case", BAD_VALUES)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_bad_values_are_named(make_engine, case, gradient):

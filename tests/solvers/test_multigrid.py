@@ -182,6 +182,7 @@ def test_cycle_in_place(make, n):
     assert np.array_equal(r.get(), right)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("group_size", [None, 16], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("name", ["random", "random 3D", "star"])
 def test_few_cells_are_gone_through_by_one_group_to_the_same_bits(
@@ -303,6 +304,7 @@ def refine(points, n, rng):
 WEIGHTS = ["even", "decades", "jump", "random", "islands"]
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("mesh", ["random", "refined"])
 @pytest.mark.parametrize("name", WEIGHTS)
 def test_preconditioner_is_symmetric_positive_definite(make, name, mesh):
@@ -404,6 +406,7 @@ def test_iterations_graded_and_weighted(make):
     assert solve(make(), weights_of(graph, density))[0].iterations <= 25
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 @pytest.mark.parametrize("mesh", ["random", "refined"])
 @pytest.mark.parametrize(

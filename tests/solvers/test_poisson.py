@@ -83,6 +83,7 @@ def density_of(points):
     return (0.1 + 0.9 * points[:, 0]) ** -2.0
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("weighted", [False, True])
@@ -100,6 +101,7 @@ def test_matrix(make, dim, real, weighted):
     assert np.allclose(inverse * A.diagonal(), 1, rtol=0, atol=16 * np.finfo(real).eps)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("start", ["zero", "near"])
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 def test_rough_solves_are_in_single_precision(make, preconditioner, start):
@@ -171,6 +173,7 @@ def test_faces_measured_differently_are_averaged(make):
     assert np.array_equal(A, [[2.5, -2.5], [-2.5, 2.5]])
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_solution(make, dim, weighted):
@@ -325,6 +328,7 @@ def test_from_far_away(make):
     assert np.abs(x.get() - expected).max() <= 1e-4 * np.abs(expected).max()
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("real", REALS)
 def test_repeats_bit_by_bit(make, real, preconditioner):
@@ -339,6 +343,7 @@ def test_repeats_bit_by_bit(make, real, preconditioner):
     assert np.array_equal(first.get(), second.get())
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("left", [np.nan, 1e3])
 def test_what_earlier_solves_have_left_counts_for_nothing(make, preconditioner, left):

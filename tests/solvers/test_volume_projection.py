@@ -165,6 +165,7 @@ def test_projection(engine, points, bound):
     assert correction == pytest.approx(expected, abs=3e-5 * np.abs(expected).max())
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_tolerance(engine, points, tolerance):
     """The residual, by dense algebra, is what the recurrence says; vectors in single precision down to 1e-4."""

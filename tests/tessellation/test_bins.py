@@ -136,6 +136,7 @@ def real(request):
     return request.param
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("box", BOXES)
 def test_every_generator_in_one_leaf(ctx, real, box):
     box = BOXES[box]

@@ -104,6 +104,7 @@ def check(t, eps):
     assert np.allclose(near, np.linalg.norm(across, axis=1), rtol=1e-6, atol=32 * eps)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
 def test_is_the_diagram_itself(engine, name, share, monkeypatch):
@@ -154,6 +155,7 @@ def fitting(t):
     ])  # fmt: skip
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.2])
 def test_rows_that_are_known_to_fit_do(engine, name, share):

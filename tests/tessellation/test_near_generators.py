@@ -83,6 +83,7 @@ def test_one_rounding_apart(ctx, periodic, real):
         assert report, report
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("seed", [20, 39, 55, 135])
 def test_a_cluster_alone_in_a_periodic_box(ctx, seed, real):
@@ -120,6 +121,7 @@ def arc(seed, n, real):
     return np.unique(x.astype(real), axis=0).astype(float)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("n", [100, 400])
 def test_arcs(ctx, n, real, monkeypatch):

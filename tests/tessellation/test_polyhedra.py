@@ -184,6 +184,7 @@ def check_loops(diagram, eps, crowding=1.0):
 CROWDING = {"circle": 4, "prism": 4, "sphere": 4, "sphere with center": 4, "clusters": 1e4}
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("name", list(POINTS))
 def test_invariants(adapter, name):
     diagram = adapter.diagram(BOX, POINTS[name])
@@ -192,6 +193,7 @@ def test_invariants(adapter, name):
     check_loops(diagram, eps, CROWDING.get(name, 1))
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("kind", list(LATTICES))
 @pytest.mark.parametrize("roundings", [1, 50, 500, 5000])
 def test_lattices_off_by_roundings(adapter, kind, roundings):
@@ -233,6 +235,7 @@ def test_cells_of_points_around_an_axis(adapter, n, layers):
     assert diagram.volumes.sum() == pytest.approx(1, rel=1e-6)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("n", [300, 1000, 2000])
 def test_very_many_points_on_a_sphere(adapter, n):
     """In single precision a mesh or an error: vertices are not brought together over a share of the cells."""
@@ -250,6 +253,7 @@ def test_very_many_points_on_a_sphere(adapter, n):
         assert "float64" in said
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("n", [60, 300])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_cells_of_points_anywhere_on_a_ring(adapter, n, seed):

@@ -58,6 +58,7 @@ def wound_twice(of_three, spacing=0.06):
     return middle + 0.36 * at / abs(z[inside]).max(), middle + to
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("of_three", [False, True], ids=["generator", "three"])
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_cells_that_cover_the_box_twice(ctx, real, group_size, generous, of_three):

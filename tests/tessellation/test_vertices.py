@@ -22,6 +22,7 @@ def test_many_cells_at_a_point_of_a_wall(ctx, dtype):
         check_invariants(adapter.diagram(BOX, points), float(np.finfo(dtype).eps))
 
 
+@pytest.mark.sparse
 # At 900 and 1030 rounding makes faces that cross, at one turn or another.
 @pytest.mark.parametrize("n", [300, 900, 1030, 2000])
 @pytest.mark.parametrize("turn", [0.0, 0.1, 0.3])

@@ -83,6 +83,7 @@ def test_shares_are_those_of_area(name: str) -> None:
     assert np.abs(inside.mean(axis=1) - cover.share).max() < spread
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("start", ["density", "uniform"])
 @pytest.mark.parametrize("name", DOMAINS)

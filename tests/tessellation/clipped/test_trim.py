@@ -102,6 +102,7 @@ def test_pieces_change_cells(adapters):
     assert roots <= set(range(150))
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("kind", ["centers", "corners", "hexagons"])
 @pytest.mark.parametrize(
     "name",
@@ -312,6 +313,7 @@ def test_sentinels_change_nothing(stages, name):
     assert np.array_equal(found[0][3], found[1][3])
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "koch", "comb"])
 def test_repaired_diagrams_are_those_made_anew(stages, name):
     domain = POLYGONS[name]()

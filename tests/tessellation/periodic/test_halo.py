@@ -117,6 +117,7 @@ def blocks_of(array, dim, counts):
     return found
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("walks", [True, False])
 @pytest.mark.parametrize(("dim", "count"), [(2, 7), (3, 4)])
 @pytest.mark.parametrize("walled", [False, True], ids=["", "walls"])

@@ -84,6 +84,7 @@ def faces_of(diagram):
     return dict(zip(keys, diagram.face_measures.tolist(), strict=True))
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 60, 500])
 @pytest.mark.parametrize(
     "box", [UNIT, CHANNEL, CUBE, SLAB], ids=["unit", "channel", "cube", "slab"]
@@ -204,6 +205,7 @@ def test_clusters_need_wide_margins(adapter):
         assert d.check()
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("box", [CHANNEL, SLAB], ids=["channel", "slab"])
 def test_images_are_all_that_cells_need(adapter, box):
     """All that lie on the balls around the corners of cells, in which none lies; few where cells are small."""
@@ -307,6 +309,7 @@ SPOT = sizing.Expression(
 """A refined spot around (0.05, 0.9), beyond two seams."""
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize(
     "options",
     [
@@ -396,6 +399,7 @@ def test_faces_that_one_side_does_not_see_are_dropped(adapter):
     drop_faces(adapter)
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
 def test_face_that_one_side_does_not_see_ends_in_one_vertex(adapter, box, monkeypatch):
     """Four cells meet in each corner but for rounding, and those beyond a seam are cut in another order."""
@@ -582,6 +586,7 @@ def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
         Case.from_toml(text.replace("[true, true]", "1"), "wave")
 
 
+@pytest.mark.sparse
 @pytest.mark.parametrize("periodic", [(True, True), (True, False)])
 @pytest.mark.parametrize("order", [1, 2])
 def test_values_are_carried_over_the_seams(adapter, periodic, order):

@@ -1,0 +1,44 @@
+"""Split grids of parameters: the fast set of tests runs some of their points, the slow set the others."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+
+import pytest
+
+Point = list[tuple[object, ...]]
+
+
+def points_to_leave(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield the tests that are marked `sparse` and left to the slow set.
+
+    The fast set keeps every value of every axis at least once, in combinations that differ as much as possible.
+    """
+    grids: dict[str, list[tuple[pytest.Item, Point]]] = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("sparse") and not item.get_closest_marker("slow"):
+            grids[item.nodeid.partition("[")[0]].append((item, _point_of(item)))
+    for left in grids.values():
+        used: Counter[tuple[object, ...]] = Counter()
+        while left:
+            # The point with most new values; among equals, the one whose values are rarest so far.
+            item, point = min(
+                left, key=lambda p: (sum(v in used for v in p[1]), sum(used[v] for v in p[1]))
+            )
+            if all(v in used for v in point):
+                yield from (item for item, _ in left)
+                break
+            used.update(point)
+            left.remove((item, point))
+
+
+def _point_of(item: pytest.Item) -> Point:
+    """Return one value per axis: of each `parametrize`, and of each fixture with parameters."""
+    params = dict(item.callspec.params) if hasattr(item, "callspec") else {}
+    point: Point = []
+    for mark in item.iter_markers("parametrize"):
+        names = mark.args[0] if mark.args else mark.kwargs["argnames"]
+        names = [n.strip() for n in names.split(",")] if isinstance(names, str) else list(names)
+        point.append((*names, *(id(params.pop(name)) for name in names)))
+    return point + [(name, id(value)) for name, value in params.items()]
