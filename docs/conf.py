@@ -61,6 +61,7 @@ sphinx_gallery_conf = {
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "remove_config_comments": True,
+    "capture_repr": (),
     "show_memory": False,
     "download_all_examples": False,
     "min_reported_time": 10_000,

@@ -72,23 +72,26 @@ def hessian_size(
     -------
     Raster
 
-    Second derivatives are central differences over neighboring values (at the sides those one row
-    further in). They magnify noise by 1 / spacing^2: smooth noisy data first.
-
-    Measured on a layer (bench/interpolation.py): the default p within `Graded`, growth 1.2 to 1.4, and an `h_max` of a
-    tenth of the box or more interpolate best; p = 1 is as good in L^1, a larger p buys the largest error with the mean.
-
     Raises
     ------
     InputError, InputTypeError
         If the array has fewer than 3 values along an axis or an argument is out of range; if no
         common factor meets `n_cells` within the bounds.
 
+    Notes
+    -----
+    Second derivatives are central differences of neighboring values; on the sides, those of the next row inside. They
+    magnify noise by 1 / spacing^2: smooth noisy data first.
+
+    On a layer (bench/interpolation.py) the default p within `Graded`, with growth 1.2 to 1.4 and an `h_max` of a tenth
+    of the box or more, interpolates best. p = 1 is as good in L^1. A larger p decreases the largest error and increases
+    the mean.
+
     Examples
     --------
     About 5000 cells, small where a tanh bends and large elsewhere. Between its two bends, and
-    wherever else a second derivative passes through 0, the formula asks for large cells; `Graded`
-    fills such gaps, and `n_cells` of the run brings the count back::
+    wherever else a second derivative is zero, the formula gives large cells. `Graded`
+    fills such gaps, and `n_cells` of the run restores the count::
 
         x, y = np.meshgrid(np.linspace(0, 1, 401), np.linspace(0, 1, 401))
         u = np.tanh(50 * (x + y - 1))

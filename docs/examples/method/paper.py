@@ -15,11 +15,14 @@ domain = clvoro.Box((0, 0), (2.5, 1.5))
 size = sizing.Distance(sizing.Circle((0.9, 0.75), radius=0.3), h_min=0.02, slope=0.3)
 
 # %%
-# The methods that repeat one kind of step start from the same random points. `tol=0` takes all 100 steps.
+# These methods repeat one kind of step. They start from the same random points. `tol=0` takes all 100 steps.
 
 adapter = clvoro.Adapter()
-options = dict(start="uniform", max_steps=100, tol=0, k=1, seed=20251)
-runs = {m: adapter.run(domain, size, method=m, **options) for m in ("lloyd", "poisson", "coupled")}
+options = clvoro.PaperOptions(tol=0, k=1)
+runs = {
+    method: adapter.run(domain, size, "uniform", method, seed=20251, max_steps=100, options=options)
+    for method in ("lloyd", "poisson", "coupled")
+}
 
 # %%
 figure, axes = plt.subplots(3, 1, figsize=(6.4, 11), layout="constrained")
