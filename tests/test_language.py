@@ -26,10 +26,8 @@ DIALECT = re.compile(
     r"\bcomes of it\b|\bone's\b|\blets? go of\b|\bwhat could be meant\b"
 )
 WORDS_OF_OTHERS = {
-    # OpenFOAM's file, and words in names of other people's things.
-    "neighbour": ("io", "foam", "formats"),
-    "centre": ("io",),
-    "colour": (),
+    "neighbour": ("/io/", "foam"),  # OpenFOAM's file
+    "centre": ("/io/", "tests/cli/test_cases.py"),  # a file format's, and a mistake in a case
 }
 """British words, and parts of paths where others have chosen them."""
 PLAIN = (
