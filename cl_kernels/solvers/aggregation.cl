@@ -1,16 +1,17 @@
-/* Coarse graphs by matching, for multigrid: cells joined by a heavy weight become one. Rows of a graph are
-   columns[starts[i] .. starts[i + 1]) with weights > 0; an entry with weight 0 or naming its own row counts for
-   nothing, nor does a negative one (a wall).
+/* Coarse graphs for multigrid by pairwise aggregation: cells that a heavy weight connects form one coarse cell.
 
-   Everything is decided by each cell or group for itself from the last kernel's result, so there is one outcome. */
+   Row i of a graph is columns[starts[i] .. starts[i + 1]) with its weights. Entries of weight 0, entries with
+   columns[k] == i and negative columns (walls) are ignored.
+
+   One work-item per cell or aggregate, unless a kernel says otherwise. Each work-item reads only results of earlier
+   kernels, so the outcome does not depend on their order. */
 #include "opencl/real.h"
 #include "opencl/blocks.h"
 
 #define NONE (-1)
 
-/* The largest weight, one partial value per work-item. Arrays may have room behind the last row: what is there counts
-   for nothing. */
-kernel void largest(int n, global const int *starts, global const SOURCE *weights, global SOURCE *partial)
+/* partial[item] = largest weight of the entries of one work-item. Entries behind the last row are ignored. */
+kernel void find_largest_weight(int n, global const int *starts, global const SOURCE *weights, global SOURCE *partial)
 {
     const int m = starts[n];
     SOURCE most = 0;
@@ -19,17 +20,18 @@ kernel void largest(int n, global const int *starts, global const SOURCE *weight
     partial[get_global_id(0)] = most;
 }
 
-/* Weights times 2^exponent in the multigrid's precision, whose range may be less than the operator's. */
-kernel void convert(int m, int exponent, global const SOURCE *weights, global REAL *out)
+/* out[k] = 2^exponent weights[k], in the multigrid's precision, whose range may be smaller than the operator's. One
+   work-item per entry. */
+kernel void scale_weights(int m, int exponent, global const SOURCE *weights, global REAL *out)
 {
     const int k = get_global_id(0);
     if (k < m)
         out[k] = (REAL)ldexp(weights[k], exponent);
 }
 
-/* inverse[i] = 1 / (sum of i's weights), 0 without any. */
-kernel void inverse_sums(int n, global const int *starts, global const int *columns, global const REAL *weights,
-                         global REAL *inverse)
+/* inverse[i] = 1 / sum_j w_ij, or 0 if the sum is 0. */
+kernel void invert_row_sums(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                            global REAL *inverse)
 {
     const int i = get_global_id(0);
     if (i >= n)
@@ -41,9 +43,9 @@ kernel void inverse_sums(int n, global const int *starts, global const int *colu
     inverse[i] = sum > 0 ? 1 / sum : 0;
 }
 
-/* A weight times 1 + less than a thousandth, by chance but the same from both sides: it breaks the ties of regular
-   meshes, where else all cells would look the same way and few would find a partner. */
-inline REAL preference(REAL weight, int i, int j)
+/* weight (1 + r), 0 <= r < 0.001, r a hash of the pair (i, j). It breaks ties on regular meshes, where all cells would
+   otherwise choose in the same direction and few pairs would form. */
+inline REAL break_tie(REAL weight, int i, int j)
 {
     uint key = (uint)min(i, j) * 0x9E3779B1u ^ (uint)max(i, j) * 0x85EBCA77u;
     key ^= key >> 15;
@@ -52,12 +54,14 @@ inline REAL preference(REAL weight, int i, int j)
     return weight * (1 + (key & 0xFFFFu) * R(1.5e-8));
 }
 
-/* Cell i without a mate looks at the neighbor it is tied to most, among those without a mate (`mated` 0) or with one
-   (1). A tie's strength is w (1/d_i + 1/d_j), d the sums of the cells' weights: the same from both sides, and the same
-   everywhere on a mesh whose weights grow steadily. By weight alone all cells of such a mesh would look uphill, and few
-   find a mate. */
-kernel void propose(int n, int mated, global const int *starts, global const int *columns, global const REAL *weights,
-                    global const REAL *inverse_sums, global const int *mate, global int *choice)
+/* choice[i] = the neighbor j with the largest strength w_ij (1/d_i + 1/d_j), d_i = sum_j w_ij, or NONE.
+
+   Only cells without a mate choose. They choose among neighbors without a mate (`matched` 0) or with one (1). The
+   strength is symmetric, and independent of position on a mesh whose weights grow steadily. By weight alone all cells
+   of such a mesh would choose in the direction of growth, and few pairs would form. */
+kernel void choose_neighbor(int n, int matched, global const int *starts, global const int *columns,
+                            global const REAL *weights, global const REAL *inverse_sums, global const int *mate,
+                            global int *choice)
 {
     const int i = get_global_id(0);
     if (i >= n)
@@ -67,9 +71,9 @@ kernel void propose(int n, int mated, global const int *starts, global const int
         REAL most = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (j < 0 || j == i || (mate[j] != NONE) != mated)
+            if (j < 0 || j == i || (mate[j] != NONE) != matched)
                 continue;
-            const REAL p = preference(weights[k] * (inverse_sums[i] + inverse_sums[j]), i, j);
+            const REAL p = break_tie(weights[k] * (inverse_sums[i] + inverse_sums[j]), i, j);
             if (p > most) {
                 most = p;
                 best = j;
@@ -79,8 +83,8 @@ kernel void propose(int n, int mated, global const int *starts, global const int
     choice[i] = best;
 }
 
-/* Two cells that look at each other are mates. */
-kernel void marry(int n, global const int *choice, global int *mate)
+/* mate[i] = j and mate[j] = i where the two have chosen each other. */
+kernel void match_pairs(int n, global const int *choice, global int *mate)
 {
     const int i = get_global_id(0);
     if (i >= n)
@@ -90,37 +94,37 @@ kernel void marry(int n, global const int *choice, global int *mate)
         mate[i] = j;
 }
 
-/* The lower one of two mates stands for their group. Who has found no mate joins that of its heaviest neighbor with
-   one (its choice now), and stands alone if there is none. is_root[i] = whether i stands for its group. */
+/* Root of the aggregate of cell i: the lower one of two mates. A cell without a mate belongs to the aggregate of its
+   choice; without a choice it is its own root. */
 inline int root_of(int i, global const int *mate, global const int *choice)
 {
     const int to = mate[i] != NONE ? i : choice[i];
     return to == NONE ? i : min(to, mate[to]);
 }
 
-kernel void join(int n, global const int *mate, global const int *choice, global int *is_root)
+/* is_root[i] = 1 for roots, else 0. */
+kernel void mark_roots(int n, global const int *mate, global const int *choice, global int *is_root)
 {
     const int i = get_global_id(0);
     if (i < n)
         is_root[i] = root_of(i, mate, choice) == i;
 }
 
-/* group[i] = number of i's group, members counted in the order of who stands for them; standing[g] = who stands for
-   g. */
-kernel void number_groups(int n, global const int *mate, global const int *choice, global const int *numbers,
-                          global int *group, global int *standing)
+/* aggregate[i] = number of the aggregate of cell i, in the order of the roots; roots[g] = root of aggregate g. */
+kernel void number_aggregates(int n, global const int *mate, global const int *choice, global const int *numbers,
+                              global int *aggregate, global int *roots)
 {
     const int i = get_global_id(0);
     if (i >= n)
         return;
     const int r = root_of(i, mate, choice);
-    group[i] = numbers[r];
+    aggregate[i] = numbers[r];
     if (r == i)
-        standing[numbers[r]] = i;
+        roots[numbers[r]] = i;
 }
 
-/* Whether row entry k of i is the first to name its column: a cell may meet another twice around a periodic box. */
-inline int is_first(int i, int k, global const int *starts, global const int *columns)
+/* Whether entry k is the first of row i with its column. In a periodic box two cells may share several faces. */
+inline int is_first_entry(int i, int k, global const int *starts, global const int *columns)
 {
     int l = starts[i];
     while (columns[l] != columns[k])
@@ -128,16 +132,17 @@ inline int is_first(int i, int k, global const int *starts, global const int *co
     return l == k;
 }
 
-/* Members of a group: the two mates, then those who have joined the one, then the other. With `fill` they are listed at
-   members[member_starts[g]], else counted. */
-kernel void list_members(int groups, int fill, global const int *starts, global const int *columns,
-                         global const int *mate, global const int *choice, global const int *standing,
+/* Members of aggregate g: the two mates, then the cells that have chosen the first mate, then those that have chosen
+   the second. With `fill` they are written from members[member_starts[g]] on; without it member_starts[g] becomes
+   their number. */
+kernel void list_members(int n_aggregates, int fill, global const int *starts, global const int *columns,
+                         global const int *mate, global const int *choice, global const int *roots,
                          global int *member_starts, global int *members)
 {
     const int g = get_global_id(0);
-    if (g >= groups)
+    if (g >= n_aggregates)
         return;
-    const int pair[2] = {standing[g], mate[standing[g]]};
+    const int pair[2] = {roots[g], mate[roots[g]]};
     int at = fill ? member_starts[g] : 0;
     for (int s = 0; s < 2; ++s) {
         if (pair[s] == NONE)
@@ -152,7 +157,7 @@ kernel void list_members(int groups, int fill, global const int *starts, global 
             continue;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (j < 0 || choice[j] != i || !is_first(i, k, starts, columns))
+            if (j < 0 || choice[j] != i || !is_first_entry(i, k, starts, columns))
                 continue;
             if (fill)
                 members[at] = j;
@@ -163,29 +168,29 @@ kernel void list_members(int groups, int fill, global const int *starts, global 
         member_starts[g] = at;
 }
 
-/* Whether an entry before row entry `last` of the group's member number `until` leads to group h, too. */
-inline int is_known(int h, int first, int until, int last, global const int *starts, global const int *columns,
-                    global const REAL *weights, global const int *group, global const int *members)
+/* Whether an entry of the aggregate before entry `last` of its member `until` connects it to aggregate h, too. */
+inline int is_counted(int h, int first, int until, int last, global const int *starts, global const int *columns,
+                      global const REAL *weights, global const int *aggregate, global const int *members)
 {
     for (int s = first; s <= until; ++s) {
         const int end = s == until ? last : starts[members[s] + 1];
         for (int k = starts[members[s]]; k < end; ++k)
-            if (weights[k] > 0 && group[columns[k]] == h)
+            if (weights[k] > 0 && aggregate[columns[k]] == h)
                 return 1;
     }
     return 0;
 }
 
-/* lengths[g] = how many other groups the members of group g are tied to. The first of them are remembered; beyond,
-   where a cell has very many neighbors, it takes another look at the entries before. */
+/* counts[g] = number of aggregates that aggregate g is connected to. The first ones are kept in private memory; with
+   more of them, earlier entries are searched again. */
 #define REMEMBERED 32
 
-kernel void count_rows(int groups, global const int *starts, global const int *columns, global const REAL *weights,
-                       global const int *group, global const int *member_starts, global const int *members,
-                       global int *lengths)
+kernel void count_coarse_entries(int n_aggregates, global const int *starts, global const int *columns,
+                                 global const REAL *weights, global const int *aggregate,
+                                 global const int *member_starts, global const int *members, global int *counts)
 {
     const int g = get_global_id(0);
-    if (g >= groups)
+    if (g >= n_aggregates)
         return;
     int known[REMEMBERED], count = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
@@ -193,7 +198,7 @@ kernel void count_rows(int groups, global const int *starts, global const int *c
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             if (weights[k] <= 0)
                 continue;
-            const int h = group[columns[k]];
+            const int h = aggregate[columns[k]];
             if (h == g)
                 continue;
             int at = 0;
@@ -203,21 +208,21 @@ kernel void count_rows(int groups, global const int *starts, global const int *c
                 continue;
             if (count < REMEMBERED)
                 known[count++] = h;
-            else if (!is_known(h, member_starts[g], s, k, starts, columns, weights, group, members))
+            else if (!is_counted(h, member_starts[g], s, k, starts, columns, weights, aggregate, members))
                 ++count;
         }
     }
-    lengths[g] = count;
+    counts[g] = count;
 }
 
-/* Row of group g: the weights between its members and those of each other group added up, times a factor. */
-kernel void merge_rows(int groups, REAL factor, global const int *starts, global const int *columns,
-                       global const REAL *weights, global const int *group, global const int *member_starts,
-                       global const int *members, global const int *row_starts, global int *row_columns,
-                       global REAL *row_weights)
+/* Coarse weights w_gh = factor sum_{i in g, j in h} w_ij: the row of aggregate g. */
+kernel void sum_coarse_weights(int n_aggregates, REAL factor, global const int *starts, global const int *columns,
+                               global const REAL *weights, global const int *aggregate, global const int *member_starts,
+                               global const int *members, global const int *row_starts, global int *row_columns,
+                               global REAL *row_weights)
 {
     const int g = get_global_id(0);
-    if (g >= groups)
+    if (g >= n_aggregates)
         return;
     const int begin = row_starts[g];
     int end = begin;
@@ -227,7 +232,7 @@ kernel void merge_rows(int groups, REAL factor, global const int *starts, global
             const REAL w = weights[k];
             if (w <= 0)
                 continue;
-            const int h = group[columns[k]];
+            const int h = aggregate[columns[k]];
             if (h == g)
                 continue;
             int at = begin;
@@ -245,12 +250,13 @@ kernel void merge_rows(int groups, REAL factor, global const int *starts, global
         row_weights[at] *= factor;
 }
 
-/* Of the two sums of a pair of groups, which differ by rounding, the lower group's is taken, so that the graph is
-   symmetric to the last bit: the upper groups' are written only, the lower ones' only read. */
-kernel void share_weights(int groups, global const int *starts, global const int *columns, global REAL *weights)
+/* w_gh = w_hg for h < g. The two sums differ by round-off; the row of the lower aggregate is kept, so that the graph is
+   symmetric to the last bit. Entries with h < g are only written, the others only read. */
+kernel void symmetrize_weights(int n_aggregates, global const int *starts, global const int *columns,
+                               global REAL *weights)
 {
     const int g = get_global_id(0);
-    if (g >= groups)
+    if (g >= n_aggregates)
         return;
     for (int k = starts[g]; k < starts[g + 1]; ++k) {
         const int h = columns[k];
@@ -263,13 +269,13 @@ kernel void share_weights(int groups, global const int *starts, global const int
     }
 }
 
-/* Groups of groups: their members among the first, at most 2 passes deep (counts first, as above). */
-kernel void compose_members(int groups, int fill, global const int *outer_starts, global const int *outer,
+/* Members of aggregates of aggregates, as cells of the fine graph. `fill` as in `list_members`. */
+kernel void compose_members(int n_aggregates, int fill, global const int *outer_starts, global const int *outer,
                             global const int *inner_starts, global const int *inner, global int *member_starts,
                             global int *members)
 {
     const int g = get_global_id(0);
-    if (g >= groups)
+    if (g >= n_aggregates)
         return;
     int at = fill ? member_starts[g] : 0;
     for (int s = outer_starts[g]; s < outer_starts[g + 1]; ++s)
@@ -282,26 +288,28 @@ kernel void compose_members(int groups, int fill, global const int *outer_starts
         member_starts[g] = at;
 }
 
-kernel void compose_groups(int n, global const int *inner, global const int *outer, global int *group)
+/* aggregate[i] = outer[inner[i]]: the aggregate after two passes. */
+kernel void compose_aggregates(int n, global const int *inner, global const int *outer, global int *aggregate)
 {
     const int i = get_global_id(0);
     if (i < n)
-        group[i] = outer[inner[i]];
+        aggregate[i] = outer[inner[i]];
 }
 
-/* Pairwise Jacobi: u = B^-1 r, B the operator's diagonal, with its 2 x 2 blocks for cells that are each other's first
-   choice. A tight pair moves as one against the others, which the diagonal alone would take many steps to see. No
-   eigenvalue of B^-1 A is above 2, as 2 B - A is a sum of squares.
+/* Pairwise Jacobi smoother u = B^-1 r. B is the diagonal of A, with 2 x 2 blocks for matched pairs:
 
        u_i = own_i r_i + both_i (r_i + r_partner_i)
 
-   in these terms, all >= 0 (but for a pair without neighbors), because the entries of the block's inverse differ by
-   less than rounding when the pair is tight: rounded on their own they can make the inverse indefinite. both is the
-   same to the last bit for the two.
+   A strongly connected pair then changes as one, which takes the diagonal alone many steps. All eigenvalues of B^-1 A
+   are at most 2, because 2 B - A is a sum of squares.
 
-   mate may be `partner` itself, of an earlier call: who is its own mate has none. */
-kernel void pair_inverse(int n, global const int *starts, global const int *columns, global const REAL *weights,
-                         global const int *mate, global int *partner, global REAL *own, global REAL *both)
+   own and both are >= 0, except for a pair without other neighbors. The entries of the inverse block itself are not
+   stored: for a strongly connected pair they differ by less than round-off, and rounding them separately can make the
+   inverse indefinite. both is the same to the last bit for the two cells of a pair.
+
+   mate may be the array `partner` of an earlier call: a cell that is its own mate has none. */
+kernel void invert_pair_blocks(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                               global const int *mate, global int *partner, global REAL *own, global REAL *both)
 {
     const int i = get_global_id(0);
     if (i >= n)
@@ -320,8 +328,8 @@ kernel void pair_inverse(int n, global const int *starts, global const int *colu
         for (int k = starts[j]; k < starts[j + 1]; ++k)
             if (columns[k] != j && columns[k] != i)
                 theirs += weights[k];
-    /* The block is [mine + between, -between; -between, theirs + between]. Without neighbors outside it is singular,
-       and its pseudo-inverse the answer. */
+    /* The block is [mine + between, -between; -between, theirs + between]. For a pair without other neighbors it is
+       singular, and its pseudo-inverse is used. */
     REAL a = 0, c = 0;
     if (j == NONE || between <= 0)
         a = mine > 0 ? 1 / mine : 0;

@@ -1,24 +1,25 @@
-/* Preconditioned conjugate gradients:
+/* Preconditioned conjugate gradients for A x = b:
 
        u = M^-1 r    gamma = (r, u)    beta = gamma / gamma_old    p = u + beta p
        q = A p       alpha = gamma / (p, q)    x += alpha p    r -= alpha q
 
-   A work-group owns a block of the vectors and leaves one partial sum per quantity; in the next kernel all groups add
-   the same partial sums, so the scalars never leave the device and no kernel of one work-item is needed. Vectors are
-   scaled by a power of two to max |b| ~ 1, lest squares of a small right side underflow. Those of the iteration are in
-   STORE, which may be single where REAL is double: memory traffic is the cost. Solution, right side and sums are in
-   REAL.
+   One work-item per unknown of a block; each work-group owns a block of the vectors. A work-group writes one partial
+   sum per quantity, and in the next kernel every group adds all of them in the same order: scalars stay on the device.
 
-   With `center` the null space is the constants: whatever rounding puts into the mean of r is taken out one iteration
-   later, or the residual could not fall below it.
+   Vectors of the iteration are in STORE, which may be single precision where REAL is double, to save memory traffic.
+   Solution, right side and sums are in REAL. Vectors are scaled by a power of two so that max |b| ~ 1: the squares of a
+   small right side would underflow.
 
-   partial: 11 rows of one value per group, see the names below; residual norms and gammas and sums of r alternate
-   between two rows.
+   With `center` the null space of A is the constants. Round-off in the mean of r is then removed one iteration later;
+   otherwise the residual could not fall below it.
 
-   Each step is a kernel; with Jacobi's preconditioner and few unknowns one group takes them all alone. */
+   partial: 11 rows, named below. Residual norms, gammas and sums of r alternate between two rows.
+
+   There is one kernel per step. `solve_by_group` does all steps in one work-group, for few unknowns. */
 #include "opencl/real.h"
 #include "opencl/blocks.h"
 #include "opencl/reduce.h"
+#include "solvers/partial_sums.h"
 #include "solvers/sparse_rows.h"
 
 #if IS_DOUBLE
@@ -27,7 +28,6 @@
 #define EXPONENT_LIMIT (FLT_MAX_EXP - 4)
 #endif
 
-#define ROW(q) (partial + (q)*get_num_groups(0))
 #define SUM_B 0
 #define MAX_B 1
 #define NORM_B 2
@@ -37,29 +37,16 @@
 #define SUM_R(k) (8 + ((k)&1))
 #define START 10
 
-/* One row of the record per iteration. */
-#define RECORD_NORM 0
-#define RECORD_GAMMA 1
-#define RECORD_RUNNING 2
-#define RECORD_CURVATURE 3
-
-#define PUT(q, sum)                                                                                                    \
-    {                                                                                                                  \
-        const REAL put_ = group_sum((sum), scratch);                                                                   \
-        if (get_local_id(0) == 0)                                                                                      \
-            ROW(q)[get_group_id(0)] = put_;                                                                            \
-    }
-
-/* What is needed to center and scale r = b - w (b, where the start is `zero`). */
-inline void add_residual(int n, int zero, global const REAL *b, global const STORE *w, global REAL *partial,
-                         local REAL *scratch)
+/* The sums and the maximum that center and scale r = b - w; r = b if the start is zero (`from_zero`). */
+inline void add_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w, global REAL *partial,
+                            local REAL *scratch)
 {
     Sum sum_b = SUM_ZERO, sum_r = SUM_ZERO;
     REAL max_b = 0;
     for (BLOCK_LOOP(i, n)) {
         const REAL bi = b[i];
         sum_add(&sum_b, bi);
-        sum_add(&sum_r, zero ? bi : bi - w[i]);
+        sum_add(&sum_r, from_zero ? bi : bi - w[i]);
         max_b = fmax(max_b, fabs(bi));
     }
     PUT(SUM_B, sum_b.value);
@@ -69,15 +56,15 @@ inline void add_residual(int n, int zero, global const REAL *b, global const STO
         ROW(MAX_B)[get_group_id(0)] = max_b;
 }
 
-kernel void residual(int n, int zero, global const REAL *b, global const STORE *w, global REAL *partial)
+kernel void sum_right_sides(int n, int from_zero, global const REAL *b, global const STORE *w, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
-    add_residual(n, zero, b, w, partial, scratch);
+    add_right_sides(n, from_zero, b, w, partial, scratch);
 }
 
-/* r = 2^e (r - mean r) if `center`, else 2^e r; norms of r and of the right side treated alike; p = 0, and x where it
-   starts from `zero`. state[1] = 2^-e, state[2] = the part of the squared norm of b that was taken away. */
-inline void set_residual(int n, int zero, int center, global const REAL *b, global const STORE *w, global REAL *x,
+/* r = 2^e (r - mean r) with `center`, else r = 2^e r; p = 0; x = 0 with `from_zero`. NORM_B, NORM_R = |b|^2, |r|^2
+   after the same scaling and centering. state[1] = 2^-e, state[2] = the part of |b|^2 that centering has removed. */
+inline void set_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w, global REAL *x,
                          global STORE *r, global STORE *p, global REAL *partial, global REAL *state,
                          local REAL *scratch)
 {
@@ -88,10 +75,10 @@ inline void set_residual(int n, int zero, int center, global const REAL *b, glob
     Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO;
     for (BLOCK_LOOP(i, n)) {
         const REAL bi = ldexp(b[i] - mean_b, exponent);
-        const STORE ri = ldexp((zero ? b[i] : b[i] - w[i]) - mean_r, exponent);
+        const STORE ri = ldexp((from_zero ? b[i] : b[i] - w[i]) - mean_r, exponent);
         r[i] = ri;
         p[i] = 0;
-        if (zero)
+        if (from_zero)
             x[i] = 0;
         sum_add(&norm_b, bi * bi);
         sum_add(&norm_r, (REAL)ri * ri);
@@ -107,15 +94,15 @@ inline void set_residual(int n, int zero, int center, global const REAL *b, glob
     }
 }
 
-kernel void begin(int n, int zero, int center, global const REAL *b, global const STORE *w, global REAL *x,
-                  global STORE *r, global STORE *p, global REAL *partial, global REAL *state)
+kernel void start_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w,
+                           global REAL *x, global STORE *r, global STORE *p, global REAL *partial, global REAL *state)
 {
     local REAL scratch[GROUP_SIZE];
-    set_residual(n, zero, center, b, w, x, r, p, partial, state, scratch);
+    set_residual(n, from_zero, center, b, w, x, r, p, partial, state, scratch);
 }
 
-/* One group: the sum of row q of what so many `groups` have left, as `total_sum` is in a kernel of all of them. */
-inline REAL sum_of(global const REAL *partial, int q, int groups, local REAL *scratch)
+/* Sum of row q over `groups` work-groups, in a kernel of one work-group: the same bits as `total_sum`. */
+inline REAL total_of_row(global const REAL *partial, int q, int groups, local REAL *scratch)
 {
     REAL sum = 0;
     for (int g = get_local_id(0); g < groups; g += GROUP_SIZE)
@@ -123,20 +110,20 @@ inline REAL sum_of(global const REAL *partial, int q, int groups, local REAL *sc
     return group_sum(sum, scratch);
 }
 
-/* One group: state[4], state[5] = the squared norms of b and r, for the host to read. */
-kernel void sum_norms(global const REAL *partial, global REAL *state, const int groups)
+/* state[4] = |b|^2, state[5] = |r|^2, for the host. One work-group. */
+kernel void read_norms(global const REAL *partial, global REAL *state, const int groups)
 {
     local REAL scratch[GROUP_SIZE];
-    const REAL norm_b = sum_of(partial, NORM_B, groups, scratch);
-    const REAL norm_r = sum_of(partial, NORM_R(0), groups, scratch);
+    const REAL norm_b = total_of_row(partial, NORM_B, groups, scratch);
+    const REAL norm_r = total_of_row(partial, NORM_R(0), groups, scratch);
     if (get_local_id(0) == 0) {
         state[4] = norm_b;
         state[5] = norm_r;
     }
 }
 
-/* u = D^-1 r and gamma: Jacobi's method, for the first iteration. */
-inline void precondition(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
+/* u = D^-1 r and gamma = (r, u), for the first iteration. */
+inline void apply_jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
                          global REAL *partial, local REAL *scratch)
 {
     Sum gamma = SUM_ZERO;
@@ -148,14 +135,14 @@ inline void precondition(int n, global const STORE *inverse_diagonal, global con
     PUT(GAMMA(0), gamma.value);
 }
 
-kernel void jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
-                   global REAL *partial)
+kernel void precondition_jacobi(int n, global const STORE *inverse_diagonal, global const STORE *r, global STORE *u,
+                                global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
-    precondition(n, inverse_diagonal, r, u, partial, scratch);
+    apply_jacobi(n, inverse_diagonal, r, u, partial, scratch);
 }
 
-/* partial row q = (a, b). */
+/* Row q of partial = (a, b). */
 kernel void dot_product(int n, int q, global const STORE *a, global const STORE *b, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
@@ -165,10 +152,10 @@ kernel void dot_product(int n, int q, global const STORE *a, global const STORE 
     PUT(q, sum.value);
 }
 
-/* p = u + beta p. From the iteration on that finds the residual at its target (or anything out of order, NaN included)
-   record[k].running is 0 and nothing changes any more, so that the host may run ahead without changing the result. */
-inline void turn(int k, int n, REAL tolerance, global const STORE *u, global STORE *p, global const REAL *partial,
-                 global REAL *state, global REAL *record, local REAL *scratch)
+/* p = u + beta p. record[k].running becomes 0 if |r| is within the tolerance, or if a value is not positive or not
+   finite. */
+inline void step_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
+                           global const REAL *partial, global REAL *state, global REAL *record, local REAL *scratch)
 {
     const int first = get_global_id(0) == 0;
     global REAL *now = record + 4 * k;
@@ -192,26 +179,26 @@ inline void turn(int k, int n, REAL tolerance, global const STORE *u, global STO
         p[i] = u[i] + beta * p[i];
 }
 
-kernel void direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p, global const REAL *partial,
-                      global REAL *state, global REAL *record)
+kernel void update_direction(int k, int n, REAL tolerance, global const STORE *u, global STORE *p,
+                             global const REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
-    turn(k, n, tolerance, u, p, partial, state, record, scratch);
+    step_direction(k, n, tolerance, u, p, partial, state, record, scratch);
 }
 
-/* How far iteration k goes along its direction: alpha, and the same for x, which is not scaled as the residual is; the
-   mean that is taken from the residual; the unknowns that are concerned, none once the iteration is over. */
+/* Step of iteration k: alpha, alpha for the unscaled x, the mean to remove from r, and the number of unknowns to
+   change, 0 where the iteration is over. */
 typedef struct {
     int end;
     REAL alpha, alpha_x, mean;
-} Stride;
+} Step;
 
-inline Stride stride_of(int k, int n, int center, global const REAL *partial, global REAL *state, global REAL *record,
-                        local REAL *scratch)
+inline Step step_of(int k, int n, int center, global const REAL *partial, global REAL *state, global REAL *record,
+                    local REAL *scratch)
 {
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
-    Stride s;
+    Step s;
     const REAL curvature = total_sum(ROW(CURVATURE), scratch);
     if (running && get_global_id(0) == 0) {
         now[RECORD_CURVATURE] = curvature;
@@ -225,13 +212,14 @@ inline Stride stride_of(int k, int n, int center, global const REAL *partial, gl
     return s;
 }
 
-/* One group: what the host may look at once iteration k - 1 has been enqueued, and whether k has anything left to do.
-   The row is written again by `direction`, if it comes to that. */
-kernel void look(int k, global const REAL *partial, global const REAL *state, global REAL *record, const int groups)
+/* Record |r| before iteration k, for the host, and whether k is needed. One work-group. `update_direction` of iteration
+   k overwrites the row. */
+kernel void record_norm(int k, global const REAL *partial, global const REAL *state, global REAL *record,
+                        const int groups)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *now = record + 4 * k;
-    const REAL norm = sum_of(partial, NORM_R(k), groups, scratch);
+    const REAL norm = total_of_row(partial, NORM_R(k), groups, scratch);
     if (get_local_id(0) == 0) {
         now[RECORD_NORM] = norm;
         now[RECORD_RUNNING] = !(norm <= state[0]);
@@ -240,11 +228,11 @@ kernel void look(int k, global const REAL *partial, global const REAL *state, gl
 }
 
 /* x += alpha p, r -= alpha q. */
-kernel void update(int k, int n, int center, global const STORE *p, global const STORE *q, global REAL *x,
-                   global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
+kernel void update_solution(int k, int n, int center, global const STORE *p, global const STORE *q, global REAL *x,
+                            global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
-    const Stride s = stride_of(k, n, center, partial, state, record, scratch);
+    const Step s = step_of(k, n, center, partial, state, record, scratch);
     Sum norm = SUM_ZERO, sum = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i];
@@ -257,12 +245,12 @@ kernel void update(int k, int n, int center, global const STORE *p, global const
     PUT(SUM_R(k + 1), sum.value);
 }
 
-/* The same with u = D^-1 r and gamma for the next iteration. */
-inline void advance(int k, int n, int center, global const STORE *inverse_diagonal, global const STORE *p,
-                    global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
-                    global REAL *state, global REAL *record, local REAL *scratch)
+/* x += alpha p, r -= alpha q, u = D^-1 r, and gamma of the next iteration. */
+inline void step_jacobi(int k, int n, int center, global const STORE *inverse_diagonal, global const STORE *p,
+                        global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
+                        global REAL *state, global REAL *record, local REAL *scratch)
 {
-    const Stride s = stride_of(k, n, center, partial, state, record, scratch);
+    const Step s = step_of(k, n, center, partial, state, record, scratch);
     Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i], ui = inverse_diagonal[i] * ri;
@@ -278,16 +266,16 @@ inline void advance(int k, int n, int center, global const STORE *inverse_diagon
     PUT(GAMMA(k + 1), gamma.value);
 }
 
-kernel void update_jacobi(int k, int n, int center, global const STORE *inverse_diagonal, global const STORE *p,
-                          global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
-                          global REAL *state, global REAL *record)
+kernel void update_solution_jacobi(int k, int n, int center, global const STORE *inverse_diagonal,
+                                   global const STORE *p, global const STORE *q, global REAL *x, global STORE *r,
+                                   global STORE *u, global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
-    advance(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+    step_jacobi(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
 }
 
-/* Leave the partial sums of x, then (next kernel) take its mean away. */
-kernel void add_up(int n, global const REAL *x, global REAL *partial)
+/* Partial sums of x, for `center_solution`. */
+kernel void sum_solution(int n, global const REAL *x, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum sum = SUM_ZERO;
@@ -296,7 +284,8 @@ kernel void add_up(int n, global const REAL *x, global REAL *partial)
     PUT(SUM_B, sum.value);
 }
 
-kernel void remove_mean(int n, global REAL *x, global const REAL *partial)
+/* x -= mean x. */
+kernel void center_solution(int n, global REAL *x, global const REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     const REAL mean = total_sum(ROW(SUM_B), scratch) / n;
@@ -304,42 +293,44 @@ kernel void remove_mean(int n, global REAL *x, global const REAL *partial)
         x[i] -= mean;
 }
 
-/* One group, where unknowns are few: all of it for A of rows (see solvers/sparse_rows.h) and Jacobi's preconditioner.
-   It begins by taking the residual from x, and goes on if that is above `enough` and not above `most` of b; b without
-   its mean is nothing if that leaves no more than rounding. The record is behind the state. */
+/* The whole solve by one work-group, for few unknowns: A in sparse rows (see solvers/sparse_rows.h), Jacobi's
+   preconditioner. It computes r = b - A x, and iterates if converged_ratio |b| < |r| <= stagnated_ratio |b|. b counts
+   as zero if centering has left only round-off. `state` is followed by the record. */
 #define STATE 8
-kernel void solve_alone(int n, int zero, int center, int turns, REAL tolerance, REAL enough, REAL most,
-                        global const int *starts, global const int *columns, global const STORE *weights,
-                        global const STORE *inverse_diagonal, global const REAL *b, global REAL *x, global STORE *r,
-                        global STORE *u, global STORE *p, global STORE *q, global REAL *partial, global REAL *state)
+kernel void solve_by_group(int n, int from_zero, int center, int max_iterations, REAL tolerance, REAL converged_ratio,
+                           REAL stagnated_ratio, global const int *starts, global const int *columns,
+                           global const STORE *weights, global const STORE *inverse_diagonal, global const REAL *b,
+                           global REAL *x, global STORE *r, global STORE *u, global STORE *p, global STORE *q,
+                           global REAL *partial, global REAL *state)
 {
     local REAL scratch[GROUP_SIZE];
     global REAL *record = state + STATE;
-    const int begun = zero ? 0 : n;
-    for (BLOCK_LOOP(i, begun)) {
+    const int n_start = from_zero ? 0 : n;
+    for (BLOCK_LOOP(i, n_start)) {
         REAL sum = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k)
             if (columns[k] >= 0)
                 sum += weights[k] * (x[i] - x[columns[k]]);
         q[i] = sum;
     }
-    add_residual(n, zero, b, q, partial, scratch);
+    add_right_sides(n, from_zero, b, q, partial, scratch);
     barrier(CLK_GLOBAL_MEM_FENCE);
-    set_residual(n, zero, center, b, q, x, r, p, partial, state, scratch);
+    set_residual(n, from_zero, center, b, q, x, r, p, partial, state, scratch);
     barrier(CLK_GLOBAL_MEM_FENCE);
     const REAL norm_b = partial[NORM_B], norm_r = partial[NORM_R(0)], least = 8 * REAL_EPS;
-    bool running = turns > 0 && norm_b > least * least * state[2] && norm_r > enough * enough * norm_b &&
-                   norm_r <= most * most * norm_b;
+    bool running = max_iterations > 0 && norm_b > least * least * state[2] &&
+                   norm_r > converged_ratio * converged_ratio * norm_b &&
+                   norm_r <= stagnated_ratio * stagnated_ratio * norm_b;
     if (get_local_id(0) == 0) {
         state[4] = norm_b;
         state[5] = norm_r;
         record[RECORD_RUNNING] = 0;
         record[RECORD_NORM] = norm_r;
     }
-    precondition(running ? n : 0, inverse_diagonal, r, u, partial, scratch);
+    apply_jacobi(running ? n : 0, inverse_diagonal, r, u, partial, scratch);
     for (int k = 0; running; ++k) {
         barrier(CLK_GLOBAL_MEM_FENCE);
-        turn(k, n, tolerance, u, p, partial, state, record, scratch);
+        step_direction(k, n, tolerance, u, p, partial, state, record, scratch);
         barrier(CLK_GLOBAL_MEM_FENCE);
         const int end = record[4 * k + RECORD_RUNNING] != 0 ? n : 0;
         Sum product = SUM_ZERO;
@@ -350,8 +341,8 @@ kernel void solve_alone(int n, int zero, int center, int turns, REAL tolerance, 
         }
         PUT(CURVATURE, product.value);
         barrier(CLK_GLOBAL_MEM_FENCE);
-        advance(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
-        running = end > 0 && partial[CURVATURE] > 0 && k + 1 < turns;
+        step_jacobi(k, n, center, inverse_diagonal, p, q, x, r, u, partial, state, record, scratch);
+        running = end > 0 && partial[CURVATURE] > 0 && k + 1 < max_iterations;
     }
     barrier(CLK_GLOBAL_MEM_FENCE);
     const int centerd = center ? n : 0;

@@ -1,22 +1,25 @@
-/* One multigrid cycle on graphs of matched cells (coarsening.cl), in a precision of its own (REAL); where that is not
-   the caller's (SOURCE), the residual comes and the correction goes in that. One work-item per cell or group, one
-   work-group where cells are few.
+/* One V-cycle of multigrid on graphs of aggregated cells (see solvers/aggregation.cl).
 
-   Smoothing is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], as two damped pairwise-Jacobi steps. */
+   Vectors are in REAL, the multigrid's own precision. SOURCE is the caller's: the residual is read and the correction
+   written in it. One work-item per cell or aggregate, or one work-group for a whole level where cells are few (kernels
+   *_by_group).
+
+   The smoother is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], applied as two damped pairwise-Jacobi
+   steps. */
 #include "opencl/real.h"
 #include "opencl/blocks.h"
 #include "solvers/sparse_rows.h"
 
-/* (B^-1 r)_i: B has the diagonal and 2 x 2 blocks of A. */
-inline REAL pairwise(int i, global const int *partner, global const REAL *own, global const REAL *both,
-                     global const REAL *r)
+/* (B^-1 r)_i: B holds the diagonal of A and its 2 x 2 blocks for pairs. */
+inline REAL apply_pair_inverse(int i, global const int *partner, global const REAL *own, global const REAL *both,
+                               global const REAL *r)
 {
     return own[i] * r[i] + both[i] * (r[i] + r[partner[i]]);
 }
 
-/* b = r, x = omega B^-1 b: the first step from a start of zero. On the finest level b is rounded from `r`. */
-kernel void first_rounded(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
-                          global const SOURCE *r, global REAL *b, global REAL *x)
+/* b = r rounded to REAL, x = omega B^-1 b: the first step from x = 0 on the finest level. */
+kernel void smooth_from_zero_rounded(int n, REAL omega, global const int *partner, global const REAL *own,
+                                     global const REAL *both, global const SOURCE *r, global REAL *b, global REAL *x)
 {
     const int i = get_global_id(0);
     if (i >= n)
@@ -26,17 +29,18 @@ kernel void first_rounded(int n, REAL omega, global const int *partner, global c
     x[i] = omega * (own[i] * bi + both[i] * (bi + (REAL)r[partner[i]]));
 }
 
-kernel void first(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
-                  global const REAL *b, global REAL *x)
+/* x = omega B^-1 b: the first step from x = 0. */
+kernel void smooth_from_zero(int n, REAL omega, global const int *partner, global const REAL *own,
+                             global const REAL *both, global const REAL *b, global REAL *x)
 {
     const int i = get_global_id(0);
     if (i < n)
-        x[i] = omega * pairwise(i, partner, own, both, b);
+        x[i] = omega * apply_pair_inverse(i, partner, own, both, b);
 }
 
 /* t = b - A x. */
-kernel void defect(int n, global const int *starts, global const int *columns, global const REAL *weights,
-                   global const REAL *b, global const REAL *x, global REAL *t)
+kernel void compute_defect(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                           global const REAL *b, global const REAL *x, global REAL *t)
 {
     const int i = get_global_id(0);
     if (i < n)
@@ -44,25 +48,25 @@ kernel void defect(int n, global const int *starts, global const int *columns, g
 }
 
 /* x += omega B^-1 t. */
-kernel void correct(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
-                    global const REAL *t, global REAL *x)
+kernel void smooth(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
+                   global const REAL *t, global REAL *x)
 {
     const int i = get_global_id(0);
     if (i < n)
-        x[i] += omega * pairwise(i, partner, own, both, t);
+        x[i] += omega * apply_pair_inverse(i, partner, own, both, t);
 }
 
-/* u = x + omega B^-1 t in the caller's precision: the cycle's last step. */
-kernel void correct_out(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
+/* u = x + omega B^-1 t, in the caller's precision: the last step of the cycle. */
+kernel void smooth_into(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
                         global const REAL *t, global const REAL *x, global SOURCE *u)
 {
     const int i = get_global_id(0);
     if (i < n)
-        u[i] = x[i] + omega * pairwise(i, partner, own, both, t);
+        u[i] = x[i] + omega * apply_pair_inverse(i, partner, own, both, t);
 }
 
-/* Sum over the members of group g. */
-inline REAL group_total(int g, global const int *member_starts, global const int *members, global const REAL *t)
+/* Sum of t over the members of aggregate g. */
+inline REAL sum_members(int g, global const int *member_starts, global const int *members, global const REAL *t)
 {
     REAL sum = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s)
@@ -70,26 +74,26 @@ inline REAL group_total(int g, global const int *member_starts, global const int
     return sum;
 }
 
-/* b of a group = sum of its members' defects. */
-kernel void restrict_defect(int groups, global const REAL *t, global const int *member_starts,
+/* Restriction: b of an aggregate = sum of the defects of its members. */
+kernel void restrict_defect(int n_aggregates, global const REAL *t, global const int *member_starts,
                             global const int *members, global REAL *coarse_b)
 {
     const int g = get_global_id(0);
-    if (g < groups)
-        coarse_b[g] = group_total(g, member_starts, members, t);
+    if (g < n_aggregates)
+        coarse_b[g] = sum_members(g, member_starts, members, t);
 }
 
-/* Every member takes its group's correction. */
-kernel void prolong(int n, global const int *group, global const REAL *e, global REAL *x)
+/* Prolongation: x_i += correction of the aggregate of i. */
+kernel void prolong(int n, global const int *aggregate, global const REAL *e, global REAL *x)
 {
     const int i = get_global_id(0);
     if (i < n)
-        x[i] += e[group[i]];
+        x[i] += e[aggregate[i]];
 }
 
-/* One group of work-items, where cells are few: t = b - A x. */
-inline void defect_alone(int n, global const int *starts, global const int *columns, global const REAL *weights,
-                         global const REAL *b, global const REAL *x, global REAL *t)
+/* t = b - A x, by one work-group. */
+inline void defect_by_group(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                            global const REAL *b, global const REAL *x, global REAL *t)
 {
     barrier(CLK_GLOBAL_MEM_FENCE);
     for (BLOCK_LOOP(i, n))
@@ -97,53 +101,54 @@ inline void defect_alone(int n, global const int *starts, global const int *colu
     barrier(CLK_GLOBAL_MEM_FENCE);
 }
 
-/* One group: a step of smoothing. */
-inline void relax_alone(int n, REAL omega, global const int *starts, global const int *columns,
-                        global const REAL *weights, global const int *partner, global const REAL *own,
-                        global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
+/* x += omega B^-1 (b - A x), by one work-group. */
+inline void smooth_by_group(int n, REAL omega, global const int *starts, global const int *columns,
+                            global const REAL *weights, global const int *partner, global const REAL *own,
+                            global const REAL *both, global const REAL *b, global REAL *x, global REAL *t)
 {
-    defect_alone(n, starts, columns, weights, b, x, t);
+    defect_by_group(n, starts, columns, weights, b, x, t);
     for (BLOCK_LOOP(i, n))
-        x[i] += omega * pairwise(i, partner, own, both, t);
+        x[i] += omega * apply_pair_inverse(i, partner, own, both, t);
 }
 
-/* One group: all that is done on a level on the way down, with the same bits as by the kernels above. */
-kernel void descend_alone(int n, REAL late, REAL early, global const int *starts, global const int *columns,
-                          global const REAL *weights, global const int *partner, global const REAL *own,
-                          global const REAL *both, global const REAL *b, global REAL *x, global REAL *t, int groups,
-                          global const int *member_starts, global const int *members, global REAL *coarse_b)
+/* All steps of a level on the way down, by one work-group: the same bits as with one kernel per step. */
+kernel void descend_by_group(int n, REAL late, REAL early, global const int *starts, global const int *columns,
+                             global const REAL *weights, global const int *partner, global const REAL *own,
+                             global const REAL *both, global const REAL *b, global REAL *x, global REAL *t,
+                             int n_aggregates, global const int *member_starts, global const int *members,
+                             global REAL *coarse_b)
 {
     for (BLOCK_LOOP(i, n))
-        x[i] = late * pairwise(i, partner, own, both, b);
-    relax_alone(n, early, starts, columns, weights, partner, own, both, b, x, t);
-    defect_alone(n, starts, columns, weights, b, x, t);
-    for (BLOCK_LOOP(g, groups))
-        coarse_b[g] = group_total(g, member_starts, members, t);
+        x[i] = late * apply_pair_inverse(i, partner, own, both, b);
+    smooth_by_group(n, early, starts, columns, weights, partner, own, both, b, x, t);
+    defect_by_group(n, starts, columns, weights, b, x, t);
+    for (BLOCK_LOOP(g, n_aggregates))
+        coarse_b[g] = sum_members(g, member_starts, members, t);
 }
 
-/* One group: the same on the way up. */
-kernel void ascend_alone(int n, REAL late, REAL early, global const int *starts, global const int *columns,
-                         global const REAL *weights, global const int *partner, global const REAL *own,
-                         global const REAL *both, global const REAL *b, global REAL *x, global REAL *t,
-                         global const int *group, global const REAL *e)
+/* All steps of a level on the way up, by one work-group: the same bits as with one kernel per step. */
+kernel void ascend_by_group(int n, REAL late, REAL early, global const int *starts, global const int *columns,
+                            global const REAL *weights, global const int *partner, global const REAL *own,
+                            global const REAL *both, global const REAL *b, global REAL *x, global REAL *t,
+                            global const int *aggregate, global const REAL *e)
 {
     for (BLOCK_LOOP(i, n))
-        x[i] += e[group[i]];
-    relax_alone(n, early, starts, columns, weights, partner, own, both, b, x, t);
-    relax_alone(n, late, starts, columns, weights, partner, own, both, b, x, t);
+        x[i] += e[aggregate[i]];
+    smooth_by_group(n, early, starts, columns, weights, partner, own, both, b, x, t);
+    smooth_by_group(n, late, starts, columns, weights, partner, own, both, b, x, t);
 }
 
-/* One group of work-items: cells are eliminated one by one, which leaves a graph of the others,
+/* A = L D L^T on the coarsest level, by one work-group. Eliminating cell i leaves a graph of the remaining cells,
 
-       w_jk += w_ij w_ik / d_i        d_i = sum_k w_ik over those not yet eliminated
+       w_jk += w_ij w_ik / d_i        d_i = sum_k w_ik over the remaining k
 
-   so that A = L D L^T with L^-1 = Z, whose entry (i, k) is the share of k's right side that has come to i when it is
-   its turn. As d is summed anew from the weights, nothing is ever subtracted, and Z and D are right to the last digits
-   whatever the weights are. A cell without anyone left (the last one, or the last of a part on its own) has 1 / d = 0.
+   L^-1 = Z: entry (i, k) is the share of the right side of k that has reached i when i is eliminated. Because d is
+   summed anew from the weights, nothing is subtracted, and Z and D are accurate to the last digits for any weights. The
+   last cell of a connected component has 1 / d = 0.
 
-   factor: Z (n, n), then the weights left (n, n), then 1 / d (n), then the means of Z's rows (n). */
-kernel void eliminate(int n, global const int *starts, global const int *columns, global const REAL *weights,
-                      global REAL *factor)
+   factor: Z (n, n), the remaining weights (n, n), 1 / d (n), the means of the rows of Z (n). */
+kernel void factorize_coarsest(int n, global const int *starts, global const int *columns, global const REAL *weights,
+                               global REAL *factor)
 {
     const int me = get_local_id(0);
     global REAL *z = factor, *w = factor + n * n, *inverse = factor + 2 * n * n;
@@ -184,11 +189,12 @@ kernel void eliminate(int n, global const int *starts, global const int *columns
     }
 }
 
-/* One group, on the coarsest level: t = D^-1 Z (b - mean b), then x = Z^T t less its mean. Such a product is positive
-   semidefinite whatever is rounded in it, as an inverse matrix in one piece is not. Without the means the last cell
-   would be the one at zero, and the constant by which all others differ from it leave its roundings in the scalar
-   products of the iteration. */
-kernel void solve(int n, global const REAL *factor, global const REAL *b, global REAL *t, global REAL *x)
+/* x = A^+ b on the coarsest level, by one work-group: t = D^-1 Z (b - mean b), then x = Z^T t minus its mean.
+
+   This product is positive semidefinite in spite of round-off, which an explicit inverse matrix is not. Without the
+   means the last cell would be zero, and the round-off of the constant that all others have in common would enter the
+   scalar products of the iteration. */
+kernel void solve_coarsest(int n, global const REAL *factor, global const REAL *b, global REAL *t, global REAL *x)
 {
     global const REAL *inverse = factor + 2 * n * n, *means = inverse + n;
     REAL mean_b = 0, mean_x = 0;

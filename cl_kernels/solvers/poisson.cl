@@ -1,36 +1,37 @@
-/* The two-point Laplacian on the neighbor graph, zero flux through walls:
+/* The Poisson matrix: the two-point Laplacian on the neighbor graph, with zero flux through walls, the paper's (3.2):
 
        (A phi)_i = sum_j w_ij (phi_i - phi_j)        w_ij = rho_ij l_ij / |x_i - x_j|
 
-   One work-item per cell in `assemble`, a block of cells per group elsewhere. Columns are the diagram's neighbors:
-   walls are negative, and have weight 0. Weights and the vectors of an iteration are in STORE, which may be single. */
+   `assemble_laplacian` assembles it, one work-item per cell. The other kernels give each work-group a block of cells.
+   Columns are the neighbors of the diagram: walls are negative and have weight 0. Weights and the vectors of an
+   iteration are in STORE, which may be single precision. */
 #include "geometry/domain.h"
 #include "opencl/blocks.h"
 #include "opencl/reduce.h"
+#include "solvers/partial_sums.h"
 #include "solvers/sparse_rows.h"
 
-/* Whether two cells may have several faces: on both sides of a seam, or of a hole. */
+/* Whether two cells may share several faces: across the periods of a box, or around a hole. */
 #if defined(PERIODIC) || defined(POLYGON)
 #define SEVERAL true
 #else
 #define SEVERAL false
 #endif
 
-/* Where the row of cell j names cell i first, negative if it does not; eight entries at a time on a CPU, as in
-   row_difference. */
-inline int place_of(int i, int j, int last, global const int *starts, global const int *neighbors)
+/* The first entry of row j with column i, or -1. `last`: no entry behind it may be read eight at a time. */
+inline int find_entry(int i, int j, int last, global const int *starts, global const int *neighbors)
 {
     const int end = starts[j + 1];
     int k = starts[j];
 #if GROUP_SIZE == 1
     for (; k < end && k <= last; k += 8) {
-        const int8 at = k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), named = (vload8(0, neighbors + k) == i) & (at < end);
-        const int8 places = select((int8)(INT_MAX), at, named);
-        const int4 p4 = min(places.lo, places.hi);
+        const int8 at = k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), matches = (vload8(0, neighbors + k) == i) & (at < end);
+        const int8 entries = select((int8)(INT_MAX), at, matches);
+        const int4 p4 = min(entries.lo, entries.hi);
         const int2 p2 = min(p4.lo, p4.hi);
-        const int place = min(p2.s0, p2.s1);
-        if (place < end)
-            return place;
+        const int entry = min(p2.s0, p2.s1);
+        if (entry < end)
+            return entry;
     }
 #endif
     for (; k < end; ++k)
@@ -39,8 +40,8 @@ inline int place_of(int i, int j, int last, global const int *starts, global con
     return -1;
 }
 
-/* The measure of face k and of those behind it, up to `end`, that lead to the same cell. */
-inline REAL measure_from(int k, int end, global const int *neighbors, global const FACE *face_measures)
+/* Sum of the measures of face k and of the later faces of its row, up to `end`, that lead to the same cell. */
+inline REAL sum_measures(int k, int end, global const int *neighbors, global const FACE *face_measures)
 {
     REAL measure = face_measures[k];
     for (int l = k + 1; SEVERAL && l < end; ++l)
@@ -48,14 +49,14 @@ inline REAL measure_from(int k, int end, global const int *neighbors, global con
     return measure;
 }
 
-/* Weights, where `weights` is 0 so far: each is put into the rows of both cells by the one of the lower number, so that
-   A is symmetric to the last bit. The two have measured the face each for itself, with roundings of their own: it is
-   the mean of the two. A face that only one of them has seen is shorter than rounding, and keeps the weight 0, as do
-   walls and, of several faces of two cells, all but the first. rho_ij is the geometric mean, symmetric and closest to
-   rho at the face where log rho is smooth. */
-kernel void assemble(int n, int weighted, global const int *starts, global const int *neighbors,
-                     global const FACE *face_measures, global const REAL *points, global const REAL *density,
-                     global STORE *weights PERIOD_ARGS)
+/* w_ij = rho_ij l_ij / |x_i - x_j|, rho_ij = sqrt(rho_i rho_j), one work-item per cell i. `weights` must be 0 before.
+
+   The work-item of the lower cell writes the entry of both rows, so that A is symmetric to the last bit. l_ij is the
+   mean of the two cells' measures of the face, which differ by round-off. The weight stays 0 for walls, for a face that
+   only one cell has (shorter than round-off), and for all but the first of several faces of two cells. */
+kernel void assemble_laplacian(int n, int weighted, global const int *starts, global const int *neighbors,
+                               global const FACE *face_measures, global const REAL *points, global const REAL *density,
+                               global STORE *weights PERIOD_ARGS)
 {
     const int i = get_global_id(0);
     if (i >= n)
@@ -66,10 +67,10 @@ kernel void assemble(int n, int weighted, global const int *starts, global const
         const int j = neighbors[k];
         if (j <= i)
             continue;
-        const int there = place_of(i, j, last, starts, neighbors);
+        const int there = find_entry(i, j, last, starts, neighbors);
         if (there < 0)
             continue;
-        if (SEVERAL && place_of(j, i, last, starts, neighbors) < k)
+        if (SEVERAL && find_entry(j, i, last, starts, neighbors) < k)
             continue;
         REAL square = 0;
         EACH_AXIS(a)
@@ -77,8 +78,8 @@ kernel void assemble(int n, int weighted, global const int *starts, global const
             const REAL d = DIFFERENCE(a, points[i * DIM + a], points[j * DIM + a]);
             square += d * d;
         }
-        const REAL here = measure_from(k, end, neighbors, face_measures);
-        const REAL other = measure_from(there, starts[j + 1], neighbors, face_measures);
+        const REAL here = sum_measures(k, end, neighbors, face_measures);
+        const REAL other = sum_measures(there, starts[j + 1], neighbors, face_measures);
         REAL weight = R(0.5) * (here + other) / sqrt(square);
         if (weighted)
             weight *= root_i * sqrt(density[j]);
@@ -87,7 +88,7 @@ kernel void assemble(int n, int weighted, global const int *starts, global const
     }
 }
 
-/* The inverse of each row's sum, 0 where there is no neighbor: Jacobi's preconditioner. */
+/* inverse_i = 1 / sum_j w_ij, or 0 if the sum is 0: Jacobi's preconditioner. */
 kernel void invert_diagonal(int n, global const int *starts, global const STORE *weights, global STORE *inverse)
 {
     const int i = get_global_id(0);
@@ -99,9 +100,9 @@ kernel void invert_diagonal(int n, global const int *starts, global const STORE 
     inverse[i] = sum == 0 ? 0 : 1 / sum;
 }
 
-/* y = A x, and row `q` of partial = (x, y). */
-kernel void apply(int n, int q, global const int *starts, global const int *columns, global const STORE *weights,
-                  global const STORE *x, global STORE *y, global REAL *partial)
+/* y = A x, and row q of partial = (x, y). */
+kernel void apply_laplacian(int n, int q, global const int *starts, global const int *columns,
+                            global const STORE *weights, global const STORE *x, global STORE *y, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum product = SUM_ZERO;
@@ -110,14 +111,12 @@ kernel void apply(int n, int q, global const int *starts, global const int *colu
         y[i] = yi;
         sum_add(&product, (REAL)x[i] * yi);
     }
-    const REAL put = group_sum(product.value, scratch);
-    if (get_local_id(0) == 0)
-        partial[q * get_num_groups(0) + get_group_id(0)] = put;
+    PUT(q, product.value);
 }
 
-/* The same without the product, for an x in full precision: the residual of a start. */
-kernel void apply_full(int n, global const int *starts, global const int *columns, global const STORE *weights,
-                       global const REAL *x, global STORE *y)
+/* y = A x for x in REAL, without the scalar product: for the residual of a start. */
+kernel void apply_laplacian_full(int n, global const int *starts, global const int *columns,
+                                 global const STORE *weights, global const REAL *x, global STORE *y)
 {
     for (BLOCK_LOOP(i, n)) {
         REAL sum = 0;
@@ -128,8 +127,8 @@ kernel void apply_full(int n, global const int *starts, global const int *column
     }
 }
 
-/* The right side V_i (s_i - mean s), mean = sum V s / sum V, whose sum vanishes: partial sums, then the values. */
-kernel void source_sums(int n, global const REAL *source, global const REAL *volumes, global REAL *partial)
+/* Rows 0 and 1 of partial: sum V s and sum V. */
+kernel void sum_sources(int n, global const REAL *source, global const REAL *volumes, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum moment = SUM_ZERO, volume = SUM_ZERO;
@@ -137,18 +136,16 @@ kernel void source_sums(int n, global const REAL *source, global const REAL *vol
         sum_add(&moment, volumes[i] * source[i]);
         sum_add(&volume, volumes[i]);
     }
-    const REAL put_moment = group_sum(moment.value, scratch), put_volume = group_sum(volume.value, scratch);
-    if (get_local_id(0) == 0) {
-        partial[get_group_id(0)] = put_moment;
-        partial[get_num_groups(0) + get_group_id(0)] = put_volume;
-    }
+    PUT(0, moment.value);
+    PUT(1, volume.value);
 }
 
-kernel void compatible(int n, global const REAL *source, global const REAL *volumes, global REAL *rhs,
-                       global const REAL *partial)
+/* rhs_i = V_i (s_i - mean s), mean s = sum V s / sum V: the right sides sum up to 0. */
+kernel void subtract_mean_source(int n, global const REAL *source, global const REAL *volumes, global REAL *rhs,
+                                 global const REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
-    const REAL moment = total_sum(partial, scratch), volume = total_sum(partial + get_num_groups(0), scratch);
+    const REAL moment = total_sum(ROW(0), scratch), volume = total_sum(ROW(1), scratch);
     const REAL mean = moment / volume;
     for (BLOCK_LOOP(i, n))
         rhs[i] = volumes[i] * (source[i] - mean);

@@ -1,20 +1,21 @@
-/* Rows of a weighted graph: columns[starts[i] .. starts[i + 1]) with their weights; starts has n + 1 entries. A column
-   may be negative (a wall) if its weight is 0. Weights and vectors are in STORE, by default REAL. Include after real.h
-   and blocks.h. */
+/* Sparse rows of a weighted graph: columns[starts[i] .. starts[i + 1]) with their weights; starts has n + 1 entries.
+   Negative columns (walls) have weight 0. Weights and vectors are in STORE, by default REAL. Include after real.h and
+   blocks.h. */
 
 #ifndef STORE
 #define STORE REAL
 #endif
 #define STORE8 CLVORO_JOIN(STORE, 8)
-/* What select() takes to choose among eight of a type. */
+/* The type of mask that select() takes for eight values of TYPE. */
 #define MASK8_double(inside) convert_long8(inside)
 #define MASK8_float(inside) (inside)
 #define MASK8(TYPE) CLVORO_JOIN(MASK8_, TYPE)
 
-/* (A x)_i = sum_k w_k (x_i - x_columns[k]). On a CPU eight entries at a time, those behind the row's end (of the next
-   rows) with weight 0: rows are short and of all lengths, so that a plain loop waits for mispredicted branches most of
-   the time (measured: 2.7 times as long). Near the end of the arrays, where eight entries might reach beyond them, it
-   is that plain loop. */
+/* (A x)_i = sum_k w_k (x_i - x_columns[k]).
+
+   On a CPU eight entries at a time; entries behind the end of the row get weight 0. Rows are short and of different
+   lengths, so that a plain loop mispredicts branches (measured: 2.7 times as long). The last eight entries of the
+   arrays are left to the plain loop. */
 inline STORE row_difference(int i, int n, global const int *starts, global const int *columns,
                             global const STORE *weights, global const STORE *x)
 {

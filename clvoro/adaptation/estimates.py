@@ -11,7 +11,7 @@ from ..geometry.polygon import Polygon
 from ..opencl.host_memory import host_memory
 from ..opencl.primitives import scan_width
 from ..opencl.program import Engine
-from ..solvers.poisson import most_iterations
+from ..solvers.poisson import max_jacobi_iterations
 from ..tessellation.periodic.halo import block_count
 from .forecast import IMAGE_REACH, shore_expected
 
@@ -47,7 +47,7 @@ FEW = 6000
 def fixed_bytes(engine: Engine, n: float) -> float:
     """Return the bytes of a run that do not grow with its number of cells, `n`, or hardly."""
     real = engine.real.itemsize
-    records = 8 * real * most_iterations(int(min(n, FEW)))
+    records = 8 * real * max_jacobi_iterations(int(min(n, FEW)))
     return records + PARTIAL_SUMS * engine.groups * real + spare_bytes(engine)
 
 

@@ -16,8 +16,9 @@ from typing import Protocol
 
 import numpy as np
 
-from ..solvers.components import balance_pieces
-from ..solvers.conjugate_gradient import Solution
+from ..solvers.components import balance_components
+from ..solvers.conjugate_gradient import Limits, Solution
+from ..solvers.volume_projection import Penalty, Targets
 from .state import Mesh
 
 
@@ -70,14 +71,14 @@ class PublishedMethod:
         mesh.begin_step()
         mesh.lloyd = t.offsets
         mesh.take_source()
-        poisson.compatible(mesh.error, t.volumes, mesh.source)
-        balance_pieces(mesh, t.volumes)
+        poisson.subtract_mean_source(mesh.error, t.volumes, mesh.source)
+        balance_components(mesh.domain, t, mesh.source, t.volumes)
         with mesh.engine.workspace.frame():
             laplacian = poisson.assemble(
                 t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=r.tolerance
             )
             solution = poisson.solve(
-                laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, numbering=mesh.labels
+                laplacian, mesh.source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels
             )
         motion.follow_potential(t, mesh.potential, mesh.correction)
         mesh.measure_speeds()
@@ -122,8 +123,8 @@ class WeightedMethod:
         # Nobody asks for the gradient afterwards.
         w = mesh.weigh(gradient=mesh.correction)
         mesh.hold(mesh.lloyd)
-        poisson.compatible(w.excess, w.weight, mesh.source)
-        balance_pieces(mesh, w.weight)
+        poisson.subtract_mean_source(w.excess, w.weight, mesh.source)
+        balance_components(mesh.domain, t, mesh.source, w.weight)
         with mesh.engine.workspace.frame():
             laplacian = poisson.assemble(
                 t.starts, t.neighbors, t.face_measures, mesh.points, w.density,
@@ -132,7 +133,7 @@ class WeightedMethod:
             # Generators get new labels, in an array of their own, whenever their order changes.
             solution = poisson.solve(
                 laplacian, mesh.source, mesh.potential, tolerance=self.tolerance,
-                numbering=mesh.labels, from_zero=True,
+                ordering=mesh.labels, from_zero=True,
             )  # fmt: skip
         motion.follow_potential(t, mesh.potential, mesh.correction)
         mesh.measure_speeds()
@@ -225,10 +226,9 @@ class ProjectedMethod:
         if mesh.multipliers is None:
             mesh.multipliers = mesh.engine.zeros(mesh.n, np.float32)
         solution = stages.projection.project(
-            t, mesh.reach, gradient, excess, mesh.lloyd, mesh.correction, mesh.quality,
-            eps=self.eps, lenience=self.lenience, bound=self.bound,
-            max_iterations=self.iterations, tolerance=self.tolerance, labels=mesh.labels,
-            fixed=mesh.fixed, start=mesh.multipliers, warm=warm,
+            t, Targets(mesh.reach, gradient, excess, mesh.quality), mesh.lloyd, mesh.correction,
+            Penalty(self.eps, self.lenience, self.bound), Limits(self.tolerance, self.iterations),
+            labels=mesh.labels, fixed=mesh.fixed, start=mesh.multipliers, warm=warm,
         )  # fmt: skip
         mesh.measure_speeds()
         mesh.note_speeds()

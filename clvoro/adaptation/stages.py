@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from ..solvers.poisson import Poisson
-from ..solvers.volume_projection import Projection
+from ..solvers.volume_projection import VolumeProjection
 from ..tessellation.stages import TessellationStages
 from .density import Density
 from .insertion_deletion import PopulationControl
@@ -21,7 +21,7 @@ class Stages(TessellationStages):
     metric: Metric
     density: Density
     poisson: Poisson
-    projection: Projection
+    projection: VolumeProjection
     shape: Shape
     motion: Motion
     refinement: Refinement
@@ -29,6 +29,6 @@ class Stages(TessellationStages):
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson,
-        "projection": Projection, "shape": Shape, "motion": Motion, "refinement": Refinement,
+        "projection": VolumeProjection, "shape": Shape, "motion": Motion, "refinement": Refinement,
         "population": PopulationControl,
     }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Coarse graphs for multigrid: cells joined by heavy weights become one, on the device."""
+"""Coarse graphs for multigrid by pairwise aggregation, on the device (`aggregation.cl`)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,17 @@ from ..opencl.device_array import read_number
 from ..opencl.primitives import Room, Scan
 from ..opencl.program import Engine, Kernels
 
-ROUNDS = 3
-"""Rounds of matching; the third still pairs off every fifth cell, a fourth would not pay."""
+MATCHING_ROUNDS = 3
+"""Rounds of matching per pass. The third still matches every fifth cell; a fourth is not worth its time."""
+WORK_GROUP = 64
+"""Work-items per work-group. It is constant because PoCL compiles a kernel for each size."""
+_EXPONENT_RANGE = 60
+"""Weights between 2^-60 and 2^60 need no scaling in single precision, and neither do their inverses."""
 
 
-GROUP = 64
-"""Work-items per work-group, always the same: PoCL compiles a kernel for every size it meets."""
-
-
-def whole_groups(size: int) -> int:
+def round_to_work_group(size: int) -> int:
     """Return `size` rounded up to whole work-groups."""
-    return max(1, -(-size // GROUP)) * GROUP
-
-
-_IN_RANGE = 60
-"""Weights up to 2^60 and down to 2^-60 are in single precision as they are: so are their inverses."""
+    return max(1, -(-size // WORK_GROUP)) * WORK_GROUP
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,7 @@ class Graph:
     ----------
     starts : (n + 1,) int32
     columns : (m,) int32
-        An entry that names its own row counts for nothing, nor does one of weight 0; a negative one has weight 0.
+        Entries on the diagonal are ignored. Negative columns (walls) have weight 0.
     weights : (m,) real
         Symmetric, >= 0.
     """
@@ -51,21 +47,26 @@ class Graph:
     def __len__(self) -> int:
         return len(self.starts) - 1
 
+    @property
+    def rows(self) -> tuple[cla.Array, cla.Array, cla.Array]:
+        """Starts, columns and weights, as kernels take them."""
+        return self.starts, self.columns, self.weights
+
 
 @dataclass(frozen=True)
-class Groups:
-    """A partition of a graph's cells.
+class Aggregates:
+    """A partition of the cells of a graph.
 
     Attributes
     ----------
-    group : (n,) int32
-        Number of each cell's group.
-    starts : (groups + 1,) int32
+    aggregate : (n,) int32
+        Number of each cell's aggregate.
+    starts : (aggregates + 1,) int32
     members : (n,) int32
-        Group g has the cells ``members[starts[g]:starts[g + 1]]``.
+        Aggregate g has the cells ``members[starts[g]:starts[g + 1]]``.
     """
 
-    group: cla.Array
+    aggregate: cla.Array
     starts: cla.Array
     members: cla.Array
 
@@ -75,7 +76,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class PairInverse:
-    """Inverse of diagonal and 2 x 2 blocks, each (n,).
+    """The smoother B^-1: inverse of the diagonal and of the 2 x 2 blocks of matched pairs, each (n,).
 
     u_i = own_i r_i + both_i (r_i + r_partner_i).
     """
@@ -84,117 +85,126 @@ class PairInverse:
     own: cla.Array
     both: cla.Array
 
+    @property
+    def blocks(self) -> tuple[cla.Array, cla.Array, cla.Array]:
+        """The three arrays, as kernels take them."""
+        return self.partner, self.own, self.both
 
-class Coarsening:
-    """Makes a graph a few times smaller by two passes of matching.
 
-    In a pass each cell looks at the free neighbor it is tied to most, and two that look at each
-    other are joined; after `ROUNDS` rounds the rest joins the pair it is tied to most. A tie is
-    w (1/d_i + 1/d_j), d the sums of weights: what counts is the share of a cell's weights, as on
-    meshes with a density all heavy neighbors lie one way. Two passes make groups of four to five.
+class Aggregation:
+    """Coarsen a graph by two passes of pairwise matching, to a fourth or a fifth of its cells.
+
+    In a pass each unmatched cell chooses its strongest unmatched neighbor, and two cells that choose each other are
+    matched. After `MATCHING_ROUNDS` rounds the remaining cells join the pair of their strongest neighbor. The strength
+    of a connection is w (1/d_i + 1/d_j), d the row sums of the weights: on meshes with a density all heavy neighbors of
+    a cell lie on one side, and the share of the cell's weights matters.
 
     Parameters
     ----------
     engine : Engine
-        Of the multigrid's precision.
+        In the precision of the multigrid.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._converters: dict[np.dtype, Kernels] = {}
+        self._kernels_of: dict[np.dtype, Kernels] = {}
         self._kernels = self._kernels_from(engine.real)
         self._scan = Scan(engine)
         self._room = Room(engine)
         self.exponent = 0
 
     def _kernels_from(self, source: np.dtype) -> Kernels:
-        """Kernels that convert from another precision."""
-        if source not in self._converters:
-            self._converters[source] = self.engine.kernels(
+        """Return the kernels for weights in precision `source`."""
+        if source not in self._kernels_of:
+            self._kernels_of[source] = self.engine.kernels(
                 "solvers/aggregation", {"SOURCE": self.engine.name_of(source)}
             )
-        return self._converters[source]
+        return self._kernels_of[source]
 
     def _run(self, kernel: cl.Kernel, size: int, *args: object) -> None:
-        self.engine.run(kernel, whole_groups(size), *args)
+        self.engine.run(kernel, round_to_work_group(size), *args)
 
-    def convert(self, graph: Graph, level: int, *, anew: bool = True) -> Graph:
-        """Return `graph` with its weights in this engine's precision, times a power of two.
+    def _run_rows(self, kernel: cl.Kernel, graph: Graph, *args: object) -> None:
+        """Run a kernel that takes the number of cells and the graph's rows first."""
+        self._run(kernel, len(graph), np.int32(len(graph)), *graph.rows, *args)
 
-        The largest becomes 1 at most, so that weights of any unit and their inverses are in range;
-        where they are so already they stay as they are. Without `anew` the power is the last call's.
+    def scale(self, graph: Graph, level: int, *, same_exponent: bool = False) -> Graph:
+        """Return `graph` with weights in this engine's precision, times a power of two.
+
+        The power makes the largest weight at most 1, so that weights of any unit and their inverses are in range. It
+        is 1 where they are in range already. With `same_exponent` it is that of the last call.
         """
         m, source = len(graph.weights), graph.weights.dtype
         kernels = self._kernels_from(source)
-        if anew:
+        if not same_exponent:
             items = self.engine.groups * self.engine.group_size
             partial = self._room("largest", source, size=items, dtype=source)
-            rows = (np.int32(len(graph)), graph.starts)
-            self.engine.run_blocks(kernels.largest, *rows, graph.weights, partial)
-            most = float(partial.get().max())
-            self.exponent = -math.frexp(most)[1] if 0 < most < math.inf else 0
-            if source == self.engine.real and abs(self.exponent) <= _IN_RANGE:
+            size = np.int32(len(graph))
+            self.engine.run_blocks(
+                kernels.find_largest_weight, size, graph.starts, graph.weights, partial
+            )
+            largest = float(partial.get().max())
+            self.exponent = -math.frexp(largest)[1] if 0 < largest < math.inf else 0
+            if source == self.engine.real and abs(self.exponent) <= _EXPONENT_RANGE:
                 self.exponent = 0
         if source == self.engine.real and self.exponent == 0:
             return graph
         weights = self._room(level, "weights", size=m)
-        self._run(kernels.convert, m, np.int32(m), np.int32(self.exponent), graph.weights, weights)
+        exponent = np.int32(self.exponent)
+        self._run(kernels.scale_weights, m, np.int32(m), exponent, graph.weights, weights)
         return Graph(graph.starts, graph.columns, weights)
 
-    def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Groups, Graph]:
-        """Return the smoother's blocks of `graph`, its groups, and the graph of the groups.
+    def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Aggregates, Graph]:
+        """Return the smoother of `graph`, its aggregates, and the coarse graph.
 
-        Weights between groups are the sums of those between their members, times the ratio of
-        lengths (groups / cells)^(1/d): groups are that much farther apart than cells.
+        A coarse weight is the sum of the weights between the members of two aggregates, times the ratio of lengths
+        (aggregates / cells)^(1/d), because aggregates are that much farther apart than cells.
         """
         n, dim = len(graph), self.engine.dim
         with self.engine.workspace.frame():
-            inverse, first = self._group(graph, level)
-            middle = self._graph_of(graph, first, 1.0)
-            _, second = self._group(middle)
+            inverse, first = self._aggregate(graph, level)
+            middle = self._coarse_graph(graph, first, 1.0)
+            _, second = self._aggregate(middle)
             ratio = (len(second) / n) ** (1 / dim)
-            coarse = self._graph_of(middle, second, ratio, level)
+            coarse = self._coarse_graph(middle, second, ratio, level)
             assert inverse is not None
             return inverse, self._compose(first, second, level), coarse
 
     def clear(self) -> None:
-        """Let go of all buffers."""
+        """Free all buffers."""
         self._room.clear()
 
-    def pairs(self, graph: Graph, level: int) -> PairInverse:
-        """Return the smoother's blocks alone, for the coarsest graph."""
+    def match_pairs(self, graph: Graph, level: int) -> PairInverse:
+        """Return the smoother of the coarsest graph."""
         n, ints = len(graph), np.int32
         with self.engine.workspace.frame():
             mate, choice = (self.engine.scratch(n, ints) for _ in range(2))
-            self._round(graph, self._sums(graph), mate.fill(-1), choice)
+            self._match(graph, self._inverse_sums(graph), mate.fill(-1), choice)
             return self._pair_inverse(graph, mate, level)
 
-    def renew_pairs(self, graph: Graph, pairs: PairInverse) -> None:
-        """Set the blocks of `pairs` for other weights of the same cells; the pairs stay."""
-        n = len(graph)
-        self._run(
-            self._kernels.pair_inverse, n, np.int32(n), graph.starts, graph.columns, graph.weights,
-            pairs.partner, pairs.partner, pairs.own, pairs.both,
-        )  # fmt: skip
+    def update_pairs(self, graph: Graph, pairs: PairInverse) -> None:
+        """Recompute the blocks of `pairs` for other weights of the same cells. The pairs stay."""
+        self._run_rows(self._kernels.invert_pair_blocks, graph, pairs.partner, *pairs.blocks)
 
-    def _sums(self, graph: Graph) -> cla.Array:
-        """Inverse sums of the rows' weights, in the workspace."""
-        n = len(graph)
-        sums = self.engine.scratch(n)
-        self._run(
-            self._kernels.inverse_sums, n, np.int32(n), graph.starts, graph.columns, graph.weights,
-            sums,
-        )  # fmt: skip
+    def _inverse_sums(self, graph: Graph) -> cla.Array:
+        """Return the inverse row sums of the weights (n,), in the workspace."""
+        sums = self.engine.scratch(len(graph))
+        self._run_rows(self._kernels.invert_row_sums, graph, sums)
         return sums
 
-    def _round(self, graph: Graph, sums: cla.Array, mate: cla.Array, choice: cla.Array) -> None:
-        run, k, n = self._run, self._kernels, len(graph)
-        size = np.int32(n)
-        run(
-            k.propose, n, size, np.int32(0), graph.starts, graph.columns, graph.weights, sums, mate,
-            choice,
+    def _choose(
+        self, graph: Graph, matched: int, sums: cla.Array, mate: cla.Array, choice: cla.Array
+    ) -> None:
+        self._run(
+            self._kernels.choose_neighbor, len(graph), np.int32(len(graph)), np.int32(matched),
+            *graph.rows, sums, mate, choice,
         )  # fmt: skip
-        run(k.marry, n, size, choice, mate)
+
+    def _match(self, graph: Graph, sums: cla.Array, mate: cla.Array, choice: cla.Array) -> None:
+        """Do one round of matching."""
+        n = len(graph)
+        self._choose(graph, 0, sums, mate, choice)
+        self._run(self._kernels.match_pairs, n, np.int32(n), choice, mate)
 
     def _pair_inverse(self, graph: Graph, mate: cla.Array, level: int) -> PairInverse:
         n, room = len(graph), self._room
@@ -203,75 +213,84 @@ class Coarsening:
             room(level, "own", size=n),
             room(level, "both", size=n),
         )
-        self._run(
-            self._kernels.pair_inverse, n, np.int32(n), graph.starts, graph.columns, graph.weights,
-            mate, pairs.partner, pairs.own, pairs.both,
-        )  # fmt: skip
+        self._run_rows(self._kernels.invert_pair_blocks, graph, mate, *pairs.blocks)
         return pairs
 
-    def _group(self, graph: Graph, level: int | None = None) -> tuple[PairInverse | None, Groups]:
-        """One pass: groups of mates and who has joined them, in the workspace; the smoother's blocks of `level`."""
+    def _aggregate(
+        self, graph: Graph, level: int | None = None
+    ) -> tuple[PairInverse | None, Aggregates]:
+        """Do one pass: return the smoother (if a `level` is given) and the aggregates, in the workspace."""
         run, k, n, scratch = self._run, self._kernels, len(graph), self.engine.scratch
-        size, zero, one, ints = np.int32(n), np.int32(0), np.int32(1), np.int32
-        group, members, starts = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
+        size, ints = np.int32(n), np.int32
+        aggregate, members, starts = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
         with self.engine.workspace.frame():
             mate, choice, numbers = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
             mate.fill(-1)
-            inverse, sums = None, self._sums(graph)
-            for turn in range(ROUNDS):
-                self._round(graph, sums, mate, choice)
+            inverse, sums = None, self._inverse_sums(graph)
+            for turn in range(MATCHING_ROUNDS):
+                self._match(graph, sums, mate, choice)
                 if turn == 0 and level is not None:
                     inverse = self._pair_inverse(graph, mate, level)
-            rows = (graph.starts, graph.columns, graph.weights)
-            run(k.propose, n, size, one, *rows, sums, mate, choice)
-            run(k.join, n, size, mate, choice, numbers)
+            self._choose(graph, 1, sums, mate, choice)
+            run(k.mark_roots, n, size, mate, choice, numbers)
             self._scan.exclusive(numbers, numbers, n)
             count = read_number(numbers, n)
-            standing, number = scratch(count, ints), np.int32(count)
-            run(k.number_groups, n, size, mate, choice, numbers, group, standing)
-            listing = (graph.starts, graph.columns, mate, choice, standing, starts)
-            run(k.list_members, count, number, zero, *listing, members)
-            self._scan.exclusive(starts, starts, count)
-            run(k.list_members, count, number, one, *listing, members)
-        return inverse, Groups(group, starts[: count + 1], members)
+            roots = scratch(count, ints)
+            run(k.number_aggregates, n, size, mate, choice, numbers, aggregate, roots)
+            lists = (graph.starts, graph.columns, mate, choice, roots, starts)
+            self._list(k.list_members, count, lists, starts, members)
+        return inverse, Aggregates(aggregate, starts[: count + 1], members)
 
-    def _graph_of(
-        self, graph: Graph, groups: Groups, factor: float, level: int | None = None
+    def _list(
+        self,
+        kernel: cl.Kernel,
+        count: int,
+        lists: tuple[cla.Array, ...],
+        starts: cla.Array,
+        members: cla.Array,
+    ) -> None:
+        """List the members of `count` aggregates: count them, then write them."""
+        number = np.int32(count)
+        self._run(kernel, count, number, np.int32(0), *lists, members)
+        self._scan.exclusive(starts, starts, count)
+        self._run(kernel, count, number, np.int32(1), *lists, members)
+
+    def _coarse_graph(
+        self, graph: Graph, aggregates: Aggregates, factor: float, level: int | None = None
     ) -> Graph:
-        """Return the graph of `groups`, weights times `factor`: kept for `level`, else in the workspace."""
-        run, k, count = self._run, self._kernels, len(groups)
+        """Return the graph of `aggregates`, weights times `factor`: kept for `level`, else in the workspace."""
+        run, k, count = self._run, self._kernels, len(aggregates)
 
         def array(name: str, size: int, dtype: DTypeLike | None = None) -> cla.Array:
             if level is None:
                 return self.engine.scratch(size, dtype)
             return self._room(level, f"coarse {name}", size=size, dtype=dtype)
 
-        lists = (groups.group, groups.starts, groups.members)
-        rows = (graph.starts, graph.columns, graph.weights, *lists)
+        lists = (aggregates.aggregate, aggregates.starts, aggregates.members)
         number, starts = np.int32(count), array("starts", count + 1, np.int32)
-        run(k.count_rows, count, number, *rows, starts)
+        run(k.count_coarse_entries, count, number, *graph.rows, *lists, starts)
         self._scan.exclusive(starts, starts, count)
         entries = read_number(starts, count)
-        columns, weights = array("columns", entries, np.int32), array("weights", entries)
+        coarse = Graph(starts, array("columns", entries, np.int32), array("weights", entries))
         scale = self.engine.real.type(factor)
-        run(k.merge_rows, count, number, scale, *rows, starts, columns, weights)
+        run(k.sum_coarse_weights, count, number, scale, *graph.rows, *lists, *coarse.rows)
         if level is not None:
-            # What lies between two passes is for the choice of mates only, where roundings do no harm.
-            run(k.share_weights, count, number, starts, columns, weights)
-        return Graph(starts, columns, weights)
+            # The graph between the two passes only serves the choice of mates, where round-off does no harm.
+            run(k.symmetrize_weights, count, number, *coarse.rows)
+        return coarse
 
-    def _compose(self, inner: Groups, outer: Groups, level: int) -> Groups:
-        run, k, room = self._run, self._kernels, self._room
-        n, count = len(inner.group), len(outer)
-        groups = Groups(
-            room(level, "group", size=n, dtype=np.int32),
+    def _compose(self, inner: Aggregates, outer: Aggregates, level: int) -> Aggregates:
+        """Return the aggregates of two passes, as a partition of the cells."""
+        room = self._room
+        n, count = len(inner.aggregate), len(outer)
+        both = Aggregates(
+            room(level, "aggregate", size=n, dtype=np.int32),
             room(level, "starts", size=count + 1, dtype=np.int32),
             room(level, "members", size=n, dtype=np.int32),
         )
-        run(k.compose_groups, n, np.int32(n), inner.group, outer.group, groups.group)
-        lists = (outer.starts, outer.members, inner.starts, inner.members, groups.starts)
-        number = np.int32(count)
-        run(k.compose_members, count, number, np.int32(0), *lists, groups.members)
-        self._scan.exclusive(groups.starts, groups.starts, count)
-        run(k.compose_members, count, number, np.int32(1), *lists, groups.members)
-        return groups
+        self._run(
+            self._kernels.compose_aggregates, n, np.int32(n), inner.aggregate, outer.aggregate, both.aggregate
+        )  # fmt: skip
+        lists = (outer.starts, outer.members, inner.starts, inner.members, both.starts)
+        self._list(self._kernels.compose_members, count, lists, both.starts, both.members)
+        return both

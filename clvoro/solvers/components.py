@@ -1,4 +1,4 @@
-"""Domains of several pieces: the graph of neighbors falls apart, and so does the Poisson equation."""
+"""Connected components of the neighbor graph: a domain of several pieces has one Poisson equation per component."""
 
 from __future__ import annotations
 
@@ -11,42 +11,48 @@ from ..geometry.polygon import Polygon
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
-    from ..adaptation.state import Mesh
+    from ..geometry.box import Domain
     from ..tessellation.device_diagram import Tessellation
 
 
-def balance_pieces(mesh: Mesh, weights: cla.Array) -> None:
-    """Take each part's mean from the right side `mesh.source` = weight * (s - mean s), so that it sums up to 0 there.
+def balance_components(
+    domain: Domain, t: Tessellation, source: cla.Array, weights: cla.Array
+) -> None:
+    """Subtract from `source` its mean in each connected component, so that it sums up to 0 there.
 
-    No cells can be given from part to part, and the operator's null space has a constant for each. It is done on the
-    host, and costs the time of bringing neighbors and sources there and back; in one piece nothing is done.
+    The right side is source_i = weight_i (s_i - mean s). The null space of the operator has one constant per component.
+    The work is done on the host. Nothing is done if the domain has one piece.
+
+    Parameters
+    ----------
+    source : (n,) real, device
+        Right side, changed in place. It may be longer than n.
+    weights : (n,) real, device
     """
-    domain = mesh.domain
     if not isinstance(domain, Polygon) or domain.n_pieces == 1:
         return
-    n = mesh.n
-    part = connected_parts(mesh.t)
-    source, weight = mesh.source[:n].get(), weights[:n].get().astype(float)
-    sums, total = (np.bincount(part, v) for v in (source, weight))
-    balanced = source - weight * np.divide(sums, total, out=sums, where=total > 0)[part]
-    # With no cell beside it nothing can take up what would round.
-    balanced[np.bincount(part)[part] == 1] = 0
-    mesh.source[:n].set(balanced.astype(source.dtype))
+    component = connected_components(t)
+    values, weight = source[: t.n].get(), weights[: t.n].get().astype(float)
+    sums, total = (np.bincount(component, v) for v in (values, weight))
+    means = np.divide(sums, total, out=sums, where=total > 0)
+    balanced = values - weight * means[component]
+    # A component of one cell has no neighbor that could absorb its round-off.
+    balanced[np.bincount(component)[component] == 1] = 0
+    source[: t.n].set(balanced.astype(values.dtype))
 
 
-def connected_parts(t: Tessellation) -> np.ndarray:
-    """Return for each cell the number of the part of the graph of neighbors that it is in, (n,) int.
+def connected_components(t: Tessellation) -> np.ndarray:
+    """Return the number of each cell's connected component in the neighbor graph, (n,) int.
 
-    By the graph, as the place of a generator does not tell: one in a corner that pieces share is in all of them, its
-    cell in one; a piece without a generator is made of parts of cells, and joins them.
+    The positions of the generators do not tell: a generator in a corner that several pieces share lies in all of them,
+    and a piece without a generator consists of parts of cells and connects them.
     """
-    # It takes a fifth of a second to import; most runs do without.
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
+    # This import takes 0.2 s, and most runs do without it.
+    from scipy.sparse import csgraph, csr_array
 
     starts = t.starts.get()
     other = t.neighbors[: starts[-1]].get()
     walls = other < 0
     other[walls] = np.repeat(np.arange(t.n, dtype=other.dtype), np.diff(starts))[walls]
     graph = csr_array((np.ones(len(other), np.int8), other, starts), shape=(t.n, t.n))
-    return connected_components(graph, directed=False)[1]
+    return csgraph.connected_components(graph, directed=False)[1]

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on the device, for any operator that can enqueue itself."""
+"""Preconditioned conjugate gradients on the device, for any operator that enqueues itself (`conjugate_gradient.cl`)."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from ..opencl.workspace import framed
 Apply = Callable[[cla.Array, cla.Array], object]
 Precondition = Callable[[cla.Array, cla.Array, cla.Array], object]
 
-# Rows of the array of partial sums, and columns of the record: as in cl_kernels/krylov.cl.
+# Rows of the partial sums (as in conjugate_gradient.cl) and columns of the record (as in partial_sums.h).
 CURVATURE, _GAMMA, _ROWS = 3, 6, 11
-_NORM, _RUNNING, _CURVATURE = 0, 2, 3
+RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32
-"""Iterations whose record is read together with the state that `solve_alone` leaves."""
+"""Iterations whose record is read together with the state that `solve_by_group` leaves."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """How an iterative solve went.
+    """Outcome of an iterative solve.
 
     Attributes
     ----------
     iterations : int
     residual : float
-        True relative residual ||b - A x|| / ||b|| (2-norm), evaluated from x at the end; the
-        recurrence's where only few digits are asked for.
+        True relative residual ||b - A x|| / ||b|| (2-norm), evaluated from x at the end. If `Limits.verify` is False,
+        that of the recurrence.
     residuals : (iterations + 1,) float64
-        The relative residual before each iteration, as the recurrence tracks it, and the last one.
+        Relative residual before each iteration, by the recurrence, and the final one.
     converged : bool
         Whether `residual` is within the tolerance.
     reason : str
-        ``"converged"``, ``"zero right side"``, ``"stagnated"`` (the precision allows no less) or
-        ``"max_iterations"``; followed by ``" (Jacobi after ...)"`` where the preconditioner asked
-        for was given up on the way. Iterations and residuals are then those of both.
+        ``"converged"``, ``"zero right side"``, ``"stagnated"`` (limited by the precision) or ``"max_iterations"``.
+        ``" (Jacobi after ...)"`` follows if the solver changed to Jacobi's preconditioner; iterations and residuals
+        are then those of both.
     """
 
     iterations: int
@@ -52,14 +52,19 @@ class Solution:
     converged: bool
     reason: str
 
+    @classmethod
+    def zero(cls) -> Solution:
+        """Return the outcome for a right side of zero."""
+        return cls(0, 0.0, np.zeros(1), True, "zero right side")
+
 
 class BreakdownError(SolverError):
-    """The operator or the preconditioner was found not to be positive definite, or not finite.
+    """The operator or the preconditioner is not positive definite, or not finite.
 
     Attributes
     ----------
     residuals : (iterations + 1,) float64
-        As in `Solution`. The iterate is that of the last good iteration.
+        As in `Solution`. The iterate is that of the last valid iteration.
     """
 
     def __init__(self, message: str, residuals: list[float]) -> None:
@@ -67,13 +72,57 @@ class BreakdownError(SolverError):
         self.residuals = np.array(residuals)
 
 
+@dataclass(frozen=True)
+class Operator:
+    """A symmetric positive (semi-)definite operator A.
+
+    Attributes
+    ----------
+    apply : callable (x, y)
+        Enqueues y = A x on the engine's queue. y has the dtype of the iteration's vectors, and so has x, except for the
+        start and the solution.
+    writes_curvature : bool
+        `apply` also writes the partial sums of (x, y) to row `CURVATURE` of `ConjugateGradient.partial`.
+    singular : bool
+        The null space of A is the constants: the mean of the right side is removed first, that of x at the end.
+    rows : tuple of device arrays, optional
+        Starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then solves
+        systems of few unknowns, if the preconditioner is diagonal.
+    """
+
+    apply: Apply
+    writes_curvature: bool = False
+    singular: bool = False
+    rows: tuple[cla.Array, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When an iteration ends.
+
+    Attributes
+    ----------
+    tolerance : float
+        Relative residual in the 2-norm.
+    max_iterations : int
+    lookahead : int
+        Iterations to enqueue at most before the host reads the record. The first read is after that many, or 8.
+    verify : bool
+        Evaluate the true residual at the end. Otherwise that of the recurrence is trusted.
+    """
+
+    tolerance: float
+    max_iterations: int
+    lookahead: int = 64
+    verify: bool = True
+
+
 class ConjugateGradient:
     """Conjugate gradients for a symmetric positive (semi-)definite operator.
 
-    All vectors and scalars stay on the device. The host enqueues iterations ahead, as many as the
-    convergence so far lets it expect, and then reads one row of scalars for each; the iterate is
-    frozen on the device when the tolerance is met, so the result does not depend on when the host
-    looks.
+    All vectors and scalars stay on the device. The host enqueues as many iterations as it expects from the
+    convergence so far, and then reads one row of scalars per iteration. The iterate is frozen on the device when the
+    tolerance is met, so the result does not depend on when the host reads.
 
     Parameters
     ----------
@@ -84,14 +133,14 @@ class ConjugateGradient:
         self.engine = engine
         self._kernels: dict[np.dtype, Kernels] = {}
         self.partial = engine.zeros(_ROWS * engine.groups)
-        """Partial sums; a fused operator leaves those of (x, A x) in row `CURVATURE`."""
+        """Partial sums, one row per quantity."""
         self.state = engine.zeros(6)
         self._record_capacity = 0
-        self._alone = engine.zeros(_STATE + 4)
+        self._group_state = engine.zeros(_STATE + 4)
         self._most_alone = most_alone(engine)
 
     def kernels_in(self, store: np.dtype) -> Kernels:
-        """Return the kernels whose vectors are in `store`."""
+        """Return the kernels for vectors in `store`."""
         if store not in self._kernels:
             self._kernels[store] = self.engine.kernels(
                 "solvers/conjugate_gradient", {"STORE": self.engine.name_of(store)}
@@ -101,51 +150,29 @@ class ConjugateGradient:
     @framed
     def solve(
         self,
-        apply: Apply,
+        operator: Operator,
         rhs: cla.Array,
         x: cla.Array,
-        *,
         precondition: cla.Array | Precondition,
-        tolerance: float,
-        max_iterations: int,
-        fused: bool = False,
-        center: bool = False,
-        lookahead: int = 64,
+        limits: Limits,
+        *,
         from_zero: bool = False,
-        verify: bool = True,
         store: np.dtype | None = None,
-        rows: tuple[cla.Array, ...] | None = None,
     ) -> Solution:
         """Solve A x = b from the start `x`, in place.
 
         Parameters
         ----------
-        apply : callable (x, y)
-            Enqueues y = A x on the engine's queue; y is in `store`, and so is x but for the start and the solution.
-            The operator must be symmetric.
+        operator : Operator
         rhs, x : (n,) real, device
-        precondition : (n,) store or callable (r, u, spare)
-            The inverse of a diagonal, or what enqueues u = M^-1 r, M symmetric positive definite, all in `store`;
-            `spare` is a vector that it may use.
-        tolerance : float
-            Of the relative residual in the 2-norm.
-        max_iterations : int
-        fused : bool
-            `apply` leaves the partial sums of (x, y) in row `CURVATURE` of `partial` itself.
-        center : bool
-            The operator's null space is the constants: take the mean of the right side away first
-            and that of x at the end.
-        lookahead : int
-            The most iterations to enqueue before the host looks; the first look is after that many, or 8.
+        precondition : (n,) store or callable (r, u, work)
+            Inverse of a diagonal, or a function that enqueues u = M^-1 r, M symmetric positive definite, all in
+            `store`. It may overwrite `work`.
+        limits : Limits
         from_zero : bool
-            Start from zero, whatever `x` holds: saves an application of the operator.
-        verify : bool
-            Evaluate the true residual at the end; else trust the recurrence's that it is within the tolerance.
+            Start from zero and ignore `x`. This saves an application of the operator.
         store : numpy.dtype, optional
-            Of the iteration's vectors: the engine's precision or, where few digits are asked for, float32.
-        rows : tuple of device arrays, optional
-            Starts, columns and weights of the operator's matrix, if it has one (see solvers/sparse_rows.h). Where
-            unknowns are few and the preconditioner is a diagonal, one work-group then solves alone.
+            Type of the iteration's vectors: the engine's precision, or float32 for a large tolerance.
 
         Returns
         -------
@@ -154,224 +181,221 @@ class ConjugateGradient:
         Raises
         ------
         SolverError
-            If a number of the right side, start or operator is not finite.
+            If the right side, the start or the operator is not finite.
         BreakdownError
-            If the operator or preconditioner is not positive definite: a SolverError, too.
+            If the operator or the preconditioner is not positive definite.
         """
         store = self.engine.real if store is None else np.dtype(store)
-        n = len(rhs)
-        if max_iterations > self._record_capacity:
-            self._record_capacity = max_iterations
-            self.record = self.engine.zeros(4 * (max_iterations + 1))
-            self._alone = self.engine.zeros(_STATE + 4 * (max_iterations + 1))
-        if rows is not None and isinstance(precondition, cla.Array) and n <= self._most_alone:
-            return self._solve_alone(
-                store, rows, rhs, x, precondition, tolerance, max_iterations, center, from_zero, verify
-            )  # fmt: skip
-        system = _System(self, apply, precondition, rhs, x, store, tolerance, fused, center)
+        if limits.max_iterations > self._record_capacity:
+            self._record_capacity = limits.max_iterations
+            self.record = self.engine.zeros(4 * (limits.max_iterations + 1))
+            self._group_state = self.engine.zeros(_STATE + 4 * (limits.max_iterations + 1))
+        if operator.rows is not None and isinstance(precondition, cla.Array):
+            if len(rhs) <= self._most_alone:
+                return self._solve_by_group(
+                    operator, rhs, x, precondition, limits, from_zero, store
+                )
+        system = _System(self, operator, rhs, x, precondition, limits.tolerance, store)
         iterations, history, reason = 0, [], "max_iterations"
         residual = system.measure(from_zero)
         if residual < 0:
             x.fill(0)
-            return Solution(0, 0.0, np.zeros(1), True, "zero right side")
+            return Solution.zero()
         while True:
-            if residual <= tolerance:
+            if residual <= limits.tolerance:
                 reason = "converged"
                 break
-            if iterations >= max_iterations:
+            if iterations >= limits.max_iterations:
                 break
-            most = max_iterations - iterations
-            iterations += self._cycle(system, most, tolerance, residual, lookahead, history)
-            if not verify and self._left <= tolerance:
-                residual, reason = self._left, "converged"
+            iterations += self._iterate(system, iterations, limits, residual, history)
+            if not limits.verify and self._final <= limits.tolerance:
+                residual, reason = self._final, "converged"
                 break
             before, residual = residual, system.measure()
-            # A restart gains digits as long as the recurrence, not x's precision, was the limit.
-            if residual > max(tolerance, 0.5 * before) and iterations < max_iterations:
+            # A restart gains digits only if the recurrence was the limit, not the precision of x.
+            stagnated = residual > max(limits.tolerance, 0.5 * before)
+            if stagnated and iterations < limits.max_iterations:
                 reason = "stagnated"
                 break
-        if center:
+        if operator.singular:
             system.center()
-        residuals = np.array([*history, residual])
-        return Solution(iterations, residual, residuals, residual <= tolerance, reason)
+        converged = residual <= limits.tolerance
+        return Solution(iterations, residual, np.array([*history, residual]), converged, reason)
 
-    def _solve_alone(
+    def _solve_by_group(
         self,
-        store: np.dtype,
-        rows: tuple[cla.Array, ...],
+        operator: Operator,
         rhs: cla.Array,
         x: cla.Array,
         inverse_diagonal: cla.Array,
-        tolerance: float,
-        max_iterations: int,
-        center: bool,
+        limits: Limits,
         from_zero: bool,
-        verify: bool,
+        store: np.dtype,
     ) -> Solution:
-        """Have one work-group solve, in a launch for each time that the recurrence is begun."""
-        engine, real, n = self.engine, self.engine.real.type, len(rhs)
-        vectors = (engine.scratch(n, store) for _ in range(4))
-        given = (*rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._alone)
-        kernel, done, history, most = self.kernels_in(store).solve_alone, 0, [], math.inf
+        """Solve with one work-group: one launch per start of the recurrence."""
+        engine, real, tolerance = self.engine, self.engine.real.type, limits.tolerance
+        vectors = (engine.scratch(len(rhs), store) for _ in range(4))
+        assert operator.rows is not None
+        given = (
+            *operator.rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._group_state
+        )  # fmt: skip
+        size, center = np.int32(len(rhs)), np.int32(operator.singular)
+        kernel = self.kernels_in(store).solve_by_group
+        done, history, stagnated = 0, [], math.inf
         while True:
-            left = max_iterations - done
+            left = limits.max_iterations - done
             Launch(
-                engine, kernel, np.int32(n), np.int32(from_zero), np.int32(center),
-                np.int32(left), real(0.95 * tolerance), real(tolerance),
-                real(min(most, float(np.finfo(real).max))), *given, groups=1,
+                engine, kernel, size, np.int32(from_zero), center, np.int32(left), real(0.95 * tolerance),
+                real(tolerance), real(min(stagnated, float(np.finfo(real).max))), *given, groups=1,
             )()  # fmt: skip
-            host = self._alone[: _STATE + 4 * min(left, _FIRST_READ)].get()
-            residual = self.relate(*host[2:6])
+            host = self._group_state[: _STATE + 4 * min(left, _FIRST_READ)].get()
+            residual = self.relative_residual(*host[2:6])
             if residual < 0:
                 x.fill(0)
-                return Solution(0, 0.0, np.zeros(1), True, "zero right side")
+                return Solution.zero()
             converged = residual <= tolerance
-            if converged or left == 0 or residual > most:
+            if converged or left == 0 or residual > stagnated:
                 reason = "converged" if converged else "stagnated" if left else "max_iterations"
                 break
-            taken = self._follow(host[_STATE:], 0, tolerance, history)
-            if taken is None and left > _FIRST_READ:
-                host = self._alone[_STATE : _STATE + 4 * left].get()
-                taken = self._follow(host[4 * _FIRST_READ :], _FIRST_READ, tolerance, history)
-            done += left if taken is None else taken
-            if not verify and self._left <= tolerance:
-                residual, converged, reason = self._left, True, "converged"
+            stop = self._read_record(host[_STATE:], 0, tolerance, history)
+            if stop is None and left > _FIRST_READ:
+                host = self._group_state[_STATE : _STATE + 4 * left].get()
+                stop = self._read_record(host[4 * _FIRST_READ :], _FIRST_READ, tolerance, history)
+            done += left if stop is None else stop
+            if not limits.verify and self._final <= tolerance:
+                residual, converged, reason = self._final, True, "converged"
                 break
             # As in `solve`.
-            from_zero, most = False, max(tolerance, 0.5 * residual)
+            from_zero, stagnated = False, max(tolerance, 0.5 * residual)
         return Solution(done, residual, np.array([*history, residual]), converged, reason)
 
-    def relate(self, taken: float, _: float, norm_b: float, norm_r: float) -> float:
-        """Return the relative residual by words 2 to 5 of the device's state; negative: b is zero."""
+    def relative_residual(self, removed: float, _: float, norm_b: float, norm_r: float) -> float:
+        """Return the relative residual from words 2 to 5 of the device's state; negative if b is zero."""
         if not (math.isfinite(norm_b) and math.isfinite(norm_r)):
             raise SolverError(
-                f"the linear solve got a right side, start or operator that is not finite: "
-                f"|b|^2 = {norm_b}, |b - A x|^2 = {norm_r} after scaling; check the input"
+                "the linear solve got a right side, start or operator that is not finite: |b|^2 = "
+                f"{norm_b} and |b - A x|^2 = {norm_r} after scaling. Check the input"
             )
-        # What is left of a constant right side is rounding.
-        if norm_b <= (8 * np.finfo(self.engine.real).eps) ** 2 * taken:
+        # Of a constant right side only round-off remains.
+        if norm_b <= (8 * np.finfo(self.engine.real).eps) ** 2 * removed:
             return -1.0
         self._norm_b = float(norm_b)
         return math.sqrt(norm_r / norm_b)
 
-    def _cycle(
-        self,
-        system: _System,
-        most: int,
-        tolerance: float,
-        residual: float,
-        lookahead: int,
-        history: list[float],
+    def _iterate(
+        self, system: _System, begun: int, limits: Limits, residual: float, history: list[float]
     ) -> int:
-        """Iterate from the residual in place until it stops, or `most` times; return how often."""
-        done, ahead, first = 0, min(8, lookahead), residual
+        """Iterate from the present residual until a stop, or up to `max_iterations`; return the number of iterations.
+
+        `begun` iterations have been done before.
+        """
+        most, tolerance = limits.max_iterations - begun, limits.tolerance
+        done, ahead, first = 0, min(8, limits.lookahead), residual
         system.begin()
         while done < most:
             end = min(done + ahead, most)
             for k in range(done, end):
                 system.iterate(k)
-            system.look(end)
+            system.record_norm(end)
             rows = self.record[4 * done : 4 * (end + 1)].get()
-            stop = self._follow(rows, done, tolerance, history)
+            stop = self._read_record(rows, done, tolerance, history)
             if stop is not None:
                 return stop
-            residual = history.pop()  # the next iteration leaves it again
+            residual = history.pop()  # the next iteration records it again
             done = end
             rate = math.log(first / residual) / done if residual < first else 0.0
-            left = math.log(residual / tolerance) / rate if rate > 0 else lookahead
-            ahead = min(max(math.ceil(left), 1), lookahead)
+            left = math.log(residual / tolerance) / rate if rate > 0 else limits.lookahead
+            ahead = min(max(math.ceil(left), 1), limits.lookahead)
         return done
 
-    def _follow(
+    def _read_record(
         self, record: np.ndarray, begin: int, tolerance: float, history: list[float]
     ) -> int | None:
-        """Take over the record from iteration `begin` on; return the iteration that stopped, if one did."""
-        self._left = math.inf
+        """Append the record from iteration `begin` on to `history`; return the iteration that stopped, if any."""
+        self._final = math.inf
         for k, row in enumerate(record.reshape(-1, 4).astype(np.float64), start=begin):
-            residual = math.sqrt(row[_NORM] / self._norm_b)
-            if row[_RUNNING] == 0 or not row[_CURVATURE] > 0:
-                self._left = residual
-                self._judge(k, row, residual, tolerance, history)
+            residual = math.sqrt(row[RECORD_NORM] / self._norm_b)
+            if row[RECORD_RUNNING] == 0 or not row[RECORD_CURVATURE] > 0:
+                self._final = residual
+                self._check_stop(k, row, residual, tolerance, history)
                 return k
             history.append(residual)
         return None
 
-    def _judge(
+    def _check_stop(
         self, k: int, row: np.ndarray, residual: float, tolerance: float, history: list[float]
     ) -> None:
-        """Tell a stop at the tolerance, or at the precision's limit, from a breakdown at k."""
+        """Raise if iteration `k` stopped neither at the tolerance nor at the limit of the precision."""
         if residual <= tolerance:
             return
-        # Far down, rounding may take the sign of these; the true residual then decides what to do.
+        # Close to the limit of the precision round-off can change the signs. The true residual then decides.
         if k > 0 and residual < 1e-3:
             return
-        curvature = row[_CURVATURE] if row[_RUNNING] else math.nan
+        curvature = row[RECORD_CURVATURE] if row[RECORD_RUNNING] else math.nan
         raise BreakdownError(
-            f"conjugate gradients broke down at iteration {k}: (r, M^-1 r) = {row[1]:.3g}, "
-            f"curvature (p, A p) = {curvature:.3g}, relative residual {residual:.3g}; the first "
-            "two must be positive and finite: the operator or its preconditioner is not "
-            "positive definite",
+            f"conjugate gradients broke down at iteration {k}: (r, M^-1 r) = {row[1]:.3g} and "
+            f"(p, A p) = {curvature:.3g}, expected positive finite numbers; relative residual {residual:.3g}. "
+            "The operator or its preconditioner is not positive definite",
             [*history, residual],
         )
 
 
 class _System:
-    """One linear system, the vectors of its iteration, and what all work-groups do to them together."""
+    """One linear system with the vectors and launches of its iteration."""
 
     def __init__(
         self,
         solver: ConjugateGradient,
-        apply: Apply,
-        precondition: cla.Array | Precondition,
+        operator: Operator,
         rhs: cla.Array,
         x: cla.Array,
-        store: np.dtype,
+        precondition: cla.Array | Precondition,
         tolerance: float,
-        fused: bool,
-        center: bool,
+        store: np.dtype,
     ) -> None:
         self._solver, self._engine, n = solver, solver.engine, len(rhs)
-        self._apply, self._precondition, self._fused = apply, precondition, fused
+        self._operator, self._precondition = operator, precondition
         self._rhs, self._x = rhs, x
         self._kernels = k = solver.kernels_in(store)
         self._r, self._u, self._p, self._q = (self._engine.scratch(n, store) for _ in range(4))
-        self._size, self._center = np.int32(n), np.int32(center)
-        # The recurrence stops a little lower, so that the true residual is within the tolerance.
+        self._size, self._center = np.int32(n), np.int32(operator.singular)
+        # The recurrence stops slightly below the tolerance, so that the true residual is within it.
         limit = self._engine.real.type(0.95 * tolerance)
         self._tail = (solver.partial, solver.state, solver.record)
         first = np.int32(0)
-        self._direction = Launch(
-            self._engine, k.direction, first, self._size, limit, self._u, self._p, *self._tail
+        self._update_direction = Launch(
+            self._engine, k.update_direction, first, self._size, limit, self._u, self._p, *self._tail
         )  # fmt: skip
         vectors = self._p, self._q, x, self._r
         if isinstance(precondition, cla.Array):
-            self._update = Launch(
-                self._engine, k.update_jacobi, first, self._size, self._center, precondition, *vectors, self._u,
-                *self._tail,
+            self._update_solution = Launch(
+                self._engine, k.update_solution_jacobi, first, self._size, self._center, precondition, *vectors,
+                self._u, *self._tail,
             )  # fmt: skip
         else:
-            self._update = Launch(
-                self._engine, k.update, first, self._size, self._center, *vectors, *self._tail
+            self._update_solution = Launch(
+                self._engine, k.update_solution, first, self._size, self._center, *vectors, *self._tail
             )  # fmt: skip
 
-    def measure(self, zero: bool = False) -> float:
-        """Set r to the true residual, of x or of `zero`, and return its relative norm; negative: b is zero."""
-        if not zero:
-            self._apply(self._x, self._q)
-        k, anew = self._kernels, np.int32(zero)
+    def measure(self, from_zero: bool = False) -> float:
+        """Set r to the true residual, of x or of zero, and return its relative norm; negative if b is zero."""
+        if not from_zero:
+            self._operator.apply(self._x, self._q)
+        k, anew = self._kernels, np.int32(from_zero)
         partial, state, _ = self._tail
-        self._launch(k.residual, self._size, anew, self._rhs, self._q, partial)
+        self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
         self._launch(
-            k.begin, self._size, anew, self._center, self._rhs, self._q, self._x, self._r, self._p, partial, state
+            k.start_residual, self._size, anew, self._center, self._rhs, self._q, self._x, self._r, self._p, partial,
+            state,
         )  # fmt: skip
-        self._alone(k.sum_norms, partial, state, np.int32(self._engine.groups))
-        return self._solver.relate(*state.get()[2:])
+        self._launch_one_group(k.read_norms, partial, state, np.int32(self._engine.groups))
+        return self._solver.relative_residual(*state.get()[2:])
 
     def begin(self) -> None:
-        """Make the first u of the residual in place."""
+        """Precondition the first residual."""
         if isinstance(self._precondition, cla.Array):
             self._launch(
-                self._kernels.jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
+                self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
             )  # fmt: skip
 
     def iterate(self, k: int) -> None:
@@ -379,21 +403,22 @@ class _System:
         if not isinstance(self._precondition, cla.Array):
             self._precondition(self._r, self._u, self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
-        self._direction.set_first(k)
-        self._direction()
-        self._apply(self._p, self._q)
-        if not self._fused:
+        self._update_direction.set_first(k)
+        self._update_direction()
+        self._operator.apply(self._p, self._q)
+        if not self._operator.writes_curvature:
             self._dot_product(CURVATURE, self._p, self._q)
-        self._update.set_first(k)
-        self._update()
+        self._update_solution.set_first(k)
+        self._update_solution()
 
-    def look(self, k: int) -> None:
-        """Have row k of the record tell whether there is an iteration k."""
-        self._alone(self._kernels.look, np.int32(k), *self._tail, np.int32(self._engine.groups))
+    def record_norm(self, k: int) -> None:
+        """Record the residual before iteration k, and whether k is needed."""
+        groups = np.int32(self._engine.groups)
+        self._launch_one_group(self._kernels.record_norm, np.int32(k), *self._tail, groups)
 
     def center(self) -> None:
-        """Take the mean of x away."""
-        for kernel in (self._kernels.add_up, self._kernels.remove_mean):
+        """Subtract its mean from x."""
+        for kernel in (self._kernels.sum_solution, self._kernels.center_solution):
             self._launch(kernel, self._size, self._x, self._tail[0])
 
     def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:
@@ -402,7 +427,6 @@ class _System:
     def _launch(self, kernel: cl.Kernel, *args: object) -> None:
         self._engine.run_blocks(kernel, *args)
 
-    def _alone(self, kernel: cl.Kernel, *args: object) -> None:
-        """Enqueue a kernel of one work-group."""
+    def _launch_one_group(self, kernel: cl.Kernel, *args: object) -> None:
         group = self._engine.group_size
         self._engine.run(kernel, group, *args, group=group)

@@ -1,4 +1,4 @@
-"""One multigrid cycle, as a list of launches whose arguments are set (`multigrid.cl`)."""
+"""One multigrid V-cycle as a list of launches with their arguments set (`multigrid.cl`)."""
 
 from __future__ import annotations
 
@@ -13,48 +13,40 @@ import pyopencl.array as cla
 from ..opencl.launch import most_alone
 from ..opencl.primitives import Room
 from ..opencl.program import Engine, bind, key_of
-from .aggregation import GROUP, Graph, Groups, PairInverse, whole_groups
+from .aggregation import WORK_GROUP, Aggregates, Graph, PairInverse, round_to_work_group
 
-# Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as damping factors of two steps. What lies
-# below is left to the coarse levels.
+# Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as the damping factors of two steps. Smaller eigenvalues are left
+# to the coarse levels.
 _LOWEST = 0.35
 _CENTER, _RADIUS = (2 + _LOWEST) / 2, (2 - _LOWEST) / 2
 _EARLY = np.float32(1 / (_CENTER - _RADIUS * math.sqrt(0.5)))
 _LATE = np.float32(1 / (_CENTER + _RADIUS * math.sqrt(0.5)))
-_NONE = np.float32(0)
+_NO_DAMPING = np.float32(0)
+_ONE_GROUP = ("descend_by_group", "ascend_by_group", "solve_coarsest")
+"""Kernels of one work-group."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A graph, its smoother's blocks, and the groups that are the next level's cells; None on the coarsest."""
+    """A graph, its smoother, and the aggregates that are the cells of the next level (None on the coarsest)."""
 
     graph: Graph
     pairs: PairInverse
-    groups: Groups | None
+    aggregates: Aggregates | None
 
     def __len__(self) -> int:
         return len(self.graph)
 
-    @property
-    def rows(self) -> tuple[cla.Array, ...]:
-        """The graph, as kernels take it."""
-        return self.graph.starts, self.graph.columns, self.graph.weights
-
-    @property
-    def blocks(self) -> tuple[cla.Array, ...]:
-        """The smoother's blocks, as kernels take them."""
-        return self.pairs.partner, self.pairs.own, self.pairs.both
-
 
 class Cycle:
-    """Enqueues cycles: down to the coarsest level, and up again.
+    """Enqueues cycles: from the finest level down to the coarsest, and up again.
 
-    Levels of few cells, below the finest, are each gone through by one work-group in one launch, with the same bits.
+    Coarse levels of few cells take one launch of one work-group each, with the same bits.
 
     Parameters
     ----------
     engine : Engine
-        Of the multigrid's precision.
+        In the precision of the multigrid.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -65,109 +57,111 @@ class Cycle:
         self.clear()
 
     def clear(self) -> None:
-        """Let go of all buffers."""
+        """Free all buffers."""
         self._room.clear()
-        self.take([], None)
+        self.set_levels([], None)
 
-    def take(self, levels: Sequence[Level], factor: cla.Array | None) -> None:
-        """Work on these levels from now on, the finest first; `factor` eliminates on the coarsest, if there is any."""
+    def set_levels(self, levels: Sequence[Level], factor: cla.Array | None) -> None:
+        """Use these levels, the finest first. `factor` is the factorized coarsest level, if it is solved exactly."""
         self._levels, self._factor = levels, factor
-        self._vectors_of: list[object] | None = None
+        self._key: list[object] | None = None
 
-    def enqueue(self, r: cla.Array, u: cla.Array, spare: cla.Array | None) -> None:
-        """Enqueue u = M^-1 r; what is in `spare`, if there is one, is lost."""
-        vectors = key_of([a for a in (r, u, spare) if a is not None])
-        if self._vectors_of != vectors:
-            self._vectors_of, self._launches = None, []
-            self._plan(r, u, spare)
-            self._vectors_of = vectors
+    def enqueue(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
+        """Enqueue u = M^-1 r. The content of `work`, if given, is overwritten."""
+        key = key_of([a for a in (r, u, work) if a is not None])
+        if self._key != key:
+            self._key, self._launches = None, []
+            self._set_launches(r, u, work)
+            self._key = key
         for kernel, size, group in self._launches:
             cl.enqueue_nd_range_kernel(self.engine.queue, kernel, size, group)
 
-    def _plan(self, r: cla.Array, u: cla.Array, spare: cla.Array | None) -> None:
+    def _set_launches(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
         levels = self._levels
         self._source = r.dtype
-        # In their place on the finest level where the precision is the same.
-        inside = spare is not None and r.dtype == np.float32
-        finest = [r, u, spare] if inside else self._make_vectors(0)
+        # The finest level uses the caller's vectors if they have the same precision.
+        in_place = work is not None and r.dtype == np.float32
+        finest = [r, u, work] if in_place else self._make_vectors(0)
         self._vectors = [finest, *(self._make_vectors(depth) for depth in range(1, len(levels)))]
         smoothed = len(levels) - (self._factor is not None)
         for depth in range(smoothed):
-            self._descend(depth, None if depth or inside else r)
+            self._descend(depth, None if depth or in_place else r)
         if self._factor is not None:
-            self._solve(smoothed, *(None, None) if smoothed or inside else (r, u))
+            self._solve_coarsest(smoothed, *(None, None) if smoothed or in_place else (r, u))
         for depth in reversed(range(smoothed)):
-            self._ascend(depth, None if depth or inside else u)
+            self._ascend(depth, None if depth or in_place else u)
 
     def _make_vectors(self, depth: int) -> list[cla.Array]:
-        """Right side, solution and defect of a level."""
+        """Return the right side, solution and defect of a level."""
         return [self._room(depth, name, size=len(self._levels[depth])) for name in "bxt"]
 
     def _add(self, depth: int, name: str, size: int, *args: object, turn: int = 0) -> None:
-        """Add a launch; of a kernel there is one for each level and `turn`, as it has one set of arguments."""
+        """Add a launch. Each level and `turn` has a kernel object of its own, because it has one set of arguments."""
         key = (depth, name, turn, self._source)
         if key not in self._kernels:
             defines = {"SOURCE": self.engine.name_of(self._source)}
             self._kernels[key] = getattr(self.engine.kernels("solvers/multigrid", defines), name)
         kernel, one = self._kernels[key], self.engine.group_size
         bind(kernel, (np.int32(size), *args))
-        alone = name in ("descend_alone", "ascend_alone", "solve")
-        whole, group = (one, one) if alone else (whole_groups(size), GROUP)
+        whole, group = (one, one) if name in _ONE_GROUP else (round_to_work_group(size), WORK_GROUP)
         self._launches.append((kernel, (whole,), (group,)))
 
-    def _is_few(self, depth: int) -> bool:
+    def _is_small(self, depth: int) -> bool:
+        """Tell whether one work-group does all steps of a level."""
         level = self._levels[depth]
-        return depth > 0 and level.groups is not None and len(level) <= self._most_alone
+        return depth > 0 and level.aggregates is not None and len(level) <= self._most_alone
 
     def _descend(self, depth: int, r: cla.Array | None) -> None:
-        """Smooth from zero, and hand the defect down; the right side is rounded from `r`, if there is one."""
+        """Smooth from zero and restrict the defect. The right side is rounded from `r`, if given."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
-        lists: tuple[object, ...] = ()
-        count = 0
-        if level.groups is not None:
-            lists = level.groups.starts, level.groups.members, self._vectors[depth + 1][0]
-            count = len(level.groups)
-        if self._is_few(depth):
-            given = (_LATE, _EARLY, *level.rows, *level.blocks, b, x, t, np.int32(count), *lists)
-            self._add(depth, "descend_alone", n, *given)
+        blocks, lists, count = level.pairs.blocks, (), 0
+        if level.aggregates is not None:
+            coarse_b = self._vectors[depth + 1][0]
+            lists = (level.aggregates.starts, level.aggregates.members, coarse_b)
+            count = len(level.aggregates)
+        if self._is_small(depth):
+            given = (_LATE, _EARLY, *level.graph.rows, *blocks, b, x, t, np.int32(count), *lists)
+            self._add(depth, "descend_by_group", n, *given)
             return
         if r is None:
-            self._add(depth, "first", n, _LATE, *level.blocks, b, x)
+            self._add(depth, "smooth_from_zero", n, _LATE, *blocks, b, x)
         else:
-            self._add(depth, "first_rounded", n, _LATE, *level.blocks, r, b, x)
-        self._relax(depth, _EARLY)
+            self._add(depth, "smooth_from_zero_rounded", n, _LATE, *blocks, r, b, x)
+        self._smooth(depth, _EARLY)
         if lists:
-            self._add(depth, "defect", n, *level.rows, b, x, t)
+            self._add(depth, "compute_defect", n, *level.graph.rows, b, x, t)
             self._add(depth, "restrict_defect", count, t, *lists)
 
-    def _solve(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
-        """Solve on the coarsest level; from `r` and into `u`, if there are any."""
+    def _solve_coarsest(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
+        """Solve on the coarsest level, from `r` and into `u`, if given."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
+        blocks = level.pairs.blocks
         if r is not None:
-            self._add(depth, "first_rounded", n, _NONE, *level.blocks, r, b, x)
-        self._add(depth, "solve", n, self._factor, b, t, x)
+            self._add(depth, "smooth_from_zero_rounded", n, _NO_DAMPING, *blocks, r, b, x)
+        self._add(depth, "solve_coarsest", n, self._factor, b, t, x)
         if u is not None:
-            self._add(depth, "correct_out", n, _NONE, *level.blocks, b, x, u)
+            self._add(depth, "smooth_into", n, _NO_DAMPING, *blocks, b, x, u)
 
     def _ascend(self, depth: int, u: cla.Array | None) -> None:
-        """Take the coarser level's correction, and smooth; the last step leads to `u`, if there is any."""
+        """Add the correction of the coarser level and smooth. The last step writes to `u`, if given."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
-        if level.groups is not None:
-            taken = level.groups.group, self._vectors[depth + 1][1]
-            if self._is_few(depth):
-                given = (_LATE, _EARLY, *level.rows, *level.blocks, b, x, t, *taken)
-                self._add(depth, "ascend_alone", n, *given)
+        if level.aggregates is not None:
+            correction = level.aggregates.aggregate, self._vectors[depth + 1][1]
+            if self._is_small(depth):
+                rows, blocks = level.graph.rows, level.pairs.blocks
+                given = (_LATE, _EARLY, *rows, *blocks, b, x, t, *correction)
+                self._add(depth, "ascend_by_group", n, *given)
                 return
-            self._add(depth, "prolong", n, *taken, x)
-        self._relax(depth, _EARLY)
-        self._relax(depth, _LATE, u)
+            self._add(depth, "prolong", n, *correction, x)
+        self._smooth(depth, _EARLY)
+        self._smooth(depth, _LATE, u)
 
-    def _relax(self, depth: int, damping: np.float32, u: cla.Array | None = None) -> None:
-        """Take one step of smoothing from the x that there is; into `u`, if that is given."""
+    def _smooth(self, depth: int, damping: np.float32, u: cla.Array | None = None) -> None:
+        """Do one step of smoothing in place, or into `u`."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
-        self._add(depth, "defect", n, *level.rows, b, x, t)
+        self._add(depth, "compute_defect", n, *level.graph.rows, b, x, t)
         if u is None:
             turn = int(damping is _LATE)
-            self._add(depth, "correct", n, damping, *level.blocks, t, x, turn=turn)
+            self._add(depth, "smooth", n, damping, *level.pairs.blocks, t, x, turn=turn)
         else:
-            self._add(depth, "correct_out", n, damping, *level.blocks, t, x, u)
+            self._add(depth, "smooth_into", n, damping, *level.pairs.blocks, t, x, u)

@@ -1,84 +1,106 @@
-"""Multigrid preconditioner for the Laplacian of a graph, without anything but the graph."""
+"""Multigrid preconditioner for the Laplacian of a graph. It needs the graph only."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..opencl.primitives import Room
 from ..opencl.program import Engine
-from .aggregation import Coarsening, Graph, Groups, PairInverse
+from .aggregation import Aggregates, Aggregation, Graph, PairInverse
 from .cycle import Cycle, Level
 
 _COARSEST = 64
-_MOST_LEVELS = 30
+"""Cells of the coarsest level, at most, if it is solved exactly."""
+_MAX_LEVELS = 30
+_LEAST_COARSENING = 0.8
+"""Ratio of the cells of two levels above which coarsening ends."""
+_GRAPH = ("starts", "columns", "weights")
+_AGGREGATES = ("aggregate", "starts", "members")
 
 
+@dataclass(frozen=True)
 class _SavedLevel:
-    """Level `depth` of what `Multigrid.save` has returned, found sound: nothing in it leads outside of its arrays."""
+    """One level of what `Multigrid.save` returns, with all indices checked."""
 
-    def __init__(self, arrays: Mapping[str, np.ndarray], depth: int, n: int) -> None:
-        self.n, self.coarse = n, 0
-        self.partner = arrays[f"{depth}.partner"]
-        _demand(_within(self.partner, n, n))
-        self.graph: tuple[np.ndarray, ...] = ()
-        self.groups: tuple[np.ndarray, ...] | None = None
+    n: int
+    partner: np.ndarray
+    graph: tuple[np.ndarray, ...]
+    aggregates: tuple[np.ndarray, ...]
+
+    @property
+    def n_coarse(self) -> int:
+        """Cells of the next level, 0 on the coarsest."""
+        return len(self.aggregates[1]) - 1 if self.aggregates else 0
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, np.ndarray], depth: int, n: int) -> _SavedLevel:
+        """Return level `depth`, of `n` cells.
+
+        Raises
+        ------
+        KeyError, ValueError
+            If an array is missing, or an index leads outside of its array.
+        """
+        partner = arrays[f"{depth}.partner"]
+        _require(_is_within(partner, n, n))
+        graph: tuple[np.ndarray, ...] = ()
+        aggregates: tuple[np.ndarray, ...] = ()
         if depth > 0:
-            starts, columns, weights = self.graph = tuple(
-                arrays[f"{depth}.graph.{name}"] for name in ("starts", "columns", "weights")
+            starts, columns, weights = graph = tuple(arrays[f"{depth}.graph.{k}"] for k in _GRAPH)
+            m = len(columns)
+            _require(_are_starts(starts, n, m) and _is_within(columns, m, n))
+            _require(weights.shape == columns.shape and weights.dtype == np.float32)
+            _require(bool((weights >= 0).all() and np.isfinite(weights).all()))
+        if f"{depth}.aggregate" in arrays:
+            aggregate, starts, members = aggregates = tuple(
+                arrays[f"{depth}.{k}"] for k in _AGGREGATES
             )
-            _demand(_cuts(starts, n, len(columns)) and _within(columns, len(columns), n))
-            _demand(weights.shape == columns.shape and weights.dtype == np.float32)
-            _demand(bool((weights >= 0).all() and np.isfinite(weights).all()))
-        if f"{depth}.group" in arrays:
-            group, starts, members = self.groups = tuple(
-                arrays[f"{depth}.{name}"] for name in ("group", "starts", "members")
-            )
-            self.coarse = len(starts) - 1
-            _demand(0 < self.coarse < n and depth < _MOST_LEVELS)
-            _demand(_cuts(starts, self.coarse, n) and _within(group, n, self.coarse))
-            _demand(_within(members, n, n))
+            count = len(starts) - 1
+            _require(0 < count < n and depth < _MAX_LEVELS)
+            _require(_are_starts(starts, count, n) and _is_within(aggregate, n, count))
+            _require(_is_within(members, n, n))
+        return cls(n, partner, graph, aggregates)
 
 
 def _factor_size(n: int) -> int:
-    """Entries of the coarsest level's elimination."""
+    """Return the number of entries of the factorized coarsest level."""
     return (2 * n + 2) * n
 
 
-def _demand(holds: bool) -> None:
-    if not holds:
+def _require(condition: bool) -> None:
+    if not condition:
         raise ValueError("multigrid")
 
 
-def _within(array: np.ndarray, length: int, end: int) -> bool:
+def _is_within(array: np.ndarray, length: int, end: int) -> bool:
     """Tell whether `array` holds `length` integers from 0 to below `end`."""
     fits = array.shape == (length,) and array.dtype == np.int32
     return fits and (length == 0 or (array.min() >= 0 and array.max() < end))
 
 
-def _cuts(starts: np.ndarray, rows: int, length: int) -> bool:
-    """Tell whether `starts` cuts `length` entries into `rows` rows."""
+def _are_starts(starts: np.ndarray, rows: int, length: int) -> bool:
+    """Tell whether `starts` divides `length` entries into `rows` rows."""
     fits = starts.shape == (rows + 1,) and starts.dtype == np.int32
     return fits and starts[0] == 0 and starts[-1] == length and bool((np.diff(starts) >= 0).all())
 
 
 class Multigrid:
-    """Aggregation multigrid cycle as a preconditioner: symmetric positive definite, deterministic.
+    """Aggregation multigrid V-cycle as a preconditioner: symmetric positive definite, deterministic.
 
-    Groups of four to five cells that are tied together (see `Coarsening`), constant interpolation,
-    coarse weights scaled by the ratio of lengths, pairwise-Jacobi Chebyshev smoothing of degree 2,
-    elimination on the coarsest level of at most 64 groups. It works in float32, whatever the
-    engine's precision: half the memory to read, and the outer iteration sets the accuracy. If that
-    one's vectors are in float32, too, the finest level works on them in place.
+    Aggregates of four to five strongly connected cells (see `Aggregation`), constant interpolation, coarse weights
+    scaled by the ratio of lengths, a pairwise-Jacobi Chebyshev smoother of degree 2, and a factorized coarsest level of
+    at most 64 cells. It works in float32 whatever the engine's precision, which halves the memory traffic; the
+    outer iteration sets the accuracy. If the vectors of that iteration are in float32, too, the finest level works on
+    them in place.
 
-    With S the smoother's polynomial and C a level's coarse correction, a cycle is
-    M^-1 = 2 S - S A S + (1 - S A) C (1 - A S), positive definite for whatever weights: S A has its
-    eigenvalues within [0, 1], and it does not matter by how much C, positive semidefinite itself,
-    overshoots. This does not hold for a level visited twice, 2 C - C A C: coarse weights scaled
-    down make C A exceed 2 where weights vary much. Hence the V-cycle.
+    With S the polynomial of the smoother and C the coarse correction of a level, a cycle is
+    M^-1 = 2 S - S A S + (1 - S A) C (1 - A S). It is positive definite for all weights: the eigenvalues of S A are
+    within [0, 1], and C is positive semidefinite, however much it overshoots. A level visited twice, 2 C - C A C, is
+    not: with scaled weights C A can exceed 2 where weights vary strongly. Hence the V-cycle.
 
     Parameters
     ----------
@@ -89,139 +111,135 @@ class Multigrid:
         self.engine = engine
         self._single = engine.single()
         self._kernels = self._single.kernels("solvers/multigrid", {"SOURCE": "float"})
-        self._coarsening = Coarsening(self._single)
+        self._aggregation = Aggregation(self._single)
         self._cycle = Cycle(self._single)
         self._room = Room(self._single)
         self._levels: list[Level] = []
         self._factor: cla.Array | None = None
 
     def clear(self) -> None:
-        """Let go of all levels."""
+        """Free all levels."""
         self._levels, self._factor = [], None
         self._cycle.clear()
-        self._coarsening.clear()
+        self._aggregation.clear()
         self._room.clear()
 
     @property
     def sizes(self) -> list[int]:
-        """Cells or groups on each level, the finest first."""
-        return [len(level.graph) for level in self._levels]
+        """Cells of each level, the finest first."""
+        return [len(level) for level in self._levels]
 
     def set_up(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
-        """Make the levels for the operator (A x)_i = sum_k w_k (x_i - x_columns[k]).
+        """Build the levels for the operator (A x)_i = sum_k w_k (x_i - x_columns[k]).
 
         Parameters
         ----------
         starts : (n + 1,) int32
         columns : (m,) int32
         weights : (m,) real
-            Symmetric, >= 0. The arrays must not change until the last use.
+            Symmetric, >= 0. The arrays must not change as long as the levels are used.
         """
-        graph = self._coarsening.convert(Graph(starts, columns, weights), 0)
+        graph = self._aggregation.scale(Graph(starts, columns, weights), 0)
         self._levels, self._factor = [], None
         while True:
             depth, n = len(self._levels), len(graph)
             if n <= _COARSEST:
-                pairs = self._coarsening.pairs(graph, depth)
+                pairs = self._aggregation.match_pairs(graph, depth)
                 self._levels.append(Level(graph, pairs, None))
-                self._eliminate(graph)
+                self._factorize(graph)
                 break
-            pairs, groups, coarse = self._coarsening.coarsen(graph, depth)
-            if len(groups) > 0.8 * n or depth == _MOST_LEVELS:
-                # Hardly a neighbor left: smoothing is all there is to do.
+            pairs, aggregates, coarse = self._aggregation.coarsen(graph, depth)
+            if len(aggregates) > _LEAST_COARSENING * n or depth == _MAX_LEVELS:
+                # Few cells have neighbors; smoothing is enough.
                 self._levels.append(Level(graph, pairs, None))
                 break
-            self._levels.append(Level(graph, pairs, groups))
+            self._levels.append(Level(graph, pairs, aggregates))
             graph = coarse
-        self._cycle.take(self._levels, self._factor)
+        self._cycle.set_levels(self._levels, self._factor)
 
-    def renew(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
-        """Take a similar operator on the same cells: only the smoother of the finest level follows.
+    def update_finest(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
+        """Replace the operator by a similar one on the same cells: recompute only the smoother of the finest level.
 
-        Any coarse correction will do for a positive definite cycle, and that of a graph that has
-        changed a little does nearly as well: groups hold together, and flows between them change
-        less than those between cells.
+        The cycle stays positive definite with any coarse correction. That of a slightly different graph is nearly as
+        good: aggregates stay together, and weights between them change less than those between cells.
 
         Parameters
         ----------
         starts, columns, weights
             As for `set_up`, which has been called for as many cells.
         """
-        graph = self._coarsening.convert(Graph(starts, columns, weights), 0, anew=False)
+        graph = Graph(starts, columns, weights)
+        graph = self._aggregation.scale(graph, 0, same_exponent=True)
         finest = self._levels[0]
-        self._coarsening.renew_pairs(graph, finest.pairs)
+        self._aggregation.update_pairs(graph, finest.pairs)
         self._levels[0] = replace(finest, graph=graph)
-        self._cycle.take(self._levels, self._factor)
+        self._cycle.set_levels(self._levels, self._factor)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return what `renew` builds on: pairs, groups and coarse graphs, fetched from the device."""
-        arrays = {"exponent": np.array(self._coarsening.exponent)}
+        """Return what `update_finest` builds on: pairs, aggregates and coarse graphs, read from the device."""
+        arrays = {"exponent": np.array(self._aggregation.exponent)}
         if self._factor is not None:
             arrays["factor"] = self._factor.get()
         for depth, level in enumerate(self._levels):
             arrays[f"{depth}.partner"] = level.pairs.partner.get()
-            if level.groups is not None:
-                for name in ("group", "starts", "members"):
-                    arrays[f"{depth}.{name}"] = getattr(level.groups, name).get()
+            if level.aggregates is not None:
+                for name in _AGGREGATES:
+                    arrays[f"{depth}.{name}"] = getattr(level.aggregates, name).get()
             if depth > 0:
-                for name in ("starts", "columns", "weights"):
+                for name in _GRAPH:
                     arrays[f"{depth}.graph.{name}"] = getattr(level.graph, name).get()
         return arrays
 
     def restore(self, arrays: Mapping[str, np.ndarray], n: int) -> None:
-        """Set the levels to those that `save` has returned, for `n` cells; `renew` comes next.
+        """Set the levels to what `save` has returned, for `n` cells. `update_finest` must follow.
 
         Raises
         ------
         KeyError, ValueError
-            If they are no such levels, before anything is changed.
+            If the arrays are not valid. Nothing is changed then.
         """
-        hosts, depth = [], 0
-        while not hosts or hosts[-1].groups is not None:
-            hosts.append(_SavedLevel(arrays, depth, n))
-            n, depth = hosts[-1].coarse, depth + 1
-        n = hosts[-1].n
-        factor = arrays.get("factor")
-        _demand((factor is not None) == (n <= _COARSEST))
-        _demand(factor is None or factor.shape == (_factor_size(n),))
-        single, self._factor = self._single, None
-        self._coarsening.exponent = int(arrays["exponent"])
-        self._levels = []
-        for depth, host in enumerate(hosts):
-            n = host.n
-            # The finest level's graph comes with `renew`, as do the blocks of its pairs.
-            graph = Graph(
-                *(single.upload(a, d) for a, d in zip(host.graph, "iif", strict=True))
-                if host.graph
-                else (single.empty(n + 1, np.int32), single.empty(1, np.int32), single.empty(1))
-            )
-            partner = single.upload(host.partner, np.int32)
-            pairs = PairInverse(partner, single.empty(n), single.empty(n))
-            if depth > 0:
-                self._coarsening.renew_pairs(graph, pairs)
-            groups = host.groups and Groups(*(single.upload(a, np.int32) for a in host.groups))
-            self._levels.append(Level(graph, pairs, groups))
-        if "factor" in arrays:
-            self._factor = single.upload(arrays["factor"], np.float32)
-        self._cycle.take(self._levels, self._factor)
+        saved = [_SavedLevel.read(arrays, 0, n)]
+        while saved[-1].aggregates:
+            saved.append(_SavedLevel.read(arrays, len(saved), saved[-1].n_coarse))
+        coarsest, factor = saved[-1].n, arrays.get("factor")
+        _require((factor is not None) == (coarsest <= _COARSEST))
+        _require(factor is None or factor.shape == (_factor_size(coarsest),))
+        self._aggregation.exponent = int(arrays["exponent"])
+        self._factor = None if factor is None else self._single.upload(factor, np.float32)
+        self._levels = [self._upload_level(level) for level in saved]
+        self._cycle.set_levels(self._levels, self._factor)
 
-    def _eliminate(self, graph: Graph) -> None:
-        n = len(graph)
+    def _upload_level(self, level: _SavedLevel) -> Level:
+        """Return a saved level on the device. `update_finest` sets the graph and the blocks of the finest one."""
+        single, n = self._single, level.n
+        if level.graph:
+            graph = Graph(*(single.upload(a, d) for a, d in zip(level.graph, "iif", strict=True)))
+        else:
+            graph = Graph(single.empty(n + 1, np.int32), single.empty(1, np.int32), single.empty(1))
+        pairs = PairInverse(
+            single.upload(level.partner, np.int32), single.empty(n), single.empty(n)
+        )
+        if level.graph:
+            self._aggregation.update_pairs(graph, pairs)
+        if not level.aggregates:
+            return Level(graph, pairs, None)
+        lists = (single.upload(a, np.int32) for a in level.aggregates)
+        return Level(graph, pairs, Aggregates(*lists))
+
+    def _factorize(self, graph: Graph) -> None:
+        """Factorize the coarsest level."""
+        n, group = len(graph), self._single.group_size
         self._factor = self._room("factor", size=_factor_size(n))
-        kernel = self._kernels.eliminate
-        group = self._single.group_size
-        self._single.run(
-            kernel, group, np.int32(n), graph.starts, graph.columns, graph.weights, self._factor,
-            group=group,
-        )  # fmt: skip
+        kernel = self._kernels.factorize_coarsest
+        self._single.run(kernel, group, np.int32(n), *graph.rows, self._factor, group=group)
 
-    def apply(self, r: cla.Array, u: cla.Array, spare: cla.Array | None = None) -> None:
+    def apply(self, r: cla.Array, u: cla.Array, work: cla.Array | None = None) -> None:
         """Enqueue u = M^-1 r: one cycle.
 
         Parameters
         ----------
         r, u : (n,) real or float32
-        spare : (n,) of the same, optional
-            What is in it is lost.
+        work : (n,) of the same, optional
+            Overwritten.
         """
-        self._cycle.enqueue(r, u, spare)
+        self._cycle.enqueue(r, u, work)

@@ -1,4 +1,8 @@
-"""The metric correction's Poisson equation on the neighbor graph, the paper's (3.2)."""
+"""The Poisson equation on the neighbor graph, the paper's (3.2).
+
+`Poisson.assemble` assembles the matrix, with the kernel `assemble_laplacian` in poisson.cl. `Poisson.solve` solves the
+equation.
+"""
 
 from __future__ import annotations
 
@@ -12,37 +16,47 @@ import pyopencl.array as cla
 from ..errors import InputError
 from ..opencl.launch import Launch, most_alone
 from ..opencl.program import Engine, Kernels
-from .conjugate_gradient import CURVATURE, BreakdownError, ConjugateGradient, Precondition, Solution
+from .conjugate_gradient import (
+    CURVATURE,
+    BreakdownError,
+    ConjugateGradient,
+    Limits,
+    Operator,
+    Precondition,
+    Solution,
+)
 from .multigrid import Multigrid
 
-_MOST_CYCLES = 200
-ROUGH = 1e-3
-"""Tolerance from which on the recurrence, whose vectors are then in single precision, is trusted with the residual.
+SINGLE_PRECISION_TOLERANCE = 1e-3
+"""Tolerance from which on weights and the iteration's vectors are in float32 and the recurrence's residual is trusted.
 
-It loses digits only far down, and the solution itself is summed up in full precision.
+The recurrence loses digits only far below this tolerance, and the solution is summed up in full precision.
 """
-_MOST_LOST = 5
-"""Iterations that a solve may take more than the first with the same multigrid; a set-up costs about nine."""
+_MAX_CYCLES = 200
+_MAX_EXTRA_ITERATIONS = 5
+"""Iterations a solve with a reused multigrid may take more than the first one. A set-up costs about nine."""
 _PRECONDITIONERS = ("auto", "jacobi", "multigrid")
 
 
-def expected_costs(n: int, dim: int, tolerance: float, alone: bool = False) -> tuple[float, float]:
-    """Return the expected cost of a solve with Jacobi's method and with multigrid, its set-up included.
+def expected_costs(
+    n: int, dim: int, tolerance: float, one_group: bool = False
+) -> tuple[float, float]:
+    """Return the expected costs of a solve with Jacobi's preconditioner and with multigrid, set-up included.
 
-    In milliseconds of processor time with PoCL on two cores, from fits to random and adapted
-    meshes of 500 to 10^6 cells; on other devices the parts (enqueueing, cells) are larger or
-    smaller alike. Jacobi's iterations grow with the mesh's width in cells, multigrid's do not; they cost next to
-    nothing but the cells where one work-group goes through them `alone`.
+    The costs are milliseconds of processor time with PoCL on two cores, from fits to random and adapted meshes of 500
+    to 10^6 cells. On other devices the parts (enqueueing, cells) change by similar factors. Jacobi's iterations grow
+    with the number of cells across the mesh, multigrid's do not. With `one_group` one work-group does all Jacobi
+    iterations, which then cost little per launch.
     """
     digits, thousands = max(-math.log10(tolerance), 0.0), n / 1000
-    iteration = 0.001 + 0.0105 * thousands if alone else 0.04 + 0.0085 * thousands
+    iteration = 0.001 + 0.0105 * thousands if one_group else 0.04 + 0.0085 * thousands
     jacobi = n ** (1 / dim) * (1.2 + 0.7 * digits) * iteration
     multigrid = 6 + 0.5 * thousands + (2 + 1.8 * digits) * (0.3 + 0.05 * thousands)
     return jacobi, multigrid
 
 
-def most_iterations(n: int) -> int:
-    """Return how many iterations Jacobi's method may take for `n` cells."""
+def max_jacobi_iterations(n: int) -> int:
+    """Return how many iterations Jacobi's preconditioner may take for `n` cells."""
     return 500 + 30 * math.isqrt(n)
 
 
@@ -54,7 +68,7 @@ class Laplacian:
     ----------
     starts : (n + 1,) int32
     neighbors : (m,) int32
-        The diagram's: walls are negative.
+        Neighbors of the diagram: walls are negative.
     weights : (m,) real or float32
         w_ij = rho_ij l_ij / d_ij; 0 at walls.
     """
@@ -65,6 +79,22 @@ class Laplacian:
 
     def __len__(self) -> int:
         return len(self.starts) - 1
+
+    @property
+    def rows(self) -> tuple[cla.Array, cla.Array, cla.Array]:
+        """The three arrays, as kernels take them."""
+        return self.starts, self.neighbors, self.weights
+
+
+@dataclass(frozen=True)
+class _System:
+    """One system A phi = b and how accurately it is solved."""
+
+    laplacian: Laplacian
+    operator: Operator
+    rhs: cla.Array
+    potential: cla.Array
+    tolerance: float
 
 
 class Poisson:
@@ -78,20 +108,21 @@ class Poisson:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels: dict[tuple[np.dtype, np.dtype], Kernels] = {}
-        self._krylov = ConjugateGradient(engine)
+        self._conjugate_gradient = ConjugateGradient(engine)
         self._multigrid: Multigrid | None = None
-        self._prepared: Laplacian | None = None
-        self._numbering: object = None
-        self._at_best = self._latest = 0
+        self._multigrid_of: Laplacian | None = None
+        self._ordering: object = None
+        # Iterations of the first and of the last solve with the present aggregates.
+        self._first_iterations = self._last_iterations = 0
 
     def clear(self) -> None:
-        """Let go of all buffers, and of what the next solve might take over from the last."""
-        self._prepared = self._numbering = None
+        """Free all buffers and forget what the next solve could reuse."""
+        self._multigrid_of = self._ordering = None
         if self._multigrid is not None:
             self._multigrid.clear()
 
     def _kernels_in(self, store: np.dtype, face: np.dtype | None = None) -> Kernels:
-        """Return the kernels for vectors, and measures of faces, in these precisions."""
+        """Return the kernels for vectors in `store` and face measures in `face`."""
         key = store, self.engine.face if face is None else face
         if key not in self._kernels:
             names = (self.engine.name_of(real) for real in key)
@@ -109,7 +140,9 @@ class Poisson:
         *,
         tolerance: float = 0.0,
     ) -> Laplacian:
-        """Build (A phi)_i = sum_j w_ij (phi_i - phi_j), w_ij = rho_ij l_ij / |x_i - x_j|.
+        """Assemble the Poisson matrix, the paper's (3.2) integrated over the cells.
+
+        (A phi)_i = sum_j w_ij (phi_i - phi_j), w_ij = rho_ij l_ij / |x_i - x_j|.
 
         Parameters
         ----------
@@ -120,14 +153,19 @@ class Poisson:
         points : (n, d) real
             Generators.
         density : (n,) real, optional
-            rho > 0; rho_ij is the geometric mean. Without it rho = 1.
+            rho > 0; rho_ij is the geometric mean. By default rho = 1.
         tolerance : float
-            Of the solves to come. From `ROUGH` on, weights and the vectors of the iteration are in float32.
+            Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
 
         Returns
         -------
         Laplacian
-            Its weights are of the workspace: they last as long as the present frame.
+            Its weights are in the workspace and valid to the end of the present frame.
+
+        Raises
+        ------
+        InputError
+            If an array has the wrong shape.
         """
         engine = self.engine
         n = len(starts) - 1
@@ -135,18 +173,18 @@ class Poisson:
         _check("face_measures", face_measures, neighbors.shape)
         if density is not None:
             _check("density", density, (n,))
-        store = np.dtype(np.float32) if tolerance >= ROUGH else engine.real
+        store = np.dtype(np.float32) if tolerance >= SINGLE_PRECISION_TOLERANCE else engine.real
         weights = engine.scratch(len(neighbors), store)
         weights.fill(0)
         engine.run(
-            self._kernels_in(store, face_measures.dtype).assemble, n, np.int32(n),
+            self._kernels_in(store, face_measures.dtype).assemble_laplacian, n, np.int32(n),
             np.int32(density is not None), starts, neighbors, face_measures, points,
             points if density is None else density, weights, *self.engine.period_args,
         )  # fmt: skip
         return Laplacian(starts, neighbors, weights)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
-        """Return the inverses of the sums of weights (n,), 0 of 0, in the workspace."""
+        """Return the inverse row sums of the weights (n,), 0 for a sum of 0, in the workspace."""
         n, store = len(laplacian), laplacian.weights.dtype
         inverse = self.engine.scratch(n, store)
         self.engine.run(
@@ -155,72 +193,76 @@ class Poisson:
         )  # fmt: skip
         return inverse
 
-    def compatible(self, source: cla.Array, volumes: cla.Array, rhs: cla.Array) -> cla.Array:
-        """Set rhs_i = V_i (s_i - mean s), the mean weighted by volume, so that its sum is 0.
+    def subtract_mean_source(
+        self, source: cla.Array, volumes: cla.Array, rhs: cla.Array
+    ) -> cla.Array:
+        """Set rhs_i = V_i (s_i - mean s), mean s = sum V s / sum V, so that its sum is 0.
+
+        The equation with zero flux through all walls has solutions only for such right sides.
 
         Parameters
         ----------
         source, volumes, rhs : (n,) real
-            s, V, and where the result goes (also returned).
+            s, V and the result, which is also returned.
         """
         size = np.int32(len(rhs))
-        partial, kernels = self._krylov.partial, self._kernels_in(self.engine.real)
-        self.engine.run_blocks(kernels.source_sums, size, source, volumes, partial)
-        self.engine.run_blocks(kernels.compatible, size, source, volumes, rhs, partial)
+        partial, kernels = self._conjugate_gradient.partial, self._kernels_in(self.engine.real)
+        self.engine.run_blocks(kernels.sum_sources, size, source, volumes, partial)
+        self.engine.run_blocks(kernels.subtract_mean_source, size, source, volumes, rhs, partial)
         return rhs
 
     def apply(self, laplacian: Laplacian, x: cla.Array, y: cla.Array) -> None:
-        """Enqueue y = A x, both in the precision of the weights; x may be in the engine's."""
+        """Enqueue y = A x, both in the precision of the weights; x may also be in that of the engine."""
         kernel, *args = self._launch(laplacian, x, y)
         self.engine.run_blocks(kernel, *args)
 
-    def set_up_multigrid(self, laplacian: Laplacian, numbering: object = None) -> Multigrid:
-        """Make the preconditioner for `laplacian` unless it was made last; `solve` does so.
+    def set_up_multigrid(self, laplacian: Laplacian, ordering: object = None) -> Multigrid:
+        """Return the preconditioner for `laplacian`, built unless it was built last. `solve` calls this.
 
-        With the `numbering` of the last call only its finest level is made anew, as long as that
-        costs the solves no more than `_MOST_LOST` iterations.
+        With the `ordering` of the last call only its finest level is recomputed, as long as solves take at most
+        `_MAX_EXTRA_ITERATIONS` iterations more than the first one.
         """
         if self._multigrid is None:
             self._multigrid = Multigrid(self.engine)
-        if self._prepared is laplacian:
+        if self._multigrid_of is laplacian:
             return self._multigrid
-        operator = laplacian.starts, laplacian.neighbors, laplacian.weights
-        if self._is_similar(numbering):
-            self._multigrid.renew(*operator)
+        if self._can_reuse(ordering):
+            self._multigrid.update_finest(*laplacian.rows)
         else:
-            self._multigrid.set_up(*operator)
-            self._at_best = self._latest = 0
-        self._prepared, self._numbering = laplacian, numbering
+            self._multigrid.set_up(*laplacian.rows)
+            self._first_iterations = self._last_iterations = 0
+        self._multigrid_of, self._ordering = laplacian, ordering
         return self._multigrid
 
-    def save(self, numbering: object) -> dict[str, np.ndarray]:
-        """Return what the next solve with this `numbering` takes over from the last; nothing if it begins anew."""
-        if self._multigrid is None or not self._is_similar(numbering):
+    def save(self, ordering: object) -> dict[str, np.ndarray]:
+        """Return what the next solve with this `ordering` reuses; nothing if it builds a new multigrid."""
+        if self._multigrid is None or not self._can_reuse(ordering):
             return {}
-        iterations = np.array([self._at_best, self._latest])
+        iterations = np.array([self._first_iterations, self._last_iterations])
         return {"iterations": iterations, **self._multigrid.save()}
 
-    def restore(self, arrays: Mapping[str, np.ndarray], numbering: object, n: int) -> None:
-        """Go on from what `save` has returned, with the `numbering` of the `n` cells now.
+    def restore(self, arrays: Mapping[str, np.ndarray], ordering: object, n: int) -> None:
+        """Continue from what `save` has returned, with the present `ordering` of the `n` cells.
 
         Raises
         ------
         KeyError, ValueError
-            If it is unsound.
+            If the arrays are not valid.
         """
-        self._prepared = self._numbering = None
+        self._multigrid_of = self._ordering = None
         if not arrays:
             return
         if self._multigrid is None:
             self._multigrid = Multigrid(self.engine)
-        at_best, latest = map(int, arrays["iterations"])
+        first, last = map(int, arrays["iterations"])
         self._multigrid.restore(arrays, n)
-        self._at_best, self._latest, self._numbering = at_best, latest, numbering
+        self._first_iterations, self._last_iterations, self._ordering = first, last, ordering
 
-    def _is_similar(self, numbering: object) -> bool:
-        """Tell whether the last multigrid will do for cells with this numbering."""
-        similar = numbering is not None and numbering is self._numbering
-        return similar and 0 < self._latest <= self._at_best + _MOST_LOST
+    def _can_reuse(self, ordering: object) -> bool:
+        """Tell whether the coarse levels of the last multigrid serve for cells in this ordering."""
+        same = ordering is not None and ordering is self._ordering
+        most = self._first_iterations + _MAX_EXTRA_ITERATIONS
+        return same and 0 < self._last_iterations <= most
 
     def solve(
         self,
@@ -231,7 +273,7 @@ class Poisson:
         tolerance: float = 1e-8,
         max_iterations: int | None = None,
         preconditioner: str = "auto",
-        numbering: object = None,
+        ordering: object = None,
         from_zero: bool = False,
     ) -> Solution:
         """Solve A phi = b, the paper's (3.2) integrated over the cells; phi has mean zero.
@@ -240,25 +282,24 @@ class Poisson:
         ----------
         laplacian : Laplacian
         rhs : (n,) real
-            Its mean is taken away, as the operator's null space is the constants; see `compatible`.
+            Its mean is removed, because the null space of A is the constants; see `subtract_mean_source`.
         potential : (n,) real
-            Start on entry (zeros, or the last step's), phi on return.
+            Start on entry (zeros, or the solution of the last step), phi on return.
         tolerance : float
-            Of the relative residual. In float32 about 1e-5 can be had, less on large meshes with a
-            smooth right side: the solve then ends as ``"stagnated"``, with the residual reached.
+            Relative residual. float32 reaches about 1e-5, less on large meshes with a smooth right side: the solve
+            then ends as ``"stagnated"`` with the residual that it reached.
         max_iterations : int, optional
         preconditioner : ``"auto"``, ``"jacobi"`` or ``"multigrid"``
-            Multigrid leaves 15 to 22 iterations whatever the size; its set-up costs about as much
-            as ten of them. ``"auto"`` takes what is expected to cost less (`expected_costs`): at
-            tolerances of 1e-8 and 1e-2 multigrid from about 2000 and 3400 cells on in the plane,
-            from 18,000 and 56,000 in space. Should multigrid break down, stagnate early, or not
-            converge in 200 iterations where `max_iterations` is not given, Jacobi's method takes over
-            from there; `Solution.reason` says so.
-        numbering : object, optional
-            One that is the same as in an earlier call tells that the cells are the same, in the same
-            order, and have only moved a little: most of the multigrid is then used again.
+            Multigrid takes 15 to 22 iterations for any size; its set-up costs about as much as ten. ``"auto"`` takes
+            the cheaper one by `expected_costs`: at tolerances of 1e-8 and 1e-2 multigrid from about 2000 and 3400
+            cells on in 2D, from 18,000 and 56,000 in 3D. If multigrid breaks down, stagnates early, or does not
+            converge in 200 iterations without `max_iterations`, Jacobi's preconditioner continues; `Solution.reason`
+            says so.
+        ordering : object, optional
+            The same object as in an earlier call states that the cells are the same, in the same order, and have moved
+            little. The coarse levels of the multigrid are then reused.
         from_zero : bool
-            Start from zero, whatever `potential` holds.
+            Start from zero and ignore `potential`.
 
         Returns
         -------
@@ -269,7 +310,7 @@ class Poisson:
         InputError
             If an argument has the wrong size or value.
         SolverError
-            If a number is not finite, or the iteration breaks down with Jacobi's method.
+            If a number is not finite, or the iteration breaks down with Jacobi's preconditioner.
         """
         n = len(laplacian)
         _check("rhs", rhs, (n,))
@@ -280,49 +321,40 @@ class Poisson:
             )
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        operator = self._operator(laplacian)
-
-        def run(precondition: cla.Array | Precondition, most: int, lookahead: int) -> Solution:
-            return self._krylov.solve(
-                operator,
-                rhs,
-                potential,
-                precondition=precondition,
-                tolerance=tolerance,
-                max_iterations=most,
-                fused=True,
-                center=True,
-                lookahead=lookahead,
-                from_zero=from_zero,
-                verify=tolerance < ROUGH,
-                store=laplacian.weights.dtype,
-                rows=(laplacian.starts, laplacian.neighbors, laplacian.weights),
-            )
-
-        def run_jacobi(most: int) -> Solution:
-            with self.engine.workspace.frame():
-                return run(self.inverse_diagonal(laplacian), most, 64)
-
-        default = most_iterations(n)
+        operator = Operator(
+            self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows
+        )
+        system = _System(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
-            alone = n <= most_alone(self.engine)
-            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, alone)
+            one_group = n <= most_alone(self.engine)
+            jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, one_group)
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":
-            most = default if max_iterations is None else max_iterations
-            return run_jacobi(most)
+            most = max_jacobi_iterations(n) if max_iterations is None else max_iterations
+            return self._solve_jacobi(system, most, from_zero)
+        return self._solve_multigrid(system, max_iterations, ordering, from_zero)
+
+    def _solve_jacobi(self, system: _System, max_iterations: int, from_zero: bool) -> Solution:
+        with self.engine.workspace.frame():
+            inverse = self.inverse_diagonal(system.laplacian)
+            return self._run(system, inverse, max_iterations, 64, from_zero)
+
+    def _solve_multigrid(
+        self, system: _System, max_iterations: int | None, ordering: object, from_zero: bool
+    ) -> Solution:
+        """Solve with multigrid, and with Jacobi's preconditioner from there if that fails."""
+        most = _MAX_CYCLES if max_iterations is None else max_iterations
         try:
-            most = _MOST_CYCLES if max_iterations is None else max_iterations
-            multigrid = self.set_up_multigrid(laplacian, numbering)
-            # What is enqueued in vain costs a cycle each, a look of the host much less.
-            first = run(
-                multigrid.apply, most, max(1, min(self._latest - 1, 4)) if self._latest else 4
-            )
-            self._latest = first.iterations
-            self._at_best = self._at_best or first.iterations
-            # Far above what the precision allows it is the preconditioner, in float32, that is stuck.
-            stuck = laplacian.weights.dtype == np.float64 and first.residual > 1e-8
-            if first.reason == "stagnated" and stuck:
+            multigrid = self.set_up_multigrid(system.laplacian, ordering)
+            # An unnecessary iteration costs a cycle, which is much more than a read by the host.
+            last = self._last_iterations
+            lookahead = max(1, min(last - 1, 4)) if last else 4
+            first = self._run(system, multigrid.apply, most, lookahead, from_zero)
+            self._last_iterations = first.iterations
+            self._first_iterations = self._first_iterations or first.iterations
+            # Far above the limit of double precision the preconditioner, in float32, is the cause.
+            double = system.laplacian.weights.dtype == np.float64
+            if first.reason == "stagnated" and double and first.residual > 1e-8:
                 cause = "multigrid stagnated"
             elif first.reason == "max_iterations" and max_iterations is None:
                 cause = f"{most} iterations with multigrid"
@@ -332,11 +364,13 @@ class Poisson:
         except BreakdownError as breakdown:
             residuals, cause = breakdown.residuals, "multigrid broke down"
         if not residuals[-1] <= 1:
-            potential.fill(0)
+            system.potential.fill(0)
         done = len(residuals) - 1
-        most = default if max_iterations is None else max(max_iterations - done, 0)
-        from_zero = False
-        second = run_jacobi(most)
+        if max_iterations is None:
+            most = max_jacobi_iterations(len(system.rhs))
+        else:
+            most = max(max_iterations - done, 0)
+        second = self._solve_jacobi(system, most, from_zero=False)
         return Solution(
             done + second.iterations,
             second.residual,
@@ -345,8 +379,24 @@ class Poisson:
             f"{second.reason} (Jacobi after {cause})",
         )
 
-    def _operator(self, laplacian: Laplacian) -> Callable[[cla.Array, cla.Array], None]:
-        """Return `apply` for one operator; it sets the kernel's arguments when they change only."""
+    def _run(
+        self,
+        system: _System,
+        precondition: cla.Array | Precondition,
+        max_iterations: int,
+        lookahead: int,
+        from_zero: bool,
+    ) -> Solution:
+        """Run conjugate gradients."""
+        verify = system.tolerance < SINGLE_PRECISION_TOLERANCE
+        limits = Limits(system.tolerance, max_iterations, lookahead, verify)
+        return self._conjugate_gradient.solve(
+            system.operator, system.rhs, system.potential, precondition, limits,
+            from_zero=from_zero, store=system.laplacian.weights.dtype,
+        )  # fmt: skip
+
+    def _apply_of(self, laplacian: Laplacian) -> Callable[[cla.Array, cla.Array], None]:
+        """Return a function that enqueues y = A x. It sets the kernel's arguments only when they change."""
         last: list = [None, None, None]
 
         def apply(x: cla.Array, y: cla.Array) -> None:
@@ -360,10 +410,10 @@ class Poisson:
         """Return the kernel that applies the operator, and its arguments."""
         store = laplacian.weights.dtype
         kernels, n = self._kernels_in(store), np.int32(len(laplacian))
-        operator = (laplacian.starts, laplacian.neighbors, laplacian.weights, x, y)
         if x.dtype != store:
-            return kernels.apply_full, n, *operator
-        return kernels.apply, n, np.int32(CURVATURE), *operator, self._krylov.partial
+            return kernels.apply_laplacian_full, n, *laplacian.rows, x, y
+        partial = self._conjugate_gradient.partial
+        return kernels.apply_laplacian, n, np.int32(CURVATURE), *laplacian.rows, x, y, partial
 
 
 def _check(name: str, array: cla.Array, shape: tuple[int, ...]) -> None:

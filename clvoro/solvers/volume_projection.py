@@ -1,62 +1,114 @@
-"""Exact projection: the least displacement that gives every cell its volume, to first order (`projection.cl`).
+"""Volume projection: the smallest displacement that gives all cells their volumes, to first order.
 
-The paper's Poisson step approximates this, as an approximate projection does in incompressible flow.
+The kernels are in volume_projection.cl. The paper's Poisson step approximates this projection, as an approximate
+projection does in incompressible flow.
 """
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import dataclass
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..errors import SolverError
 from ..opencl.launch import Launch, most_alone
-from ..opencl.program import Engine
+from ..opencl.program import Engine, Kernels
 from ..opencl.workspace import framed
 from ..tessellation.device_diagram import Tessellation
-from .conjugate_gradient import Solution
+from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING, Limits, Solution
 
-SINGLE = 1e-4
-"""Tolerance from which on the iteration's vectors are in single precision."""
+SINGLE_PRECISION_TOLERANCE = 1e-4
+"""Tolerance from which on the vectors of the iteration are in single precision."""
 _ROWS = 5
-_NORM, _RUNNING, _CURVATURE = 0, 2, 3
 
 
-class Projection:
+@dataclass(frozen=True)
+class Targets:
+    """Cells against the size field, on the device.
+
+    Attributes
+    ----------
+    h : (n,) real
+        Target size, the unit of displacements.
+    gradient : (n, d) real
+        grad log h.
+    log_ratio : (n,) real
+        r = log(V / h^d).
+    quality : (n,) real
+        Q.
+    """
+
+    h: cla.Array
+    gradient: cla.Array
+    log_ratio: cla.Array
+    quality: cla.Array
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """The penalty eps that trades accuracy of the volumes for a shorter displacement.
+
+    eps_i = min(3, eps (1 + q_i^2 / quality_scale^2)) / (1 + (r_i / log_ratio_scale)^2), q = (1 - Q) / sqrt Q of the
+    worst cell among i and its neighbors. A scale of 0 leaves its factor out.
+    """
+
+    eps: float
+    quality_scale: float = 0.0
+    log_ratio_scale: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Arrays:
+    """Arrays of one iteration, as volume_projection.cl names them."""
+
+    rows: cla.Array
+    columns: cla.Array
+    own: cla.Array
+    eps: cla.Array
+    inverse: cla.Array
+    p: cla.Array
+    s: cla.Array
+    u: cla.Array
+    y: cla.Array
+    r: cla.Array
+    z: cla.Array
+
+
+class VolumeProjection:
     """Solve for the correction u' in ``u = Ld + u'``, ``u' = -W J^T y``, ``(J W J^T + eps) y = r + J Ld``.
 
-    J is the derivative of the excess r (see `Density`) by the generators, W = diag(h^2). With eps = 0 the excess would
-    vanish to first order; eps > 0 is a penalty that trades it for a shorter displacement, and damps the modes which J
-    hardly sees.
+    J is the derivative of the log ratios r by the generators, W = diag(h^2). With eps = 0 the log ratios vanish to
+    first order. A penalty eps > 0 gives a shorter displacement and damps the modes that hardly change any volume.
 
-    Conjugate gradients with the diagonal as a preconditioner, from y = 0 or along the last solution first, in two
-    kernels an iteration. The host enqueues as many as the last solve took and then reads their record; the iterate is
-    frozen on the device when the tolerance is met, so the result does not depend on when the host looks. Where cells
-    are few, one kernel of one work-group does all of that alone.
+    Conjugate gradients with a diagonal preconditioner start from y = 0, or along the last solution. An iteration takes
+    two kernels. The host enqueues as many iterations as the last solve took and then reads their record. The iterate is
+    frozen on the device when the tolerance is met, so the result does not depend on when the host reads. One work-group
+    does all iterations where cells are few.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._partial = engine.empty(_ROWS * engine.groups)
-        self._record = engine.zeros(4 * 64)  # more rows than are written are read
-        self._kernels: dict[np.dtype, SimpleNamespace] = {}
+        # The host may read rows that no kernel has written.
+        self._record = engine.zeros(4 * 64)
+        self._kernels: dict[np.dtype, Kernels] = {}
         self._ahead = 8
         self._most_alone = most_alone(engine)
 
-    def _kernels_in(self, store: np.dtype) -> SimpleNamespace:
+    def _kernels_in(self, store: np.dtype) -> Kernels:
         if store not in self._kernels:
             self._kernels[store] = self.engine.kernels(
                 "solvers/volume_projection", {"STORE": self.engine.name_of(store)}
             )
         return self._kernels[store]
 
-    def _reserve(self, n: int, m: int, store: np.dtype, most: int) -> SimpleNamespace:
-        """Return the iteration's arrays for `n` cells and `m` faces; make room for `most` iterations."""
+    def _reserve(self, n: int, m: int, store: np.dtype, max_iterations: int) -> _Arrays:
+        """Return the arrays for `n` cells and `m` faces, and enlarge the record for `max_iterations`."""
         engine, d = self.engine, self.engine.dim
-        if 4 * (most + 1) > len(self._record):
-            self._record = engine.zeros(4 * (most + 1))
-        return SimpleNamespace(
+        if 4 * (max_iterations + 1) > len(self._record):
+            self._record = engine.zeros(4 * (max_iterations + 1))
+        return _Arrays(
             **{name: engine.scratch((d, m), np.float32) for name in ("rows", "columns")},
             **{name: engine.scratch((n, d), store) for name in ("own", "s", "u")},
             **{name: engine.scratch(n, store) for name in ("eps", "inverse", "y", "r", "z", "p")},
@@ -66,18 +118,12 @@ class Projection:
     def project(
         self,
         t: Tessellation,
-        h: cla.Array,
-        gradient: cla.Array,
-        excess: cla.Array,
+        targets: Targets,
         displacement: cla.Array,
         correction: cla.Array,
-        quality: cla.Array,
+        penalty: Penalty,
+        limits: Limits,
         *,
-        eps: float,
-        lenience: float = 0.0,
-        bound: float = 0.0,
-        max_iterations: int,
-        tolerance: float = 1e-6,
         labels: cla.Array | None = None,
         fixed: int = 0,
         start: cla.Array | None = None,
@@ -87,85 +133,77 @@ class Projection:
 
         Parameters
         ----------
-        h, excess, quality : (n,) real
-        gradient : (n, d) real
-            grad log h.
-        eps : float
-        lenience : float
-            (1 - Q) / sqrt Q, which is next to -log Q, at which the eps of a cell and its neighbors is twice as large;
-            0: quality does not matter.
-        bound : float
-            Excess at which a cell's eps is half; 0: the same eps for all.
-        max_iterations : int
-        tolerance : float
-            Of the relative residual, by the recurrence. From `SINGLE` on the vectors are in single precision.
+        targets : Targets
+        penalty : Penalty
+        limits : Limits
+            The relative residual is that of the recurrence. From `SINGLE_PRECISION_TOLERANCE` on the vectors are in
+            single precision.
         labels : (n,) int32, optional
         fixed : int
-            Generators with smaller labels do not move.
+            Generators with labels below `fixed` do not move.
         start : (n,) float32, optional
-            Where the solution y goes, if there is a need of one.
+            Receives the solution y.
         warm : bool
-            Begin from what `start` holds: a solution of a similar system.
+            Start from the content of `start`: the solution of a similar system.
 
         Returns
         -------
         Solution
-            `residual` is the recurrence's, too.
+            `residual` is that of the recurrence, too.
 
         Raises
         ------
         SolverError
             If a number is not finite.
         """
-        engine, n = self.engine, t.n
-        real = engine.real.type
-        store = np.dtype(np.float32) if tolerance >= SINGLE else engine.real
-        v = self._reserve(n, t.neighbors.shape[0], store, max_iterations)
-        k = self._kernels_in(store)
-        sizes = np.int32(n), np.int32(max_iterations), np.int32(t.neighbors.shape[0])
-        number, _, room = sizes
-        faces, partial, record = (t.starts, t.neighbors), self._partial, self._record
-        groups = 1 if n <= self._most_alone else engine.groups
+        engine, n, m = self.engine, t.n, t.neighbors.shape[0]
+        real, tolerance, most = engine.real.type, limits.tolerance, limits.max_iterations
+        single = tolerance >= SINGLE_PRECISION_TOLERANCE
+        store = np.dtype(np.float32) if single else engine.real
+        v, k = self._reserve(n, m, store, most), self._kernels_in(store)
         start = engine.scratch(n, np.float32) if start is None else start
+        groups = 1 if n <= self._most_alone else engine.groups
         Launch(
-            engine, k.assemble, number, room, *faces, t.face_measures, t.face_centroids, t.volumes,
-            t.points, gradient, h, quality, excess, displacement, real(eps), real(lenience),
-            real(bound), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, partial,
+            engine, k.assemble_projection, np.int32(n), np.int32(m), t.starts, t.neighbors, t.face_measures,
+            t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,
+            targets.log_ratio, displacement, real(penalty.eps), real(penalty.quality_scale),
+            real(penalty.log_ratio_scale), v.rows, v.columns, v.own, v.eps, v.inverse, v.r, v.z, self._partial,
             t.starts if labels is None else labels, np.int32(fixed), np.int32(warm), start,
             *engine.period_args, groups=groups,
         )()  # fmt: skip
         iteration = (
-            *sizes, np.int32(warm), real(tolerance), *faces, v.rows, v.columns, v.own, v.eps, v.inverse,
-            v.p, v.s, v.u, v.y, v.r, v.z, partial, record,
+            np.int32(n), np.int32(most), np.int32(m), np.int32(warm), real(tolerance), t.starts, t.neighbors,
+            v.rows, v.columns, v.own, v.eps, v.inverse, v.p, v.s, v.u, v.y, v.r, v.z, self._partial, self._record,
         )  # fmt: skip
         if groups == 1:
-            Launch(engine, k.iterate, *iteration, groups=1)()
-            rows = self._read(max_iterations)
+            Launch(engine, k.project_by_group, *iteration, groups=1)()
+            rows = self._read(most)
         else:
-            descend, update = (
-                Launch(engine, kernel, np.int32(0), *iteration) for kernel in (k.descend, k.update)
+            rows = self._iterate(
+                Launch(engine, k.update_projection_direction, np.int32(0), *iteration),
+                Launch(engine, k.update_projection, np.int32(0), *iteration),
+                most,
             )
-            rows = self._iterate(descend, update, max_iterations)
-        solution = self._judge(rows, tolerance)
+        solution = self._solution(rows, tolerance)
         if solution.iterations:
-            engine.run_each(k.put_correction, n, v.u, v.y, h, correction, start)
+            engine.run_each(k.write_correction, n, v.u, v.y, targets.h, correction, start)
         else:
             correction.fill(0)
         return solution
 
-    def _iterate(self, descend: Launch, update: Launch, most: int) -> np.ndarray:
-        """Iterate until the tolerance is met, or `most` times; return the record up to then, or later."""
-        descend()
+    def _iterate(self, direction: Launch, update: Launch, most: int) -> np.ndarray:
+        """Iterate until the tolerance is met, or `most` times; return the record up to there or further."""
+        direction()
         done, ahead = 0, self._ahead
         while True:
             end = min(done + ahead, most)
             for k in range(done, end):
-                for launch, number in ((update, k), (descend, k + 1)):
+                for launch, number in ((update, k), (direction, k + 1)):
                     launch.set_first(number)
                     launch()
             rows = self._read(end)
-            if not rows[:, _RUNNING].all():
-                self._ahead = _stop(rows) + 2
+            if not rows[:, RECORD_RUNNING].all():
+                self._ahead = _first_stop(rows) + 2
                 return rows
             done, ahead = end, 4
 
@@ -173,26 +211,33 @@ class Projection:
         """Return the rows of the record up to iteration `end`."""
         return self._record[: 4 * (end + 1)].get().reshape(-1, 4).astype(np.float64)
 
-    def _judge(self, rows: np.ndarray, tolerance: float) -> Solution:
-        """Return how it went, by the record."""
-        iterations = _stop(rows)
-        flat = bool(iterations and not rows[iterations - 1, _CURVATURE] > 0)
+    def _solution(self, rows: np.ndarray, tolerance: float) -> Solution:
+        """Return the outcome by the record.
+
+        Raises
+        ------
+        SolverError
+            If a number is not finite.
+        """
+        iterations = _first_stop(rows)
+        flat = bool(iterations and not rows[iterations - 1, RECORD_CURVATURE] > 0)
         iterations -= flat
-        norms, curvature = rows[: iterations + 1, _NORM], rows[iterations, _CURVATURE]
-        # A curvature of zero: what is left is too small for the precision.
+        norms = rows[: iterations + 1, RECORD_NORM]
+        curvature = rows[iterations, RECORD_CURVATURE]
+        # A curvature of 0 means that the residual is below the limit of the precision.
         if not np.isfinite(norms).all() or (flat and curvature != 0):
             raise SolverError(
-                "the projection got an excess, displacement or diagram that is not finite: squared "
-                f"residuals {norms}, curvature {curvature}; check the input"
+                "the volume projection got sizes, a displacement or a diagram that is not finite: squared residuals "
+                f"{norms}, curvature {curvature}. Check the input"
             )
         if norms[0] == 0:
-            return Solution(0, 0.0, np.zeros(1), True, "zero right side")
+            return Solution.zero()
         residuals = np.sqrt(norms / norms[0])
         converged = bool(residuals[-1] <= tolerance)
         reason = "converged" if converged else "stagnated" if flat else "max_iterations"
         return Solution(iterations, float(residuals[-1]), residuals, converged, reason)
 
 
-def _stop(rows: np.ndarray) -> int:
-    """Return the first iteration that was not carried out; what the record holds behind it is of no meaning."""
-    return int(np.flatnonzero(rows[:, _RUNNING] == 0)[0])
+def _first_stop(rows: np.ndarray) -> int:
+    """Return the first iteration that was not carried out. Later rows of the record have no meaning."""
+    return int(np.flatnonzero(rows[:, RECORD_RUNNING] == 0)[0])

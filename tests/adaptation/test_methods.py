@@ -16,6 +16,8 @@ from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import Mesh
 from clvoro.errors import SizeFieldError
 from clvoro.sizing import Sizing
+from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.volume_projection import Penalty, Targets
 from tests.reference import graphs, patch
 
 N = 150
@@ -162,8 +164,8 @@ def test_projected_displacements(stages):
     expected = 1.3 * lloyd + 0.6 * velocity
     correction = stages.engine.empty((N, 2))
     stages.projection.project(
-        mesh.t, mesh.reach, w.gradient, w.excess, stages.engine.upload(expected), correction, mesh.quality,
-        eps=0.2, lenience=0.1, bound=0.3, max_iterations=25, tolerance=1e-2,
+        mesh.t, Targets(mesh.reach, w.gradient, w.excess, mesh.quality), stages.engine.upload(expected), correction,
+        Penalty(0.2, 0.1, 0.3), Limits(1e-2, 25),
     )  # fmt: skip
     ProjectedMethod("lloyd", 1.3, 0.6, eps=0.2, lenience=0.1, bound=0.3, iterations=25).displace(
         mesh

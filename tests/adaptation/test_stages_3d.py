@@ -10,7 +10,7 @@ from clvoro.adaptation.motion import Motion
 from clvoro.adaptation.refinement import Refinement
 from clvoro.geometry.box import Box
 from clvoro.solvers.poisson import Poisson
-from clvoro.solvers.volume_projection import Projection
+from clvoro.solvers.volume_projection import VolumeProjection
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
@@ -153,7 +153,7 @@ def test_potential_solves_the_equation(double):
     r = np.random.default_rng(6).normal(size=N)
     source, potential = double.empty(N), double.zeros(N)
     laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, t.points)
-    poisson.compatible(double.upload(r), t.volumes, source)
+    poisson.subtract_mean_source(double.upload(r), t.volumes, source)
     poisson.solve(laplacian, source, potential, tolerance=1e-10)
     phi, inner = potential.get(), host.neighbors >= 0
     i, j = host.owners[inner], host.neighbors[inner]
@@ -165,7 +165,7 @@ def test_potential_solves_the_equation(double):
     assert off < 1e-8 * np.abs(wanted).max()
 
 
-# Projection.
+# VolumeProjection.
 
 
 def excess_of(points):
@@ -184,7 +184,7 @@ def test_projection_knows_the_derivative_of_the_volumes(double):
         # What the volumes should change by; its mean is what moving along grad h can give.
         ask = size * np.random.default_rng(3).normal(size=60)
         u = double.empty((60, 3))
-        solution = Projection(double).project(
+        solution = VolumeProjection(double).project(
             t, double.upload(h), double.upload(np.tile(SLOPE, (60, 1))), double.upload(ask),
             double.zeros((60, 3)), u, double.upload(np.ones(60)), eps=1e-9, max_iterations=2000,
             tolerance=1e-11,

@@ -340,7 +340,7 @@ def fields(adapter: clvoro.Adapter) -> None:
 def multigrid(adapter: clvoro.Adapter) -> None:
     """The preconditioner, which runs would only take for larger meshes; a solve in two precisions."""
     from clvoro.solvers import cycle
-    from clvoro.solvers.poisson import ROUGH, Poisson
+    from clvoro.solvers.poisson import SINGLE_PRECISION_TOLERANCE, Poisson
 
     n = 300  # the fewest that take every kernel of it
     stages = stages_of(adapter)
@@ -365,8 +365,12 @@ def multigrid(adapter: clvoro.Adapter) -> None:
         )
         assert alone.converged
     # One that starts from something else than zero.
-    rough = stage.assemble(t.starts, t.neighbors, t.face_measures, t.points, tolerance=ROUGH)
-    assert stage.solve(rough, rhs, engine.upload(points(n)[:, 1]), tolerance=ROUGH).converged
+    rough = stage.assemble(
+        t.starts, t.neighbors, t.face_measures, t.points, tolerance=SINGLE_PRECISION_TOLERANCE
+    )
+    assert stage.solve(
+        rough, rhs, engine.upload(points(n)[:, 1]), tolerance=SINGLE_PRECISION_TOLERANCE
+    ).converged
 
 
 def nuclei(adapter: clvoro.Adapter) -> None:

@@ -12,7 +12,7 @@ from clvoro import create_context
 from clvoro.errors import SolverError
 from clvoro.opencl.program import Engine
 from clvoro.solvers import cycle
-from clvoro.solvers.aggregation import Coarsening, Graph
+from clvoro.solvers.aggregation import Aggregation, Graph
 from clvoro.solvers.multigrid import Multigrid
 from clvoro.solvers.poisson import Laplacian, Poisson
 from tests.reference import graphs, patch
@@ -84,10 +84,10 @@ def test_groups_and_their_graph(make, name):
     """Against P^T W P of SciPy, P the groups' indicator."""
     engine, W = make(3 if "3D" in name else 2, np.float32), GRAPHS[name]()
     n = W.shape[0]
-    coarsening = Coarsening(engine)
+    aggregation = Aggregation(engine)
     fine = Graph(*upload(engine, W))
-    _, groups, coarse = coarsening.coarsen(fine, 0)
-    group, count = groups.group.get(), len(groups)
+    _, groups, coarse = aggregation.coarsen(fine, 0)
+    group, count = groups.aggregate.get(), len(groups)
     starts, members = groups.starts.get(), groups.members.get()
     assert sorted(members) == list(range(n))
     assert np.array_equal(group[members], np.repeat(np.arange(count), np.diff(starts)))
@@ -112,7 +112,7 @@ def test_pair_inverse(make):
     n = W.shape[0]
     # What groups weigh within themselves, as rows of coarse graphs have it, counts for nothing.
     within = sp.diags(np.random.default_rng(17).uniform(0.5, 2, n) * W.max())
-    blocks = Coarsening(engine).pairs(Graph(*upload(engine, sp.csr_matrix(W + within))), 0)
+    blocks = Aggregation(engine).match_pairs(Graph(*upload(engine, sp.csr_matrix(W + within))), 0)
     partner, own, both = (a.get() for a in (blocks.partner, blocks.own, blocks.both))
     D = W.toarray().sum(axis=1)
     first = (W.toarray() * (1 / D[:, None] + 1 / D)).argmax(axis=1)
@@ -144,7 +144,7 @@ def reference_cycle(multigrid, depth, b):
     A = dense_graph(level.graph)
     n, sparse = len(A), sp.csr_matrix(A)
     partner, own, both = (a.get() for a in (level.pairs.partner, level.pairs.own, level.pairs.both))
-    if level.groups is None:
+    if level.aggregates is None:
         # The mean is taken away from both sides; in between the last value is zero.
         x = np.zeros(b.shape)
         b = b - b.mean(axis=0)
@@ -154,7 +154,9 @@ def reference_cycle(multigrid, depth, b):
     S = sp.csr_matrix((both.astype(float), (cells, partner)), (n, n)) + sp.diags(
         own + np.where(partner == cells, 0, both.astype(float))
     )
-    P = sp.csr_matrix((np.ones(n), (cells, level.groups.group.get())), (n, len(level.groups)))
+    P = sp.csr_matrix(
+        (np.ones(n), (cells, level.aggregates.aggregate.get())), (n, len(level.aggregates))
+    )
     low, high = 0.35, 2.0
     roots = (low + high) / 2 + (high - low) / 2 * np.cos(np.pi * np.array([1, 3]) / 4)
     x = np.zeros(b.shape)
@@ -205,7 +207,7 @@ def test_few_cells_are_gone_through_by_one_group_to_the_same_bits(
                 lambda *args, into=launched: into.append(args[1].function_name) or plain(*args),
             )  # fmt: skip
             multigrid.apply(r, u)
-        assert ("descend_alone" in launched) == (most > 0 and len(multigrid.sizes) > 2)
+        assert ("descend_by_group" in launched) == (most > 0 and len(multigrid.sizes) > 2)
         found.append(u.get())
     assert np.array_equal(*found)
 
@@ -224,8 +226,8 @@ def test_walls_count_for_nothing(make):
         engine.upload(np.concatenate([weights, np.zeros(90)])[order]),
     )
     plain = Graph(*upload(engine, W))
-    pairs, groups, coarse = Coarsening(engine).coarsen(plain, 0)
-    others = Coarsening(engine).coarsen(with_walls, 0)
+    pairs, groups, coarse = Aggregation(engine).coarsen(plain, 0)
+    others = Aggregation(engine).coarsen(with_walls, 0)
     for a, b in zip((pairs, groups, coarse), others, strict=True):
         for name, array in vars(a).items():
             assert np.array_equal(array.get(), getattr(b, name).get())
@@ -259,7 +261,7 @@ def test_cycle(make, real, n):
 
 def test_coarse_graphs_are_symmetric_to_the_last_bit(make):
     engine, W = make(2, np.float32), weighted_weights("decades", 3000)
-    coarse = Coarsening(engine).coarsen(Graph(*upload(engine, W)), 0)[2]
+    coarse = Aggregation(engine).coarsen(Graph(*upload(engine, W)), 0)[2]
     assert (matrix_of(coarse) != matrix_of(coarse).T).nnz == 0
 
 
@@ -556,7 +558,7 @@ def test_renewed_cycle(make):
     multigrid.set_up(*upload(engine, before))
     coarse = dense_graph(multigrid._levels[1].graph)
     partner = multigrid._levels[0].pairs.partner.get()
-    multigrid.renew(*upload(engine, after))
+    multigrid.update_finest(*upload(engine, after))
     assert np.array_equal(multigrid._levels[0].pairs.partner.get(), partner)
     assert np.array_equal(dense_graph(multigrid._levels[1].graph), coarse)
     A = sp.diags(np.asarray(after.sum(axis=1)).ravel()) - after
@@ -580,7 +582,7 @@ def test_renewed_cycle_is_positive_definite(make, amount):
     before, after = neighboring_weights(n, amount)
     multigrid = Multigrid(engine)
     multigrid.set_up(*upload(engine, before))
-    multigrid.renew(*upload(engine, after))
+    multigrid.update_finest(*upload(engine, after))
     M = reference_cycle(multigrid, 0, np.eye(n))
     assert np.abs(M - M.T).max() <= 1e-6 * np.abs(M).max()
     assert np.linalg.eigvalsh((M + M.T) / 2).min() > 0
@@ -594,12 +596,12 @@ def test_multigrid_is_used_again_while_it_serves(make):
     poisson, cells = Poisson(engine), object()
     b = np.random.default_rng(10).standard_normal(n)
 
-    def solve(W, numbering):
+    def solve(W, ordering):
         diagonal = np.asarray(W.sum(axis=1)).ravel()
         laplacian = Laplacian(*upload(engine, W))
         phi = engine.zeros(n)
         solution = poisson.solve(
-            laplacian, engine.upload(b), phi, preconditioner="multigrid", numbering=numbering
+            laplacian, engine.upload(b), phi, preconditioner="multigrid", ordering=ordering
         )
         assert solution.reason == "converged"
         A = sp.diags(diagonal) - W

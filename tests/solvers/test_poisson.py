@@ -9,8 +9,8 @@ import scipy.sparse.linalg as sla
 from clvoro import Box, create_context
 from clvoro.errors import InputError, SolverError
 from clvoro.opencl.program import Engine
-from clvoro.solvers import conjugate_gradient as krylov
-from clvoro.solvers.conjugate_gradient import ConjugateGradient
+from clvoro.solvers import conjugate_gradient
+from clvoro.solvers.conjugate_gradient import ConjugateGradient, Limits, Operator
 from clvoro.solvers.poisson import Poisson, expected_costs
 from tests.reference import graphs
 
@@ -23,7 +23,7 @@ def make(request):
     ctx = create_context()
     queue = cl.CommandQueue(ctx)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(krylov, "most_alone", lambda engine: request.param)
+        patched.setattr(conjugate_gradient, "most_alone", lambda engine: request.param)
         yield lambda dim=2, real=np.float64: Engine(ctx, queue, dim, np.dtype(real))
 
 
@@ -52,6 +52,11 @@ def as_matrix(laplacian):
     rows = np.repeat(np.arange(n), np.diff(starts))
     off = sp.csr_matrix((weights, np.where(columns < 0, rows, columns), starts), (n, n))
     return sp.csr_matrix(sp.diags(np.asarray(off.sum(axis=1)).ravel()) - off)
+
+
+def singular(poisson, laplacian):
+    """The operator as any other one: neither fused nor by rows."""
+    return Operator(lambda p, q: poisson.apply(laplacian, p, q), singular=True)
 
 
 def dense_cg(A, b, iterations):
@@ -246,7 +251,7 @@ def test_compatible(make):
     poisson, _ = assembled(engine, graph)
     source = np.sin(5 * points[:, 0]) + 3
     rhs = engine.empty(400)
-    poisson.compatible(engine.upload(source), engine.upload(volumes), rhs)
+    poisson.subtract_mean_source(engine.upload(source), engine.upload(volumes), rhs)
     expected = volumes * (source - (volumes @ source) / volumes.sum())
     assert np.allclose(rhs.get(), expected, rtol=0, atol=1e-15)
     assert abs(rhs.get().sum()) < 1e-14
@@ -289,7 +294,7 @@ def test_auto_takes_what_costs_less(make):
     assert np.argmin(expected_costs(3000, 2, 1e-1)) == 0
     assert np.argmin(expected_costs(3000, 2, 1e-8)) == 1
     # One work-group alone is through with a thousand cells sooner than many launches are.
-    assert expected_costs(1000, 2, 1e-2, alone=True)[0] < 0.5 * expected_costs(1000, 2, 1e-2)[0]
+    assert expected_costs(1000, 2, 1e-2, one_group=True)[0] < 0.5 * expected_costs(1000, 2, 1e-2)[0]
     for n, jacobi in ((600, True), (8000, False)):
         engine = make()
         poisson, laplacian = assembled(engine, graphs.random_graph(n, seed=14))
@@ -352,9 +357,12 @@ def test_what_earlier_solves_have_left_counts_for_nothing(make, preconditioner, 
     b = engine.upload(np.random.default_rng(60).standard_normal(900))
     for soiled in (False, True):
         poisson, laplacian = assembled(engine, graphs.random_graph(900, seed=59))
-        solver, options = poisson._krylov, {"tolerance": 1e-6, "preconditioner": preconditioner}
+        solver, options = (
+            poisson._conjugate_gradient,
+            {"tolerance": 1e-6, "preconditioner": preconditioner},
+        )
         poisson.solve(laplacian, b, engine.zeros(900), max_iterations=300, **options)
-        for array in (solver.partial, solver.state, solver.record, solver._alone) * soiled:
+        for array in (solver.partial, solver.state, solver.record, solver._group_state) * soiled:
             array.fill(left)
         x = engine.zeros(900)
         solution = poisson.solve(laplacian, b, x, max_iterations=300, **options)
@@ -373,8 +381,7 @@ def test_result_does_not_depend_on_when_the_host_looks(make):
     for lookahead in (1, 7, 200):
         x = engine.zeros(800)
         solution = ConjugateGradient(engine).solve(
-            lambda p, q: poisson.apply(laplacian, p, q), b, x, tolerance=1e-6, max_iterations=500,
-            precondition=poisson.inverse_diagonal(laplacian), center=True, lookahead=lookahead,
+            singular(poisson, laplacian), b, x, poisson.inverse_diagonal(laplacian), Limits(1e-6, 500, lookahead)
         )  # fmt: skip
         results.append((solution.iterations, x.get()))
     assert len({iterations for iterations, _ in results}) == 1
@@ -395,8 +402,7 @@ def test_no_preconditioning_in_vain(make):
 
     b = engine.upload(np.random.default_rng(58).standard_normal(800))
     solution = ConjugateGradient(engine).solve(
-        lambda p, q: poisson.apply(laplacian, p, q), b, engine.zeros(800), tolerance=1e-2,
-        max_iterations=500, precondition=precondition, center=True, lookahead=1, verify=False,
+        singular(poisson, laplacian), b, engine.zeros(800), precondition, Limits(1e-2, 500, 1, verify=False)
     )  # fmt: skip
     assert solution.converged
     assert applied == solution.iterations > 10
@@ -415,7 +421,7 @@ def test_group_alone(n, group_size, monkeypatch):
     ctx, results = create_context(), []
     b = np.random.default_rng(59).standard_normal(n)
     for few in (0, n):
-        monkeypatch.setattr(krylov, "most_alone", lambda engine, few=few: few)
+        monkeypatch.setattr(conjugate_gradient, "most_alone", lambda engine, few=few: few)
         engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
         if group_size is not None:
             object.__setattr__(engine, "group_size", group_size)
@@ -440,8 +446,7 @@ def test_callable_preconditioner(make):
 
     x, y = engine.zeros(800), engine.zeros(800)
     solution = ConjugateGradient(engine).solve(
-        lambda p, q: poisson.apply(laplacian, p, q), b, x, tolerance=1e-8, max_iterations=500,
-        precondition=jacobi, center=True,
+        singular(poisson, laplacian), b, x, jacobi, Limits(1e-8, 500)
     )  # fmt: skip
     expected = poisson.solve(laplacian, b, y)
     assert abs(solution.iterations - expected.iterations) <= 2
@@ -462,8 +467,8 @@ def test_breakdown_is_reported(make):
 
     with pytest.raises(SolverError, match="positive definite"):
         solver.solve(
-            apply, engine.upload(b), negative, tolerance=1e-8, max_iterations=50,
-            precondition=poisson.inverse_diagonal(laplacian), center=True,
+            Operator(apply, singular=True), engine.upload(b), negative, poisson.inverse_diagonal(laplacian),
+            Limits(1e-8, 50),
         )  # fmt: skip
     b[7] = np.nan
     with pytest.raises(SolverError, match="not finite"):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from clvoro.solvers import volume_projection as projection
-from clvoro.solvers.volume_projection import Projection
+from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import patch
 
-EPS, LENIENCE, BOUND = 0.2, 0.3, 0.4
+EPS, QUALITY_SCALE, LOG_RATIO_SCALE = 0.2, 0.3, 0.4
 
 
 class Given:
@@ -27,18 +28,18 @@ class Given:
         self.displacement = 0.01 * rng.normal(size=(self.n, box.dim))
         self.displacement[self.held] = 0
 
-    def project(self, **options):
+    def project(self, tolerance, max_iterations):
         """Return the solution, its correction, what it leaves as the next start, and the iteration's arrays."""
         u, start = self.engine.empty((self.n, self.box.dim)), self.engine.empty(self.n, np.float32)
-        names = ("h", "gradient", "excess", "displacement")
-        given = [self.engine.upload(getattr(self, name)) for name in names]
-        stage, taken = Projection(self.engine), []
+        names = ("h", "gradient", "excess", "quality", "displacement")
+        *targets, displacement = (self.engine.upload(getattr(self, name)) for name in names)
+        stage, taken = VolumeProjection(self.engine), []
         reserve = stage._reserve
         stage._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
         solution = stage.project(
-            self.t, *given, u, self.engine.upload(self.quality), eps=EPS, lenience=LENIENCE,
-            bound=BOUND, labels=self.engine.upload(self.labels, np.int32), fixed=self.fixed,
-            start=start, **options,
+            self.t, Targets(*targets), displacement, u, Penalty(EPS, QUALITY_SCALE, LOG_RATIO_SCALE),
+            Limits(tolerance, max_iterations), labels=self.engine.upload(self.labels, np.int32),
+            fixed=self.fixed, start=start,
         )  # fmt: skip
         return solution, u.get(), start.get(), taken[0]
 
@@ -55,8 +56,8 @@ class Given:
             worst[i] = min(worst[i], self.quality[j])
         J[np.arange(self.n), np.arange(self.n)] -= dim * self.gradient
         J[:, self.held] = 0
-        eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / LENIENCE**2), 3)
-        return J, eps / (1 + (self.excess / BOUND) ** 2)
+        eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / QUALITY_SCALE**2), 3)
+        return J, eps / (1 + (self.excess / LOG_RATIO_SCALE) ** 2)
 
 
 @pytest.fixture(

@@ -9,7 +9,8 @@ from clvoro.adaptation.density import Density
 from clvoro.errors import SolverError
 from clvoro.opencl.program import Engine
 from clvoro.solvers import volume_projection as projection
-from clvoro.solvers.volume_projection import Projection
+from clvoro.solvers.conjugate_gradient import Limits
+from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import diagrams as reference
 from tests.reference import patch
 
@@ -45,17 +46,17 @@ class Assembled:
 
     def __init__(self, engine, points, h, gradient, r=None, displacement=None, **options):
         n = len(points)
-        t, projection = patch.tessellate(engine, points), Projection(engine)
+        t, projection = patch.tessellate(engine, points), VolumeProjection(engine)
         given = {"r": np.zeros(n), "displacement": np.zeros((n, 2)), "quality": np.ones(n)}
         given |= {"r": r} if r is not None else {}
         given |= {"displacement": displacement} if displacement is not None else {}
         given["quality"] = options.pop("quality", given["quality"])
         taken, reserve = [], projection._reserve
         projection._reserve = lambda *args: taken.append(reserve(*args)) or taken[-1]
+        targets = Targets(*map(engine.upload, (h, gradient, given["r"], given["quality"])))
         projection.project(
-            t, engine.upload(h), engine.upload(gradient), engine.upload(given["r"]),
-            engine.upload(given["displacement"]), engine.empty((n, 2)),
-            engine.upload(given["quality"]), max_iterations=0, tolerance=1e-12, **options,
+            t, targets, engine.upload(given["displacement"]), engine.empty((n, 2)), Penalty(**options),
+            Limits(1e-12, 0),
         )  # fmt: skip
         host, (v,) = patch.fetch(t), taken
         self.eps, self.inverse, self.rhs = v.eps.get(), v.inverse.get(), v.r.get()
@@ -130,33 +131,46 @@ def test_right_side(engine, points):
     """r + J Ld."""
     r, lloyd = excess(points), np.random.default_rng(17).normal(0, 0.01, (N, 2))
     made = Assembled(
-        engine, points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd, eps=0.3, bound=0.4
+        engine,
+        points,
+        sizes(points),
+        np.tile(SLOPE, (N, 1)),
+        r,
+        lloyd,
+        eps=0.3,
+        log_ratio_scale=0.4,
     )
     expected = r + np.einsum("ija,ja->i", made.derivative(), lloyd)
     assert made.rhs == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
 
 
-def project(engine, points, h, gradient, r, displacement, **options):
+def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **options):
     out = engine.empty((len(points), 2))
-    quality = options.pop("quality", np.ones(len(points)))
-    solution = Projection(engine).project(
-        patch.tessellate(engine, points), engine.upload(h), engine.upload(gradient), engine.upload(r),
-        engine.upload(displacement), out, engine.upload(quality), **options,
+    targets = Targets(*map(engine.upload, (h, gradient, r, np.ones(len(points)))))
+    penalty = Penalty(options.pop("eps"), log_ratio_scale=options.pop("log_ratio_scale", 0.0))
+    solution = VolumeProjection(engine).project(
+        patch.tessellate(engine, points), targets, engine.upload(displacement), out, penalty,
+        Limits(tolerance, options.pop("max_iterations")), **options,
     )  # fmt: skip
     return out.get(), solution
 
 
-@pytest.mark.parametrize("bound", [0.0, 0.2])
-def test_projection(engine, points, bound):
+@pytest.mark.parametrize("log_ratio_scale", [0.0, 0.2])
+def test_projection(engine, points, log_ratio_scale):
     """u' = -W J^T (J W J^T + eps)^-1 (r + J Ld), by dense algebra; a cell that is far off has the smaller eps."""
     r, lloyd = excess(points), np.random.default_rng(14).normal(0, 0.01, (N, 2))
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd)
-    made = Assembled(engine, *given, eps=0.02, bound=bound)
-    eps = 0.02 / (1 + (r / bound) ** 2 if bound else np.ones(N))
+    made = Assembled(engine, *given, eps=0.02, log_ratio_scale=log_ratio_scale)
+    eps = 0.02 / (1 + (r / log_ratio_scale) ** 2 if log_ratio_scale else np.ones(N))
     assert made.eps == pytest.approx(eps, rel=1e-6)  # of single precision
     expected = made.correction(made.rhs)
     correction, solution = project(
-        engine, *given, eps=0.02, bound=bound, max_iterations=1000, tolerance=1e-12
+        engine,
+        *given,
+        eps=0.02,
+        log_ratio_scale=log_ratio_scale,
+        max_iterations=1000,
+        tolerance=1e-12,
     )
     assert solution.converged
     assert solution.reason == "converged"
@@ -212,12 +226,12 @@ def test_result_does_not_depend_on_when_the_host_looks(engine, points):
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points))
     t, results = patch.tessellate(engine, points), []
     for ahead in (1, 2, 7, 40):
-        projection, out = Projection(engine), engine.empty((N, 2))
+        projection, out = VolumeProjection(engine), engine.empty((N, 2))
         projection._ahead = ahead
         h, gradient, r = (engine.upload(a) for a in given[1:])
         solution = projection.project(
-            t, h, gradient, r, engine.zeros((N, 2)), out, engine.upload(np.ones(N)), eps=0.1,
-            max_iterations=40, tolerance=1e-3,
+            t, Targets(h, gradient, r, engine.upload(np.ones(N))), engine.zeros((N, 2)), out, Penalty(0.1),
+            Limits(1e-3, 40),
         )  # fmt: skip
         results.append((out.get(), solution.residuals))
     for u, residuals in results[1:]:
@@ -269,7 +283,7 @@ def test_not_finite(engine, points):
         )  # fmt: skip
 
 
-def test_lenience(engine, points, assembled):
+def test_penalty_of_bad_cells(engine, points, assembled):
     """eps grows with (1 - Q) / sqrt Q of the worst cell around, up to 3."""
     quality = np.random.default_rng(15).uniform(0.3, 1, N)
     host = patch.fetch(patch.tessellate(engine, points))
@@ -279,7 +293,7 @@ def test_lenience(engine, points, assembled):
     eps = np.minimum(0.2 * (1 + (1 - worst) ** 2 / worst / 0.3**2), 3)
     assert 5 < (eps == 3).sum() < N - 5
     made = Assembled(
-        engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, lenience=0.3, quality=quality
+        engine, points, sizes(points), np.tile(SLOPE, (N, 1)), eps=0.2, quality_scale=0.3, quality=quality
     )  # fmt: skip
     assert made.eps == pytest.approx(eps, rel=1e-5)  # of single precision
 

@@ -7,7 +7,7 @@ import shapely
 import clvoro
 from clvoro.adaptation.insertion_deletion import Population, PopulationControl
 from clvoro.adaptation.stages import Stages
-from clvoro.solvers.components import connected_parts
+from clvoro.solvers.components import connected_components
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
 from tests.reference.shores import TOUCHING, scattered
@@ -97,4 +97,4 @@ def test_parts_of_the_graph_are_not_told_by_places(ctx):
     corner = shared_corners(domain)
     for others, count in (([(0.2, 0.3), (0.7, 0.6)], 2), ([(0.2, 0.3), (0.1, 0.1)], 1)):
         _, t = tessellate(ctx, domain, np.concatenate([corner, others]))
-        assert connected_parts(t).max() + 1 == count
+        assert connected_components(t).max() + 1 == count

@@ -1,0 +1,21 @@
+/* What the kernels of an iterative solver share: partial sums, and the record of the iterations that the host reads.
+   Include after reduce.h. */
+
+/* Row q of `partial`: one value per work-group. */
+#define ROW(q) (partial + (q)*get_num_groups(0))
+
+/* Write the sum over the work-group to row q. `scratch` has GROUP_SIZE entries. */
+#define PUT(q, sum)                                                                                                    \
+    {                                                                                                                  \
+        const REAL put_ = group_sum((sum), scratch);                                                                   \
+        if (get_local_id(0) == 0)                                                                                      \
+            ROW(q)[get_group_id(0)] = put_;                                                                            \
+    }
+
+/* The record has one row of four values per iteration: |r|^2, (r, M^-1 r), whether the iteration is carried out, and
+   (p, A p). From the iteration on that is not carried out, kernels change nothing. The host may therefore enqueue more
+   iterations than needed: the result is the same. */
+#define RECORD_NORM 0
+#define RECORD_GAMMA 1
+#define RECORD_RUNNING 2
+#define RECORD_CURVATURE 3
