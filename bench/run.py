@@ -41,9 +41,9 @@ from _common import (
 import clvoro
 from clvoro.opencl.profile import Profile
 
-SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
+SOLVERS = ("poisson", "multigrid", "aggregation", "conjugate_gradient", "volume_projection")
 """Programs that solve linear systems."""
-TESSELLATION = ("bins", "cells", "repair", "primitives")
+TESSELLATION = ("bins", "cells", "incremental", "primitives")
 """Programs of the diagram; the scans and the reductions of the figures are in "primitives"."""
 
 CELLS_OF_F2 = 22972

@@ -52,7 +52,7 @@ from clvoro.sizing import Sizing
 from clvoro.solvers.conjugate_gradient import Solution
 
 CELLS_OF_F2 = 22972
-SOLVERS = ("poisson", "multigrid", "coarsening", "krylov", "projection")
+SOLVERS = ("poisson", "multigrid", "aggregation", "conjugate_gradient", "volume_projection")
 WARM_UP = 4
 
 
@@ -69,22 +69,22 @@ KINDS = kinds()
 
 NEEDS = {
     # kernel: (reals, integers, operations) per cell of six faces
-    "repair.check_rows": (2, 6 + 3, 6 * 40),
+    "incremental.check_rows": (2, 6 + 3, 6 * 40),
     "cells.match_faces": (0, 4, 0),
     "cells.measure_cells": (2 + 1 + 2 + 3, 6 + 6 + 4 + 6 + 12, 6 * 75 + 40),
     "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
     "metric.compare_neighbors": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
     "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
-    "shape.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
+    "quality_descent.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
-    "poisson.assemble": (2 + 1, 6 + 1 + 6 + 12, 3 * 20),
-    "projection.assemble": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),
-    "projection.descend": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
-    "projection.update": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
+    "poisson.assemble_laplacian": (2 + 1, 6 + 1 + 6 + 12, 3 * 20),
+    "volume_projection.assemble_projection": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),
+    "volume_projection.update_projection_direction": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
+    "volume_projection.update_projection": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
 }
 """What each kernel must read or write, and compute. Faces and the projection's vectors are single: integers here."""
 
-ITERATED = ("descend", "update")
+ITERATED = ("update_projection_direction", "update_projection")
 """Kernels that are enqueued ahead, and find nothing to do once the iteration is over: only its calls count."""
 
 PEAK = """

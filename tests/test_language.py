@@ -31,6 +31,8 @@ WORDS_OF_OTHERS = {
 }
 """British words, and parts of paths where others have chosen them."""
 PLAIN = (
+    "cl_kernels/solvers/",
+    "clvoro/solvers/",
     "bench/RESULTS.md",
     "docs/",
     "README.md",

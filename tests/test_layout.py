@@ -30,9 +30,9 @@ UPWARD = {("mesh.results", "io"), ("mesh.results", "plotting"), ("mesh.results",
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
 TWICE = {
-    "remove_mean", "count_children", "keep_inside", "reflect_inside", "add_run", "corner_of", "eliminate", "cross8",
-    "fold_rows", "choose_lanes", "wrap_cells", "join", "update", "place_of", "assemble", "clip_cells", "match_faces",
-    "clip_cell", "clip_by_row", "find_owners", "add_face", "start_cell", "clip_by_bins", "place_vertices",
+    "count_children", "keep_inside", "reflect_inside", "add_run", "corner_of", "cross8", "fold_rows",
+    "choose_lanes", "wrap_cells", "clip_cells", "match_faces", "clip_cell", "clip_by_row", "find_owners",
+    "add_face", "start_cell", "clip_by_bins", "place_vertices",
 }  # fmt: skip
 """Names of kernels and device functions that are still in two files."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")

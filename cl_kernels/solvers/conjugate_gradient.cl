@@ -193,8 +193,8 @@ typedef struct {
     REAL alpha, alpha_x, mean;
 } Step;
 
-inline Step step_of(int k, int n, int center, global const REAL *partial, global REAL *state, global REAL *record,
-                    local REAL *scratch)
+inline Step step_length(int k, int n, int center, global const REAL *partial, global REAL *state, global REAL *record,
+                        local REAL *scratch)
 {
     global REAL *now = record + 4 * k;
     const int running = now[RECORD_RUNNING] != 0;
@@ -232,7 +232,7 @@ kernel void update_solution(int k, int n, int center, global const STORE *p, glo
                             global STORE *r, global REAL *partial, global REAL *state, global REAL *record)
 {
     local REAL scratch[GROUP_SIZE];
-    const Step s = step_of(k, n, center, partial, state, record, scratch);
+    const Step s = step_length(k, n, center, partial, state, record, scratch);
     Sum norm = SUM_ZERO, sum = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i];
@@ -250,7 +250,7 @@ inline void step_jacobi(int k, int n, int center, global const STORE *inverse_di
                         global const STORE *q, global REAL *x, global STORE *r, global STORE *u, global REAL *partial,
                         global REAL *state, global REAL *record, local REAL *scratch)
 {
-    const Step s = step_of(k, n, center, partial, state, record, scratch);
+    const Step s = step_length(k, n, center, partial, state, record, scratch);
     Sum norm = SUM_ZERO, gamma = SUM_ZERO, sum = SUM_ZERO;
     for (BLOCK_LOOP(i, s.end)) {
         const STORE ri = r[i] - s.mean - s.alpha * q[i], ui = inverse_diagonal[i] * ri;

@@ -84,8 +84,8 @@ def test_launches_of_every_kind_are_seen(run):
     assert calls["cells", "measure_cells"] >= tessellations
     assert calls["motion", "move_generators"] == 5
     # The solver enqueues its kernels itself: one a solve, or two, where cells are so few.
-    assert tessellations <= calls["conjugate_gradient", "solve_alone"] <= 2 * tessellations
-    assert ("poisson", "apply") not in calls
+    assert tessellations <= calls["conjugate_gradient", "solve_by_group"] <= 2 * tessellations
+    assert ("poisson", "apply_laplacian") not in calls
     assert calls[_hooks.MEMORY, "read"] > 0
     assert calls[_hooks.MEMORY, "write"] > 0
     assert calls[_hooks.MEMORY, "fill"] > 0

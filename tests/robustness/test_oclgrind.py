@@ -41,15 +41,16 @@ NOT_IN = {
     "float64": set(),
     # These are between float32 and the precision of the mesh.
     "float32": LANES | {
-        "cells.measure_faces", "coarsening.convert", "multigrid.correct_out", "multigrid.first_rounded",
-        "poisson.apply_full",
+        "cells.measure_faces", "aggregation.scale_weights", "multigrid.smooth_into",
+        "multigrid.smooth_from_zero_rounded", "poisson.apply_laplacian_full",
     },
     "work-groups": LANES,
 }  # fmt: skip
 """Kernels that have no place in a variant; all others run in it."""
 ALIKE = {
-    "coarsening", "copy", "gradation", "krylov", "multigrid", "primitives", "transfer", "bins.count_children",
-    "bins.make_grids", "cells.drop_loops", "poisson.apply", "poisson.apply_full", "projection.iterate",
+    "aggregation", "conjugate_gradient", "copy", "gradation", "multigrid", "primitives", "transfer",
+    "bins.count_children", "bins.make_grids", "cells.drop_loops", "poisson.apply_laplacian",
+    "poisson.apply_laplacian_full", "volume_projection.project_by_group",
 }  # fmt: skip
 """Files, and kernels of others, that work alike whatever the domain: that they run in any is enough."""
 IN_PLANE = {
