@@ -30,7 +30,7 @@ from .stages import Stages
 if TYPE_CHECKING:
     from .loop import Loop
 
-FORMAT, VERSION = "clvoro-checkpoint", 6
+FORMAT, VERSION = "clvoro-checkpoint", 7
 MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
 PER_FACE = ("neighbors", "face_measures", "face_centroids")
 DIAGRAM = (

@@ -319,7 +319,7 @@ DAMAGED = {
 
 
 DAMAGED_LEVELS = {
-    "groups": spoil("multigrid.0.group", 5, 10**6),
+    "groups": spoil("multigrid.0.aggregate", 5, 10**6),
     "members": spoil("multigrid.0.members", 5, -1),
     "rows": spoil("multigrid.1.graph.starts", 3, 10**6),
     "columns": spoil("multigrid.1.graph.columns", 3, -1),

@@ -9,8 +9,9 @@ from clvoro.adaptation.metric import Metric
 from clvoro.adaptation.motion import Motion
 from clvoro.adaptation.refinement import Refinement
 from clvoro.geometry.box import Box
+from clvoro.solvers.conjugate_gradient import Limits
 from clvoro.solvers.poisson import Poisson
-from clvoro.solvers.volume_projection import VolumeProjection
+from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
@@ -185,9 +186,8 @@ def test_projection_knows_the_derivative_of_the_volumes(double):
         ask = size * np.random.default_rng(3).normal(size=60)
         u = double.empty((60, 3))
         solution = VolumeProjection(double).project(
-            t, double.upload(h), double.upload(np.tile(SLOPE, (60, 1))), double.upload(ask),
-            double.zeros((60, 3)), u, double.upload(np.ones(60)), eps=1e-9, max_iterations=2000,
-            tolerance=1e-11,
+            t, Targets(*map(double.upload, (h, np.tile(SLOPE, (60, 1)), ask, np.ones(60)))),
+            double.zeros((60, 3)), u, Penalty(1e-9), Limits(1e-11, 2000),
         )  # fmt: skip
         assert solution.residual < 1e-9
         change = excess_of(points + u.get()) - base
