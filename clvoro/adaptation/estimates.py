@@ -88,7 +88,7 @@ def memory_needed(
         cells, folded = n * (1 + images), n
     trimmed = isinstance(domain, Polygon)
     if isinstance(domain, Polygon):
-        edges = len(domain.vertices)
+        edges = len(domain.oriented.vertices)
         if shore is None:
             spacing = (domain.measure / max(n, 1.0)) ** 0.5
             shore = shore_expected(domain, lambda p: np.full(len(p), spacing))

@@ -194,8 +194,8 @@ def shore_expected(domain: Polygon, size: Callable[[np.ndarray], np.ndarray]) ->
     size : callable
         h(points (k, 2)) -> (k,), that of the cells.
     """
-    begins = domain.vertices
-    along = begins[domain.next_vertex] - begins
+    begins = domain.oriented.vertices
+    along = begins[domain.oriented.next_vertex] - begins
     lengths = np.hypot(*along.T)
     parts = np.maximum(1, np.ceil(lengths / (lengths.sum() / SHORE_SAMPLE))).astype(int)
     edge = np.repeat(np.arange(len(parts)), parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from ..arguments import check_integer, check_number
 from ..errors import InputError, InputTypeError
+from .boundary_names import Walls
 from .box import Box, Domain
 from .layer_columns import count_columns, find_chains, place_columns
 from .polygon import Polygon
@@ -41,9 +42,8 @@ class Layers:
         Ratio of the heights of neighboring layers, at least 1.
     spacing : float, optional
         Width of the cells along the wall; by default the height of the last layer.
-    edges : sequence of int, optional
-        Walls of the `Box` (0 to 3; where it is periodic there are none), or edges of the `Polygon` (see
-        `Polygon.edge_numbers` for their numbers in the rings as they were given); by default all.
+    edges : int, str, or sequence of them, optional
+        Numbers or names of edges of the `Polygon`, or of sides of the `Box`; by default all that are not periodic.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class Layers:
 
     Examples
     --------
-    >>> layers = clvoro.Layers(0.01, count=3, growth=1.2, edges=[2, 3])  # lower and upper wall of a box
+    >>> layers = clvoro.Layers(0.01, count=3, growth=1.2, edges=["yMin", "yMax"])
     >>> layers.heights.round(4).tolist(), round(layers.width, 4)
     ([0.01, 0.012, 0.0144], 0.0144)
     """
@@ -66,7 +66,7 @@ class Layers:
     count: int = 1
     growth: float = 1.2
     spacing: float | None = None
-    edges: Sequence[int] | None = None
+    edges: Walls | None = None
 
     def __post_init__(self) -> None:
         check_number("Layers height", self.height, above=0)
@@ -75,12 +75,20 @@ class Layers:
         if self.spacing is not None:
             check_number("Layers spacing", self.spacing, above=0)
         if self.edges is not None:
-            if not isinstance(self.edges, Iterable):
+            one = isinstance(self.edges, str | int | np.integer)
+            if not one and (
+                isinstance(self.edges, Mapping) or not isinstance(self.edges, Iterable)
+            ):
                 raise InputTypeError(
-                    f"Layers edges is {self.edges!r}, expected a sequence of integers"
+                    f"Layers edges is {self.edges!r}, expected numbers or names of edges"
                 )
+            edges = [self.edges] if one else self.edges
             object.__setattr__(
-                self, "edges", tuple(check_integer("Layers edges", e, 0) for e in self.edges)
+                self,
+                "edges",
+                tuple(
+                    e if isinstance(e, str) else check_integer("Layers edges", e, 0) for e in edges
+                ),
             )
 
     @property
@@ -126,10 +134,10 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     InputTypeError
         If the domain is neither a `Box` nor a `Polygon` in 2D.
     """
-    polygon, number = as_polygon(domain)
+    polygon, _ = as_polygon(domain)
     found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
     for layer in layers:
-        for chain in find_chains(polygon, _chosen(polygon, number, layer)):
+        for chain in find_chains(polygon, _chosen(domain, layer)):
             feet, normals = place_columns(chain, layer.width, layer.thickness)
             for y in layer.rows:
                 found.append(feet + y * normals)
@@ -175,10 +183,10 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
     InputTypeError
         If something is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
     """
-    polygon, number = as_polygon(domain)
+    polygon, _ = as_polygon(domain)
     total = 0
     for layer in layers:
-        chains = find_chains(polygon, _chosen(polygon, number, layer))
+        chains = find_chains(polygon, _chosen(domain, layer))
         if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
             raise InputError(_NO_ROOM)
         columns = sum(sum(count_columns(chain, layer.width, layer.thickness)) for chain in chains)
@@ -187,48 +195,41 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
 
 
 def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
-    """Return a domain in 2D as a polygon, and for each of its edges the number by which `Layers.edges` means it.
-
-    The number is -1 where a periodic box has a seam in the place of a wall.
-    """
+    """Return a domain in 2D as a polygon, and the number in `domain` of each of its oriented edges."""
     if isinstance(domain, Polygon):
-        return domain, np.arange(len(domain.vertices))
+        return domain, domain.oriented.edge_numbers
     if not isinstance(domain, Box) or domain.dim != 2 or all(domain.periodic):
         raise InputTypeError(
             f"layers are for a Box with walls or a Polygon in 2D, not for {domain}"
         )
     (a, b), (c, d) = domain.lower, domain.upper
-    walls = np.array([2, 1, 3, 0])
-    return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.where(
-        np.take(domain.periodic, walls // 2), -1, walls
-    )
+    return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
 
 
 def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
     """Return the edges along which `layer` lies, (k, 2, 2): both ends of each."""
-    polygon, number = as_polygon(domain)
-    chosen = _chosen(polygon, number, layer)
-    ends = np.stack([polygon.vertices, polygon.vertices[polygon.next_vertex]], axis=1)
-    return ends[chosen]
+    polygon, _ = as_polygon(domain)
+    oriented = polygon.oriented
+    ends = np.stack([oriented.vertices, oriented.vertices[oriented.next_vertex]], axis=1)
+    return ends[_chosen(domain, layer)]
 
 
-def _chosen(polygon: Polygon, number: np.ndarray, layer: Layers) -> np.ndarray:
+def _chosen(domain: Domain, layer: Layers) -> np.ndarray:
+    """Return which of the oriented edges of `as_polygon` have the layer, (k,) bool."""
     if not isinstance(layer, Layers):
         raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
-    if layer.edges is None:
-        return number >= 0
-    missing = np.setdiff1d(layer.edges, number)
-    if missing.size or not layer.edges:
-        walls = np.sort(number[number >= 0])
-        known = f"0 to {len(number) - 1}" if len(walls) == len(number) else str(walls.tolist())
-        raise InputError(f"Layers edges has {missing.tolist() or 'none'}, expected some of {known}")
-    return np.isin(number, layer.edges)
+    _, numbers = as_polygon(domain)
+    walls = domain.boundaries.select("Layers edges", layer.edges)
+    chosen = np.isin(numbers, walls)
+    if not chosen.any():
+        raise InputError("Layers edges has only edges without length, expected one with a length")
+    return chosen
 
 
 def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
-    polygon, number = as_polygon(domain)
-    chains = find_chains(polygon, _chosen(polygon, number, layer))
+    polygon, _ = as_polygon(domain)
+    chains = find_chains(polygon, _chosen(domain, layer))
     made = [place_columns(chain, layer.width, layer.thickness) for chain in chains]
     feet, normals = zip(*made, strict=True)
     return np.concatenate(feet), np.concatenate(normals)
@@ -248,8 +249,7 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
     if isinstance(domain, Box):
         corners = np.array([domain.lower, domain.upper])
         for layer, distance in zip(layers, distances, strict=True):
-            walls = [w for w in range(4) if not domain.periodic[w // 2]]
-            for wall in walls if layer.edges is None else layer.edges:
+            for wall in domain.boundaries.select("Layers edges", layer.edges).tolist():
                 axis, end = divmod(wall, 2)
                 moved = (domain.lower, domain.upper)[end][axis] + (-distance if end else distance)
                 corners[end, axis] = (min if end else max)(corners[end, axis], moved)

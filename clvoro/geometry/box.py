@@ -1,16 +1,21 @@
-"""Domains: what is meshed, as the host describes it and as the device sees it."""
+"""Domains in general, and axis-aligned boxes: as the host describes them and as the device sees them."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
+from .boundary_names import BoundaryNames, Walls
+from .shapes import Edges
+from .surface import Surface, box_surface
 
 if TYPE_CHECKING:
     from ..opencl.program import Engine
@@ -40,6 +45,7 @@ class Domain(ABC):
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
+    names: Mapping[str, Walls] | None
 
     @property
     def periodic(self) -> tuple[bool, ...]:
@@ -65,6 +71,42 @@ class Domain(ABC):
     @abstractmethod
     def measure(self) -> float:
         """Area or volume."""
+
+    # The boundary: walls are the sides of a box or the edges of a polygon.
+
+    @abstractmethod
+    def _default_names(self) -> BoundaryNames:
+        """Return the parts of the boundary as they are called without names by the caller."""
+
+    @cached_property
+    def boundaries(self) -> BoundaryNames:
+        """The parts of the boundary, with the caller's names."""
+        default = self._default_names()
+        return (
+            default.renamed(f"{type(self).__name__} names", self.names) if self.names else default
+        )
+
+    @property
+    def boundary_names(self) -> tuple[str, ...]:
+        """Names of the parts of the boundary: the caller's first, then the default names of all other walls."""
+        return self.boundaries.names
+
+    @property
+    def boundary_index(self) -> np.ndarray:
+        """Index in `boundary_names` for each wall, (k,) int32; -1 for the periodic sides of a box.
+
+        A face with the neighbor -1 - k belongs to ``boundary_names[boundary_index[k]]``.
+        """
+        return self.boundaries.index
+
+    @abstractmethod
+    def boundary(self, walls: Walls | None = None) -> Edges | Surface:
+        """Return walls as a shape for `clvoro.sizing.Distance`: numbers, names, or by default all."""
+
+    def _described_names(self) -> dict[str, Any]:
+        """Return the caller's names as `describe` does, as lists of numbers; nothing without names."""
+        parts = self.boundaries
+        return {"names": {n: parts.select(n, n).tolist() for n in self.names}} if self.names else {}
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
@@ -133,22 +175,29 @@ class Box(Domain):
     Parameters
     ----------
     lower, upper : sequences of 2 or 3 floats
-        Opposite corners. Wall ``2 a`` is the lower one of axis a, wall ``2 a + 1`` the upper one.
+        Opposite corners. Side ``2 a`` is the lower one of axis a, side ``2 a + 1`` the upper one.
     periodic : bool, or a sequence of 2 or 3
         Directions without walls: what leaves on one side comes in on the other. One bool stands for all directions.
+    names : mapping, optional
+        Names of boundaries, each with its sides: numbers, default names, or a sequence of them. The default names are
+        ``xMin``, ``xMax``, ``yMin``, ... Sides that are not mentioned keep them.
 
     Raises
     ------
     InputError
-        If the corners are not 2 or 3 finite numbers each with lower < upper, or too near or far for float64.
+        If the corners are not 2 or 3 finite numbers each with lower < upper, or too near or far for float64; or if a
+        name is not a word, clashes with another one, or stands for a side that does not exist or is periodic.
     InputTypeError
-        If `periodic` is something else than truth values.
+        If `periodic` is something else than truth values, or `names` is not a mapping.
 
     Examples
     --------
     >>> channel = clvoro.Box((0, 0), (4, 1), periodic=(True, False))
     >>> channel.measure, channel.contains(np.array([(0.5, 0.5), (0.5, 1.5)])).tolist()
     (4.0, [True, False])
+    >>> tunnel = clvoro.Box((0, 0), (4, 1), names={"inlet": "xMin", "walls": ["yMin", "yMax"]})
+    >>> tunnel.boundary_names, tunnel.boundary_index.tolist()
+    (('inlet', 'walls', 'xMax'), [0, 2, 1, 1])
 
     Notes
     -----
@@ -160,6 +209,7 @@ class Box(Domain):
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     periodic: tuple[bool, ...] = False  # type: ignore[assignment]
+    names: Mapping[str, Walls] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         try:
@@ -190,10 +240,46 @@ class Box(Domain):
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))
         object.__setattr__(self, "periodic", _directions(self.periodic, lower.size))
+        _ = self.boundaries  # which checks the names
 
     def __repr__(self) -> str:
         periodic = f", periodic={self.periodic}" if any(self.periodic) else ""
         return f"Box(lower={self.lower}, upper={self.upper}{periodic})"
+
+    def _default_names(self) -> BoundaryNames:
+        sides = [f"{axis}{end}" for axis in "xyz"[: self.dim] for end in ("Min", "Max")]
+        walls = np.flatnonzero(~np.repeat(self.periodic, 2))
+        index = np.full(len(sides), -1, np.int32)
+        index[walls] = np.arange(len(walls))
+        return BoundaryNames(tuple(sides[w] for w in walls), index, "side")
+
+    def boundary(self, walls: Walls | None = None) -> Edges | Surface:
+        """Return sides as a shape for `clvoro.sizing.Distance`: segments in 2D, triangles in 3D.
+
+        Parameters
+        ----------
+        walls : int, str, or a sequence of them, optional
+            Numbers or names of sides; by default all that are not periodic.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If a side or name does not exist, or there is none.
+        """
+        chosen = self.boundaries.select("boundary", walls)
+        if not chosen.size:
+            raise InputError(
+                f"{self} is periodic in every direction, expected a box with a boundary"
+            )
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        if self.dim == 3:
+            whole = box_surface(lower, upper)
+            sides = whole.triangles.reshape(6, 2, 3)[[4, 5, 2, 3, 0, 1]]
+            return Surface(whole.vertices, sides[chosen].reshape(-1, 3), "boundary")
+        corners = np.array([(0, 1), (0, 0), (1, 0), (1, 1)])  # counter-clockwise, side 0 first
+        order = np.array([0, 2, 1, 3])[chosen]  # where each side stands on that way
+        x = np.where(corners, upper, lower)
+        return Edges(x[order], x[(order + 1) % 4])
 
     @property
     def measure(self) -> float:
@@ -202,7 +288,8 @@ class Box(Domain):
 
     def describe(self) -> dict[str, Any]:
         """Return the arguments that make this box."""
-        return {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
+        corners = {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
+        return corners | self._described_names()
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.

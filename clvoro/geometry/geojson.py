@@ -6,7 +6,7 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
@@ -62,8 +62,18 @@ def pieces_of_wkt(text: str) -> list[list[np.ndarray]]:
     return pieces_of_shape(geometry)
 
 
-def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[list[object]]:
-    """Return the rings of the polygons in a GeoJSON file, text or object, piece by piece."""
+def pieces_of_geojson(
+    source: str | PathLike[str] | Mapping[str, Any],
+) -> tuple[list[list[object]], dict[str, list[int]] | None]:
+    """Read the polygons in a GeoJSON file, text or object.
+
+    Returns
+    -------
+    pieces : list of lists of rings
+        For each polygon its outer ring and its holes.
+    names : dict or None
+        Names of boundaries and the numbers of their edges, from the property "boundaries" of Features.
+    """
     name = "GeoJSON"
     # What shapely, geopandas and their kin make of themselves.
     source = getattr(source, "__geo_interface__", source)
@@ -85,11 +95,13 @@ def pieces_of_geojson(source: str | PathLike[str] | Mapping[str, Any]) -> list[l
             found = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{name} is no JSON ({error}), expected GeoJSON") from error
-    pieces = list(_pieces(found, name))
+    names: dict[str, list[int]] = {}
+    pieces: list[list[object]] = []
+    _collect(found, name, pieces, names)
     if not pieces:
         raise InputError(f"{name} holds no Polygon, expected at least one")
     _warn_of_degrees(found, pieces, name)
-    return pieces
+    return pieces, names or None
 
 
 def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:
@@ -124,31 +136,65 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
 _MEMBERS = {"FeatureCollection": "features", "GeometryCollection": "geometries"}
 
 
-def _pieces(node: object, name: str) -> Iterator[list[object]]:
-    """Walk through collections and features to the coordinates."""
+def _collect(
+    node: object, name: str, pieces: list[list[object]], names: dict[str, list[int]]
+) -> None:
+    """Walk through collections and features; append the rings of each polygon to `pieces`, and add to `names`."""
     kind = node.get("type") if isinstance(node, Mapping) else None
     if not isinstance(node, Mapping) or not isinstance(kind, str):
         raise InputError(f"{name} holds {node!r:.40}, expected an object with a type")
     if kind in _MEMBERS:
         for member in _list(node, _MEMBERS[kind], name):
-            yield from _pieces(member, name)
+            _collect(member, name, pieces, names)
     elif kind == "Feature":
         if node.get("geometry") is None:
             raise InputError(
                 f"{name} holds a Feature without geometry, expected Polygons only; leave it out"
             )
-        yield from _pieces(node["geometry"], name)
+        before = len(pieces)
+        _collect(node["geometry"], name, pieces, names)
+        _add_names(node.get("properties"), name, pieces, before, names)
     elif kind == "Polygon":
-        yield [_flat(ring, name) for ring in _list(node, "coordinates", name)]
+        pieces.append([_flat(ring, name) for ring in _list(node, "coordinates", name)])
     elif kind == "MultiPolygon":
         for piece in _list(node, "coordinates", name):
             if not isinstance(piece, (list, tuple)):
                 raise InputError(f"{name} has a MultiPolygon of {piece!r:.40}, expected lists")
-            yield [_flat(ring, name) for ring in piece]
+            pieces.append([_flat(ring, name) for ring in piece])
     else:
         raise InputError(
             f"{name} holds a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out"
         )
+
+
+def _add_names(
+    properties: object,
+    name: str,
+    pieces: list[list[object]],
+    before: int,
+    names: dict[str, list[int]],
+) -> None:
+    """Add the names of a feature's boundaries to `names`; its own pieces follow the first `before` ones."""
+    given = properties.get("boundaries") if isinstance(properties, Mapping) else None
+    if not isinstance(given, Mapping):
+        return
+    counts = [sum(map(_count_edges, piece)) for piece in pieces]
+    first, count = sum(counts[:before]), sum(counts[before:])
+    for key, edges in given.items():
+        numbers = edges if isinstance(edges, list | tuple) else [edges]
+        for number in numbers:
+            if type(number) is not int or not 0 <= number < count:
+                raise InputError(
+                    f"{name} has the boundary {key!r:.40} with {number!r:.40}, expected numbers of edges of its "
+                    f"Feature, 0 to {count - 1}"
+                )
+        names.setdefault(key, []).extend(first + number for number in numbers)
+
+
+def _count_edges(ring: object) -> int:
+    if not isinstance(ring, list):
+        return 0
+    return len(ring) - (len(ring) > 1 and ring[0] == ring[-1])
 
 
 def _flat(ring: object, name: str) -> object:

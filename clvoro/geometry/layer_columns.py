@@ -35,8 +35,8 @@ class Chain:
 
 
 def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
-    """Join the `chosen` edges, (k,) bool, to chains."""
-    vertices, following = polygon.vertices, polygon.next_vertex
+    """Join the `chosen` edges of `polygon.oriented`, (k,) bool, to chains."""
+    vertices, following = polygon.oriented.vertices, polygon.oriented.next_vertex
     along = vertices[following] - vertices
     after = along[following]
     turn = np.arctan2(

@@ -14,10 +14,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ..errors import InputError, InputTypeError
+from .boundary_names import BoundaryNames, Walls
 from .edge_grid import bin_edges
 from .geojson import pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .region import Region
-from .rings import make_rings, signed_area
+from .rings import OrientedRings, make_rings, signed_area
+from .shapes import Edges
 
 if TYPE_CHECKING:
     from ..opencl.program import Engine
@@ -41,26 +43,23 @@ class Polygon(Region):
         Vertices of the outer ring in either order; the first may be repeated at the end.
     holes : sequence of array_like (k, 2)
         Rings that are left out; they may touch each other and the outer ring in single points.
+    names : mapping, optional
+        Names of boundaries, each with its edges: numbers, default names, or a sequence of them. By default a boundary
+        is a ring: ``outer``, ``hole-1``, ``hole-2``, ..., or ``outer-1``, ``outer-2``, ... with several pieces. Edges
+        that are not mentioned keep the name of their ring.
 
     Attributes
     ----------
     vertices : (k, 2) float64
-        Of all rings, one after the other, each once. Outer rings run counter-clockwise, holes clockwise:
-        the interior is on the left of every edge. Vertices on a straight line are kept, as they number
-        edges; repeated ones are dropped.
+        The vertices of all rings as the caller gave them, one ring after the other, without closing vertices. Edge k
+        goes from vertex k to the next one of its ring; a face on it has the neighbor ``-1 - k``.
     ring_starts : (r + 1,) int32
         Ring i is ``vertices[ring_starts[i] : ring_starts[i + 1]]``. Each piece's outer ring comes before
         its holes.
-    next_vertex : (k,) int32
-        Edge e goes from vertex e to vertex ``next_vertex[e]``. Faces of cells on it have the neighbor
-        ``-1 - e``.
     piece_of_ring : (r,) int32
         Which piece each ring bounds; pieces may touch in single points.
-    edge_numbers : (k,) int32
-        The number that edge e has in the rings as they were given: ring by ring, in their order, the edge
-        from a ring's vertex i to the next is number i after those of the rings before. It differs from
-        e where a ring was reversed (then from the first edge on) or a repeated vertex dropped (from there
-        on), and ``numpy.flatnonzero(numpy.isin(polygon.edge_numbers, mine))`` finds edges by their numbers.
+    oriented : OrientedRings
+        The same edges with the domain on their left, for algorithms.
     lower, upper : (2,) tuples of float
         The bounding box.
 
@@ -70,31 +69,42 @@ class Polygon(Region):
         Naming the ring and the place: if numbers are not finite, a ring has fewer than 3 distinct vertices,
         no area, crosses or touches itself (slits of no width, too), holes lie outside or overlap or cut
         the domain apart, pieces overlap, an edge is shorter than 1e-12 of the domain, or the whole is
-        too large, small or far from the origin for float64.
+        too large, small or far from the origin for float64. Or if a name is not a word, clashes with
+        another one, or stands for an edge that does not exist or has a name already.
 
     Examples
     --------
     >>> square = [(0, 0), (1, 0), (1, 1), (0, 1)]
-    >>> pond = clvoro.Polygon(square, [[(0.4, 0.4), (0.6, 0.4), (0.5, 0.6)]])
-    >>> round(pond.measure, 12), pond.n_pieces, pond.edge_numbers[pond.ring_starts[1]:].tolist()
-    (0.98, 1, [5, 4, 6])
+    >>> island = [(0.4, 0.4), (0.6, 0.4), (0.5, 0.6)]
+    >>> pond = clvoro.Polygon(square, [island], names={"island": range(4, 7), "inlet": 3})
+    >>> round(pond.measure, 12), pond.boundary_names
+    (0.98, ('island', 'inlet', 'outer'))
     """
 
     framed_by: Polygon | None = None
     """The polygon whose frame this one, a part of it, is to have on the device."""
 
-    def __init__(self, outer: object, holes: Sequence[object] = ()):
+    def __init__(
+        self,
+        outer: object,
+        holes: Sequence[object] = (),
+        names: Mapping[str, Walls] | None = None,
+    ):
         try:
             rings = [outer, *holes]
         except TypeError:
             raise InputTypeError(
                 f"holes is a {type(holes).__name__}, expected a list of rings"
             ) from None
-        self._build([rings])
+        self._build([rings], names)
 
     @classmethod
-    def from_pieces(cls, pieces: Sequence[Sequence[object]]) -> Polygon:
+    def from_pieces(
+        cls, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None = None
+    ) -> Polygon:
         """Make a domain of several pieces, each a list of its outer ring and its holes.
+
+        Edges are numbered, and named, through all rings of the first piece, then of the second one, and so on.
 
         Examples
         --------
@@ -102,16 +112,16 @@ class Polygon(Region):
         2
         """
         made = cls.__new__(cls)
-        made._build(pieces)
+        made._build(pieces, names)
         return made
 
     @classmethod
-    def from_shapely(cls, geometry: Any) -> Polygon:
+    def from_shapely(cls, geometry: Any, names: Mapping[str, Walls] | None = None) -> Polygon:
         """Make a domain of a shapely Polygon or MultiPolygon; heights are left out."""
-        return cls.from_pieces(pieces_of_shape(geometry))
+        return cls.from_pieces(pieces_of_shape(geometry), names)
 
     @classmethod
-    def from_wkt(cls, text: str) -> Polygon:
+    def from_wkt(cls, text: str, names: Mapping[str, Walls] | None = None) -> Polygon:
         """Make a domain of a POLYGON or MULTIPOLYGON in well-known text.
 
         Examples
@@ -119,10 +129,14 @@ class Polygon(Region):
         >>> clvoro.Polygon.from_wkt("POLYGON ((0 0, 2 0, 2 1, 0 1, 0 0))").measure
         2.0
         """
-        return cls.from_pieces(pieces_of_wkt(text))
+        return cls.from_pieces(pieces_of_wkt(text), names)
 
     @classmethod
-    def from_geojson(cls, source: str | PathLike[str] | Mapping[str, Any]) -> Polygon:
+    def from_geojson(
+        cls,
+        source: str | PathLike[str] | Mapping[str, Any],
+        names: Mapping[str, Walls] | None = None,
+    ) -> Polygon:
         """Make a domain of the polygons in GeoJSON.
 
         Parameters
@@ -130,7 +144,10 @@ class Polygon(Region):
         source : path, str or dict
             A file, a text that begins with ``{``, or what `json.loads` makes of it: a Polygon, MultiPolygon,
             Feature or collection of these. Coordinates are taken as they are, in the plane: project
-            longitudes and latitudes before.
+            longitudes and latitudes before. A Feature may name its boundaries in its properties, by its own edges:
+            ``"boundaries": {"island": [4, 5, 6]}``.
+        names : mapping, optional
+            Names of boundaries, in place of those in `source`.
 
         Raises
         ------
@@ -143,43 +160,35 @@ class Polygon(Region):
         >>> clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [ring]}).measure
         1.0
         """
-        pieces = pieces_of_geojson(source)
+        pieces, own_names = pieces_of_geojson(source)
         try:
-            return cls.from_pieces(pieces)
+            return cls.from_pieces(pieces, own_names if names is None else names)
         except InputError as error:
             if isinstance(source, Mapping) or str(source).lstrip().startswith("{"):
                 raise
             raise InputError(f"{source}: {error}") from error
 
-    def _build(self, pieces: Sequence[Sequence[object]]) -> None:
+    def _build(self, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None) -> None:
         made = make_rings(pieces)
         rings = [ring for piece in made for ring in piece]
-        counts = [len(ring.vertices) for ring in rings]
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        given = np.concatenate([[0], np.cumsum([ring.n_given for ring in rings])])
-        following = np.arange(1, starts[-1] + 1)
-        following[starts[1:] - 1] = starts[:-1]
-        self.vertices = np.concatenate([ring.vertices for ring in rings])
-        self.ring_starts = starts.astype(np.int32)
-        self.next_vertex = following.astype(np.int32)
+        self.vertices = np.concatenate([ring.given for ring in rings])
+        self.ring_starts = np.cumsum([0, *(len(ring.given) for ring in rings)]).astype(np.int32)
         self.piece_of_ring = np.repeat(
             np.arange(len(made), dtype=np.int32), [len(piece) for piece in made]
         )
-        self.edge_numbers = np.concatenate(
-            [first + ring.numbers for first, ring in zip(given[:-1], rings, strict=True)]
-        ).astype(np.int32)
         for array in self._arrays():
             array.setflags(write=False)
+        self.oriented = OrientedRings.of(rings)
         self.lower = tuple(self.vertices.min(axis=0).tolist())
         self.upper = tuple(self.vertices.max(axis=0).tolist())
         self._measure = math.fsum(signed_area(ring.vertices) for ring in rings)
+        self.names = names
+        _ = self.boundaries  # which checks the names
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
-        return (
-            self.vertices, self.ring_starts, self.next_vertex, self.piece_of_ring, self.edge_numbers
-        )  # fmt: skip
+        return self.vertices, self.ring_starts, self.piece_of_ring
 
-    # What is equal: the same rings in the same order, numbered alike.
+    # Equal domains have the same rings in the same order, with equal numbers of edges. Names may differ.
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Polygon):
@@ -191,12 +200,12 @@ class Polygon(Region):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of vertices, rings, pieces and numbers: equal domains have the same."""
+        """SHA-256 of vertices, rings and pieces: equal domains have the same."""
         return hashlib.sha256(b"".join(array.tobytes() for array in self._arrays())).hexdigest()
 
     def __repr__(self) -> str:
         pieces, holes = self.n_pieces, len(self.piece_of_ring) - self.n_pieces
-        parts = [f"{len(self.vertices)} edges"]
+        parts = [f"{len(self.oriented.vertices)} edges"]
         if pieces > 1:
             parts.append(f"{pieces} pieces")
         if holes:
@@ -213,15 +222,19 @@ class Polygon(Region):
             "vertices": self.vertices.tolist(),
             "ring_starts": self.ring_starts.tolist(),
             "piece_of_ring": self.piece_of_ring.tolist(),
-            "edge_numbers": self.edge_numbers.tolist(),
+            **self._described_names(),
         }
 
     @classmethod
     def described(cls, **values: Any) -> Polygon:
         """Make the domain that `describe` described; damaged values are refused by an InputError."""
+        if "edge_numbers" in values:
+            raise InputError(
+                "the Polygon was written by an earlier version of clvoro, which numbered its edges in another order; "
+                "make the mesh anew"
+            )
         try:
             starts = np.array(values["ring_starts"], np.int32)
-            numbers = np.array(values["edge_numbers"], np.int32)
             pieces = np.array(values["piece_of_ring"], np.int32)
             vertices = np.array(values["vertices"], float)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -233,47 +246,76 @@ class Polygon(Region):
             and (np.diff(starts, prepend=0) >= 0).all()
             and (steps * (steps - 1) == 0).all()
             and pieces[0] == 0
-            and numbers.shape == vertices.shape[:1] == (starts[-1],)
+            and vertices.shape == (starts[-1], 2)
         ):
             raise InputError("the description of a Polygon is damaged: its arrays do not fit")
-        rings = [vertices[a:b] for a, b in pairwise(starts)]
+        # Closed, as a last vertex that is the first one would be taken for a closing one.
+        rings = [np.concatenate([vertices[a:b], vertices[a : a + 1]]) for a, b in pairwise(starts)]
         firsts = [*np.flatnonzero(steps), len(rings)]
-        made = cls.from_pieces([rings[a:b] for a, b in pairwise(firsts)])
-        if not np.array_equal(made.vertices, vertices):
-            raise InputError("the description of a Polygon is damaged: its rings are not oriented")
-        numbers.setflags(write=False)
-        made.edge_numbers = numbers
-        return made
+        return cls.from_pieces([rings[a:b] for a, b in pairwise(firsts)], values.get("names"))
 
     @property
     def measure(self) -> float:
         """Area; rounded once per ring, and as a sum."""
         return self._measure
 
-    def boundary(self, edges: object = None) -> Any:
+    def _default_names(self) -> BoundaryNames:
+        first = np.diff(self.piece_of_ring, prepend=-1) > 0
+        names = [
+            (f"outer-{o}" if self.n_pieces > 1 else "outer") if is_outer else f"hole-{h}"
+            for is_outer, o, h in zip(first, np.cumsum(first), np.cumsum(~first), strict=True)
+        ]
+        index = np.repeat(np.arange(len(names), dtype=np.int32), np.diff(self.ring_starts))
+        return BoundaryNames(tuple(names), index, "edge")
+
+    def find_edges(self, what: str, walls: Walls | None) -> np.ndarray:
+        """Return the places in `oriented` of the selected edges, (m,) int64, ascending.
+
+        Parameters
+        ----------
+        what : str
+            What errors call the selection.
+        walls : int, str, sequence of both, (k,) bool or None
+            Numbers or names of edges; None selects all.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If an edge or name does not exist, or none of the edges has a length.
+        """
+        places = np.sort(self.oriented.places[self.boundaries.select(what, walls)])
+        if places[-1] < 0:
+            raise InputError(
+                f"{what} has only edges without length, expected at least one with a length"
+            )
+        return places[places >= 0].astype(np.int64)
+
+    def edge_ends(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the begins and ends, (m, 2) each, of edges by their `numbers` (m,), the domain on their left."""
+        oriented, places = self.oriented, self.oriented.places[numbers]
+        return oriented.vertices[places], oriented.vertices[oriented.next_vertex[places]]
+
+    def boundary(self, walls: Walls | None = None) -> Edges:
         """Return edges as a shape for `clvoro.sizing.Distance`.
 
         Parameters
         ----------
-        edges : int, sequence of int or bool, optional
-            Numbers of edges as in `next_vertex`, or which ones; by default all. Numbers of the rings as they
-            were given are found in `edge_numbers`.
-        """
-        from .shapes import Edges
+        walls : int, str, sequence of them or (k,) bool, optional
+            Numbers or names of edges; by default all.
 
-        rows = every = np.arange(len(self.vertices))
-        if edges is not None:
-            try:
-                rows = np.atleast_1d(every[edges])  # type: ignore[call-overload]
-            except IndexError as error:
-                raise InputError(
-                    f"edges is {edges!r:.60} ({error}), expected numbers below {len(every)}"
-                ) from error
-            if not rows.size:
-                raise InputError(
-                    f"edges is {edges!r:.60}, expected at least one number below {len(every)}"
-                )
-        return Edges(self.vertices[rows], self.vertices[self.next_vertex[rows]])
+        Raises
+        ------
+        InputError, InputTypeError
+            If an edge or name does not exist, or none of the edges has a length.
+
+        Examples
+        --------
+        >>> square = clvoro.Polygon([(0, 0), (0, 1), (1, 1), (1, 0)], names={"inlet": 0})
+        >>> square.boundary("inlet").begin.tolist(), square.boundary("inlet").end.tolist()
+        ([[0.0, 1.0]], [[0.0, 0.0]])
+        """
+        rows, vertices = self.find_edges("boundary", walls), self.oriented.vertices
+        return Edges(vertices[rows], vertices[self.oriented.next_vertex[rows]])
 
     # The device's view: the polygon never touches the box that cells are clipped by.
 
@@ -301,8 +343,8 @@ class Polygon(Region):
         there = self._on_device.setdefault(engine.workspace, {})
         if engine.real not in there:
             origin, scale = self.frame
-            begins = (self.vertices - origin) / scale
-            ends = begins[self.next_vertex]
+            begins = (self.oriented.vertices - origin) / scale
+            ends = begins[self.oriented.next_vertex]
             frame, shape, starts, listed = bin_edges(begins, ends)
             # Where what is put on an edge may be: by the rounding of device and domain.
             frame[3] = _BEHIND * float(np.finfo(engine.real).eps) + self._rounding / scale

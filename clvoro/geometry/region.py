@@ -11,7 +11,7 @@ import shapely
 
 from ..arguments import check_rows
 from .box import Domain
-from .rings import project
+from .rings import OrientedRings, project
 
 _ROUNDINGS = 8  # of a coordinate, by which a point may lie off the boundary and still be on it
 
@@ -21,8 +21,8 @@ class Region(Domain):
 
     vertices: np.ndarray
     ring_starts: np.ndarray
-    next_vertex: np.ndarray
     piece_of_ring: np.ndarray
+    oriented: OrientedRings
 
     @property
     def n_pieces(self) -> int:
@@ -31,29 +31,8 @@ class Region(Domain):
 
     @property
     def rings(self) -> list[np.ndarray]:
-        """Vertices (k, 2) of each ring."""
+        """Vertices (k, 2) of each ring, as the caller gave them."""
         return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
-
-    @cached_property
-    def turns(self) -> np.ndarray:
-        """How far the boundary turns to the left in each vertex, -pi to pi, (k,)."""
-        ahead = self.vertices[self.next_vertex] - self.vertices
-        ahead /= np.hypot(*ahead.T)[:, None]
-        after = ahead[self.next_vertex]
-        found = np.empty(len(ahead))
-        found[self.next_vertex] = np.arctan2(
-            ahead[:, 0] * after[:, 1] - ahead[:, 1] * after[:, 0], (ahead * after).sum(axis=1)
-        )
-        return found
-
-    @cached_property
-    def sharpest(self) -> np.ndarray:
-        """The vertex of each ring in which it turns farthest, the first but for roundings, (r,) int."""
-        found = []
-        for a, b in pairwise(self.ring_starts.tolist()):
-            by = np.abs(self.turns[a:b])
-            found.append(a + int(np.argmax(by >= (1 - 1e-9) * by.max())))
-        return np.array(found)
 
     @cached_property
     def pieces(self) -> list[Any]:
@@ -61,7 +40,9 @@ class Region(Domain):
         found = []
         for p in range(self.n_pieces):
             mine = [
-                r for r, piece in zip(self.rings, self.piece_of_ring, strict=True) if piece == p
+                r
+                for r, piece in zip(self.oriented.rings, self.piece_of_ring, strict=True)
+                if piece == p
             ]
             found.append(shapely.Polygon(mine[0], mine[1:]))
         return found
@@ -75,8 +56,9 @@ class Region(Domain):
 
     @cached_property
     def _edges(self) -> Any:
-        """Tree of the edges."""
-        ends = np.stack([self.vertices, self.vertices[self.next_vertex]], axis=1)
+        """Tree of the oriented edges."""
+        vertices = self.oriented.vertices
+        ends = np.stack([vertices, vertices[self.oriented.next_vertex]], axis=1)
         return shapely.STRtree(np.asarray(shapely.linestrings(ends)))
 
     @property
@@ -129,7 +111,9 @@ class Region(Domain):
         found = self.piece_of(points)
         rest = np.flatnonzero(found < 0)
         if rest.size:  # off by a rounding
-            edge, _ = self.nearest_edge(points[rest])
+            edge, _ = self.nearest_edge(
+                points[rest]
+            )  # by the caller's number, as are the starts of rings
             ring = np.searchsorted(self.ring_starts, edge, side="right") - 1
             found[rest] = self.piece_of_ring[ring]
         return found
@@ -141,25 +125,33 @@ class Region(Domain):
     def nearest_edge(
         self, points: np.ndarray, within: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return for each of `points` (n, 2) an edge that is nearest, (n,) int, and the nearest point on it (n, 2).
+        """Return the number of an edge that is nearest to each of `points` (n, 2), and the nearest point on it.
 
         Looking no farther than `within` is faster; where there is no edge, its number is -1.
+
+        Returns
+        -------
+        edges : (n,) int
+        nearest : (n, 2) float64
         """
+        oriented = self.oriented
         points = np.asarray(points, dtype=float)
         edge = np.full(len(points), -1)
         rows, edges = self._edges.query_nearest(
             shapely.points(points), max_distance=within, all_matches=False
         )
         edge[rows] = edges
-        return edge, project(points, self.vertices[edge], self.vertices[self.next_vertex[edge]])
+        begin, end = oriented.vertices[edge], oriented.vertices[oriented.next_vertex[edge]]
+        return np.where(edge >= 0, oriented.edge_numbers[edge], -1), project(points, begin, end)
 
     def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
         """Tell for each of `points` (n, 2) whether the boundary runs by more than once, within `within`; (n,) bool."""
         rows, edges = self._edges.query(
             shapely.points(points), predicate="dwithin", distance=within
         )
-        after, count = self.next_vertex[edges], len(self.next_vertex)
-        on = np.hypot(*(self.vertices[after] - points[rows]).T) <= within
+        following = self.oriented.next_vertex
+        after, count = following[edges], len(following)
+        on = np.hypot(*(self.oriented.vertices[after] - points[rows]).T) <= within
         on &= np.isin(rows * count + after, rows * count + edges)
         return np.bincount(rows, minlength=len(points)) > 1 + np.bincount(
             rows[on], minlength=len(points)

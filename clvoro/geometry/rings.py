@@ -6,6 +6,8 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from numbers import Real
 from os import PathLike
 from pathlib import Path
@@ -31,20 +33,90 @@ class Ring:
 
     Attributes
     ----------
+    given : (g, 2) float64
+        The caller's vertices, without a closing vertex.
     vertices : (k, 2) float64
-        Without a closing vertex; the interior of the domain is on the left of every edge.
+        Those that differ from the next one, in the caller's order or in reverse.
     numbers : (k,) int64
-        Of each edge, the user's: in his ring, edge i goes from his vertex i to the next.
-    n_given : int
-        Edges of the ring as it was given.
+        The caller's number of each edge between `vertices`: his edge i goes from his vertex i to the next.
     name : str
         As errors call it: "outer ring", "hole 2 of piece 0".
     """
 
+    given: np.ndarray
     vertices: np.ndarray
     numbers: np.ndarray
-    n_given: int
     name: str
+
+
+@dataclass(frozen=True)
+class OrientedRings:
+    """The boundary of a polygon as algorithms walk along it: the domain on the left of every edge.
+
+    Outer rings run counter-clockwise, holes clockwise. Vertices on a straight line are kept, repeated ones are dropped.
+    The place of an edge in these arrays is not its number: `edge_numbers` and `places` translate.
+
+    Attributes
+    ----------
+    vertices : (k, 2) float64
+    ring_starts : (r + 1,) int32
+        Ring i is ``vertices[ring_starts[i] : ring_starts[i + 1]]``.
+    next_vertex : (k,) int32
+        Edge e goes from vertex e to vertex ``next_vertex[e]``.
+    edge_numbers : (k,) int32
+        The caller's number of each edge.
+    places : (n,) int32
+        The place of each edge by the caller's number; -1 for an edge without length.
+    """
+
+    vertices: np.ndarray
+    ring_starts: np.ndarray
+    next_vertex: np.ndarray
+    edge_numbers: np.ndarray
+    places: np.ndarray
+
+    @classmethod
+    def of(cls, rings: Sequence[Ring]) -> OrientedRings:
+        """Join `rings` one after the other."""
+        starts = np.cumsum([0, *(len(ring.vertices) for ring in rings)])
+        given = np.cumsum([0, *(len(ring.given) for ring in rings)])
+        following = np.arange(1, starts[-1] + 1)
+        following[starts[1:] - 1] = starts[:-1]
+        numbers = [first + ring.numbers for first, ring in zip(given[:-1], rings, strict=True)]
+        numbers = np.concatenate(numbers)
+        places = np.full(given[-1], -1, np.int32)
+        places[numbers] = np.arange(len(numbers))
+        vertices = np.concatenate([ring.vertices for ring in rings])
+        arrays = vertices, *(a.astype(np.int32) for a in (starts, following, numbers)), places
+        for array in arrays:
+            array.setflags(write=False)
+        return cls(*arrays)
+
+    @property
+    def rings(self) -> list[np.ndarray]:
+        """Vertices (k, 2) of each ring."""
+        return [self.vertices[a:b] for a, b in pairwise(self.ring_starts)]
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """How far the boundary turns to the left in each vertex, -pi to pi, (k,)."""
+        ahead = self.vertices[self.next_vertex] - self.vertices
+        ahead /= np.hypot(*ahead.T)[:, None]
+        after = ahead[self.next_vertex]
+        found = np.empty(len(ahead))
+        found[self.next_vertex] = np.arctan2(
+            ahead[:, 0] * after[:, 1] - ahead[:, 1] * after[:, 0], (ahead * after).sum(axis=1)
+        )
+        return found
+
+    @cached_property
+    def sharpest(self) -> np.ndarray:
+        """The vertex of each ring in which it turns farthest, the first one up to round-off, (r,) int."""
+        found = []
+        for a, b in pairwise(self.ring_starts.tolist()):
+            by = np.abs(self.turns[a:b])
+            found.append(a + int(np.argmax(by >= (1 - 1e-9) * by.max())))
+        return np.array(found)
 
 
 def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
@@ -136,7 +208,7 @@ def _cleaned(given: object, name: str) -> Ring:
         raise InputError(
             f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
         )
-    return Ring(vertices, np.flatnonzero(long), len(array), name)
+    return Ring(array, vertices, np.flatnonzero(long), name)
 
 
 def _shape_key(vertices: np.ndarray) -> bytes:
@@ -275,7 +347,7 @@ def _oriented(ring: Ring, clockwise: bool) -> Ring:
         return ring
     # Edge j of the reversed ring is edge k - 2 - j of the other: it begins where that ends.
     numbers = np.roll(ring.numbers[::-1], -1)
-    return Ring(np.ascontiguousarray(ring.vertices[::-1]), numbers, ring.n_given, ring.name)
+    return Ring(ring.given, np.ascontiguousarray(ring.vertices[::-1]), numbers, ring.name)
 
 
 def _at(place: np.ndarray) -> str:

@@ -5,12 +5,13 @@ Every writer works on a temporary file beside the target and puts it in place wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
+from ..geometry.boundary_names import Walls
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .foam import write_foam
@@ -64,7 +65,7 @@ def save(
     result: Result,
     path: str | PathLike[str],
     *,
-    patches: Mapping[str, Iterable[int]] | None = None,
+    patches: Mapping[str, Walls] | None = None,
     convention: str | None = None,
 ) -> None:
     """Write `result` to `path`; the suffix chooses the format.
@@ -81,8 +82,8 @@ def save(
         atmospheres, QGIS, ParaView and xarray; ``.vtk``, ``.ply`` and ``.obj`` hold 2D meshes and are written
         through meshio (``pip install "clvoro[formats]"``), the latter two without cell data.
     patches : mapping, optional
-        For OpenFOAM and a polygonal domain: names of patches, and the numbers of the edges in each, as in
-        `Polygon.edge_numbers`. Edges in none are in the patch of their ring, ``outer``, ``hole-1``, ...
+        For OpenFOAM: names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls
+        that are not mentioned keep the name that the domain gives them.
     convention : {"ugrid", "mpas"}, optional
         For netCDF: what is in the file. With "ugrid", the default, cells as polygons with size, error, quality and
         area, and for each edge the number of its wall; at seams as in ``.vtu``. With "mpas" what the MPAS mesh

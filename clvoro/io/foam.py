@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from ..geometry.boundary_names import Walls
 from ..mesh.results import Result
 from .atomic import atomic_file, atomic_folder, make_folder
 from .polymesh import PolyMesh, poly_mesh
@@ -14,7 +15,7 @@ from .polymesh import PolyMesh, poly_mesh
 _FILES = {
     "points": "vectorField",
     "owner": "labelList",
-    "neighbour": "labelList",
+    "neighbour": "labelList",  # as OpenFOAM spells it
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
@@ -23,9 +24,7 @@ _FILES = {
 _CHUNK = 1 << 16
 
 
-def write_foam(
-    result: Result, path: Path, patches: Mapping[str, Iterable[int]] | None = None
-) -> None:
+def write_foam(result: Result, path: Path, patches: Mapping[str, Walls] | None = None) -> None:
     """Write a polyMesh.
 
     Parameters

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from ..files import open_plain
-from ..geometry.boundary import wall_count
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
 from ..mesh.results import HISTORY_DTYPE, Diagram, Displacements, Result
@@ -193,7 +192,7 @@ def _not_in(domain: Domain) -> tuple[str, ...]:
 def _check_domain(arrays: Mapping[str, np.ndarray], domain: Domain) -> None:
     """Check what must fit the domain, so that nobody indexes out of bounds later."""
     neighbors = arrays["diagram.neighbors"]
-    if neighbors.size and neighbors.min() < -wall_count(domain):
+    if neighbors.size and neighbors.min() < -len(domain.boundary_index):
         raise FileError("diagram.neighbors points to what does not exist")
     shifts = arrays.get("diagram.shifts")
     if shifts is not None and shifts.size and not (shifts.min() >= -1 and shifts.max() <= 1):

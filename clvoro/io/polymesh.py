@@ -6,16 +6,14 @@ become pairs of patches of type `cyclic`.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ClvoroError, InputError, InputTypeError
-from ..geometry.boundary import wall_groups
+from ..errors import ClvoroError, InputError
+from ..geometry.boundary_names import BoundaryNames, Walls
 from ..geometry.box import Domain
-from ..geometry.polygon import Polygon
 from ..mesh.connectivity import (
     Faces,
     cell_corners,
@@ -77,37 +75,33 @@ class PolyMesh:
     patches: list[Patch]
 
 
-def poly_mesh(diagram: Diagram, patches: Mapping[str, Iterable[int]] | None = None) -> PolyMesh:
+def poly_mesh(diagram: Diagram, patches: Mapping[str, Walls] | None = None) -> PolyMesh:
     """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
 
-    The patches are `xMin`, `xMax`, `yMin`, ... of a box, `outer`, `hole-1`, ... of a polygon (see `wall_groups`); in 2D
-    also `back` and `front`, at z = 0 and at z = the mean size of a cell. Cells of a periodic box are not cut at its
+    The patches are the boundaries that the domain names; in 2D also `back` and `front`, at z = 0 and at z = the mean
+    size of a cell. Cells of a periodic box are not cut at its
     seams: the faces there are in cyclic patches, `xMin` and `xMax`, and those towards images across two or three seams
     in `xMin-yMin` and `xMax-yMax`, and so on.
 
     Parameters
     ----------
     patches : mapping, optional
-        Of a polygon: names of patches, and the numbers of their edges (`Polygon.edge_numbers`). They come before those
-        of the rings, which keep the edges that are in none.
+        Names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that are not
+        mentioned keep the name that the domain gives them.
 
     Raises
     ------
-    InputError
-        If there are no such edges; or for a cell with an island in it, as no face of OpenFOAM's has a hole.
+    InputError, InputTypeError
+        If `patches` names walls that do not exist, or a wall twice; or for a cell with an island in it, as a face of
+        OpenFOAM has no hole.
     """
-    domain = diagram.domain
-    names, groups = wall_groups(domain) if patches is None else _named(domain, patches)
-    faces = _by_group(faces_once(diagram), groups)
-    counts = np.bincount(groups[-1 - faces.neighbor[faces.inner :]], minlength=len(names))
-    made = [Patch(name, "patch", int(k)) for name, k in zip(names, counts, strict=True)]
+    domain, parts = diagram.domain, _parts(diagram.domain, patches)
+    faces = _by_group(faces_once(diagram), parts.index)
+    walls = -1 - faces.neighbor[faces.inner :]
+    counts = np.bincount(parts.index[walls], minlength=len(parts.names))
+    made = [Patch(name, "patch", int(k)) for name, k in zip(parts.names, counts, strict=True)]
     seams = []
     if any(domain.periodic):
-        made = [
-            patch
-            for patch, axis in zip(made, _axes(domain), strict=True)
-            if not domain.periodic[axis]
-        ]
         faces, seams = _with_seams(diagram, faces)
     owner, neighbor = faces.owner, faces.neighbor[: faces.inner]
     if domain.dim == 2:
@@ -124,11 +118,6 @@ def poly_mesh(diagram: Diagram, patches: Mapping[str, Iterable[int]] | None = No
         made += [Patch("back", "empty", len(diagram)), Patch("front", "empty", len(diagram))]
     used, corners = np.unique(corners, return_inverse=True)
     return PolyMesh(points[used], starts, corners.ravel(), owner, neighbor, made)
-
-
-def _axes(domain: Domain) -> list[int]:
-    """Return the axis across each wall of a box."""
-    return [wall // 2 for wall in range(2 * domain.dim)]
 
 
 @dataclass(frozen=True)
@@ -232,57 +221,10 @@ def _space(points: np.ndarray) -> np.ndarray:
     return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 
-def _named(domain: Domain, patches: Mapping[str, Iterable[int]]) -> tuple[list[str], np.ndarray]:
-    """Return names of the patches, and the one that each edge of the polygon belongs to."""
-    if not isinstance(patches, Mapping):
-        raise InputTypeError(
-            f"patches is {patches!r:.60} of type {type(patches).__name__}, expected names with the numbers of edges in "
-            "each, as {'inlet': [0, 1]}"
-        )
-    if not isinstance(domain, Polygon):
-        raise InputError(
-            "patches are groups of a polygon's edges, and the domain is no polygon; leave them out"
-        )
-    rings, groups = wall_groups(domain)
-    groups = groups + len(patches)
-    for k, (name, numbers) in enumerate(patches.items()):
-        given = np.array(list(numbers) if isinstance(numbers, Iterable) else numbers)
-        if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
-            raise InputTypeError(
-                f"patches has for {name} {numbers!r:.60}, expected the numbers of edges in a list"
-            )
-        wanted = np.unique(given.astype(np.int64))
-        unknown = np.setdiff1d(wanted, domain.edge_numbers)
-        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_][\w.-]*", name):
-            raise InputError(
-                f"patches has the name {name!r:.60}, expected a word of letters, digits, _, . and -"
-            )
-        if unknown.size or not wanted.size:
-            what = (
-                f"the edges {unknown[:5].tolist()}, which the polygon lacks"
-                if wanted.size
-                else "no edges"
-            )
-            raise InputError(
-                f"patches has for {name} {what}; expected numbers as in Polygon.edge_numbers"
-            )
-        mine = np.isin(domain.edge_numbers, wanted)
-        taken = np.flatnonzero(mine & (groups < len(patches)))
-        if taken.size:
-            other = list(patches)[groups[taken[0]]]
-            raise InputError(
-                f"patches has edge {domain.edge_numbers[taken[0]]} both in {other} and in {name}, expected in one"
-            )
-        groups[mine] = k
-    left = np.unique(groups[groups >= len(patches)])
-    twice = [rings[g - len(patches)] for g in left if rings[g - len(patches)] in patches]
-    if twice:
-        raise InputError(
-            f"patches has the name {twice[0]}, which is that of a ring with other edges; take another"
-        )
-    places = np.concatenate([np.arange(len(patches)), np.full(len(rings), -1)])
-    places[left] = len(patches) + np.arange(len(left))
-    return [*patches, *(rings[g - len(patches)] for g in left)], places[groups]
+def _parts(domain: Domain, patches: Mapping[str, Walls] | None) -> BoundaryNames:
+    """Return the parts of the boundary that become patches."""
+    parts = domain.boundaries
+    return parts if patches is None else parts.renamed("patches", patches)
 
 
 def _by_group(faces: Faces, groups: np.ndarray) -> Faces:

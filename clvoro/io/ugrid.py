@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.polygon import Polygon
 from ..mesh.connectivity import cell_corners
 from ..mesh.results import Result
-from .half_edges import HalfEdges, half_edges
+from .half_edges import half_edges
 from .netcdf import NetCDF
 
 _CONNECTIVITY = {
@@ -34,9 +33,10 @@ _FACE_DATA = {
 
 
 def write_ugrid(result: Result, path: Path) -> None:
-    """Write the cells with size, error, quality and area, and the number of the wall at each edge.
+    """Write the cells with size, error, quality and area, and the number and name of the wall at each edge.
 
-    The coordinates of faces are the generators, those of edges their middles.
+    The coordinates of faces are the generators, those of edges their middles. Names of boundaries are the flags of the
+    variable `boundary`.
     """
     _describe(result, path).write()  # when all that it was made of has been let go of
 
@@ -105,11 +105,21 @@ def _describe(result: Result, path: Path) -> NetCDF:
             name, ("mesh_faces",), values[name],
             long_name=what, mesh="mesh", location="face", coordinates="mesh_face_x mesh_face_y",
         )  # fmt: skip
+    walls = np.maximum(-1 - diagram.neighbors[halves.rows[first]], -1)
     file.add(
-        "wall", ("mesh_edges",), _walls(result, halves),
+        "wall", ("mesh_edges",), walls,
         long_name="number of the wall that the edge lies on", mesh="mesh", location="edge",
         coordinates="mesh_edge_x mesh_edge_y", _FillValue=minus,
     )  # fmt: skip
+    names = diagram.domain.boundary_names
+    if names:
+        parts = np.where(walls >= 0, diagram.domain.boundary_index[np.maximum(walls, 0)], -1)
+        file.add(
+            "boundary", ("mesh_edges",), parts,
+            long_name="boundary that the edge lies on", mesh="mesh", location="edge",
+            coordinates="mesh_edge_x mesh_edge_y", flag_values=np.arange(len(names), dtype=np.int32),
+            flag_meanings=" ".join(names), _FillValue=minus,
+        )  # fmt: skip
     return file
 
 
@@ -119,11 +129,3 @@ def _role(name: str) -> dict[str, str | np.generic]:
         "long_name": _CONNECTIVITY[name],
         "start_index": np.int32(0),
     }
-
-
-def _walls(result: Result, halves: HalfEdges) -> np.ndarray:
-    """Return the number of the wall that each edge lies on, in a polygon as its edge was given; -1 for none."""
-    domain = result.diagram.domain
-    walls = -1 - result.diagram.neighbors[halves.rows[halves.first]]
-    numbers = domain.edge_numbers if isinstance(domain, Polygon) else np.arange(2 * domain.dim)
-    return np.where(walls >= 0, numbers[np.maximum(walls, 0)], -1)

@@ -15,12 +15,15 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_corners, face_owners
 from ..mesh.outlines import count_sides, next_faces
 from ..mesh.results import Diagram, Result
 from .atomic import atomic_file
 
+NAMES = "clvoro names: "
+"""Beginning of the comment with names of boundaries."""
 _POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
 _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
@@ -30,8 +33,9 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
     """Write the cells as polygons or polyhedra with their data; the settings go along in a comment.
 
     Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces_of_cell`),
-    `label` (the cell's row in the result), and the vector `generator`, from the origin to the cell's generator.
-    A polygonal or periodic domain goes along as field data. In a periodic box cells are not cut at the seams.
+    `label` (the cell's row in the result), `boundary` (see `largest_boundary`), and the vector `generator`, from the
+    origin to the cell's generator. Names of boundaries that the caller gave go along in a comment, a polygonal or
+    periodic domain as field data. In a periodic box cells are not cut at the seams.
     """
     diagram = result.diagram
     n = len(diagram)
@@ -52,6 +56,7 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
 header_type="UInt64"{compressor}>
 {_comment("clvoro settings: " + json.dumps(result.settings, default=repr))}
+{_names_comment(diagram.domain)}\
 <UnstructuredGrid>
 {_field_data(field)}<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
 <Points>
@@ -96,7 +101,6 @@ def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
         "domain_vertices": in_space(domain.vertices),
         "domain_ring_starts": domain.ring_starts,
         "domain_piece_of_ring": domain.piece_of_ring,
-        "domain_edge_numbers": domain.edge_numbers,
         **_polygon_graph(diagram),
     }
 
@@ -179,8 +183,20 @@ def cell_data(result: Result) -> dict[str, np.ndarray]:
         "volume": diagram.volumes,
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),
         "label": np.arange(n, dtype=np.int32),
+        "boundary": largest_boundary(diagram),
         "generator": in_space(result.points),
     }
+
+
+def largest_boundary(diagram: Diagram) -> np.ndarray:
+    """Return the index in `boundary_names` of the boundary with the largest face of each cell, (n,) int32; -1: none."""
+    found = np.full(len(diagram), -1, np.int32)
+    walls = np.flatnonzero(diagram.neighbors < 0)
+    walls = walls[np.argsort(diagram.face_measures[walls], kind="stable")]  # the last one stays
+    found[face_owners(diagram)[walls]] = diagram.domain.boundary_index[
+        -1 - diagram.neighbors[walls]
+    ]
+    return found
 
 
 def in_space(points: np.ndarray) -> np.ndarray:
@@ -229,6 +245,14 @@ def _packed(raw: bytes) -> bytes:
 def _comment(text: str) -> str:
     # A field of type String would show up in ParaView, but meshio cannot read such a file.
     return f"<!-- {text.replace('--', '- -')} -->"
+
+
+def _names_comment(domain: Domain) -> str:
+    """Return a line with the caller's names of boundaries, which the loader reads."""
+    named = domain.describe().get("names")
+    # A comment has no "--".
+    text = json.dumps(named).replace("--", r"-\u002d")
+    return _comment(NAMES + text) + "\n" if named else ""
 
 
 def _field_data(elements: list[str]) -> str:

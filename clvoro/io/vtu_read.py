@@ -6,6 +6,7 @@ every array's size is known from the numbers of points and cells, or bounded by 
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import sys
@@ -21,12 +22,12 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import open_plain
-from ..geometry.boundary import wall_count
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
 from ..mesh.check.rebuilt import rebuild
 from ..mesh.results import HISTORY_DTYPE, Diagram, Result
 from .arrays import EXPANSION, LEAST
+from .vtu import NAMES
 from .vtu_more import check_repeated
 
 _LONGEST_HEAD = 1 << 22
@@ -73,8 +74,9 @@ def load_vtu(path: str | PathLike[str]) -> Result:
             file.seek(max(0, size - len(_END)))
             if file.read() != _END:
                 raise _FileError("its end is missing: it is cut off, or something follows")
-            arrays = _Reader(head[:end], start, size).read_all(file)
-        return _assemble(arrays)
+            reader = _Reader(head[:end], start, size)
+            arrays = reader.read_all(file)
+        return _assemble(arrays, reader.names)
     except _FileError as problem:
         raise InputError(f"cannot read {name}: {problem}") from problem
     except (
@@ -83,6 +85,8 @@ def load_vtu(path: str | PathLike[str]) -> Result:
         ValueError,
         OverflowError,
         KeyError,
+        TypeError,
+        RecursionError,
         expat.ExpatError,
     ) as error:
         raise InputError(f"cannot read {name}: it is damaged or foreign ({error})") from error
@@ -100,18 +104,25 @@ class _Reader:
         self.points = self.cells = -1
         self.compressed = False
         self.entries: dict[str, tuple[str, int, int]] = {}
+        self.names: dict[str, list[int]] | None = None
         self._within: list[str] = []
         parser = expat.ParserCreate()
         parser.StartDoctypeDeclHandler = self._refuse
         parser.EntityDeclHandler = self._refuse
         parser.StartElementHandler = self._element
         parser.EndElementHandler = lambda _: self._within.pop()
+        parser.CommentHandler = self._comment
         parser.Parse(head, False)
         if min(self.points, self.cells) < 0:
             raise _FileError("it has no piece with points and cells")
 
     def _refuse(self, *_: object) -> NoReturn:
         raise _FileError("it declares a document type or entities, which clvoro's never do")
+
+    def _comment(self, text: str) -> None:
+        text = text.strip()
+        if text.startswith(NAMES):
+            self.names = json.loads(text.removeprefix(NAMES))
 
     def _element(self, tag: str, given: dict[str, str]) -> None:
         if tag == "VTKFile":
@@ -193,7 +204,7 @@ class _Reader:
             yield data
 
 
-def _assemble(arrays: dict[str, np.ndarray]) -> Result:
+def _assemble(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) -> Result:
     vertices = arrays["Points."].astype(float)
     kinds = arrays["Cells.types"]
     if not len(kinds) or not len(vertices) or not np.isfinite(vertices).all():
@@ -208,11 +219,12 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
     lower, upper = vertices.min(axis=0)[:dim], vertices.max(axis=0)[:dim]
     if not (lower < upper).all():
         raise _FileError("its vertices lie on a line")
-    polygon = _polygon(arrays) if dim == 2 else None
-    domain = Box(tuple(lower), tuple(upper)) if polygon is None else polygon
+    polygon = _polygon(arrays, names) if dim == 2 else None
     periodic = "FieldData.box_periodic" in arrays
     if periodic:
-        domain = _periodic_box(arrays, dim)
+        domain = _periodic_box(arrays, dim, names)
+    else:
+        domain = polygon or Box(tuple(lower), tuple(upper), names=names)
     x = np.ascontiguousarray(vertices[:, :dim])
     points = arrays["CellData.generator"][:, :dim].astype(float)
     owner = np.repeat(np.arange(len(kinds)), np.diff(cell_starts))
@@ -257,13 +269,15 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
     )  # fmt: skip
 
 
-def _periodic_box(arrays: dict[str, np.ndarray], dim: int) -> Box:
+def _periodic_box(
+    arrays: dict[str, np.ndarray], dim: int, names: dict[str, list[int]] | None
+) -> Box:
     """Return the periodic box that the file has."""
     corners = arrays["FieldData.box_corners"].reshape(2, 3)[:, :dim].astype(float)
     axes = arrays["FieldData.box_periodic"]
     if axes.shape != (dim,):
         raise _FileError("box_periodic has another number of directions")
-    return Box(*corners.tolist(), periodic=tuple(bool(a) for a in axes))
+    return Box(*corners.tolist(), periodic=tuple(bool(a) for a in axes), names=names)
 
 
 def _seam(
@@ -281,7 +295,7 @@ def _seam(
     return {"shifts": shifts}
 
 
-def _polygon(arrays: dict[str, np.ndarray]) -> Polygon | None:
+def _polygon(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) -> Polygon | None:
     """Return the polygonal domain, if the file has one."""
     prefix = "FieldData.domain_"
     values = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
@@ -289,13 +303,13 @@ def _polygon(arrays: dict[str, np.ndarray]) -> Polygon | None:
         return None
     if "vertices" in values:
         values["vertices"] = values["vertices"].reshape(-1, 3)[:, :2]
-    return Polygon.described(**values)
+    return Polygon.described(**values, names=names)
 
 
 def _set_walls(arrays: dict[str, np.ndarray], neighbors: np.ndarray, domain: Domain) -> None:
     """Put in the edges behind faces on the boundary, as the file has them."""
     faces = _indices(arrays["FieldData.wall_faces"], len(neighbors), "wall_faces")
-    edges = _indices(arrays["FieldData.wall_edges"], wall_count(domain), "wall_edges")
+    edges = _indices(arrays["FieldData.wall_edges"], len(domain.boundary_index), "wall_edges")
     if len(faces) != len(edges):
         raise _FileError("its faces on walls do not fit each other")
     neighbors[faces] = -1 - edges

@@ -125,10 +125,13 @@ def _stretches(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which stretch each face is a part of, (m,), -1 for none; and the first and last face of each, (s,)."""
     following = _along_rings(diagram, domain)
-    edges = -1 - diagram.neighbors
+    edges = _places(diagram, domain)
     begins = _beginnings(domain, following, edges, owner)
     onward, of_face, cells = following.tolist(), edges.tolist(), owner.tolist()
-    next_edge, turns = domain.next_vertex.tolist(), list(domain.turns.astype(real))
+    next_edge, turns = (
+        domain.oriented.next_vertex.tolist(),
+        list(domain.oriented.turns.astype(real)),
+    )
     stretch = np.full(len(edges), -1)
     first: list[int] = []
     final: list[int] = []
@@ -152,18 +155,24 @@ def _stretches(
     return stretch, np.array(first, int), np.array(final, int)
 
 
+def _places(diagram: Diagram, domain: Polygon) -> np.ndarray:
+    """Return the place in `domain.oriented` of the edge behind each face, (m,); -1 for a face between cells."""
+    walls = np.maximum(-1 - diagram.neighbors, 0)
+    return np.where(diagram.neighbors < 0, domain.oriented.places[walls], -1)
+
+
 def _along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
     """Return for each face on the boundary the next one on its ring, (m,); -1 for others, and where there is none."""
     rows = np.flatnonzero(diagram.neighbors < 0)
-    edge = -1 - diagram.neighbors[rows]
+    edge = _places(diagram, domain)[rows]
     begin, end = face_ends(diagram)[rows].T.astype(np.int64)
     # Edges may be too short for a face.
     used = np.unique(edge)
-    ring = np.searchsorted(domain.ring_starts, used, side="right")
+    ring = np.searchsorted(domain.oriented.ring_starts, used, side="right")
     starts = np.flatnonzero(np.diff(ring, prepend=-1))
     after = np.roll(used, -1)
     after[np.append(starts[1:], len(used)) - 1] = used[starts]
-    onward = np.zeros(len(domain.vertices), np.int64)
+    onward = np.zeros(len(domain.oriented.vertices), np.int64)
     onward[used] = after
     keys = edge * len(diagram.vertices) + begin
     order = np.argsort(keys, kind="stable")
@@ -185,14 +194,15 @@ def _beginnings(
     before = np.full(len(edges), -1)
     before[following[goes_on]] = goes_on
     begins = rows[(before[rows] < 0) | (owner[before[rows]] != owner[rows])]
-    ring = np.searchsorted(domain.ring_starts, edges, side="right") - 1
-    divided = np.zeros(len(domain.sharpest), bool)
+    oriented = domain.oriented
+    ring = np.searchsorted(oriented.ring_starts, edges, side="right") - 1
+    divided = np.zeros(len(oriented.sharpest), bool)
     divided[ring[begins]] = True
     is_outer = np.diff(domain.piece_of_ring, prepend=-1) > 0
     # Of those that are all one cell's the first faces of edges, the nearest behind the sharpest corner.
     firsts = rows[(edges[before[rows]] != edges[rows]) & (is_outer & ~divided)[ring[rows]]]
-    size = np.diff(domain.ring_starts)[ring[firsts]]
-    away = (edges[firsts] - domain.sharpest[ring[firsts]]) % size
+    size = np.diff(oriented.ring_starts)[ring[firsts]]
+    away = (edges[firsts] - oriented.sharpest[ring[firsts]]) % size
     order = np.lexsort((away, ring[firsts]))
     nearest = np.diff(ring[firsts[order]], prepend=-1) > 0
     return [*begins.tolist(), *firsts[order][nearest].tolist()]

@@ -96,10 +96,10 @@ class Diagram:
     neighbor_starts : (n + 1,) int32
         Row i of the graph is ``neighbors[neighbor_starts[i]:neighbor_starts[i + 1]]``.
     neighbors : (m,) int32
-        A generator's index, or ``-1 - b`` for the wall b of the domain: in a box wall 2 a is the lower one of axis a,
-        wall 2 a + 1 the upper one; in a polygon wall e is the edge e, and ``domain.edge_numbers[e]`` the number that
-        it was given. In 2D in counter-clockwise order around the cell, in a polygon loop by loop, clockwise around
-        holes.
+        A generator's index, or ``-1 - k`` for wall k of the domain: in a box wall 2 a is the lower side of axis a,
+        wall 2 a + 1 the upper one; in a polygon wall k is the edge from vertex k on, as the caller gave them. Its name
+        is ``domain.boundary_names[domain.boundary_index[k]]``. In 2D in counter-clockwise order around the cell, in a
+        polygon loop by loop, clockwise around holes.
     shifts : (m, d) int8
         In a periodic box: face k of cell i lies towards the image of its neighbor j at
         ``points[j] + shifts[k] * domain.extent``. Zeros in other domains, and towards walls.

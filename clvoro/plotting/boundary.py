@@ -18,7 +18,7 @@ _MARGIN = 0.01  # of the longer side, around a whole domain
 
 def outline_path(domain: Polygon) -> Path:
     """Return the domain as a path: outer rings run counter-clockwise, holes clockwise."""
-    closed = [np.vstack([ring, ring[:1]]) for ring in domain.rings]
+    closed = [np.vstack([ring, ring[:1]]) for ring in domain.oriented.rings]
     return Path.make_compound_path(*(Path(ring, closed=True) for ring in closed))
 
 

@@ -128,8 +128,9 @@ class FeatureSize(Field):
         if self.curvature:
             radius = radii_of_curvature(domain)
             curved = np.flatnonzero(radius < self.curvature * self.h_max)
-            begin = np.concatenate([begin, domain.vertices[curved]])
-            end = np.concatenate([end, domain.vertices[domain.next_vertex[curved]]])
+            oriented = domain.oriented
+            begin = np.concatenate([begin, oriented.vertices[curved]])
+            end = np.concatenate([end, oriented.vertices[oriented.next_vertex[curved]]])
             size = np.concatenate([size, radius[curved] / self.curvature])
         size = np.maximum(size, self.h_min)
         kept = size < self.h_max

@@ -41,7 +41,8 @@ def gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, np.nda
     begin, end : (m, 2) float64
         Where the balls touch.
     """
-    start, edge = domain.vertices, domain.vertices[domain.next_vertex] - domain.vertices
+    start = domain.oriented.vertices
+    edge = start[domain.oriented.next_vertex] - start
     length = np.hypot(*edge.T)
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
     found = [_from_corners(domain, normal, most)]
@@ -71,7 +72,7 @@ def _from_corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return chords from corners whose angle inside the domain is more than 180 degrees."""
     before = np.empty(len(normal), np.int64)
-    before[domain.next_vertex] = np.arange(len(normal))
+    before[domain.oriented.next_vertex] = np.arange(len(normal))
     first = normal[before]
     turn = np.arctan2(
         first[:, 0] * normal[:, 1] - first[:, 1] * normal[:, 0], (first * normal).sum(axis=1)
@@ -84,7 +85,7 @@ def _from_corners(
         counts + 1, counts
     )
     direction = np.column_stack([np.cos(angle), np.sin(angle)])
-    begin, end, radius = _balls(domain, domain.vertices[row], direction, most)
+    begin, end, radius = _balls(domain, domain.oriented.vertices[row], direction, most)
     return begin[np.isfinite(radius)], end[np.isfinite(radius)]
 
 
@@ -122,15 +123,16 @@ def _balls(
 
 
 def radii_of_curvature(domain: Polygon) -> np.ndarray:
-    """Return for each edge the radius of the curve that it is part of, (k,); infinite beside corners or if straight.
+    """Return the radius of the curve that each oriented edge is part of, (k,); infinite beside corners or if straight.
 
     At a vertex where the boundary turns by an angle a between edges of lengths p and q, the radius is that of the
     circle that touches both at half the shorter one's length, ``min(p, q) / (2 tan(a / 2))``.
     """
-    edge = domain.vertices[domain.next_vertex] - domain.vertices
+    following = domain.oriented.next_vertex
+    edge = domain.oriented.vertices[following] - domain.oriented.vertices
     length = np.hypot(*edge.T)
     before = np.empty(len(edge), np.int64)
-    before[domain.next_vertex] = np.arange(len(edge))
+    before[following] = np.arange(len(edge))
     last = edge[before]
     turn = np.abs(
         np.arctan2(last[:, 0] * edge[:, 1] - last[:, 1] * edge[:, 0], (last * edge).sum(axis=1))
@@ -139,4 +141,4 @@ def radii_of_curvature(domain: Polygon) -> np.ndarray:
     radius = np.full(len(edge), math.inf)
     shorter = np.minimum(length, length[before])
     radius[smooth] = shorter[smooth] / (2 * np.tan(turn[smooth] / 2))
-    return np.minimum(radius, radius[domain.next_vertex])
+    return np.minimum(radius, radius[following])

@@ -102,7 +102,7 @@ def test_children_in_polygons(ctx, name, fixed):
     assert np.array_equal(finer[:n], points)
     origin, scale = domain.frame
     shape = shapely.transform(domain.geometry, lambda y: (y - origin) / scale)
-    along = domain.vertices[domain.next_vertex] - domain.vertices
+    along = domain.oriented.vertices[domain.oriented.next_vertex] - domain.oriented.vertices
     tangents = along / np.hypot(*along.T)[:, None]
     expected = children_in(shape, tangents, patch.fetch(t), h, labels, fixed)
     assert len(expected) > n

@@ -101,10 +101,10 @@ def test_what_is_refused(text: str, says: str) -> None:
 
 def test_edges_of_a_boundary_must_be_there() -> None:
     shape = "\n[size]\nkind = 'distance'\nh_min = 0.1\nslope = 0.5\nshapes = [{ kind = 'boundary', edges = [8] }]\n"
-    with pytest.raises(InputError, match=r"edges has 8, .* from 0 to 7"):
+    with pytest.raises(InputError, match=r"boundary has edge 8, .* from 0 to 7"):
         Case.from_toml(RINGS + shape, "my.toml").size_field()
     box = "[domain]\nlower = [0, 0]\nupper = [1, 1]\n"
-    with pytest.raises(InputError, match="need a polygon as domain"):
+    with pytest.raises(InputError, match=r"boundary has side 8, .* from 0 to 3"):
         Case.from_toml(box + shape, "my.toml").size_field()
     with pytest.raises(InputError, match="needs a polygon as domain"):
         Case.from_toml(box + "\n[size]\nkind = 'feature'\n", "my.toml").size_field()
@@ -151,7 +151,7 @@ def test_the_channel_leaves_its_section_out() -> None:
     assert size(np.array([(-1.0, 0.6), (2.5, -0.6)])) == pytest.approx(0.006)
     # Around the section sizes come from the layers.
     (layer,) = case.run_arguments()["layers"]
-    assert layer.edges == tuple(range(4, 4 + len(section.vertices)))
+    assert layer.edges == ("section",)
     assert size(np.array([(-1.0, 0.0)])) == pytest.approx(0.06)
 
 
@@ -175,7 +175,7 @@ value = 0.1
 [[layers]]
 height = 0.02
 count = 2
-rings = [1]
+edges = "hole-1"
 
 [[layers]]
 height = 0.03
@@ -186,23 +186,9 @@ edges = [0]
 def test_layers_of_a_case(tmp_path):
     case = Case.from_toml(LAYERED, "layered")
     around, below = case.run_arguments()["layers"]
-    assert around == clvoro.Layers(0.02, count=2, edges=range(4, 20))
+    assert around == clvoro.Layers(0.02, count=2, edges="hole-1")
     assert below == clvoro.Layers(0.03, edges=[0])
     again = load_case(case.write(tmp_path))
     assert again.run_arguments()["layers"] == [around, below]
-    # Edges are numbered as the rings are given: here that one runs around the hole counter-clockwise.
-    (_, beside) = Case.from_toml(
-        LAYERED.replace("edges = [0]", "edges = [4]"), "layered"
-    ).run_arguments()["layers"]
-    (edge,) = beside.edges
-    assert case.domain.edge_numbers[edge] == 4 != edge
-    assert case.domain.vertices[edge] == pytest.approx(
-        (1 + 0.2 * np.cos(np.pi / 8), 0.5 + 0.2 * np.sin(np.pi / 8))
-    )
-    with pytest.raises(InputError, match=r"rings has \[2\], expected 0 to 1"):
-        Case.from_toml(LAYERED.replace("rings = [1]", "rings = [2]"), "layered").run_arguments()
-    boxed = LAYERED.split("[size]")[1]
-    with pytest.raises(InputError, match="polygonal domain"):
-        Case.from_toml(
-            f"[domain]\nlower = [0, 0]\nupper = [2, 1]\n[size]{boxed}", "boxed"
-        ).run_arguments()
+    with pytest.raises(InputError, match=r"edges is \[0\.5\], expected the number or name"):
+        Case.from_toml(LAYERED.replace("edges = [0]", "edges = [0.5]"), "layered")

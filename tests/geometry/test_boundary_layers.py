@@ -80,7 +80,7 @@ def test_cells_have_their_corners_at_those_of_the_wall(adapter, domain, edges, s
     diagram = adapter.diagram(domain, rows)
     owners = np.repeat(np.arange(len(rows)), np.diff(diagram.neighbor_starts))
     walls = -1 - diagram.neighbors
-    mine = np.isin(walls, np.flatnonzero(np.isin(domain.edge_numbers, edges)))
+    mine = np.isin(walls, edges)
     lengths = diagram.face_measures[mine]
     ends = domain.boundary_distance(rows[owners[mine]]) < 1.01 * layers.rows[0]
     assert ends.all()  # the first row has all of the wall
@@ -119,9 +119,7 @@ def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
     others = result.points[len(rows) :, 1 - axis]
     assert np.minimum(others, 1 - others).min() > layers.rows[-1]
     result.check().demand()
-    with pytest.raises(
-        InputError, match=r"expected some of \[" + ("2, 3" if axis == 0 else "0, 1")
-    ):
+    with pytest.raises(InputError, match="expected one of " + ("2, 3" if axis == 0 else "0, 1")):
         adapter.run(channel, 0.1, layers=Layers(0.02, edges=[0, 2]))
 
 
@@ -183,8 +181,11 @@ def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
         (lambda: Layers(0), "height"),
         (lambda: Layers(0.1, count=0), "count"),
         (lambda: Layers(0.1, growth=0.9), "growth"),
-        (lambda: place_layers(BOX, [Layers(0.1, edges=[4])]), r"\[4\]"),
-        (lambda: place_layers(BOX, [Layers(0.1, edges=[])]), "none"),
+        (
+            lambda: place_layers(BOX, [Layers(0.1, edges=[4])]),
+            "has side 4, expected numbers from 0 to 3",
+        ),
+        (lambda: place_layers(BOX, [Layers(0.1, edges=[])]), "empty"),
         (lambda: free_domain(BOX, [Layers(0.4, edges=[2, 3])]), "no room"),
         (lambda: free_domain(CHANNEL, [Layers(0.4)]), "no room"),
     ],
@@ -210,7 +211,9 @@ def test_what_cannot_be_is_refused(make, words):
         (lambda: Layers(0.01, count=3, growth=1e200), InputError),
         (lambda: Layers(1e308, count=2, growth=1e308), InputError),
         (lambda: Layers(0.01, spacing=1e308), InputError),
-        (lambda: Layers(0.1, edges=3), InputTypeError),
+        (lambda: Layers(0.1, edges=3.0), InputTypeError),
+        (lambda: Layers(0.1, edges={3: "a"}), InputTypeError),
+        (lambda: Layers(0.1, edges="nowhere"), InputError),
         (lambda: 5, InputTypeError),
         (lambda: None, InputTypeError),
         (lambda: ["thin"], InputTypeError),

@@ -97,8 +97,8 @@ def test_one_way_against_shapely(move, name):
 
 
 def edges(domain, origin, scale):
-    begins = (domain.vertices - origin) / scale
-    return list(zip(begins, begins[domain.next_vertex], strict=True))
+    begins = (domain.oriented.vertices - origin) / scale
+    return list(zip(begins, begins[domain.oriented.next_vertex], strict=True))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -126,8 +126,8 @@ def test_whoever_is_pushed_stays_inside(move, name):
 def test_generators_on_the_boundary_may_leave_it(move):
     domain = POLYGONS["burr"]()
     origin, scale = domain.frame
-    v = domain.vertices
-    e = v[domain.next_vertex] - v
+    v = domain.oriented.vertices
+    e = v[domain.oriented.next_vertex] - v
     x = ((v + e / 3 - origin) / scale).astype(move.real)
     inwards = 1e-4 * np.column_stack([-e[:, 1], e[:, 0]]) / np.hypot(*e.T)[:, None]
     y = move(domain, x, inwards)
@@ -145,7 +145,7 @@ def test_generators_on_the_boundary_may_leave_it(move):
 @pytest.mark.parametrize("name", ["square", "koch", "far", "thin spit"])
 def test_bins_hold_their_edges(name):
     domain = POLYGONS[name]()
-    begins, ends = domain.vertices, domain.vertices[domain.next_vertex]
+    begins, ends = domain.oriented.vertices, domain.oriented.vertices[domain.oriented.next_vertex]
     frame, shape, starts, listed = bin_edges(begins, ends)
     held = [set(listed[a:b].tolist()) for a, b in pairwise(starts)]
     # Points all along each edge are in bins that list it.

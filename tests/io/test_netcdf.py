@@ -146,8 +146,7 @@ def test_walls_are_numbered(result, mesh):
     for number in np.unique(wall[wall >= 0]):
         these = wall == number
         if isinstance(domain, clvoro.Polygon):
-            (e,) = np.flatnonzero(domain.edge_numbers == number)
-            a, b = domain.vertices[[e, domain.next_vertex[e]]]
+            a, b = (end[0] for end in domain.edge_ends(np.array([number])))
         else:
             axis, upper = divmod(int(number), 2)
             assert not domain.periodic[axis]

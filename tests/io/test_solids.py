@@ -11,7 +11,7 @@ import pytest
 
 from clvoro import io
 from clvoro.errors import InputError
-from clvoro.io.vtu import _polyhedra, write_vtu
+from clvoro.io.vtu import _polyhedra, largest_boundary, write_vtu
 from clvoro.mesh.connectivity import face_corners, face_owners, faces_once, take_rows
 from clvoro.mesh.results import Diagram
 from tests.io.test_io import assert_equal_results, assert_same_array, rewrite
@@ -189,6 +189,7 @@ def test_vtu_holds_cells_and_data(result, tmp_path, compress):
         "volume": d.volumes,
         "faces_of_cell": np.diff(d.neighbor_starts),
         "label": np.arange(len(d), dtype=np.int32),
+        "boundary": largest_boundary(d),
         "generator": d.points,
     }
     assert set(arrays) == set(expected)

@@ -134,9 +134,9 @@ def polygon_voronoi(domain, points) -> PolygonCells:
             lengths[i, j] += length
             lengths[j, i] += length
     tree = shapely.STRtree([p.shape for p in pieces])
-    for e, (a, b) in enumerate(
-        zip(domain.vertices, domain.vertices[domain.next_vertex], strict=True)
-    ):
+    rings = domain.oriented
+    ends = rings.vertices[rings.next_vertex]
+    for e, a, b in zip(rings.edge_numbers.tolist(), rings.vertices, ends, strict=True):
         for home in {pieces[p].home for p in tree.query(shapely.LineString([a, b]).buffer(small))}:
             # What lies on a face counts to the cell on the left.
             left = small / 1000 * np.array([a[1] - b[1], b[0] - a[0]]) / math.dist(a, b)
@@ -222,8 +222,8 @@ def faults(diagram, real: str = "float64") -> list[str]:
         demand(np.isfinite(getattr(d, name)).all(), f"{name} not finite")
     demand((d.volumes > 0).all(), f"volumes {d.volumes.min():.3g} of cell {d.volumes.argmin()}")
     total = d.volumes.sum() - domain.measure
-    ends = domain.vertices[domain.next_vertex]
-    around = float(np.hypot(*(ends - domain.vertices).T).sum())
+    ends = domain.oriented.vertices[domain.oriented.next_vertex]
+    around = float(np.hypot(*(ends - domain.oriented.vertices).T).sum())
     demand(
         abs(total) <= slack * (around + size) / 8, f"areas: {total / domain.measure:.3g} too much"
     )
@@ -252,10 +252,10 @@ def faults(diagram, real: str = "float64") -> list[str]:
             f"faces differ from both sides by {off.max(initial=0):.3g}",
         )
     # Edges are covered once.
-    edges = -1 - j[~inner]
+    edges = domain.oriented.places[-1 - j[~inner]]
     demand((edges < len(ends)).all(), "no such edge")
     covered = np.bincount(edges, d.face_measures[~inner], minlength=len(ends))
-    off = np.abs(covered - np.hypot(*(ends - domain.vertices).T))
+    off = np.abs(covered - np.hypot(*(ends - domain.oriented.vertices).T))
     demand(off.max() <= 8 * slack, f"faces on edge {off.argmax()}: off by {off.max():.3g}")
     # Faces run from vertex to vertex, in loops, the cell on their left.
     off = np.abs(np.hypot(*(b - a).T) - d.face_measures)

@@ -35,17 +35,18 @@ def outlines(diagram) -> list[Outline]:
     Ring by ring, in the order in which faces lie on the edges. For cells of three sides and more.
     """
     d, domain = diagram, diagram.domain
+    rings = domain.oriented
     found = [Outline() for _ in range(len(d))]
     ends = d.vertices[d.face_vertices.reshape(-1, 2)]
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts)).tolist()
     on_edge = defaultdict(list)
     for f, j in enumerate(d.neighbors.tolist()):
         if j < 0:
-            on_edge[-1 - j].append(f)
+            on_edge[rings.places[-1 - j]].append(f)
         else:
             found[owner[f]].sides += 1
             found[owner[f]].add(d.points[owner[f]], *ends[f])
-    for r, (ring, first) in enumerate(zip(domain.rings, domain.ring_starts.tolist(), strict=False)):
+    for r, (ring, first) in enumerate(zip(rings.rings, rings.ring_starts.tolist(), strict=False)):
         ways = (np.roll(ring, -1, axis=0) - ring) @ (1, 1j)
         turns = np.angle(ways / np.roll(ways, 1))
         sharpest = int(np.argmax(np.abs(turns) > np.abs(turns).max() - 1e-6))

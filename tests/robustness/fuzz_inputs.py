@@ -238,9 +238,9 @@ def placed_in_polygon(rng: np.random.Generator, domain: clvoro.Polygon) -> np.nd
     if kind < 0.3:
         x = shores.lattice(int(rng.integers(1, 20)), rng.choice(["centers", "corners", "hexagons"]))
     elif kind < 0.5:
-        v = domain.vertices
+        v = domain.oriented.vertices
         t = rng.choice([0, 0.25, 0.5, rng.random()], (len(v), 1))
-        x = (v + t * (v[domain.next_vertex] - v) - low) / extent
+        x = (v + t * (v[domain.oriented.next_vertex] - v) - low) / extent
         x = np.concatenate([x, rng.random((rng.integers(0, 30), 2))])
     else:
         x = some_points(rng)

@@ -19,7 +19,7 @@ CIRCLE = np.column_stack([f(np.arange(200) * math.pi / 100) for f in (np.cos, np
 
 
 def inner(domain: clvoro.Polygon, n: int = 4000) -> np.ndarray:
-    return np.concatenate([sample_uniform(domain, n, 1), domain.vertices])
+    return np.concatenate([sample_uniform(domain, n, 1), domain.oriented.vertices])
 
 
 # --- distance to the boundary --------------------------------------------------------------------
@@ -30,18 +30,18 @@ def test_distance_to_the_boundary_of_the_domain() -> None:
     x = inner(domain)
     size = sizing.Distance(domain, 0.1, slope=0.5)(x)
     assert np.abs(size - 0.1 - 0.5 * domain.boundary_distance(x)).max() < 1e-15
-    # Edges of our numbers, those of a mask, and those of the user's numbers.
     chosen = [3, 60, 17]
     mask = np.isin(np.arange(80), chosen)
+    rings = [np.roll(ring, -1, axis=0) for ring in domain.rings]
     for edges in (chosen, mask):
-        a, b = domain.vertices[mask], domain.vertices[domain.next_vertex[mask]]
+        a, b = domain.vertices[mask], np.concatenate(rings)[mask]
         wanted = [
             sizing.Distance(sizing.Segment(p, q), 0.1, slope=0.5)(x)
             for p, q in zip(a, b, strict=True)
         ]
         found = sizing.Distance(domain.boundary(edges), 0.1, slope=0.5)(x)
         assert np.abs(found - np.min(wanted, axis=0)).max() < 1e-15
-    with pytest.raises(InputError, match="expected numbers below 80"):
+    with pytest.raises(InputError, match="has edge 80, expected numbers from 0 to 79"):
         domain.boundary([80])
     with pytest.raises(InputError, match="at least one"):
         domain.boundary([])
@@ -93,7 +93,7 @@ def reference(
     domain: clvoro.Polygon, x: np.ndarray, across: float, slope: float, facing: float
 ) -> np.ndarray:
     """The same size from the Delaunay triangles of a dense sample of the boundary, whose circles hold no sample."""
-    start, end = domain.vertices, domain.vertices[domain.next_vertex]
+    start, end = domain.oriented.vertices, domain.oriented.vertices[domain.oriented.next_vertex]
     t = (np.arange(120) + 0.5)[:, None, None] / 120
     apart = np.hypot(*(end - start).T).max() / 120
     p = np.concatenate([*(start + t * (end - start)), start])
@@ -135,7 +135,12 @@ def test_narrow_places_of_any_polygon(seed: int) -> None:
     h = size(x)
     # The sample is 1/120 of an edge apart, so are the ends of its chords off; those that just face each other,
     # or just do not, may be told apart otherwise: ten degrees either way.
-    step = np.hypot(*(domain.vertices[domain.next_vertex] - domain.vertices).T).max() / 120
+    step = (
+        np.hypot(
+            *(domain.oriented.vertices[domain.oriented.next_vertex] - domain.oriented.vertices).T
+        ).max()
+        / 120
+    )
     turn = math.radians(10)
     more, fewer = (reference(domain, x, 4, 0.3, FACING + s * turn).clip(0.02, 0.5) for s in (-1, 1))
     assert (h >= more - (0.25 + 0.3) * step).all()

@@ -13,11 +13,12 @@ from typing import Any
 from ...adaptation.options import uses
 from ...errors import InputError
 from ...files import open_plain, read_text
+from ...geometry.boundary_layers import Layers
 from ...geometry.box import Domain
 from ...io.atomic import atomic_file
 from . import schema, toml
 from .checks import file_name
-from .domains import build_domain, build_layers
+from .domains import build_domain
 from .fields import build_size, load_array, named_files
 from .files import FOLDER, WRITTEN, locate
 from .naca import naca4
@@ -131,7 +132,7 @@ class Case:
         if "points" in arguments:
             arguments["points"] = load_array(self.folder / arguments["points"], "run.points")
         if self.layers:
-            arguments["layers"] = [build_layers(table, self.domain) for table in self.layers]
+            arguments["layers"] = [Layers(**table) for table in self.layers]
         return arguments
 
     def table(self) -> dict[str, Any]:

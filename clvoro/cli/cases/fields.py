@@ -14,7 +14,6 @@ from ...errors import InputError
 from ...geometry.box import Box, Domain
 from ...geometry.polygon import Polygon
 from ...io.arrays import read_array
-from .domains import edges_of
 from .files import locate
 from .naca import naca4
 
@@ -96,7 +95,7 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
                 surface.check()
         return surface
     if kind == "boundary":
-        return _boundary(domain, node.get("edges"))
+        return domain if "edges" not in node else domain.boundary(node["edges"])
     if kind == "box":
         return Box(node.get("lower", domain.lower), node.get("upper", domain.upper))
     if kind in ("circle", "sphere"):
@@ -108,15 +107,6 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     if kind == "polygon":
         return sizing.Polygon(node["points"])
     return sizing.Polygon(naca4(**{key: value for key, value in node.items() if key != "kind"}))
-
-
-def _boundary(domain: Domain, edges: list[int] | None) -> Any:
-    """Return the domain's own boundary; `edges` number the rings as the case gives them."""
-    if not isinstance(domain, (Box, Polygon)) or (edges is not None and isinstance(domain, Box)):
-        raise InputError(f"edges of a boundary need a polygon as domain, not {domain}")
-    if isinstance(domain, Box) or edges is None:
-        return domain
-    return domain.boundary(edges_of(domain, edges))
 
 
 def load_array(path: Path, place: str) -> np.ndarray:

@@ -29,12 +29,28 @@ from .checks import (
     whole,
 )
 
+
+def walls(value: object, place: str) -> Any:
+    """Check a selection of edges or sides: a number, a name, or a list of them."""
+    items = value if isinstance(value, list) else [value]
+    if not items or not all(isinstance(v, str | int) and not isinstance(v, bool) for v in items):
+        raise refuse(place, value, "the number or name of an edge or side, or a list of them")
+    return value
+
+
+def names(value: object, place: str) -> dict[str, Any]:
+    """Check names of boundaries with their edges or sides."""
+    if not isinstance(value, Mapping):
+        raise refuse(place, value, "a table of names, as {inlet = 0, island = [4, 5, 6]}")
+    return {name: walls(chosen, f"{place}.{name}") for name, chosen in value.items()}
+
+
 SHAPE = Kinds(
     {
         "circle": Table({"center": vector(2, 3), "radius": not_negative}, {}),
         "sphere": Table({"center": vector(3), "radius": not_negative}, {}),
         "box": Table({}, {"lower": vector(2, 3), "upper": vector(2, 3)}),
-        "boundary": Table({}, {"edges": list_of(whole(0))}),
+        "boundary": Table({}, {"edges": walls}),
         "surface": Table({"file": text}, {"closed": true_or_false, "join": positive}),
         "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
         "polyline": Table({"points": vectors(2)}, {}),
@@ -154,9 +170,13 @@ def directions(value: object, place: str) -> bool | list[bool]:
 
 _DOMAINS = Kinds(
     {
-        "box": Table({"lower": vector(2, 3), "upper": vector(2, 3)}, {"periodic": directions}),
+        "box": Table(
+            {"lower": vector(2, 3), "upper": vector(2, 3)}, {"periodic": directions, "names": names}
+        ),
         "polygon": Table(
-            {}, {"file": text, "outer": ring, "holes": list_of(ring)}, choice=("file", "outer")
+            {},
+            {"file": text, "outer": ring, "holes": list_of(ring), "names": names},
+            choice=("file", "outer"),
         ),
     },
     default="box",
@@ -211,11 +231,10 @@ LAYERS = Table(
         "count": whole(1),
         "growth": positive,
         "spacing": positive,
-        "edges": list_of(whole(0)),
-        "rings": list_of(whole(0)),
+        "edges": walls,
     },
 )
-"""Rows of generators along walls; rings stand for all their edges, 0 the first outer ring."""
+"""Layers of cells along edges or sides."""
 
 _CASE = Table(
     {"domain": domain, "size": size},

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
-from ...geometry.boundary import surface, wall_count, wall_distance
+from ...geometry.boundary import boundary_measure, wall_distance
 from ...geometry.polygon import Polygon
 from ..connectivity import face_keys
 from .faces import check_corners, check_measures
@@ -100,7 +100,7 @@ def _check_structure(check: Check) -> None:
         "corners exist", (corners < 0) | (corners >= len(d.vertices)),
         lambda k: f"corner {k} is vertex {corners[k]} of {len(d.vertices)}", stop=True,
     )  # fmt: skip
-    j, walls = d.neighbors, wall_count(d.domain)
+    j, walls = d.neighbors, len(d.domain.boundary_index)
     check.note(
         "neighbors exist", (j >= n) | (j < -walls),
         lambda f: f"face {f} leads to {j[f]}, expected a cell below {n} or a wall from {-walls} to -1",
@@ -198,7 +198,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
     )  # fmt: skip
     total = float(d.volumes.sum())
-    allowed = slack * (g.perimeters.sum() / np.sqrt(n) + surface(domain))
+    allowed = slack * (g.perimeters.sum() / np.sqrt(n) + boundary_measure(domain))
     check.note(
         "volumes sum", np.array([abs(total - domain.measure) > allowed]),
         lambda _: f"the volumes' sum is {total:.17g}, expected the domain's {domain.measure:.17g}",

@@ -58,8 +58,9 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     """Check that the faces on each edge of the polygon cover it, one after the other."""
     d = check.diagram
     rows = np.flatnonzero(d.neighbors < 0)
-    edge = -1 - d.neighbors[rows]
-    begin, end = domain.vertices, domain.vertices[domain.next_vertex]
+    oriented = domain.oriented
+    edge = oriented.places[-1 - d.neighbors[rows]]
+    begin, end = oriented.vertices, oriented.vertices[oriented.next_vertex]
     length = np.hypot(*(end - begin).T)
     along = (end - begin) / length[:, None]
     first, last = (
@@ -72,15 +73,16 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     gap = np.abs(first - np.where(new, 0.0, np.roll(last, 1)))
     check.note(
         "edges covered", np.maximum(gap - 2 * slack, 0),
-        lambda k: f"on edge {edge[k]} there is a gap or an overlap of {gap[k]:.3g} before the face of cell "
-        f"{g.owner[rows[order[k]]]}",
+        lambda k: f"on edge {oriented.edge_numbers[edge[k]]} there is a gap or an overlap of {gap[k]:.3g} before the "
+        f"face of cell {g.owner[rows[order[k]]]}",
     )  # fmt: skip
     reached = np.zeros(len(length))
     reached[edge] = last  # the last one written is the last on the edge
     rest = np.abs(length - reached)
     check.note(
         "edges covered", np.maximum(rest - 2 * slack, 0),
-        lambda e: f"the faces on edge {e} of length {length[e]:.6g} end {rest[e]:.3g} from its end",
+        lambda e: f"the faces on edge {oriented.edge_numbers[e]} of length {length[e]:.6g} end {rest[e]:.3g} from its "
+        "end",
     )  # fmt: skip
 
 
@@ -139,8 +141,8 @@ def hidden(
     # Which leads over slits that are no wider: from their sides nothing behind them is seen.
     before = np.argsort(next_faces(d))
     for faces in (places, before[places]):
-        edge = np.maximum(-1 - d.neighbors[faces], 0)
-        along = domain.vertices[domain.next_vertex[edge]] - domain.vertices[edge]
+        begin, end = domain.edge_ends(np.maximum(-1 - d.neighbors[faces], 0))
+        along = end - begin
         along /= np.linalg.norm(along, axis=1)[:, None]
         right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
         away[place[(right > 4 * unit) & (d.neighbors[faces] < 0)[place]]] = True
@@ -155,7 +157,7 @@ def hidden(
 
 def near_shared_corners(domain: Polygon, places: np.ndarray, slack: float) -> np.ndarray:
     """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of a corner that several rings have."""
-    once, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    once, times = np.unique(domain.oriented.vertices, axis=0, return_counts=True)
     return near_places(places, once[times > 1], slack)
 
 
@@ -171,7 +173,7 @@ def near_places(places: np.ndarray, others: np.ndarray, slack: float) -> np.ndar
 
 def _reflex_corners(domain: Polygon) -> np.ndarray:
     """Return the corners (m, 2) where the domain takes more than half of the surroundings."""
-    after = domain.next_vertex
-    edges = domain.vertices[after] - domain.vertices
+    after, vertices = domain.oriented.next_vertex, domain.oriented.vertices
+    edges = vertices[after] - vertices
     turn = edges[:, 0] * edges[after, 1] - edges[:, 1] * edges[after, 0]
-    return domain.vertices[after[turn < 0]]
+    return vertices[after[turn < 0]]

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...geometry.boundary import wall_count
 from ...geometry.polygon import Polygon
 from ..outlines import straighten
 from .findings import ROUNDINGS
@@ -71,7 +70,7 @@ def borders_on_lost_faces(d: Diagram, g: Rebuilt, cells: np.ndarray) -> np.ndarr
     Such a face lay along an edge, or a part of it: two others meet there that are not neighbors of each other, or
     whose edge has more than one part.
     """
-    n, walls = len(d), wall_count(d.domain)
+    n, walls = len(d), len(d.domain.boundary_index)
     half = np.flatnonzero(np.isin(g.cells, cells))  # edges, as one of two faces has them
     face, one, other = (ends[half] for ends in g.edges)
     order = np.lexsort((np.maximum(one, other), np.minimum(one, other), g.owner[face]))

@@ -66,10 +66,11 @@ class Chords:
 
 def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
     """Return vectors (k, 2), a few roundings long, from the vertices of `domain` inwards: between the edges."""
-    ahead = domain.vertices[domain.next_vertex] - domain.vertices
+    vertices, following = domain.oriented.vertices, domain.oriented.next_vertex
+    ahead = vertices[following] - vertices
     ahead /= np.hypot(*ahead.T)[:, None]
     before = np.empty_like(ahead)
-    before[domain.next_vertex] = ahead
+    before[following] = ahead
     across = before + ahead
     # Between the normals to the left; in a needle's tip, whose normals cancel, along it.
     along = ahead - before
@@ -86,8 +87,8 @@ def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
 def shells(domain: Polygon) -> np.ndarray:
     """Return for each edge of `domain` an edge of the outer ring of its piece, (k,); -1 on that ring itself."""
     first = np.searchsorted(domain.piece_of_ring, domain.piece_of_ring)  # outer rings come first
-    found = np.where(first == np.arange(len(first)), -1, domain.ring_starts[first])
-    return np.repeat(found, np.diff(domain.ring_starts))
+    found = np.where(first == np.arange(len(first)), -1, domain.oriented.ring_starts[first])
+    return np.repeat(found, np.diff(domain.oriented.ring_starts))
 
 
 class Boundary:
@@ -99,21 +100,22 @@ class Boundary:
         self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/boundary_crossings")
         origin, scale = domain.frame
-        self.edges = len(domain.vertices)
-        vertices = (domain.vertices - origin) / scale
+        oriented = domain.oriented
+        self.edges = len(oriented.vertices)
+        vertices = (oriented.vertices - origin) / scale
         inner = vertices + inward(domain, engine.real)
         # Rings that touch in a vertex have it in the same cell.
-        same = np.unique(domain.vertices, axis=0, return_index=True, return_inverse=True)
+        same = np.unique(oriented.vertices, axis=0, return_index=True, return_inverse=True)
         self._places = vertices, inner[same[1]][same[2].ravel()]
         self.vertices, self.inner = (engine.upload(places) for places in self._places)
-        self.next_vertex = engine.upload(domain.next_vertex, np.int32)
+        self.next_vertex = engine.upload(oriented.next_vertex, np.int32)
         self.shells = engine.upload(shells(domain), np.int32)
-        along = domain.vertices[domain.next_vertex] - domain.vertices
+        along = oriented.vertices[oriented.next_vertex] - oriented.vertices
         self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
-        before = np.empty_like(domain.next_vertex)
-        before[domain.next_vertex] = np.arange(self.edges)
-        before[domain.sharpest] = -1 - before[domain.sharpest]
-        self.turns = engine.upload(before, np.int32), engine.upload(domain.turns)
+        before = np.empty_like(oriented.next_vertex)
+        before[oriented.next_vertex] = np.arange(self.edges)
+        before[oriented.sharpest] = -1 - before[oriented.sharpest]
+        self.turns = engine.upload(before, np.int32), engine.upload(oriented.turns)
         self.owners = engine.zeros(self.edges, np.int32)
         self._known = 0  # cells that owners are among
         self._flags = engine.empty(1, np.int32)

@@ -67,9 +67,9 @@ class _FetchedPolygon(_Fetched):
         """
         found = []
         # Measures are those of where the boundary was.
-        for vertices in (self.device_vertices, self.domain.vertices + self.shift):
+        for vertices in (self.device_vertices, self.domain.oriented.vertices + self.shift):
             a = vertices[self.chord_edges]
-            b = vertices[self.domain.next_vertex[self.chord_edges]]
+            b = vertices[self.domain.oriented.next_vertex[self.chord_edges]]
             t = self.chord_ends[:, None]
             ends = np.where(t >= 1, b, np.where(t <= 0, a, a + t * (b - a)))
             found.append(np.concatenate([vertices, ends]))
@@ -92,7 +92,7 @@ class _FetchedPolygon(_Fetched):
         # Of trimmed cells by segments, which may come from another cell.
         s = self.face_segments[~whole]
         home, on_boundary = self.segment_cells[s], self.segment_labels[s] < 0
-        n_corners, number = len(self.domain.vertices), self.crossings[1] + count
+        n_corners, number = len(self.domain.oriented.vertices), self.crossings[1] + count
         cell_first = starts[home]
         found = []
         for side in (self.segment_from[s], self.segment_to[s]):
@@ -103,11 +103,17 @@ class _FetchedPolygon(_Fetched):
         edge = self.chord_edges[chord]
         first, last = chord == self.firsts[edge], chord + 1 == self.firsts[edge + 1]
         begin = np.where(first, number[edge], number[n_corners + np.maximum(chord - 1, 0)])
-        after = number[self.domain.next_vertex[edge]]
+        after = number[self.domain.oriented.next_vertex[edge]]
         found[0][on_boundary] = begin
         found[1][on_boundary] = np.where(last, after, number[n_corners + chord])
         ends[~whole] = np.stack(found, axis=1)
         return ends
+
+    def neighbors(self) -> np.ndarray:
+        found = super().neighbors()
+        walls = found < 0  # on the device by their places in `oriented`
+        found[walls] = -1 - self.domain.oriented.edge_numbers[-1 - found[walls]]
+        return found
 
     @cached_property
     def slots(self) -> np.ndarray:

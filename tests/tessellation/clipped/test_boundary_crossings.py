@@ -38,7 +38,7 @@ def test_chords(ctx, name, real):
     on_device, boundary = engine.upload(points), Boundary(engine, domain)
     t = tessellate_box(Stages(engine), domain, on_device, N, None, False)
     vertices = boundary.vertices.get().reshape(-1, 2).astype(float)
-    ways = vertices[domain.next_vertex] - vertices
+    ways = vertices[domain.oriented.next_vertex] - vertices
     expected = [envelope(a, e, points.astype(float)) for a, e in zip(vertices, ways, strict=True)]
     cells = np.array([cell for edge in expected for cell, _ in edge])
     rng = np.random.default_rng(5702)
@@ -87,7 +87,7 @@ def test_cells_of_generators_outside_are_named(ctx):
     vertices = boundary.vertices.get().reshape(-1, 2)
     met = {
         cell
-        for a, e in zip(vertices, vertices[domain.next_vertex] - vertices, strict=True)
+        for a, e in zip(vertices, vertices[domain.oriented.next_vertex] - vertices, strict=True)
         for cell, _ in envelope(a, e, points)
     }
     expected = sorted(cell - N for cell in met if cell >= N)
@@ -100,7 +100,7 @@ def test_vertices_go_to_the_nearer_of_generators_some_roundings_apart(ctx, real)
     """Whose distances from there are the same number, but whose bisector passes by far away."""
     domain = clvoro.Polygon(UNIT)
     engine = patch.make_engine(ctx, real, box=domain)
-    vertices = domain.place(domain.vertices, engine.real).astype(float)
+    vertices = domain.place(domain.oriented.vertices, engine.real).astype(float)
     boundary, stages = Boundary(engine, domain), Stages(engine)
     rng, made = np.random.default_rng(5703), 0
     for _ in range(40):

@@ -14,7 +14,7 @@ from tests.reference.shores import TOUCHING, scattered
 
 
 def shared_corners(domain):
-    corners, times = np.unique(domain.vertices, axis=0, return_counts=True)
+    corners, times = np.unique(domain.oriented.vertices, axis=0, return_counts=True)
     return corners[times > 1]
 
 
@@ -57,7 +57,7 @@ def test_what_is_split_off_is_apart(ctx, name):
     expected, origin, scale = [], *domain.frame
     host = patch.fetch(t)
     centers = (host.points[host.owners] + host.face_centroids) * scale + origin
-    along = domain.vertices[domain.next_vertex] - domain.vertices
+    along = domain.oriented.vertices[domain.oriented.next_vertex] - domain.oriented.vertices
     along /= np.hypot(*along.T)[:, None]
     way = np.sqrt(domain.measure) / 4
     for m, label in zip(centers, host.neighbors, strict=True):

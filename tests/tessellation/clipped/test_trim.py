@@ -120,8 +120,8 @@ def test_edges_on_faces_and_vertices_on_vertices(adapters, name, kind):
 @pytest.mark.parametrize("name", ["frame", "diamond hole", "star", "islands", "comb", "stairs"])
 def test_generators_on_the_boundary(adapters, name):
     domain = POLYGONS[name]()
-    corners = domain.vertices
-    middles = (corners + corners[domain.next_vertex]) / 2
+    corners = domain.oriented.vertices
+    middles = (corners + corners[domain.oriented.next_vertex]) / 2
     middles = middles[domain.contains(middles)]
     for points in (corners, middles, np.unique(np.concatenate([corners, middles]), axis=0)):
         compare(adapters, domain, points)
@@ -152,7 +152,11 @@ def test_points_on_a_circle_around_a_vertex(adapters):
 @pytest.mark.parametrize("name", TOUCHING)
 def test_rings_that_touch(adapters, name):
     domain = TOUCHING[name]()
-    sets = [scattered(domain, 60, 1), domain.vertices, *(lattice(k) for k in (2, 4, 6, 8, 10))]
+    sets = [
+        scattered(domain, 60, 1),
+        domain.oriented.vertices,
+        *(lattice(k) for k in (2, 4, 6, 8, 10)),
+    ]
     for points in sets:
         inside = np.unique(points[domain.contains(points)], axis=0)
         for real, adapter in adapters.items():
@@ -167,7 +171,7 @@ def test_roundings_decide_nothing(adapters):
         eps = float(np.finfo(real).eps) * 10 ** rng.uniform(-1, 1)
         name = ("frame", "diamond", "stairs", "corner", "islands", "diamond hole")[k % 6]
         domain = POLYGONS[name]()
-        rings = [ring + eps * rng.standard_normal(ring.shape) for ring in domain.rings]
+        rings = [ring + eps * rng.standard_normal(ring.shape) for ring in domain.oriented.rings]
         pieces = [[] for _ in range(domain.n_pieces)]
         for ring, piece in zip(rings, domain.piece_of_ring, strict=True):
             pieces[piece].append(ring)
