@@ -24,10 +24,10 @@ airfoil = np.concatenate(
 )
 
 # %%
-# The airfoil is a hole in the domain. Its edges get a name.
+# The airfoil is a hole in the domain, and gets a name of its own.
 
 tunnel = [(-1.2, -1), (3, -1), (3, 1), (-1.2, 1)]
-domain = clvoro.Polygon(tunnel, [airfoil], names={"airfoil": range(4, 4 + len(airfoil))})
+domain = clvoro.Polygon(tunnel, [airfoil], names={"airfoil": "hole-1"})
 
 # %%
 # Sizes grow from the airfoil and, more slowly, from a line behind it.

@@ -12,14 +12,14 @@ import clvoro
 from clvoro import sizing
 
 # %%
-# The channel's edges are numbers 0 to 3, counted along the ring. The cylinder's follow.
+# The edges of the channel have the numbers 0 to 3, counted along the ring. The cylinder is the first hole.
 
 turn = np.linspace(0, 2 * np.pi, 120, endpoint=False)
 cylinder = np.column_stack([0.2 + 0.05 * np.cos(turn), 0.2 + 0.05 * np.sin(turn)])
 domain = clvoro.Polygon(
     [(0, 0), (2.2, 0), (2.2, 0.41), (0, 0.41)],
     [cylinder],
-    names={"walls": [0, 2], "outlet": [1], "inlet": [3], "cylinder": range(4, 124)},
+    names={"walls": [0, 2], "outlet": 1, "inlet": 3, "cylinder": "hole-1"},
 )
 
 # %%
