@@ -91,7 +91,7 @@ SLAB = "x < 0.1 ? 1.0 : 6.7"
 KINDS: dict[str, Callable[[int], Kind]] = {
     "square": even(SQUARE), "square, exact": even(SQUARE, method="exact"),
     "square, best": even(SQUARE, effort="best"), "square, fast": even(SQUARE, effort="fast"),
-    "square, uniform start": even(SQUARE, start="uniform"),
+    "square, uniform start": even(SQUARE, points="uniform"),
     **{f"square, {m}": even(SQUARE, method=m, max_steps=12) for m in METHODS},
     "square, count held": lambda n: (SQUARE, sizing.Expression("0.01 + 0.1 * x"), {"n_cells": n}),
     "square, from as many points": from_points(1), "square, from few points": from_points(1 / 16),

@@ -66,7 +66,14 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
     ]
 
     a, b = (
-        adapter.run(box, field, method="weighted", max_steps=STEPS, tol=0.0, seed=FIRST_SEED)
+        adapter.run(
+            box,
+            field,
+            method="weighted",
+            max_steps=STEPS,
+            options=clvoro.PaperOptions(tol=0.0),
+            seed=FIRST_SEED,
+        )
         for adapter in (one, other)
     )
     off = float((np.linalg.norm(a.points - b.points, axis=1) / a.size).max())
@@ -78,7 +85,7 @@ def compare(options: Namespace, name: str, n: int) -> list[dict[str, Any]]:
         found = []
         for adapter in (one, other):
             result = adapter.run(box, field, effort=effort, seed=FIRST_SEED)
-            found.append(figures(result.diagram, result.size, result.quality))
+            found.append(figures(result.diagram, result.target_size, result.quality))
         a, b = found
         records.append({
             **same, "what": effort, "cells": int(a["cells"]), "cells_off": int(abs(a["cells"] - b["cells"])),

@@ -80,13 +80,13 @@ SOLID_DEFAULT = {
 SOLID_EXACT = {
     "mean_deviation": 3e-4, "max_deviation": 5e-3, "mean_quality_all": 0.67, "finest_steps": 15,
 }  # fmt: skip
-WEIGHTED = {"method": "weighted", "tol": 0}
+WEIGHTED = {"method": "weighted", "options": clvoro.PaperOptions(tol=0)}
 
 ROWS = (
     Row("weighted", ("F1",), {**WEIGHTED, "max_steps": 8}, {"mean_error": 0.030}),
     Row(
         "weighted-uniform", ("F1",),
-        {**WEIGHTED, "start": "uniform", "k": 1.0, "max_steps": 20},
+        {**WEIGHTED, "points": "uniform", "options": clvoro.PaperOptions(tol=0, k=1.0), "max_steps": 20},
         {"mean_error": 0.035},
     ),
     Row(
@@ -125,7 +125,7 @@ def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int) -> dict[str
     seconds = time.perf_counter() - start
     history = result.history
     measured = {
-        **figures(result.diagram, result.size, result.quality),
+        **figures(result.diagram, result.target_size, result.quality),
         **work(history),
         "seconds": seconds,
         "iterations": int(history["iterations"].sum()),

@@ -5,7 +5,7 @@
                             [--dtype float32] [--json]
 
 With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000 around an empty
-ball, "core", the same with the ball filled, and "bcc", the body-centerd cubic lattice, jittered
+ball, "core", the same with the ball filled, and "bcc", the body-centered cubic lattice, jittered
 likewise. Cells at the empty ball are cones to its center, each near hundreds of others; "core" is
 what grading alone costs. Areas and moments are then part of "clip", and a
 warm row bins the moved generators and clips by the neighbors of the diagram before first.
@@ -125,7 +125,7 @@ def core_3d(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Jittered body-centerd cubic lattice in random order, of about n points."""
+    """Jittered body-centered cubic lattice in random order, of about n points."""
     k = max(1, round((n / 2) ** (1 / 3)))
     p = np.stack(np.meshgrid(*[np.arange(k, dtype=float)] * 3), axis=-1).reshape(-1, 3)
     p = np.concatenate([p + 0.25, p + 0.75]) / k

@@ -116,7 +116,7 @@ def main() -> None:
             seed=FIRST_SEED,
             **example.arguments,
         )
-        found = figures(result.diagram, result.size, result.quality)
+        found = figures(result.diagram, result.target_size, result.quality)
         report.add({"domain": example.title, **found}, example.title)
         results.append((example, result))
     options.out.mkdir(parents=True, exist_ok=True)

@@ -139,7 +139,7 @@ def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
                 0.985, 0.03, f"{len(result.points):,} cells", transform=ax.transAxes, ha="right",
                 fontsize=8, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 2},
             )  # fmt: skip
-        everything = np.concatenate([result.size for _, result in results])
+        everything = np.concatenate([result.target_size for _, result in results])
         add_color_bar(
             axes[0].collections[0], axes, scheme, everything, LIMITS,
             location="bottom", shrink=0.5, aspect=50,
@@ -172,9 +172,9 @@ def main(arguments: list[str] | None = None) -> int:
         results.append((example, result))
         report.add(
             {
-                "field": example.title, "least": float(result.size.min()),
-                "most": float(result.size.max()),
-                **figures(result.diagram, result.size, result.quality),
+                "field": example.title, "least": float(result.target_size.min()),
+                "most": float(result.target_size.max()),
+                **figures(result.diagram, result.target_size, result.quality),
             },
             example.title,
         )  # fmt: skip

@@ -75,14 +75,19 @@ def plan(best: bool) -> list[tuple[str, str, dict[str, Any]]]:
     """Return (group, name, arguments of `Adapter.run`) of every point."""
     points: list[tuple[str, str, dict[str, Any]]] = []
     for method in ("lloyd", "weighted-lloyd", "poisson", "coupled", "weighted"):
-        points.append((method, method, {"method": method, "max_steps": REPEATED, "tol": 0}))
+        points.append(
+            (
+                method,
+                method,
+                {"method": method, "max_steps": REPEATED, "options": clvoro.PaperOptions(tol=0)},
+            )
+        )
     efforts = [e for e in ERROR_TARGETS if best or e != "best"]
     for effort in efforts:
         for target in ERROR_TARGETS[effort]:
             name = f"adaptive {effort}" + ("" if target is None else f", target {target:g}")
-            points.append(
-                (f"adaptive {effort}", name, {"effort": effort, "error_target": target})
-            )  # fmt: skip
+            aimed = clvoro.MultilevelOptions(error_target=target)
+            points.append((f"adaptive {effort}", name, {"effort": effort, "options": aimed}))
     for effort in efforts:
         points.append(("exact", f"exact {effort}", {"method": "exact", "effort": effort}))
     return points
@@ -99,7 +104,7 @@ def measure(
         seconds = time.perf_counter() - start
         first = first or result
         runs.append({
-            **figures(result.diagram, result.size, result.quality), **work(result.history),
+            **figures(result.diagram, result.target_size, result.quality), **work(result.history),
             "seconds": seconds,
         })  # fmt: skip
     medians = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
@@ -214,8 +219,8 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
         figure = new_figure(7.0, rows * (3.4 * shape + 0.42) + 0.35)
         axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
         for k, (ax, (result, title)) in enumerate(zip(axes, panels, strict=False)):
-            f = figures(result.diagram, result.size, result.quality)
-            error = np.abs(result.error).mean()
+            f = figures(result.diagram, result.target_size, result.quality)
+            error = np.abs(result.size_error).mean()
             plot_cells(result, "sides", ax, window=window, key=False)
             ax.set_xticks([])
             ax.set_yticks([])

@@ -145,7 +145,7 @@ def main(arguments: list[str] | None = None) -> int:
             result = adapter.run(BOX, field, n_cells=n, effort=options.effort, seed=FIRST_SEED)
             record: dict[str, Any] = {
                 "mesh": name, "cells": len(result.points), "seconds": time.perf_counter() - start,
-                "least": float(result.size.min()), "most": float(result.size.max()),
+                "least": float(result.target_size.min()), "most": float(result.target_size.max()),
                 "quality": float(result.quality.mean()),
                 **interpolation_error(result.diagram, u, 0.5 / options.steepness),
             }  # fmt: skip

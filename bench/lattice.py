@@ -1,4 +1,4 @@
-"""A constant size in 3D: from a random start, and from a body-centerd cubic lattice, coarse to fine.
+"""A constant size in 3D: from a random start, and from a body-centered cubic lattice, coarse to fine.
 
     python bench/lattice.py [--cubes 10] [--levels 1] [--efforts default] [--device NAME]
                             [--dtype float32] [--json]
@@ -18,8 +18,10 @@ import time
 import numpy as np
 from _common import CUBE, FIRST_SEED, Report, figures, heading, make_adapter, names, parser
 
+import clvoro
 
-def body_centerd(m: int) -> np.ndarray:
+
+def body_centered(m: int) -> np.ndarray:
     """Return the lattice of `m` cubes along each side of the unit cube, (2 m^3, 3)."""
     line = np.arange(m)
     corners = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
@@ -48,15 +50,21 @@ def main() -> int:
     fine = 2 * (options.cubes * 2**options.levels) ** 3
     for effort in options.efforts:
         starts = {
-            "lattice": {"points": body_centerd(options.cubes * 2**options.levels), "levels": 0},
-            "coarse lattice": {"points": body_centerd(options.cubes), "levels": options.levels},
+            "lattice": {
+                "points": body_centered(options.cubes * 2**options.levels),
+                "options": clvoro.MultilevelOptions(levels=0),
+            },
+            "coarse lattice": {
+                "points": body_centered(options.cubes),
+                "options": clvoro.MultilevelOptions(levels=options.levels),
+            },
             "random": {"n_cells": fine, "seed": FIRST_SEED},
         }
         for start, given in starts.items():
             began = time.perf_counter()
             result = adapter.run(CUBE, fine ** (-1 / 3), effort=effort, **given)
             seconds = time.perf_counter() - began
-            made = figures(result.diagram, result.size, result.quality)
+            made = figures(result.diagram, result.target_size, result.quality)
             report.add({"start": start, "effort": effort, "seconds": seconds, **made}, start)
     report.finish(heading(adapter, "Constant size in 3D"))
     return 0

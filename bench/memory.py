@@ -169,7 +169,7 @@ def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
             before.append(ledger.peak)
             ledger.begin()
 
-        adapter.told = begin
+        adapter.on_memory = begin
         diagram = adapter.run(domain, size, seed=FIRST_SEED, **given).diagram
         run = ledger.peak
         ledger.begin()
@@ -186,10 +186,10 @@ def resumed(options: Any, n: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file, size = Path(folder) / "state", n**-0.5
         make_adapter(options).run(
-            SQUARE, size, seed=FIRST_SEED, checkpoint=file, checkpoint_every=1e9,
+            SQUARE, size, seed=FIRST_SEED, checkpoint=clvoro.Checkpoint(file, every=1e9),
             callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
         )  # fmt: skip
-        return measure_kind(options, (SQUARE, size, {"resume": file, "checkpoint_every": 1e9}))
+        return measure_kind(options, (SQUARE, size, {"checkpoint": clvoro.Checkpoint(resume=file)}))
 
 
 def transferred(options: Any, n: int) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class Claim:
 
 
 def mean_error(result: Result) -> float:
-    return float(np.abs(result.error).mean())
+    return float(np.abs(result.size_error).mean())
 
 
 def spread(result: Result) -> float:
@@ -86,7 +86,7 @@ def poor(r: Mapping[str, Result]) -> dict[str, float]:
 def both(r: Mapping[str, Result]) -> dict[str, float]:
     return {
         "mean |e|": mean_error(r["coupled"]),
-        "max |e|": float(np.abs(r["coupled"].error).max()),
+        "max |e|": float(np.abs(r["coupled"].size_error).max()),
         "mean Q": float(r["coupled"].quality.mean()),
         "min Q": float(r["coupled"].quality.min()),
         "mean |e| of poisson": mean_error(r["poisson"]),
@@ -128,7 +128,7 @@ def under(r: Mapping[str, Result]) -> dict[str, float]:
 
 def balance(r: Mapping[str, Result]) -> dict[str, float]:
     """How far Lloyd's and Poisson's displacements cancel: lengths over h, and their direction."""
-    last, h = r["coupled"].final, r["coupled"].size[:, None]
+    last, h = r["coupled"].final, r["coupled"].target_size[:, None]
     lloyd, poisson = last.lloyd / h, last.poisson / h
     return {
         "mean |Lloyd|/h": float(np.linalg.norm(lloyd, axis=1).mean()),
@@ -206,8 +206,8 @@ def run_methods(adapter: clvoro.Adapter, seed: int, steps: int, k: float) -> dic
     case = load_case("paper")
     return {
         method: adapter.run(
-            case.domain, case.size_field(), method=method, start="uniform", max_steps=steps, tol=0,
-            k=k, seed=seed,
+            case.domain, case.size_field(), method=method, points="uniform", max_steps=steps,
+            options=clvoro.PaperOptions(tol=0, k=k), seed=seed,
         )
         for method in METHODS
     }  # fmt: skip

@@ -54,7 +54,9 @@ def make_graph(adapter: clvoro.Adapter, n: int, mesh: str) -> clvoro.Diagram:
         def size(x):
             return (0.05 + np.hypot(x[:, 0], x[:, 1])) / np.sqrt(n)
 
-        points = adapter.run(box, size, n_cells=n, max_steps=10, tol=0, seed=n).points
+        points = adapter.run(
+            box, size, n_cells=n, max_steps=10, options=clvoro.PaperOptions(tol=0), seed=n
+        ).points
     return adapter.diagram(box, points[morton_order(points)])
 
 

@@ -131,12 +131,12 @@ def meshes(adapter: clvoro.Adapter, edges: int, report: Report) -> bool:
     for name, field, arguments, targets in MESHES:
         begin = time.perf_counter()
         result = adapter.run(domain, test_field(field), **arguments)
-        found = figures(result.diagram, result.size, result.quality)
+        found = figures(result.diagram, result.target_size, result.quality)
         boundary = ~off_walls(result.diagram)
         record = {
             "row": name, "field": field, **found, "seconds": time.perf_counter() - begin,
             "boundary_cells": int(boundary.sum()),
-            "boundary_error": float(np.abs(result.error[boundary]).mean()),
+            "boundary_error": float(np.abs(result.size_error[boundary]).mean()),
             "boundary_quality": float(result.quality[boundary].mean()),
             "boundary_least": float(result.quality[boundary].min()),
             "sum": float(result.diagram.volumes.sum() / domain.measure - 1),

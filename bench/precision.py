@@ -93,7 +93,7 @@ def noise(options: Namespace) -> None:
             by = np.random.default_rng(FIRST_SEED).uniform(-off, off, result.points.shape) * h
             moved = adapter.diagram(box, np.clip(result.points + by, box.lower, box.upper))
             length = moved.volumes ** (1 / box.dim)
-            change = (length - h) / np.minimum(length, h) - result.error
+            change = (length - h) / np.minimum(length, h) - result.size_error
             print(
                 f"{box.dim}D, off by up to {off} h: e changes by {np.abs(change).mean() / (2 * off):.3f} spacings"
             )

@@ -48,7 +48,7 @@ def peak(x: np.ndarray) -> np.ndarray:
 
 
 def figures_of(result: Any, quality: float, seconds: float) -> dict[str, Any]:
-    history, error = result.history, np.abs(result.error)
+    history, error = result.history, np.abs(result.size_error)
     return {
         "cells": len(result.points), "seconds": seconds, "steps": int(history["step"][-1]),
         "start_error": float(history["mean_error"][0]), "start_max": float(history["max_error"][0]),

@@ -80,7 +80,7 @@ def measure(
         "method": method, "effort": effort, "seconds": seconds,
         "per_cell": seconds / len(result.points), "per_step": seconds / max(cost["work"], 1e-300),
         "finest_step": statistics.median(between) if len(between) else float("nan"),
-        **figures(result.diagram, result.size, result.quality), **cost,
+        **figures(result.diagram, result.target_size, result.quality), **cost,
         "iterations": int(history["iterations"].sum()),
     }  # fmt: skip
     if profiled:

@@ -48,7 +48,7 @@ DIAGRAM = {
     "face_vertices": "face_vertices",
 }
 """Arrays of a diagram: name in the file, and attribute. Diagrams in 2D and 3D lack some."""
-RESULT = {"size": "size", "error": "error", "quality": "quality", "origin": "origin"}
+RESULT = {"size": "target_size", "error": "size_error", "quality": "quality", "origin": "origin"}
 """Arrays that a result has besides."""
 
 Arrays = dict[str, np.ndarray]
@@ -134,10 +134,16 @@ def resumed(domain: Any, size: Any, rows: int, **options: Any) -> Run:
         with tempfile.TemporaryDirectory() as folder:
             state = Path(folder) / "state"
             once = adapted(
-                domain, size, callback=stop, checkpoint=state, checkpoint_every=1e9, **options
+                domain,
+                size,
+                callback=stop,
+                checkpoint=clvoro.Checkpoint(state, every=1e9),
+                **options,
             )
             once(adapter)
-            return adapted(domain, size, resume=state, **options)(adapter)
+            return adapted(domain, size, checkpoint=clvoro.Checkpoint(resume=state), **options)(
+                adapter
+            )
 
     return run
 
@@ -193,13 +199,16 @@ def box_cases() -> Iterator[Case]:
         yield Case(f"2D box, {effort}", adapted(BOX, circle(h), effort=effort))
     for method in PUBLISHED:
         yield Case(f"2D box, {method}", adapted(BOX, circle(0.02), method=method, max_steps=12))
-    yield Case("2D box, two levels", adapted(BOX, circle(0.015), levels=1))
+    yield Case(
+        "2D box, two levels",
+        adapted(BOX, circle(0.015), options=clvoro.MultilevelOptions(levels=1)),
+    )
     yield Case("2D box, exact", adapted(BOX, circle(0.03), method="exact"))
     yield Case(
         "2D box, number of cells",
         adapted(BOX, circle(0.03), n_cells=900, method="exact", effort="fast"),
     )
-    yield Case("2D box, uniform start", adapted(BOX, circle(0.03), start="uniform", effort="fast"))
+    yield Case("2D box, uniform start", adapted(BOX, circle(0.03), points="uniform", effort="fast"))
     yield Case("2D box", adapted(BOX, circle(0.03)), "float32")
     yield Case(
         "2D box, coupled", adapted(BOX, circle(0.02), method="coupled", max_steps=12), "float32"
@@ -208,7 +217,10 @@ def box_cases() -> Iterator[Case]:
         yield Case(f"3D box, {effort}", adapted(CUBE, sphere(h), effort=effort))
     for method in PUBLISHED:
         yield Case(f"3D box, {method}", adapted(CUBE, sphere(0.09), method=method, max_steps=4))
-    yield Case("3D box, two levels", adapted(CUBE, sphere(0.06), levels=1))
+    yield Case(
+        "3D box, two levels",
+        adapted(CUBE, sphere(0.06), options=clvoro.MultilevelOptions(levels=1)),
+    )
     yield Case("3D box, exact", adapted(CUBE, sphere(0.09), method="exact", effort="fast"))
     yield Case("3D box, fast", adapted(CUBE, sphere(0.08), effort="fast"), "float32")
 
@@ -220,8 +232,14 @@ def periodic_cases() -> Iterator[Case]:
         yield Case("2D periodic", adapted(PERIODIC, spot, effort="fast"), dtype)
         yield Case("3D periodic", adapted(PERIODIC_CUBE, ball, effort="fast"), dtype)
     yield Case("2D periodic, exact", adapted(PERIODIC, spot, method="exact"))
-    yield Case("2D periodic, three levels", adapted(PERIODIC, 0.02, levels=2, effort="fast"))
-    yield Case("3D periodic, two levels", adapted(PERIODIC_CUBE, 0.08, levels=1, effort="fast"))
+    yield Case(
+        "2D periodic, three levels",
+        adapted(PERIODIC, 0.02, options=clvoro.MultilevelOptions(levels=2), effort="fast"),
+    )
+    yield Case(
+        "3D periodic, two levels",
+        adapted(PERIODIC_CUBE, 0.08, options=clvoro.MultilevelOptions(levels=1), effort="fast"),
+    )
     yield Case("2D periodic, coupled", adapted(PERIODIC, spot, method="coupled", max_steps=12))
     yield Case("2D periodic channel", adapted(CHANNEL, spot))
     yield Case("3D periodic channel", adapted(CHANNEL_3D, ball, effort="fast"))
@@ -233,7 +251,10 @@ def polygon_cases() -> Iterator[Case]:
     shore = sizing.Distance(COAST.boundary(), h_min=0.012, slope=0.3)
     yield Case("polygon, outer ring clockwise", adapted(LAKE_REVERSED, 0.03))
     yield Case("polygon, exact", adapted(LAKE, 0.03, method="exact", effort="fast"))
-    yield Case("polygon, two levels", adapted(LAKE, 0.015, levels=1, effort="fast"))
+    yield Case(
+        "polygon, two levels",
+        adapted(LAKE, 0.015, options=clvoro.MultilevelOptions(levels=1), effort="fast"),
+    )
     yield Case("polygon, coupled", adapted(LAKE, 0.03, method="coupled", max_steps=12))
     yield Case("polygon, edges finer than cells", adapted(COAST, shore, effort="fast"))
     yield Case("polygon, several pieces", adapted(PIECES, 0.04, effort="fast"))

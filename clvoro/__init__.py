@@ -7,21 +7,22 @@ Voronoi diagram are moved, inserted and deleted until its cells have that size a
 >>> from clvoro import sizing
 >>> domain = clvoro.Box((0, 0), (2, 1))
 >>> size = sizing.Distance(sizing.Circle((0.7, 0.5), radius=0.2), h_min=0.05, slope=0.3)
->>> adapter = clvoro.Adapter(clvoro.create_context())  # the best device that works
->>> result = adapter.run(domain, size, effort="fast", seed=7)
->>> bool(abs(result.diagram.volumes.sum() - domain.measure) < 1e-12)
+>>> mesh = clvoro.adapt(domain, size, "fast")
+>>> bool(abs(mesh.diagram.volumes.sum() - domain.measure) < 1e-12)
 True
 
 Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls. Sizes:
-numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`. `Adapter.run` gives a `Result` (and
-`Adapter.diagram` a `Diagram` alone): arrays, `save`, `plot`, `check`, `transfer`; `load` reads it again. Errors and
-warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
-``clvoro``; begin with ``clvoro --help``.
+numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`. `adapt` returns a `Result`, `voronoi` a `Diagram`
+of given generators; both have arrays, `save`, `plot`, `check` and `transfer`, and `load` reads a saved result.
+`Adapter` is the full interface, on a device of your choice, with `MultilevelOptions`, `PaperOptions` and `Checkpoint`;
+Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors and warnings are in `clvoro.errors`, pictures in
+`clvoro.plotting`, times of kernels in `clvoro.profile`. The command is ``clvoro``; begin with ``clvoro --help``.
 """
 
 from . import sizing
-from .adapter import Adapter
-from .errors import ClvoroError
+from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
+from .adapter import Adapter, adapt, voronoi
+from .errors import ClvoroError, Interrupted
 from .geometry.boundary_layers import Layers
 from .geometry.box import Box
 from .geometry.polygon import Polygon
@@ -35,15 +36,21 @@ __version__ = "0.1.0"
 __all__ = [
     "Adapter",
     "Box",
+    "Checkpoint",
     "ClvoroError",
     "Diagram",
     "Displacements",
+    "Interrupted",
     "Layers",
+    "MultilevelOptions",
+    "PaperOptions",
     "Polygon",
     "Result",
+    "adapt",
     "create_context",
     "list_devices",
     "load",
     "profile",
     "sizing",
+    "voronoi",
 ]

@@ -1,25 +1,34 @@
-"""The entry: checks what the user gives, and has the stages for it."""
+"""The entry points: `adapt` and `voronoi`, and `Adapter` with the full interface."""
 
 from __future__ import annotations
 
 import threading
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
-from typing import NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 import numpy as np
 import pyopencl as cl
 
 from .adaptation.diagnostics import warn_of_errors
 from .adaptation.estimates import check_memory, memory_needed
-from .adaptation.options import Options
+from .adaptation.loop import INTERRUPTED
+from .adaptation.options import (
+    Checkpoint,
+    EffortName,
+    MethodName,
+    MultilevelOptions,
+    Options,
+    PaperOptions,
+    Start,
+    special,
+)
 from .adaptation.preparation import Preparation
-from .adaptation.run import Files, carry_out
+from .adaptation.run import carry_out
 from .adaptation.stages import Stages
-from .arguments import Naming, check_callable, check_number, check_points
-from .errors import InputError, InputTypeError, MemoryLimitError, UnusedOptionWarning
+from .arguments import Naming, check_callable, check_choice, check_points
+from .errors import DeviceError, InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.box import Domain
 from .mesh.results import Diagram, Result
@@ -29,8 +38,8 @@ from .opencl.program import Engine
 from .tessellation.readback.fetch import fetch_diagram
 from .tessellation.tessellator import Tessellator
 
-CHECKPOINT_EVERY = 60.0
-"""Seconds from one checkpoint to the next, unless the caller says otherwise."""
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
 
 
 class Adapter:
@@ -51,8 +60,8 @@ class Adapter:
     ----------
     ctx, queue : pyopencl.Context, pyopencl.CommandQueue
     dtype : numpy.dtype
-    told : callable, optional
-        What a run calls with the bytes that it takes on the device, before it begins; see `memory_needed`.
+    on_memory : callable, optional
+        Called by a run, before it begins, with the bytes that it needs on the device; see `memory_needed`.
 
     Raises
     ------
@@ -70,7 +79,11 @@ class Adapter:
     True
     """
 
-    def __init__(self, ctx: cl.Context | None = None, dtype: object = "float64") -> None:
+    def __init__(
+        self,
+        ctx: cl.Context | None = None,
+        dtype: Literal["float64", "float32"] | DTypeLike = "float64",
+    ) -> None:
         try:
             real = np.dtype(dtype)  # type: ignore[arg-type]
         except TypeError:
@@ -83,7 +96,7 @@ class Adapter:
                 "clvoro.create_context(device), with a device or a part of its name"
             )
         check_process()
-        self.ctx = device.create_context() if ctx is None else ctx
+        self.ctx = device.create_context(fp64=real == np.float64) if ctx is None else ctx
         self.dtype = real
         if real == np.float64:
             device.require_fp64(self.ctx)
@@ -92,7 +105,7 @@ class Adapter:
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
-        self.told: Callable[[float], object] | None = None
+        self.on_memory: Callable[[float], object] | None = None
 
     def __repr__(self) -> str:
         return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
@@ -166,10 +179,10 @@ class Adapter:
             self._stages[kind] = Stages(engine)
         return self._stages[kind]
 
-    def diagram(self, domain: Domain, points: np.ndarray) -> Diagram:
-        """Tessellate `domain` by `points`.
+    def diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
+        """Return the Voronoi diagram of `points` in `domain`.
 
-        To save or plot such a diagram, with sizes beside it, take no step from the points:
+        To have target sizes beside it, take no step from the points:
         ``run(domain, size, points=points, method="lloyd", max_steps=0)``.
 
         Parameters
@@ -199,7 +212,7 @@ class Adapter:
         with self._alone():
             return self._diagram(domain, points)
 
-    def _diagram(self, domain: Domain, points: np.ndarray) -> Diagram:
+    def _diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
@@ -217,24 +230,18 @@ class Adapter:
         self,
         domain: Domain,
         size: object,
-        points: np.ndarray | None = None,
-        method: str = "adaptive",
+        points: ArrayLike | Start = "density",
+        method: MethodName = "adaptive",
         n_cells: int | None = None,
-        start: str = "density",
-        max_steps: int | None = None,
-        tol: float = 1e-3,
-        alpha: float | None = None,
-        k: float = 0.5,
-        seed: int = 0,
-        callback: Callable[[np.void], object] | None = None,
         *,
-        effort: str = "default",
-        levels: int | str = "auto",
-        error_target: float | None = None,
+        effort: EffortName = "default",
         layers: Layers | Sequence[Layers] = (),
-        checkpoint: str | PathLike[str] | None = None,
-        checkpoint_every: float = CHECKPOINT_EVERY,
-        resume: str | PathLike[str] | None = None,
+        seed: int = 0,
+        max_steps: int | None = None,
+        options: MultilevelOptions | PaperOptions | None = None,
+        checkpoint: str | PathLike[str] | Checkpoint | None = None,
+        callback: Callable[[np.void], object] | None = None,
+        on_interrupt: Literal["raise", "return"] = "raise",
     ) -> Result:
         """Adapt generators until their cells have the target size and a good shape.
 
@@ -242,56 +249,43 @@ class Adapter:
         ----------
         domain : Box or Polygon
         size : number, callable or clvoro.sizing field
-            Target size h(x) > 0: a cell of the right size has volume h^d. A callable takes points (n, d), returns
-            (n,), and is evaluated on the host: each step then moves all points there and back.
-        points : (n, d) array, optional
-            Generators to start from. "adaptive" and "exact" only correct and polish a finished mesh that is near
-            `size` already (mean |e| up to 0.15, count off by 2 % at most, cells as good as the effort makes them), as
-            after the field has moved by a few cells; any others take the whole way.
+            Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable
+            takes points (n, d), returns (n,), and is evaluated on the host: each step then moves all points there and
+            back.
+        points : (n, d) array of float, "density" or "uniform"
+            Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
+            the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
+            already (mean |e| up to 0.15, count off by 2 % at most, cells as good as the effort makes them), as after
+            the size field has moved by a few cells; from any other they take the whole way.
         method : str
-            "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the
-            right size; "exact" lets every cell take the size asked for, to about 1e-4. The others repeat one kind of
-            step: "lloyd", "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density
-            h^-d (see `clvoro.adaptation.methods`).
+            "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
+            size. "exact" gives every cell its target size, to about 1e-4. The others repeat one kind of step: "lloyd",
+            "poisson" and "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d (see
+            `clvoro.adaptation.methods`).
         n_cells : int, optional
             Number of generators; by default the integral of h^-d over the domain. "adaptive" and "exact" end with
-            exactly that many; they scale the size field by the common factor at which the mean of log(L / h) vanishes,
+            exactly that many. They scale the size field by a common factor so that the mean of log(L / h) vanishes,
             and report it as ``Result.size_factor``.
-        start : "density" or "uniform"
-            Random generators with density h^-d, or uniform (the paper's).
-        max_steps : int, optional
-            Most steps, over all levels. By default 100, or what the plan of "adaptive" and "exact" takes.
-        tol : float
-            Stop when mean error and mean quality have improved by less than this share over ten steps;
-            0 takes all steps. Not of "adaptive" and "exact", which end with their plan.
-        alpha, k : float
-            Of the paper's (3.4), (3.5), for methods that repeat one kind of step: largest relaxation coefficient of the
-            correction (by default d; not of the weighted ones), and bound of its length over h ("weighted-lloyd" and
-            "weighted": of the whole displacement's). "lloyd" reports such a correction, and does not move by it.
-        seed : int
-            Of the random start.
-        callback : callable, optional
-            Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...); the
-            run stops when it returns True.
         effort : "fast", "default" or "best"
-            Work that "adaptive" and "exact" take.
-        levels : int or "auto"
-            Coarser levels that "adaptive" and "exact" begin with: 2^levels h. From the caller's `points` it is the
-            number of refinements that lead from them to the finest level.
-        error_target : float, optional
-            Mean |log(L / h)| that the last steps of "adaptive" aim at, as do those of "exact" before its projection, by
-            default .0025 (.0035 for "fast", .0039 for "best"). The larger, the better the cells' shape.
-        layers : Layers or sequence of them
-            Rows of generators along walls, in 2D, that stay where they are: the first of the result. Beyond them sizes
-            are bounded by what grows from there; see `Layers`. Their cells count as being of the right size.
-        checkpoint : path, optional
-            File to which the run's state is written every so often, and where the callback stops it. It is replaced
-            at one stroke: whenever the process dies, the file is a whole one. No file but a checkpoint is replaced.
-        checkpoint_every : float
-            Seconds from one checkpoint to the next; 0: after every step.
-        resume : path, optional
-            Checkpoint to go on from, given the same other arguments as that run. On the same device the run ends as
-            it would have, bit for bit (seconds apart).
+            Amount of work of "adaptive" and "exact".
+        layers : Layers or sequence of Layers
+            Rows of generators along walls, in 2D, that do not move: the first rows of the result. Beyond them the
+            sizes grow gradually from the size of the layers; see `Layers`. Their cells count as having the right size.
+        seed : int
+            Seed of the random start.
+        max_steps : int, optional
+            Largest number of steps, over all levels. By default 100, or all steps of the plan of "adaptive" and
+            "exact".
+        options : MultilevelOptions or PaperOptions, optional
+            Further options: `MultilevelOptions` for "adaptive" and "exact", `PaperOptions` for the other methods.
+        checkpoint : path or Checkpoint, optional
+            File to which the state of the run is written once per minute. `Checkpoint` chooses the interval, and
+            continues a run.
+        callback : callable, optional
+            Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...). The
+            run stops if it returns True.
+        on_interrupt : "raise" or "return"
+            What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
 
         Returns
         -------
@@ -300,92 +294,78 @@ class Adapter:
         Raises
         ------
         InputError, InputTypeError
-            If an argument is not as expected, or the checkpoint is damaged or of another run.
+            If an argument is not as expected, or the checkpoint is damaged or belongs to another run.
         SizeFieldError
             If h is not positive and finite somewhere; names the place.
         MemoryLimitError
-            If the run would need more memory than the device has.
+            If the run needs more memory than the device has.
         SolverError
             If a linear solve breaks down.
+        Interrupted
+            On Ctrl-C: a `KeyboardInterrupt` with the result so far.
 
         Warns
         -----
         CheckpointWarning
-            If a checkpoint cannot be written, as the disk is full; the run goes on, and the one before stays.
+            If a checkpoint cannot be written, for example on a full disk. The run continues, and the previous
+            checkpoint is kept.
         MisfitWarning, CoarseSizeWarning
-            If a part of the input hardly meets the domain, as in another unit of length.
+            If a part of the input hardly meets the domain, for example in another unit of length.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.
         SizeErrorWarning
-            If the sizes of a mesh that "adaptive" or "exact" has finished are far from those asked for.
+            If the cells of a mesh that "adaptive" or "exact" has finished are far from their target sizes.
         UnusedOptionWarning
-            If an option is given that the method does not use, or `checkpoint_every` without a `checkpoint`.
+            If an option is given that the method does not use.
         """
-        options = Options(
-            method=method, start=start, effort=effort, levels=levels, seed=seed, tol=tol, k=k, alpha=alpha,
-            max_steps=max_steps, n_cells=n_cells, error_target=error_target,
-            layers=layers,  # type: ignore[arg-type]
+        start, given = _generators(points)
+        merged = Options(
+            method=method, start=start, effort=effort, seed=seed, max_steps=max_steps, n_cells=n_cells, layers=layers,
+            **special(options),
         )  # fmt: skip
-        if callback is not None and not callable(callback):
-            raise InputTypeError(
-                f"callback is {callback!r} of type {type(callback).__name__}, expected a function "
-                "of a row of the history"
-            )
-        if callback is not None:
-            check_callable(
-                "callback", callback, "a row of the history", "write lambda row: callback(...)"
-            )
-        if isinstance(size, Domain) and not isinstance(domain, Domain):
-            raise InputTypeError(
-                f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: "
-                "run(domain, size)"
-            )
-        every = check_number("checkpoint_every", checkpoint_every, least=0)
-        if checkpoint is None and every != CHECKPOINT_EVERY:
-            warnings.warn(
-                f"checkpoint_every is {every:g}, and no file to write to is given: say checkpoint=path",
-                UnusedOptionWarning,
-                stacklevel=2,
-            )
+        check_choice("on_interrupt", on_interrupt, ("raise", "return"))
+        _check_run(domain, size, callback)
+        files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
         with self._alone():
             for kept in self._stages.values():
-                kept.release()  # a diagram's buffers, or a failed run's, are not part of what this one takes
+                kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
             stages = self._stages_for(domain)
-            host = None if points is None else check_points(points, domain)
+            host = None if given is None else check_points(given, domain)
             result = carry_out(
-                stages, domain, size, host, options, Files(checkpoint, every, resume),
-                self._shown(callback), self.told,
-            )  # fmt: skip
-        if options.planned and result.converged:
-            warn_of_errors(result, stacklevel=2)
+                stages, domain, size, host, merged, files, self._shown(callback), self.on_memory
+            )
+        if result.stop_reason == INTERRUPTED and on_interrupt == "raise":
+            raise Interrupted(result)
+        if merged.multilevel and result.converged:
+            warn_of_errors(result)
         return result
 
     def memory_needed(
         self,
         domain: Domain,
         size: object,
-        points: np.ndarray | None = None,
-        method: str = "adaptive",
+        points: ArrayLike | Start = "density",
+        method: MethodName = "adaptive",
         n_cells: int | None = None,
         *,
-        levels: int | str = "auto",
         layers: Layers | Sequence[Layers] = (),
+        options: MultilevelOptions | PaperOptions | None = None,
     ) -> float:
-        """Return how many bytes `run` takes on the device with these arguments, as it is told before it begins.
+        """Estimate the bytes that `run` needs on the device with these arguments.
 
-        A run does not exceed it by more than a tenth. Where sizes change several-fold from one cell to the next it may
-        take a fifth less, at seams of periodic boxes up to three fifths. Reading all arrays of the diagram afterwards
-        is allowed for: in 3D it takes more than the run.
+        A run needs at most a tenth more. Where sizes change several-fold from one cell to the next it may need a fifth
+        less, at seams of periodic boxes up to three fifths less. The estimate includes reading all arrays of the
+        diagram afterwards: in 3D that needs more than the run.
 
         Parameters
         ----------
-        domain, size, points, method, n_cells, levels, layers
+        domain, size, points, method, n_cells, layers, options
             As those of `run`.
 
         Raises
         ------
         MemoryLimitError
-            If the device has not as much; says how much it would be.
+            If the device has less; names the estimate.
         InputError, InputTypeError, SizeFieldError
             As `run` does.
 
@@ -396,8 +376,150 @@ class Adapter:
         >>> 4e6 < bytes_ < 5e6
         True
         """
-        options = Options(method=method, n_cells=n_cells, levels=levels, layers=layers)  # type: ignore[arg-type]
+        start, given = _generators(points)
+        merged = Options(
+            method=method, start=start, n_cells=n_cells, layers=layers, **special(options)
+        )
         with self._alone():
             stages = self._stages_for(domain)
-            host = None if points is None else check_points(points, domain)
-            return Preparation(stages, domain, size, host, options).memory
+            host = None if given is None else check_points(given, domain)
+            return Preparation(stages, domain, size, host, merged).memory
+
+
+def _generators(points: ArrayLike | Start) -> tuple[str, ArrayLike | None]:
+    """Return how a random start is distributed, and the caller's generators if they are not random."""
+    return (points, None) if isinstance(points, str) else ("density", points)
+
+
+def _check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
+    """Check the kinds of arguments before a run begins."""
+    if callback is not None and not callable(callback):
+        raise InputTypeError(
+            f"callback is {callback!r} of type {type(callback).__name__}, expected a function of a row of the history"
+        )
+    if callback is not None:
+        check_callable(
+            "callback", callback, "a row of the history", "write lambda row: callback(...)"
+        )
+    if isinstance(size, Domain) and not isinstance(domain, Domain):
+        raise InputTypeError(
+            f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, size)"
+        )
+
+
+_shared: Adapter | None = None
+_sharing = threading.Lock()
+
+
+def shared_adapter() -> Adapter:
+    """Return the adapter of `adapt` and `voronoi`, on the best device; it is created by the first call.
+
+    It computes in float64, or in float32 if no device computes in float64.
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    """
+    global _shared
+    with _sharing:
+        if _shared is None:
+            try:
+                _shared = Adapter()
+            except DeviceError:
+                _shared = Adapter(dtype="float32")
+        return _shared
+
+
+def adapt(
+    domain: Domain,
+    size: object,
+    effort: EffortName = "default",
+    *,
+    points: ArrayLike | Start = "density",
+    method: MethodName = "adaptive",
+    n_cells: int | None = None,
+    layers: Layers | Sequence[Layers] = (),
+    seed: int = 0,
+    callback: Callable[[np.void], object] | None = None,
+) -> Result:
+    """Mesh `domain` by Voronoi cells of the target size, on the best device.
+
+    All calls share one adapter, in float64 where a device has it. Calls from several threads wait for each other. For
+    a device, a precision or further options of your own use ``clvoro.Adapter(ctx, dtype).run(...)``.
+
+    Parameters
+    ----------
+    domain : Box or Polygon
+    size : number, callable or clvoro.sizing field
+        Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d.
+    effort : "fast", "default" or "best"
+        Amount of work.
+    points : (n, d) array of float, "density" or "uniform"
+        Generators to start from: those of the array, random ones with density h^-d, or uniform random ones.
+    method : str
+        "adaptive" for good cells of the right size, "exact" for cells that have it to about 1e-4; for the others see
+        `Adapter.run`.
+    n_cells : int, optional
+        Number of cells; by default what the size field asks for.
+    layers : Layers or sequence of Layers
+        Boundary layers, in 2D.
+    seed : int
+        Seed of the random start.
+    callback : callable, optional
+        Called with each new row of the history; the run stops if it returns True.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    Interrupted
+        On Ctrl-C: a `KeyboardInterrupt` with the result so far.
+    InputError, InputTypeError, SizeFieldError, MemoryLimitError, SolverError
+        As `Adapter.run`.
+
+    Examples
+    --------
+    >>> mesh = clvoro.adapt(clvoro.Box((0, 0), (2, 1)), lambda p: 0.05 + 0.1 * p[:, 0], "fast")
+    >>> bool(abs(mesh.diagram.volumes.sum() - 2) < 1e-12), bool(abs(mesh.size_error).mean() < 0.05)
+    (True, True)
+    """
+    return shared_adapter().run(
+        domain, size, points, method, n_cells, effort=effort, layers=layers, seed=seed, callback=callback
+    )  # fmt: skip
+
+
+def voronoi(domain: Domain, points: ArrayLike) -> Diagram:
+    """Return the Voronoi diagram of `points` in `domain`, computed on the best device.
+
+    Parameters
+    ----------
+    domain : Box or Polygon
+    points : (n, d) array of float
+        Distinct generators inside the domain, walls included, in the domain's unit of length.
+
+    Returns
+    -------
+    Diagram
+        Row i belongs to ``points[i]``.
+
+    Raises
+    ------
+    DeviceError
+        If no device works.
+    InputError, InputTypeError
+        If the points are not as expected, or too close together for the precision.
+    MemoryLimitError
+        If the device has not enough memory.
+
+    Examples
+    --------
+    >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)]
+    >>> clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).volumes.round(3).tolist()
+    [0.391, 0.275, 0.334]
+    """
+    return shared_adapter().diagram(domain, points)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import sys
+import warnings
 from collections.abc import Callable
 from os import fsdecode, fsencode, fspath
 from typing import TYPE_CHECKING
@@ -13,6 +15,15 @@ from .errors import InputError, InputTypeError
 
 if TYPE_CHECKING:
     from .geometry.box import Domain
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Warn at the line outside of clvoro from which its function was called."""
+    frame, level = sys._getframe(1), 2
+    package = __name__.partition(".")[0]
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == package:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 def check_points(points: object, domain: Domain) -> np.ndarray:

@@ -1,4 +1,11 @@
-"""Errors that clvoro raises; all derive from `ClvoroError`."""
+"""Errors that clvoro raises; all derive from `ClvoroError`, but for `Interrupted`, and warnings."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .mesh.results import Result
 
 
 class ClvoroError(Exception):
@@ -37,8 +44,34 @@ class SolverError(ClvoroError, ArithmeticError):
     """A linear solve broke down (not positive definite, or not finite)."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a run. It carries the mesh so far, of the size and the number of cells that were requested.
+
+    Attributes
+    ----------
+    result : Result
+        Its `stop_reason` is "interrupted". Its quality and errors are those of an unfinished run.
+
+    Examples
+    --------
+    >>> def press(row):
+    ...     if row["step"] == 3:
+    ...         raise KeyboardInterrupt  # as Ctrl-C does
+    >>> try:
+    ...     mesh = clvoro.adapt(clvoro.Box((0, 0), (1, 1)), 0.1, "fast", callback=press)
+    ... except clvoro.Interrupted as interrupted:
+    ...     mesh = interrupted.result
+    >>> mesh.stop_reason
+    'interrupted'
+    """
+
+    def __init__(self, result: Result) -> None:
+        super().__init__("interrupted: the mesh so far is in the exception's attribute `result`")
+        self.result = result
+
+
 class Aborted(BaseException):
-    """The user wants to quit at once; unlike KeyboardInterrupt, which a run answers with what it has so far."""
+    """The user quits at once. A run does not catch it, unlike KeyboardInterrupt."""
 
 
 class CheckpointWarning(UserWarning):

@@ -345,11 +345,11 @@ kernel void solve_by_group(int n, int from_zero, int center, int max_iterations,
         running = end > 0 && partial[CURVATURE] > 0 && k + 1 < max_iterations;
     }
     barrier(CLK_GLOBAL_MEM_FENCE);
-    const int centerd = center ? n : 0;
+    const int centered = center ? n : 0;
     Sum sum = SUM_ZERO;
-    for (BLOCK_LOOP(i, centerd))
+    for (BLOCK_LOOP(i, centered))
         sum_add(&sum, x[i]);
     const REAL mean = group_sum(sum.value, scratch) / n;
-    for (BLOCK_LOOP(j, centerd))
+    for (BLOCK_LOOP(j, centered))
         x[j] -= mean;
 }

@@ -13,14 +13,13 @@ import hashlib
 import json
 import os
 import time
-import warnings
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arguments import check_path
+from ..arguments import check_path, warn
 from ..errors import CheckpointWarning, InputError, OutputError
 from ..mesh.results import Displacements
 from ..tessellation.cells import Cells
@@ -81,10 +80,9 @@ class Checkpointer:
         try:
             self.write(loop)
         except OutputError as error:
-            warnings.warn(
+            warn(
                 f"{error}. The run goes on without this checkpoint; the one before is as it was",
                 CheckpointWarning,
-                stacklevel=2,
             )
         self._last = time.monotonic()
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
 
+from ..arguments import warn
 from ..errors import MisfitWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.box import Domain
@@ -21,19 +21,17 @@ SAMPLE = 64
 MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
 """Of finished meshes of fields that cells can follow means of |e| are 0.02 at most, and the largest 0.3; where sizes
 jump 1 : 2 from one cell to the next, the largest is 1."""
+STEEP = 1.25
+"""Ratio of sizes of adjacent cells from which on their change is why a cell does not have its size."""
 
 
-def warn_of_misfits(
-    field: Field, domain: Domain, layers: Sequence[Layers], stacklevel: int
-) -> None:
+def warn_of_misfits(field: Field, domain: Domain, layers: Sequence[Layers]) -> None:
     """Warn of each part of the input that hardly meets `domain`, or of layers that hardly meet `field`.
 
     Parameters
     ----------
     field : Field
         As the caller gave it, without what layers add to it.
-    stacklevel : int
-        Of the caller that is to see it, as `warnings.warn` would take it there.
 
     Warns
     -----
@@ -43,7 +41,7 @@ def warn_of_misfits(
     for k, layer in enumerate(layers):
         found += misfits_of_layer(f"layers[{k}]", layer, field, domain)
     for text in found:
-        warnings.warn(text, MisfitWarning, stacklevel=stacklevel + 1)
+        warn(text, MisfitWarning)
 
 
 def misfits_of_layer(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
@@ -72,30 +70,37 @@ def misfits_of_layer(name: str, layer: Layers, field: Field, domain: Domain) -> 
     return []
 
 
-def warn_of_errors(result: Result, stacklevel: int) -> None:
-    """Warn if the mesh of a run whose plan is completed does not meet its size field, and of where it does so least.
-
-    Parameters
-    ----------
-    stacklevel : int
-        As in `warn_of_misfits`.
+def warn_of_errors(result: Result) -> None:
+    """Warn if the mesh of a run whose plan is completed does not meet its size field, and say where it does so least.
 
     Warns
     -----
     SizeErrorWarning
     """
-    amounts = np.abs(result.error)
+    amounts = np.abs(result.size_error)
     worst = int(amounts.argmax())
     mean, largest = float(amounts.mean()), float(amounts[worst])
     if mean < MEAN_ERROR and largest < LARGEST_ERROR:
         return
+    diagram, sizes = result.diagram, result.target_size
+    wanted, made = float(sizes[worst]), float(diagram.volumes[worst]) ** (1 / diagram.domain.dim)
+    if len(diagram) == 1 and 2 * made**diagram.domain.dim < wanted**diagram.domain.dim:
+        return  # `CoarseSizeWarning` says it before the run
     place = ", ".join(f"{x:.6g}" for x in result.points[worst])
-    asked = float(result.size[worst])
-    made = float(result.diagram.volumes[worst]) ** (1 / result.points.shape[1])
-    warnings.warn(
+    row = diagram.neighbors[diagram.neighbor_starts[worst] : diagram.neighbor_starts[worst + 1]]
+    beside = sizes[[worst, *row[row >= 0]]]
+    if beside.max() > STEEP * beside.min():
+        why = (
+            "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
+            "sizing.Graded(size, growth=1.2), or use more cells"
+        )
+    else:
+        why = (
+            f"the domain has a measure of {diagram.domain.measure:.6g}, which cells of this size do not fill evenly: "
+            "use smaller sizes, or n_cells, which scales the sizes to a number of cells"
+        )
+    warn(
         f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at ({place}) has the size "
-        f"{made:.3g} where {asked:.3g} is asked for; sizes change there by more than cells can follow from one to the "
-        "next: bound their growth, as by sizing.Graded(size, growth=1.2), or use more cells",
+        f"{made:.3g} where the size field is {wanted:.3g}; {why}",
         SizeErrorWarning,
-        stacklevel=stacklevel + 1,
     )

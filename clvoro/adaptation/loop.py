@@ -26,6 +26,7 @@ LESS, MOST_SWINGS = 0.9, 2
 """Where a count comes to be too large after it has been too small, or the other way round, it has at most this share of
 the cells missing that it has had at best; the second time that it has not, it is left at that. Counts of smooth fields
 swing once on their way."""
+INTERRUPTED = "interrupted"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 """Why runs end that have converged."""
 
@@ -122,7 +123,7 @@ class Loop:
             else:
                 reason = self.why_ended(stop, over=True)
         except KeyboardInterrupt:
-            reason = "interrupted"
+            reason = INTERRUPTED
             self.mesh.update()
         # Whatever stopped the run, the mesh has the size and the count that were asked for.
         while self.level > 0:
@@ -348,8 +349,8 @@ class Loop:
         result = Result(
             points=diagram.points,
             diagram=diagram,
-            size=size,
-            error=error,
+            target_size=size,
+            size_error=error,
             quality=quality,
             # With the type it need not be found out from all of them.
             history=np.concatenate(self.rows, dtype=HISTORY_DTYPE),

@@ -1,116 +1,286 @@
-"""What a run is asked for: options, checked as they are made, and which of them matter to which method."""
+"""Options of a run, checked when they are made, and the methods that use each of them."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from numbers import Real
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arguments import check_choice, check_integer, check_number
-from ..errors import InputTypeError, UnusedOptionWarning
+from ..arguments import check_choice, check_integer, check_number, check_path, warn
+from ..errors import InputError, InputTypeError, UnusedOptionWarning
 from ..geometry.boundary_layers import Layers
 from .methods import PUBLISHED
-from .schedule import EFFORTS
 
-_PLANNED = ("adaptive", "exact")
-METHODS = (*_PLANNED, *PUBLISHED)
-STARTS = ("density", "uniform")
+MethodName = Literal[
+    "adaptive", "exact", "lloyd", "poisson", "coupled", "weighted-lloyd", "weighted"
+]
+EffortName = Literal["fast", "default", "best"]
+Start = Literal["density", "uniform"]
+METHODS, EFFORTS, STARTS = get_args(MethodName), get_args(EffortName), get_args(Start)
+_MULTILEVEL = ("adaptive", "exact")
 _MOST_STEPS = 10**6  # of a run: its plan, which names each, and its history are lists
 
 _USERS = {
-    "effort": _PLANNED,
-    "levels": _PLANNED,
-    "error_target": _PLANNED,
+    "effort": _MULTILEVEL,
+    "levels": _MULTILEVEL,
+    "error_target": _MULTILEVEL,
     "tol": PUBLISHED,
     "alpha": ("lloyd", "poisson", "coupled"),  # "lloyd" reports the correction that it leaves out
     "k": PUBLISHED,
 }
-"""Methods that an option matters to, where it does not to all: without it they do and report something else."""
-_AS_IT_IS = {"tol": 0, "levels": 0}
-"""Values of these that ask for what the other methods do anyway: take all steps, begin on no coarser level."""
+"""Options that only some methods use, and these methods."""
+_WITHOUT_EFFECT = {"tol": 0, "levels": 0}
+"""Values that ask the other methods for what they do anyway: take all steps, begin on no coarser level."""
+
+_NUMBERS: dict[str, Callable[[str, object], float]] = {
+    "levels": partial(check_integer, least=0, beside="'auto'"),
+    "error_target": partial(check_number, above=0),
+    "tol": partial(check_number, least=0),
+    "alpha": partial(check_number, above=0),
+    "k": partial(check_number, above=0),
+    "seed": partial(check_integer, least=0, most=np.inf),
+    "max_steps": partial(check_integer, least=0, most=_MOST_STEPS),
+    "n_cells": partial(check_integer, least=1),
+    "every": partial(check_number, least=0),
+}
+
+
+def _check_numbers(options: Any) -> None:
+    """Replace the numbers among the fields of `options` by checked ones."""
+    for option in fields(options):
+        value = getattr(options, option.name)
+        absent = value is None or (isinstance(value, str) and value == "auto")
+        if option.name in _NUMBERS and not (absent and value == option.default):
+            object.__setattr__(options, option.name, _NUMBERS[option.name](option.name, value))
 
 
 @dataclass(frozen=True)
-class Options:
-    """What `Adapter.run` was asked for; see there. `levels` awaits the number of cells.
+class MultilevelOptions:
+    """Options of the methods "adaptive" and "exact", which go from coarse to fine levels.
+
+    Parameters
+    ----------
+    levels : int or "auto"
+        Number of coarser levels before the finest one. Level l has the size 2^l h. With generators of the caller it is
+        the number of refinements that lead from them to the finest level.
+    error_target : float, optional
+        Mean |log(L / h)| that the last steps aim at; a larger one gives cells of a better shape. The default is .0025
+        (effort "fast": .0035, "best": .0039).
 
     Raises
     ------
     InputError, InputTypeError
-        If they are not as they should be.
+        If `levels` is no integer >= 0, or `error_target` is not positive and finite.
+
+    Examples
+    --------
+    >>> options = clvoro.MultilevelOptions(levels=0, error_target=0.01)
+    >>> clvoro.Adapter().run(clvoro.Box((0, 0), (1, 1)), 0.1, options=options).settings["levels"]
+    0
+    """
+
+    levels: int | Literal["auto"] = "auto"
+    error_target: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+
+
+@dataclass(frozen=True)
+class PaperOptions:
+    """Options of the methods that repeat one kind of step: the paper's and the weighted ones.
+
+    Parameters
+    ----------
+    tol : float
+        Stop when mean error and mean quality have improved by less than this share over ten steps. With 0 the run
+        takes all steps.
+    alpha : float, optional
+        Largest relaxation coefficient of the correction, in the paper's (3.4); by default d. The weighted methods do
+        not use it.
+    k : float
+        Bound of the correction's length over h, in the paper's (3.5). "weighted-lloyd" and "weighted" bound the whole
+        displacement.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If `tol` is negative, `alpha` or `k` is not positive, or one of them is no finite number.
+
+    Examples
+    --------
+    >>> options = clvoro.PaperOptions(tol=0, alpha=1, k=0.3)
+    >>> result = clvoro.Adapter().run(
+    ...     clvoro.Box((0, 0), (1, 1)), 0.1, method="coupled", max_steps=5, options=options
+    ... )
+    >>> result.settings["k"]
+    0.3
+    """
+
+    tol: float = 1e-3
+    alpha: float | None = None
+    k: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A file from which a run continues after the process has ended.
+
+    The file is replaced only when the new one is complete. Only checkpoints are replaced, no other file.
+
+    Parameters
+    ----------
+    path : path, optional
+        File that the run writes every so often, and when its callback stops it. With None nothing is written.
+    every : float
+        Seconds between two checkpoints; 0 writes one after every step.
+    resume : path or True, optional
+        Checkpoint to continue from; True takes `path`, if that file exists. The other arguments of the run must be the
+        same as before. On the same device the run then ends with the same bits (`seconds` in the history apart).
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If `every` is negative, or `resume` is True without a `path`.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "run.checkpoint"
+    >>> half = clvoro.Checkpoint(file, every=0, resume=True)
+    >>> box, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter()
+    >>> first = adapter.run(box, 0.2, checkpoint=half, callback=lambda row: row["step"] == 3)
+    >>> adapter.run(box, 0.2, checkpoint=half).history["step"][:4].tolist()
+    [0, 1, 2, 3]
+    """
+
+    path: str | os.PathLike[str] | None = None
+    every: float = 60.0
+    resume: str | os.PathLike[str] | Literal[True] | None = None
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+        if isinstance(self.resume, bool) and self.resume and self.path is None:
+            raise InputError(
+                "resume is True without a path, expected Checkpoint(path, resume=True) or Checkpoint(resume=path)"
+            )
+        if self.path is None and self.every != Checkpoint.every:
+            warn(
+                f"every is {self.every:g} without a path: no checkpoint is written; give Checkpoint(path, every)",
+                UnusedOptionWarning,
+            )
+
+    @property
+    def source(self) -> str | os.PathLike[str] | None:
+        """The file to continue from now, if any."""
+        if not isinstance(self.resume, bool):
+            return self.resume
+        return (
+            self.path
+            if self.resume and os.path.exists(check_path("checkpoint", self.path))
+            else None
+        )
+
+
+@dataclass(frozen=True)
+class Options:
+    """All options of a run in one place; see `Adapter.run`. `levels` is settled when the number of cells is known.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a value is not as expected.
 
     Warns
     -----
     UnusedOptionWarning
+        If an option is given that the method does not use.
     """
 
     method: str = "adaptive"
     start: str = "density"
     effort: str = "default"
-    levels: int | str = "auto"
+    levels: int | str = MultilevelOptions.levels
     seed: int = 0
-    tol: float = 1e-3
-    k: float = 0.5
+    tol: float = PaperOptions.tol
+    k: float = PaperOptions.k
     alpha: float | None = None
     max_steps: int | None = None
     n_cells: int | None = None
     error_target: float | None = None
-    layers: tuple[Layers, ...] = ()
+    layers: Layers | Sequence[Layers] = ()
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
-        check_choice("start", self.start, STARTS)
-        check_choice("effort", self.effort, tuple(EFFORTS))
-        layers: object = self.layers
+        check_choice("points", self.start, STARTS)
+        check_choice("effort", self.effort, EFFORTS)
+        layers = self.layers
         if not isinstance(layers, Layers | Sequence):
             hint = f"; write clvoro.Layers({layers!r})" if isinstance(layers, Real) else ""
             raise InputTypeError(
                 f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}"
             )
-        for name, value in self._numbers():
-            object.__setattr__(self, name, value)
+        _check_numbers(self)
         object.__setattr__(
             self, "layers", (layers,) if isinstance(layers, Layers) else tuple(layers)
         )
-        warn_of_unused(vars(self), [self.method], stacklevel=4)
-
-    def _numbers(self) -> Iterator[tuple[str, object]]:
-        """Yield the names of numbers that were given, each with what it is."""
-        if not (isinstance(self.levels, str) and self.levels == "auto"):
-            yield "levels", check_integer("levels", self.levels, 0, beside="'auto'")
-        yield "seed", check_integer("seed", self.seed, 0, np.inf)
-        yield "tol", check_number("tol", self.tol, least=0)
-        yield "k", check_number("k", self.k, above=0)
-        if self.alpha is not None:
-            yield "alpha", check_number("alpha", self.alpha, above=0)
-        if self.max_steps is not None:
-            yield "max_steps", check_integer("max_steps", self.max_steps, 0, _MOST_STEPS)
-        if self.n_cells is not None:
-            yield "n_cells", check_integer("n_cells", self.n_cells, 1)
-        if self.error_target is not None:
-            yield "error_target", check_number("error_target", self.error_target, above=0)
+        warn_of_unused(vars(self), [self.method])
 
     @property
-    def planned(self) -> bool:
-        """Whether a plan leads from coarse to fine, and not one kind of step is repeated."""
-        return self.method in _PLANNED
+    def multilevel(self) -> bool:
+        """Whether a plan leads from coarse to fine, in place of one kind of step that is repeated."""
+        return self.method in _MULTILEVEL
+
+
+def special(options: object) -> dict[str, Any]:
+    """Return the values of the `options` of `Adapter.run` by name.
+
+    Raises
+    ------
+    InputTypeError
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, MultilevelOptions | PaperOptions):
+        raise InputTypeError(
+            f"options is {options!r:.60} of type {type(options).__name__}, expected clvoro.MultilevelOptions (methods "
+            "adaptive, exact) or clvoro.PaperOptions (the other methods)"
+        )
+    return dict(vars(options))
+
+
+def arguments_of_run(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings, as a case gives them one by one, as arguments of `Adapter.run`.
+
+    The settings of one method's options become its `options`, and those of checkpoints its `checkpoint`. A start that
+    is given by its name goes where points would go.
+    """
+    given = dict(settings)
+    start = given.pop("start", None)
+    if start is not None:
+        given.setdefault("points", start)
+    for kind in (MultilevelOptions, PaperOptions):
+        mine = {f.name: given.pop(f.name) for f in fields(kind) if f.name in given}
+        if mine:
+            given["options"] = kind(**mine)
+    return given
 
 
 def uses(method: str, option: str) -> bool:
-    """Tell whether an option of a run matters to `method`."""
+    """Tell whether `method` uses an option of a run."""
     return method in _USERS.get(option, METHODS)
 
 
-def warn_of_unused(given: Mapping[str, object], methods: Sequence[str], stacklevel: int) -> None:
-    """Warn of each option that was `given`, though it matters to none of `methods`.
-
-    Parameters
-    ----------
-    stacklevel : int
-        Of the caller that is to see it, as `warnings.warn` would take it there.
+def warn_of_unused(given: Mapping[str, object], methods: Sequence[str]) -> None:
+    """Warn of each option that is `given` and that none of `methods` uses.
 
     Warns
     -----
@@ -118,14 +288,13 @@ def warn_of_unused(given: Mapping[str, object], methods: Sequence[str], stacklev
     """
     defaults = {option.name: option.default for option in fields(Options)}
     for name, value in given.items():
-        idle = name not in _USERS or value in (defaults[name], _AS_IT_IS.get(name))
+        idle = name not in _USERS or value in (defaults[name], _WITHOUT_EFFECT.get(name))
         if idle or any(uses(method, name) for method in methods):
             continue
         one = len(methods) == 1
         what = f"the method {methods[0]} does not use" if one else "none of the methods uses"
-        warnings.warn(
+        warn(
             f"{name} is {value!r}, which {what}: it is for {', '.join(_USERS[name])}; leave it out, or choose one of "
             "these methods",
             UnusedOptionWarning,
-            stacklevel=stacklevel + 1,
         )

@@ -6,11 +6,11 @@ numbers below 1. What is asked of a cell is its size, so it is the spacing over 
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..arguments import warn
 from ..errors import InputError, PrecisionWarning
 
 if TYPE_CHECKING:
@@ -67,11 +67,10 @@ def check_precision(
         )
     mean = float((spacing / h).mean())
     if ADDED * mean > MOST_ADDED or spacing > COARSE * h[least]:
-        warnings.warn(
+        warn(
             f"positions in {real} are {spacing:.3g} apart in this domain, a share of {mean:.2g} of the cells' "
             f"sizes on average ({spacing / h[least]:.2g} of the least): that alone makes a mean error of "
             f"{ADDED * mean:.2g}, and generators may come to coincide; {remedy}",
             PrecisionWarning,
-            stacklevel=4,
         )
     return mean

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import numpy as np
 
-from ..arguments import Naming
+from ..arguments import Naming, warn
 from ..errors import CoarseSizeWarning, InputError
 from ..geometry.boundary_layers import apart_from, count_rows, free_domain, place_layers
 from ..geometry.box import Domain
@@ -79,7 +78,7 @@ class Preparation:
     ) -> None:
         self.stages, self.domain, self.points, self.options = stages, domain, points, options
         n_cells, d = options.n_cells, domain.dim
-        given = points is not None and not options.planned
+        given = points is not None and not options.multilevel
         if points is not None and given and n_cells not in (None, len(points)):
             raise InputError(
                 f"n_cells is {n_cells}, but {len(points)} points are given, and method {options.method!r} "
@@ -106,7 +105,7 @@ class Preparation:
         else:
             self._tree = density_tree(self.sizing, self.free)
             asked = self._tree.integral + len(self.rows)
-        warn_of_misfits(given_field, domain, options.layers, stacklevel=4)
+        warn_of_misfits(given_field, domain, options.layers)
         self.target = n_cells if n_cells is not None else max(1, round(asked))
         if n_cells is None and asked < 0.5:
             message = (
@@ -117,17 +116,17 @@ class Preparation:
                 message += (
                     " (Coordinates that are longitudes and latitudes have to be projected first.)"
                 )
-            warnings.warn(message, CoarseSizeWarning, stacklevel=4)
+            warn(message, CoarseSizeWarning)
         most, images = max(self.target, 0 if points is None else len(points)), None
-        scaled = options.planned and n_cells is not None
+        scaled = options.multilevel and n_cells is not None
         self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
         self.levels = 0
-        if options.planned:
+        if options.multilevel:
             self.levels = self._count_levels()
             if options.levels == "auto" and most_levels is not None:
                 self.levels = min(self.levels, most_levels)
         surplus, shore = 0.0, None
-        if options.planned and self._tree is not None:
+        if options.multilevel and self._tree is not None:
             # A coarser level has steeper sizes, and hands its generators on to the next; in the plane, where there is
             # none, as many come on the finest.
             reach = self.factor * (2 if self.levels or d == 2 else 1)
@@ -215,12 +214,12 @@ class Preparation:
     @property
     def may_be_near(self) -> bool:
         """Whether the caller's points may be a mesh that only needs correction."""
-        return self.points is not None and self.options.planned and self.levels == 0
+        return self.points is not None and self.options.multilevel and self.levels == 0
 
     def plan(self, mesh: Mesh | None) -> list[Action]:
         """Return what is to be done. `mesh` (of `mesh`, as it begins) is looked at only if it `may_be_near`."""
         options = self.options
-        if not options.planned:
+        if not options.multilevel:
             relaxation = Relaxation(options.alpha, options.k)
             steps = STEPS if options.max_steps is None else options.max_steps
             return plan_steps(make_method(options.method, relaxation), steps)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,19 +13,10 @@ from ..tessellation.periodic.torus import FewCellsError
 from .checkpoint import Checkpointer
 from .fingerprint import describe
 from .loop import Loop
-from .options import Options, uses
+from .options import Checkpoint, Options, uses
 from .preparation import Preparation
 from .resume import Saved
 from .stages import Stages
-
-
-@dataclass(frozen=True)
-class Files:
-    """Checkpoints of a run: where one is written every `every` seconds, and from which it goes on, if any."""
-
-    checkpoint: str | PathLike[str] | None
-    every: float
-    resume: str | PathLike[str] | None
 
 
 def carry_out(
@@ -36,31 +25,32 @@ def carry_out(
     size: object,
     points: np.ndarray | None,
     options: Options,
-    files: Files,
+    files: Checkpoint,
     callback: Callable[[np.void], object] | None,
-    told: Callable[[float], object] | None,
+    on_memory: Callable[[float], object] | None,
 ) -> Result:
     """Return the result of a run, which has fewer coarse levels where a periodic box has too few cells around it.
 
-    `told` is called once with the bytes that it takes on the device, when that is known; `callback` with each row of
-    the history. Raises and warns as `Adapter.run` does.
+    `on_memory` is called once with the bytes that the run needs on the device, before it begins; `callback` with each
+    row of the history. Raises and warns as `Adapter.run` does.
     """
-    saved = None if files.resume is None else Saved(files.resume)
+    source = files.source
+    saved = None if source is None else Saved(source)
     made_by = {}
-    if saved is not None or files.checkpoint is not None:
+    if saved is not None or files.path is not None:
         made_by = describe(domain, vars(options), stages.engine.real, points)
     if saved is not None:
         saved.fit(made_by)
     most = None if saved is None else saved.levels
     while True:
         prepared = Preparation(stages, domain, size, points, options, most)
-        if told is not None:
-            told(prepared.memory)
-            told = None
+        if on_memory is not None:
+            on_memory(prepared.memory)
+            on_memory = None
         try:
             loop = _begin(prepared, made_by, saved, files, callback)
             return loop.run(
-                options.n_cells if options.planned else None,
+                options.n_cells if options.multilevel else None,
                 float(prepared.target),
                 _settings(prepared),
             )
@@ -74,7 +64,7 @@ def _begin(
     prepared: Preparation,
     made_by: dict,
     saved: Saved | None,
-    files: Files,
+    files: Checkpoint,
     callback: Callable[[np.void], object] | None,
 ) -> Loop:
     """Return the loop at its beginning, or where it was when it was saved."""
@@ -83,15 +73,15 @@ def _begin(
         mesh = prepared.mesh()
     plan = prepared.plan(mesh)
     writer = None
-    if files.checkpoint is not None:
-        writer = Checkpointer(files.checkpoint, files.every, made_by, plan)
+    if files.path is not None:
+        writer = Checkpointer(files.path, files.every, made_by, plan)
     if saved is not None:
         mesh = None  # and with it the room that the one from there takes
         mesh = saved.restore(
             prepared.stages, prepared.domain, prepared.sizing, plan, prepared.free, len(prepared.rows)
         )  # fmt: skip
     assert mesh is not None
-    tol = None if options.planned else options.tol
+    tol = None if options.multilevel else options.tol
     loop = Loop(mesh, plan, prepared.levels, options.max_steps, tol, callback)
     loop.checkpoint = writer
     if saved is not None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from ..adaptation.estimates import available_memory, in_bytes
-from ..adaptation.options import Options, uses, warn_of_unused
+from ..adaptation.loop import INTERRUPTED
+from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
 from ..errors import Aborted, ClvoroError, InputError
 from ..geometry.polygon import Polygon
 from ..io import save, write_history
@@ -92,9 +92,9 @@ class Job:
         from .. import Adapter, create_context
 
         arguments, size = self.case.run_arguments(), self.case.size_field()
-        self._refuse_unknown(arguments, Adapter.run)
-        warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods], 2)
-        arguments |= self._checkpoints()
+        self._refuse_unknown(arguments)
+        warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
+        files = self._checkpoints()
         named = {"checkpoint": self.checkpoint, "resume": self.resume}
         named |= {source.name: source for source in self.case.sources()}
         refuse_own_files(self.out, named)
@@ -112,7 +112,7 @@ class Job:
                 for method in self.case.methods:  # the same seed gives all the same start
                     profile = Profile(adapter) if self.profile else None
                     with profile or nullcontext():
-                        result = self._run_one(adapter, size, method, dict(arguments))
+                        result = self._run_one(adapter, size, method, arguments, files)
                     name = str(method or result.settings.get("method", "default"))
                     results[name] = result
                     if profile is not None:
@@ -138,15 +138,21 @@ class Job:
         return self.interrupted
 
     def _run_one(
-        self, adapter: Any, size: Any, method: str | None, arguments: dict[str, Any]
+        self,
+        adapter: Any,
+        size: Any,
+        method: str | None,
+        settings: dict[str, Any],
+        files: Checkpoint | None,
     ) -> Result:
         from .progress import Progress
 
-        # What another method of the case uses is not for this one.
-        arguments = {k: v for k, v in arguments.items() if uses(method or Options.method, k)}
+        # Settings that only other methods of the case use are left out.
+        used = {k: v for k, v in settings.items() if uses(method or Options.method, k)}
+        arguments = arguments_of_run(used)
         if method is not None:
             arguments["method"] = method
-        most = arguments.get("max_steps", _default(type(adapter).run, "max_steps"))
+        most = arguments.get("max_steps")
         title = f"{self.case.name} {method or ''}".strip()
         progress: Any = nullcontext() if self.quiet else Progress(title, most)
         with progress as shown:
@@ -156,19 +162,21 @@ class Job:
                     shown(row)
                 return self.interrupted
 
-            def told(needed: float) -> None:
+            def announce(needed: float) -> None:
                 if shown is not None and (shown.live or needed >= _MUCH):
                     there = in_bytes(available_memory(adapter.ctx.devices[0]))
                     shown.tell(f"{title}: takes {in_bytes(needed)} of the device's {there}")
 
-            adapter.told = told
+            adapter.on_memory = announce
             try:
-                result: Result = adapter.run(self.case.domain, size, callback=callback, **arguments)
+                result: Result = adapter.run(
+                    self.case.domain, size, callback=callback, checkpoint=files, on_interrupt="return", **arguments
+                )  # fmt: skip
             finally:
-                adapter.told = None
-        if result.stop_reason == "interrupted":
+                adapter.on_memory = None
+        if result.stop_reason == INTERRUPTED:
             self.interrupted = True
-        return replace(result, stop_reason="interrupted") if self.interrupted else result
+        return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
 
     def _now_and_then(self) -> Callable[[str], None]:
         """Return what prints a text for people, if the last one was long enough ago."""
@@ -184,8 +192,8 @@ class Job:
 
         return tell
 
-    def _refuse_unknown(self, arguments: dict[str, Any], run: Callable[..., Any]) -> None:
-        known = inspect.signature(run).parameters
+    def _refuse_unknown(self, arguments: dict[str, Any]) -> None:
+        known = {option.name for option in fields(Options)} | {"points"}
         for name in arguments:
             if name not in known:
                 raise InputError(
@@ -193,8 +201,8 @@ class Job:
                     "leave it out"
                 )
 
-    def _checkpoints(self) -> dict[str, Any]:
-        """Return the arguments of `Adapter.run` that have to do with checkpoints."""
+    def _checkpoints(self) -> Checkpoint | None:
+        """Return where checkpoints are written and read."""
         given = {
             "checkpoint": self.checkpoint,
             "checkpoint_every": self.checkpoint_every,
@@ -210,7 +218,8 @@ class Job:
                 f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
                 f"{len(self.case.methods)}; choose one with --method"
             )
-        return given
+        every = Checkpoint.every if self.checkpoint_every is None else self.checkpoint_every
+        return Checkpoint(self.checkpoint, every, self.resume) if given else None
 
     @contextmanager
     def _stopping_cleanly(self) -> Iterator[None]:
@@ -345,11 +354,6 @@ class Job:
         print(f"written: {self.out / first} and what lies beside it")
         for name, profile in profiles.items():
             print(f"\nwhere the time of {name} went:\n{profile.table()}")
-
-
-def _default(function: Callable[..., Any], name: str) -> Any:
-    parameter = inspect.signature(function).parameters.get(name)
-    return None if parameter is None or parameter.default is parameter.empty else parameter.default
 
 
 def _plain(value: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..adaptation.options import Options, uses
+from ..adaptation.options import Options, arguments_of_run, uses
 from ..io import save
 from ..io.atomic import atomic_file, writing
 from ..mesh.results import Result
@@ -55,9 +55,8 @@ def run_frames(
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     method = case.methods[-1] or Options.method
-    arguments = {
-        k: v for k, v in case.run_arguments().items() if k in _KEPT and uses(method, k)
-    } | {"method": method}
+    kept = {k: v for k, v in case.run_arguments().items() if k in _KEPT and uses(method, k)}
+    arguments = arguments_of_run(kept) | {"method": method}
     result, rows, shown = first, [], {}
     wanted = np.unique(np.linspace(0, case.frames - 1, min(PICTURED, case.frames)).round())
     try:
@@ -69,7 +68,7 @@ def run_frames(
                 tell(f"frame {frame + 1} of {case.frames}")
                 result = adapter.run(
                     case.domain, case.size_field(time), points=result.points,
-                    callback=lambda _: stop(), **arguments,
+                    callback=lambda _: stop(), on_interrupt="return", **arguments,
                 )  # fmt: skip
             save(result, folder / f"mesh-{frame:03d}.vtu")
             rows.append(_row(frame, time, result))
@@ -89,7 +88,7 @@ def _write_rows(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def _row(frame: int, time: float, result: Result) -> dict[str, Any]:
-    error, history = np.abs(result.error), result.history
+    error, history = np.abs(result.size_error), result.history
     return {
         "frame": frame, "time": time, "cells": len(error), "steps": int(history["step"][-1]),
         "mean_error": error.mean(), "max_error": error.max(),
@@ -110,7 +109,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
     domain = results[0].diagram.domain
     columns = min(3, len(results))
     lines = -(-len(results) // columns)
-    sizes = np.concatenate([r.size for r in results])
+    sizes = np.concatenate([r.target_size for r in results])
     limits = (float(sizes.min()), float(sizes.max()))
     with styled():
         figure = new_figure(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from ..arguments import warn
 from ..errors import InputError, InputTypeError, MisfitWarning
 from ..files import LONGEST_GEOMETRY, read_text
 
@@ -124,12 +124,11 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
         return
     latitude = float(np.abs(x[:, 1]).max())
     if math.cos(math.radians(latitude)) < _ALIKE:
-        warnings.warn(
+        warn(
             f"{name} is in longitudes and latitudes ({system}), which are taken as lengths in the plane: at latitude "
             f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
             "coordinates first, and leave out its crs if they are projected",
             MisfitWarning,
-            stacklevel=4,
         )
 
 

@@ -77,7 +77,7 @@ def _describe(result: Result, path: Path) -> NetCDF:
     file.add("nEdgesOnEdge", ("nEdges",), weights.counts)
     for name, items in (("edges", weights.edges + 1), ("weights", weights.values)):
         file.add_rows(f"{name}OnEdge", wide, weights.counts, items, 0)
-    file.add("meshDensity", ("nCells",), (result.size.min() / result.size) ** 4)
+    file.add("meshDensity", ("nCells",), (result.target_size.min() / result.target_size) ** 4)
     return file
 
 

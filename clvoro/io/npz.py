@@ -24,11 +24,13 @@ from ..geometry.polygon import Polygon
 from ..mesh.results import HISTORY_DTYPE, Diagram, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
 
-FORMAT, VERSION = "clvoro-result", 1
+FORMAT, VERSION = "clvoro-result", 2
 
 _DOMAINS = {"Box": Box, "Polygon": Polygon.described}
-_NEEDED = ("about", "points", "size", "error", "quality", "history", "diagram.points")
+_NEEDED = ("about", "points", "target_size", "size_error", "quality", "history", "diagram.points")
 _FIELDS = tuple(field.name for field in dataclasses.fields(Result))
+_FORMER = {"size": "target_size", "error": "size_error"}
+"""Names of arrays in files of version 1."""
 _PARTS = {
     "diagram": Diagram._NAMES,
     "initial": tuple(field.name for field in dataclasses.fields(Displacements)),
@@ -37,7 +39,7 @@ _PARTS = {
 
 # What each array must look like: sizes named by a letter are the same everywhere (d: dimension).
 _SHAPES = {
-    "points": "nd", "size": "n", "error": "n", "quality": "n", "history": "h",
+    "points": "nd", "target_size": "n", "size_error": "n", "quality": "n", "history": "h",
     "diagram.points": "nd", "diagram.volumes": "n", "diagram.centroids": "nd",
     "diagram.neighbor_starts": "N", "diagram.neighbors": "m", "diagram.shifts": "md", "diagram.face_measures": "m",
     "diagram.face_centroids": "md", "diagram.vertices": "vd", "diagram.cell_vertex_starts": "N",
@@ -91,6 +93,8 @@ def load(path: str | PathLike[str]) -> Result:
     with explained(path, "a file written by Result.save"):
         with open_plain(path) as file, zipfile.ZipFile(file) as archive:
             members = list_members(archive, FORMAT, VERSION)
+            if "target_size" not in members:
+                members = {_FORMER.get(name, name): info for name, info in members.items()}
             missing = [name for name in _NEEDED if name not in members]
             if missing:
                 raise FileError(f"it lacks {', '.join(missing)}")

@@ -95,8 +95,8 @@ def _describe(result: Result, path: Path) -> NetCDF:
     beside = np.stack([halves.cell, across], axis=1)[first]
     file.add("mesh_edge_faces", pairs, beside, **_role("edge_face"), _FillValue=minus)
     values = {
-        "size": result.size,
-        "error": result.error,
+        "size": result.target_size,
+        "error": result.size_error,
         "quality": result.quality,
         "area": diagram.volumes,
     }

@@ -177,8 +177,8 @@ def cell_data(result: Result) -> dict[str, np.ndarray]:
     seen = np.diff(face_corners(diagram)[0]) > 0
     counts = count_sides(diagram) if flat else np.bincount(face_owners(diagram)[seen], minlength=n)
     return {
-        "size": result.size,
-        "error": result.error,
+        "size": result.target_size,
+        "error": result.size_error,
         "quality": result.quality,
         "volume": diagram.volumes,
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),

@@ -264,7 +264,8 @@ def _assemble(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None)
         arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
     )
     return Result(
-        points=points, diagram=diagram, size=size, error=error, quality=quality, history=np.zeros(0, HISTORY_DTYPE),
+        points=points, diagram=diagram, target_size=size, size_error=error, quality=quality,
+        history=np.zeros(0, HISTORY_DTYPE),
         converged=False, stop_reason="read from a .vtu file",
     )  # fmt: skip
 

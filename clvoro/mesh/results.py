@@ -309,10 +309,10 @@ class Result(_Sealed):
     points : (n, d) float
         Generators: `diagram.points`, in the order of `origin`.
     diagram : Diagram
-    size : (n,) float
-        Target size h at the generators.
-    error : (n,) float
-        Signed metric error, the paper's (3.1).
+    target_size : (n,) float
+        Target size h at the generators, in the domain's unit of length.
+    size_error : (n,) float
+        Signed metric error e, the paper's (3.1).
     quality : (n,) float
         Cell quality, the paper's (4.1), 1 for a regular polygon; in 3D the isoperimetric quotient 36 pi V^2 / S^3. In a
         polygonal domain it is that of the polygon in which faces on the boundary are one straight side as long as they
@@ -328,8 +328,8 @@ class Result(_Sealed):
         Lloyd and Poisson displacements of the first and of the last step; where a run may end after any step (methods
         that repeat one kind, a callback that stops it), those of the step that would come next are the last.
     size_factor : float
-        Where a count of cells was asked for, `size` is the size field times this common factor, which makes the count
-        fit (methods "adaptive" and "exact"); else 1.
+        With `n_cells` of methods "adaptive" and "exact", `target_size` is the size field times this common factor;
+        else 1.
     settings : dict
         What is needed to repeat the run: of the options those that its method uses.
     origin : (n,) int32 or None
@@ -339,8 +339,8 @@ class Result(_Sealed):
 
     points: np.ndarray
     diagram: Diagram
-    size: np.ndarray
-    error: np.ndarray
+    target_size: np.ndarray
+    size_error: np.ndarray
     quality: np.ndarray
     history: np.ndarray
     converged: bool
@@ -395,7 +395,7 @@ class Result(_Sealed):
         return measure_mesh(self.diagram)
 
     def __repr__(self) -> str:
-        e, q = np.abs(self.error), self.quality
+        e, q = np.abs(self.size_error), self.quality
         return (
             f"Result({len(self.points)} cells, mean |e| {e.mean():.4f}, max |e| {e.max():.4f}, "
             f"mean Q {q.mean():.4f}, min Q {q.min():.4f}; {self.stop_reason})"

@@ -15,7 +15,7 @@ def summary(result: Result) -> dict[str, Any]:
 
     Of a polygonal domain also those of the cells on the boundary and of the others; see `beside_boundary`.
     """
-    error, history = np.abs(result.error), result.history
+    error, history = np.abs(result.size_error), result.history
     parts = beside_boundary(result) if isinstance(result.diagram.domain, Polygon) else {}
     apart = {
         f"{part}_{name}": value for part, some in parts.items() for name, value in some.items()
@@ -43,7 +43,7 @@ def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
     on_boundary = np.bincount(owner, d.neighbors < 0, len(d)) > 0
     found = {}
     for name, which in (("boundary", on_boundary), ("inner", ~on_boundary)):
-        error, quality = np.abs(result.error[which]), result.quality[which]
+        error, quality = np.abs(result.size_error[which]), result.quality[which]
         some = bool(which.any())
         found[name] = {
             "cells": int(which.sum()),

@@ -93,13 +93,17 @@ def _span(values: np.ndarray) -> tuple[float, float]:
 COLORINGS = {
     "error": Coloring(
         "metric error $e$ [–]   (< 0 too small, > 0 too large)",
-        lambda r: r.error,
+        lambda r: r.size_error,
         _DIVERGING,
         _symmetric,
     ),
     "quality": Coloring("cell quality $Q$ [–]", lambda r: r.quality, "viridis", _up_to_one),
     "size": Coloring(
-        "target size $h$ [units of length]", lambda r: r.size, "viridis", _span, logarithmic=True
+        "target size $h$ [units of length]",
+        lambda r: r.target_size,
+        "viridis",
+        _span,
+        logarithmic=True,
     ),
     "sides": Coloring(
         "number of sides",

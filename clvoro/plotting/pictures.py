@@ -129,11 +129,11 @@ def _closer_slice(result: Result) -> Any:
     """Draw a square window around the smallest cell, on the plane of the largest section."""
     normal = _largest_section(result)
     axes = [a for a in range(3) if a != normal]
-    center = result.points[np.argmin(result.size)]
+    center = result.points[np.argmin(result.target_size)]
     box = result.diagram.domain
     lower, upper = np.array(box.lower)[axes], np.array(box.upper)[axes]
     across = 60
-    span = np.minimum(across * float(result.size.min()), upper - lower)
+    span = np.minimum(across * float(result.target_size.min()), upper - lower)
     corner = np.clip(center[axes] - span / 2, lower, upper - span)
     with styled():
         figure = new_figure(WIDTH, (WIDTH - 1.3) * float(span[1] / span[0]) + 0.6)
@@ -220,7 +220,7 @@ def _grid(panels: Mapping[str, Result], color: str) -> Any:
         figure = new_figure(WIDTH, grid_height(lower, upper, rows, columns, 0.6, 0.28))
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for letter, ax, (name, result) in zip("abcdefghij", axes, panels.items(), strict=False):
-            e, q = np.abs(result.error).mean(), result.quality.mean()
+            e, q = np.abs(result.size_error).mean(), result.quality.mean()
             title = f"({letter}) {name}: mean $|e|$ {e:.3g}, mean $Q$ {q:.3f}"
             plot(result, color, ax, limits=limits, key=False, title=title)
             ax.set(xticks=[], yticks=[], xlabel="", ylabel="")

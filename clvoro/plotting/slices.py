@@ -32,12 +32,12 @@ def require_space(diagram: Diagram) -> None:
 def focus(result: Result) -> np.ndarray:
     """Return where a 3D mesh is looked at: amid its smallest cells, well inside of the domain."""
     box = result.diagram.domain
-    smallest = result.points[result.size <= 1.1 * result.size.min()]
+    smallest = result.points[result.target_size <= 1.1 * result.target_size.min()]
     lower, extent = np.array(box.lower), box.extent
     if len(smallest) > 0.5 * len(result.points):  # all alike
         return lower + 0.5 * extent
     # A round place, as titles name it; half a cell makes no difference.
-    step = nice(0.5 * float(result.size.min()), up=False)
+    step = nice(0.5 * float(result.target_size.min()), up=False)
     center = np.round(smallest.mean(axis=0) / step) * step + 0.0
     return np.clip(center, lower + 0.25 * extent, lower + 0.75 * extent)
 

@@ -107,8 +107,8 @@ def window_around_smallest(result: Result, across: float) -> tuple[np.ndarray, n
     """
     box = result.diagram.domain
     lower, upper, extent = np.array(box.lower), np.array(box.upper), box.extent
-    smallest = np.flatnonzero(result.size <= 1.1 * result.size.min())
+    smallest = np.flatnonzero(result.target_size <= 1.1 * result.target_size.min())
     center = result.points[smallest[np.argmin(result.points[smallest, 0])]]
-    span = np.minimum(np.array([across, 0.8 * across]) * float(result.size.min()), extent)
+    span = np.minimum(np.array([across, 0.8 * across]) * float(result.target_size.min()), extent)
     corner = np.clip(center - span / 2, lower, upper - span)
     return corner, corner + span

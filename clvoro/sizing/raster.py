@@ -211,7 +211,7 @@ class Scattered(Raster):
     --------
     The sizes of one mesh, halved, for the next::
 
-        size = 0.5 * Scattered(result.diagram.centroids, result.size, box.lower, box.upper)
+        size = 0.5 * Scattered(result.diagram.centroids, result.target_size, box.lower, box.upper)
     """
 
     def __init__(

@@ -18,16 +18,20 @@ from clvoro.adaptation.fingerprint import identity
 from clvoro.adaptation.loop import STALLED
 from clvoro.adaptation.resume import Saved
 from clvoro.cli import command as cli
-from clvoro.errors import InputError, UnusedOptionWarning
+from clvoro.errors import InputError
 from clvoro.solvers import poisson
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")
 RUNS = {
     "coupled": {"method": "coupled", "max_steps": 9},
-    "adaptive": {"method": "adaptive", "effort": "fast", "levels": 1},
+    "adaptive": {
+        "method": "adaptive",
+        "effort": "fast",
+        "options": clvoro.MultilevelOptions(levels=1),
+    },
     "count held": {"method": "exact", "effort": "fast", "n_cells": 250},
-    "in 3D": {"method": "exact", "effort": "fast", "levels": 1},
+    "in 3D": {"method": "exact", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
 }
 BOX_3D = clvoro.Box((0, 0, 0), (1, 1.5, 1))
 SIZE_3D = clvoro.sizing.Expression("0.16 + 0.2*fabs(hypot(x-0.4, y-0.7)-0.3)")
@@ -44,7 +48,7 @@ def stop_after(rows):
 
 
 def assert_same(a, b):
-    for name in ("points", "size", "error", "quality", "origin"):
+    for name in ("points", "target_size", "size_error", "quality", "origin"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     corners = "cell_vertices" if a.diagram.domain.dim == 2 else "face_vertices"
     for name in ("volumes", "neighbors", "vertices", corners, "face_measures", "centroids"):
@@ -73,21 +77,34 @@ def test_resumed_runs_end_the_same(ctx, tmp_path, dtype, kind):
     for stop in (1, 2 * rows // 3):
         path = tmp_path / "state"
         stopped = clvoro.Adapter(ctx, dtype).run(
-            box, size, seed=5, callback=stop_after(stop), checkpoint=path, checkpoint_every=1e9,
-            **RUNS[kind],
+            box, size, seed=5, callback=stop_after(stop), checkpoint=clvoro.Checkpoint(path, every=1e9), **RUNS[kind],
         )  # fmt: skip
         assert stopped.stop_reason == "stopped by the callback"
-        resumed = clvoro.Adapter(ctx, dtype).run(box, size, seed=5, resume=path, **RUNS[kind])
+        resumed = clvoro.Adapter(ctx, dtype).run(
+            box, size, seed=5, checkpoint=clvoro.Checkpoint(resume=path), **RUNS[kind]
+        )
         assert_same(resumed, whole)
         assert (np.diff(resumed.history["seconds"]) >= 0).all()
 
 
 LONG_LIVED = {
     "coupled": (BOX, SIZE, {"method": "coupled", "max_steps": 7}),
-    "weighted": (BOX, SIZE, {"method": "weighted", "max_steps": 7, "tol": 0.0}),
-    "adaptive": (BOX, SIZE, {"method": "adaptive", "effort": "fast", "levels": 1}),
+    "weighted": (
+        BOX,
+        SIZE,
+        {"method": "weighted", "max_steps": 7, "options": clvoro.PaperOptions(tol=0.0)},
+    ),
+    "adaptive": (
+        BOX,
+        SIZE,
+        {"method": "adaptive", "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)},
+    ),
     "coupled in 3D": (BOX_3D, SIZE_3D, {"method": "coupled", "max_steps": 5}),
-    "weighted in 3D": (BOX_3D, SIZE_3D, {"method": "weighted", "max_steps": 5, "tol": 0.0}),
+    "weighted in 3D": (
+        BOX_3D,
+        SIZE_3D,
+        {"method": "weighted", "max_steps": 5, "options": clvoro.PaperOptions(tol=0.0)},
+    ),
     "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
 }
 
@@ -109,29 +126,44 @@ def test_resumed_runs_go_on_with_the_same_solver(ctx, tmp_path, monkeypatch, kin
     rows, path = len(whole.history), tmp_path / "state"
     for stop in sorted({1, 2, rows // 3, rows - 2}):
         clvoro.Adapter(ctx).run(
-            box, size, seed=5, callback=stop_after(stop), checkpoint=path, checkpoint_every=1e9, **options
+            box, size, seed=5, callback=stop_after(stop), checkpoint=clvoro.Checkpoint(path, every=1e9), **options
         )  # fmt: skip
         levels = [name for name in Saved(path).arrays if name.startswith("multigrid.")]
         assert bool(levels) or solver == "jacobi" or kind.startswith("adaptive")
         assert not levels or solver == "multigrid"
-        assert_same(clvoro.Adapter(ctx).run(box, size, seed=5, resume=path, **options), whole)
+        assert_same(
+            clvoro.Adapter(ctx).run(
+                box, size, seed=5, checkpoint=clvoro.Checkpoint(resume=path), **options
+            ),
+            whole,
+        )
 
 
 def test_writing_checkpoints_changes_nothing(ctx, tmp_path):
     options = {"method": "adaptive", "effort": "fast", "seed": 8}
     path = tmp_path / "state"
     plain = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
-    written = clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=0, **options)
+    written = clvoro.Adapter(ctx).run(
+        BOX, SIZE, checkpoint=clvoro.Checkpoint(path, every=0), **options
+    )
     assert_same(plain, written)
     # The last one is the end of the plan: nothing is left to do but to fetch.
-    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **options), plain)
+    assert_same(
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options),
+        plain,
+    )
     assert os.listdir(tmp_path) == ["state"]
 
 
 def test_own_points_and_callables(ctx, tmp_path):
     points = np.random.default_rng(12).random((200, 2)) * BOX.extent
     path = tmp_path / "state"
-    options = {"points": points, "method": "weighted", "max_steps": 8, "tol": 0.0}
+    options = {
+        "points": points,
+        "method": "weighted",
+        "max_steps": 8,
+        "options": clvoro.PaperOptions(tol=0.0),
+    }
 
     def size(x):
         return 0.1 + 0.02 * x[:, 0]
@@ -139,7 +171,10 @@ def test_own_points_and_callables(ctx, tmp_path):
     whole = clvoro.Adapter(ctx).run(BOX, size, **options)
     stop = {"callback": stop_after(4), "checkpoint": path}
     clvoro.Adapter(ctx).run(BOX, size, **stop, **options)
-    assert_same(clvoro.Adapter(ctx).run(BOX, size, resume=path, **options), whole)
+    assert_same(
+        clvoro.Adapter(ctx).run(BOX, size, checkpoint=clvoro.Checkpoint(resume=path), **options),
+        whole,
+    )
 
 
 def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
@@ -150,7 +185,10 @@ def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     stop = {"callback": stop_after(3), "checkpoint": path}
     stopped = clvoro.Adapter(ctx).run(square, 0.25, **stop, **options)
     assert len(stopped.points) < 30
-    assert_same(clvoro.Adapter(ctx).run(square, 0.25, resume=path, **options), whole)
+    assert_same(
+        clvoro.Adapter(ctx).run(square, 0.25, checkpoint=clvoro.Checkpoint(resume=path), **options),
+        whole,
+    )
 
 
 @pytest.mark.parametrize("kind", ["adaptive", "in 3D"])
@@ -158,19 +196,27 @@ def test_stopped_before_the_first_step(ctx, tmp_path, kind):
     box, size = (BOX_3D, SIZE_3D) if kind == "in 3D" else (BOX, SIZE)
     path, options = tmp_path / "state", RUNS[kind]
     clvoro.Adapter(ctx).run(box, size, callback=stop_after(0), checkpoint=path, **options)
-    resumed = clvoro.Adapter(ctx).run(box, size, resume=path, **options)
+    resumed = clvoro.Adapter(ctx).run(
+        box, size, checkpoint=clvoro.Checkpoint(resume=path), **options
+    )
     assert_same(resumed, clvoro.Adapter(ctx).run(box, size, **options))
 
 
 def test_stopped_just_where_the_run_would_have_ended(ctx, tmp_path):
     """By the callback, in the row that ends a run whose error no longer improves: it ends there, resumed, too."""
-    path, options = tmp_path / "state", {"method": "coupled", "tol": 0.5}
+    path, options = (
+        tmp_path / "state",
+        {"method": "coupled", "options": clvoro.PaperOptions(tol=0.5)},
+    )
     whole = clvoro.Adapter(ctx).run(BOX, SIZE, **options)
     assert whole.stop_reason == STALLED
     rows = len(whole.history) - 1
     assert rows < 100
     clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(rows), checkpoint=path, **options)
-    assert_same(clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **options), whole)
+    assert_same(
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options),
+        whole,
+    )
 
 
 @pytest.mark.parametrize("before", ["diagram", "failed run"])
@@ -178,7 +224,7 @@ def test_stopped_just_where_the_run_would_have_ended(ctx, tmp_path):
 def test_after_something_larger(ctx, tmp_path, square, before):
     """What an adapter has done before is no part of a run's state."""
     path, size = tmp_path / "state", 0.29 if square.dim == 2 else 0.4
-    options = {"method": "coupled", "max_steps": 6, "tol": 0.0}
+    options = {"method": "coupled", "max_steps": 6, "options": clvoro.PaperOptions(tol=0.0)}
     adapter = clvoro.Adapter(ctx)
 
     def fail(row):
@@ -191,7 +237,10 @@ def test_after_something_larger(ctx, tmp_path, square, before):
             adapter.run(square, 8000 ** (-1 / square.dim), method="lloyd", callback=fail)
     adapter.run(square, size, callback=stop_after(3), checkpoint=path, **options)
     whole = clvoro.Adapter(ctx).run(square, size, **options)
-    assert_same(clvoro.Adapter(ctx).run(square, size, resume=path, **options), whole)
+    assert_same(
+        clvoro.Adapter(ctx).run(square, size, checkpoint=clvoro.Checkpoint(resume=path), **options),
+        whole,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +255,7 @@ OTHERS = {
     "seed": {"seed": 6},
     "method": {"method": "lloyd"},
     "max_steps": {"max_steps": 7},
-    "k": {"k": 0.25},
+    "k": {"options": clvoro.PaperOptions(tol=0.0, k=0.25)},
     "n_cells": {"n_cells": 300},
     "points": {"points": np.random.default_rng(4).random((50, 2))},
 }
@@ -216,21 +265,28 @@ OTHERS = {
 def test_other_settings_are_refused_by_name(ctx, saved, name):
     path, options = saved
     with pytest.raises(InputError, match=rf"cannot resume.*{name} = "):
-        clvoro.Adapter(ctx).run(BOX, SIZE, resume=path, **{**options, **OTHERS[name]})
+        clvoro.Adapter(ctx).run(
+            BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **{**options, **OTHERS[name]}
+        )
 
 
 def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
     path, options = saved
     with pytest.raises(InputError, match="domain = "):
-        clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (2.5, 1.6)), SIZE, resume=path, **options)
+        clvoro.Adapter(ctx).run(
+            clvoro.Box((0, 0), (2.5, 1.6)),
+            SIZE,
+            checkpoint=clvoro.Checkpoint(resume=path),
+            **options,
+        )
     with pytest.raises(InputError, match="dtype = float64"):
-        clvoro.Adapter(ctx, "float32").run(BOX, SIZE, resume=path, **options)
+        clvoro.Adapter(ctx, "float32").run(
+            BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
+        )
     with pytest.raises(InputError, match=r"size field is another.*this field's is [0-9]"):
-        clvoro.Adapter(ctx).run(BOX, 1.0001 * SIZE, resume=path, **options)
-    with pytest.raises(InputError, match="checkpoint_every is -1"):
-        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path, checkpoint_every=-1, **options)
-    with pytest.warns(UnusedOptionWarning, match="checkpoint_every is 5, and no file"):
-        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint_every=5, **options)
+        clvoro.Adapter(ctx).run(
+            BOX, 1.0001 * SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
+        )
     with pytest.raises(InputError, match=r"checkpoint is .*, a folder"):
         clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=path.parent, **options)
     with pytest.raises(InputError, match="no folder"):
@@ -337,7 +393,7 @@ def test_damaged_levels_are_refused(ctx, tmp_path, monkeypatch, name):
     clvoro.Adapter(ctx).run(BOX, SIZE, callback=stop_after(2), checkpoint=path, **options)
     rewrite(path, bad, DAMAGED_LEVELS[name])
     with pytest.raises(InputError, match="cannot resume"):
-        clvoro.Adapter(ctx).run(BOX, SIZE, resume=bad, **options)
+        clvoro.Adapter(ctx).run(BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=bad), **options)
 
 
 @pytest.mark.parametrize("name", list(DAMAGED))
@@ -345,7 +401,9 @@ def test_damaged_checkpoints_are_refused(ctx, saved, tmp_path, name):
     path, options = saved
     rewrite(path, tmp_path / "state", DAMAGED[name])
     with pytest.raises(InputError, match="cannot resume"):
-        clvoro.Adapter(ctx).run(BOX, SIZE, resume=tmp_path / "state", **options)
+        clvoro.Adapter(ctx).run(
+            BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=tmp_path / "state"), **options
+        )
 
 
 def flipped(data):

@@ -218,7 +218,7 @@ def test_mesh_that_does_not_meet_its_sizes(ctx, method, effort):
     with pytest.warns(SizeErrorWarning, match="mean .e. is .*sizing.Graded") as told:
         result = adapter.run(square, JUMP, method=method, effort=effort, seed=1)
     assert result.converged
-    worst = np.abs(result.error).argmax()
+    worst = np.abs(result.size_error).argmax()
     x, y = (float(v) for v in re.search(r"\(([^)]*)\)", str(told[0].message))[1].split(","))
     assert result.points[worst] == pytest.approx((x, y), rel=1e-5)
     assert told[0].filename == __file__

@@ -179,15 +179,18 @@ def test_runs_that_go_on_hold_what_they_are_told(bench, name, tmp_path):
     real = "float32" if "single" in name else "float64"
     file, given = tmp_path / "state", {"seed": 1, "effort": "fast"}
     clvoro.Adapter(dtype=real).run(
-        domain, size, checkpoint=file, **given, checkpoint_every=1e9,
+        domain, size, checkpoint=clvoro.Checkpoint(file, every=1e9), **given,
         callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
     )  # fmt: skip
     ledger, told = bench.Ledger(), []
     with bench.counted_buffers(ledger):
         adapter = clvoro.Adapter(dtype=real)
-        adapter.told = told.append
+        adapter.on_memory = told.append
         adapter.run(
-            domain, size, resume=file, checkpoint=tmp_path / "next", checkpoint_every=0, **given
+            domain,
+            size,
+            checkpoint=clvoro.Checkpoint(tmp_path / "next", every=0, resume=file),
+            **given,
         )
     assert 0 < ledger.peak / told[0] <= 1.1
 
@@ -257,7 +260,7 @@ def held_and_told(bench, domain, size, real="float64", **given):
     ledger, told = bench.Ledger(), []
     with bench.counted_buffers(ledger):
         adapter = clvoro.Adapter(dtype=real)
-        adapter.told = told.append
+        adapter.on_memory = told.append
         result = adapter.run(domain, size, seed=1, **given)
         _ = result.diagram.vertices
     return ledger.peak, told[0]
@@ -371,7 +374,7 @@ def test_jumps_take_no_more_than_the_surplus(ctx, dim, formula, n):
     size = plain * (density_tree(plain, domain).integral / n) ** (1 / dim)
     adapter = clvoro.Adapter(ctx)
     with pytest.warns(SizeErrorWarning):
-        result = adapter.run(domain, size, levels=1, seed=1)
+        result = adapter.run(domain, size, options=clvoro.MultilevelOptions(levels=1), seed=1)
     for level in (0, 1):
         cells = result.history["cells"][result.history["level"] == level]
         most = (1 + MOST_SURPLUS) * n / 2 ** (dim * level)
@@ -464,7 +467,7 @@ def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
 def test_a_run_tells_what_it_takes(ctx):
     """Once, before its first row, and what `memory_needed` says."""
     adapter, calls = clvoro.Adapter(ctx), []
-    adapter.told = calls.append
+    adapter.on_memory = calls.append
     adapter.run(SQUARE, 0.1, max_steps=2, callback=lambda row: calls.append(None))
     assert calls[0] == adapter.memory_needed(SQUARE, 0.1)
     assert calls.count(None) == len(calls) - 1 > 0

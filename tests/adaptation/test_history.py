@@ -36,7 +36,7 @@ def test_diagram_that_is_made_anew_at_the_end(ctx, dtype):
         points = middles + 3 * eps * np.random.default_rng(seed).standard_normal((144, 2))
         result = adapter.run(
             clvoro.Box((0, 0), (1, 1), periodic=True), 1 / 12, points, method="lloyd", max_steps=3,
-            tol=0, callback=lambda row, rows=rows: rows.append(row),
+            options=clvoro.PaperOptions(tol=0), callback=lambda row, rows=rows: rows.append(row),
         )  # fmt: skip
         result.check().demand()
         assert len(result.history) == len(rows) == 4
@@ -54,7 +54,13 @@ def test_sizes_that_are_scaled_to_a_count_after_the_last_row(adapter, kind, leve
     by_callback = {"callback": lambda row: row["step"] == stopped}
     for options in ({"max_steps": stopped}, by_callback):
         result = adapter.run(
-            DOMAINS[kind], SIZE, n_cells=count, levels=levels, effort="fast", seed=3, **options
+            DOMAINS[kind],
+            SIZE,
+            n_cells=count,
+            options=clvoro.MultilevelOptions(levels=levels),
+            effort="fast",
+            seed=3,
+            **options,
         )
         result.check().demand()
         assert len(result.points) == count
@@ -67,7 +73,7 @@ def test_sizes_that_are_scaled_to_a_count_after_the_last_row(adapter, kind, leve
 
 def test_numbers_that_come_and_go_are_those_of_labels(adapter):
     """What is inserted and deleted between two rows adds up to the cells of both, and to the generators at the end."""
-    result = adapter.run(FLAT, SIZE, levels=1, seed=5)
+    result = adapter.run(FLAT, SIZE, options=clvoro.MultilevelOptions(levels=1), seed=5)
     h, origin = result.history, result.origin
     assert h["inserted"].sum() > 0
     assert h["deleted"].sum() > 0
@@ -112,12 +118,21 @@ class Pressed:
 
 
 RUNS = {
-    "counted": (FLAT, {"n_cells": 260, "levels": 1}),
-    "exact": (FLAT, {"method": "exact", "levels": 0, "max_steps": 20}),
+    "counted": (FLAT, {"n_cells": 260, "options": clvoro.MultilevelOptions(levels=1)}),
+    "exact": (
+        FLAT,
+        {"method": "exact", "options": clvoro.MultilevelOptions(levels=0), "max_steps": 20},
+    ),
     "coupled": (HOUSE, {"method": "coupled", "max_steps": 6}),
-    "torus": (TORUS, {"levels": 0, "n_cells": 260, "max_steps": 15}),
-    "solid": (SOLID, {"levels": 1, "max_steps": 42}),
-    "layers": (FLAT, {"layers": clvoro.Layers(0.03, count=2), "levels": 1}),
+    "torus": (
+        TORUS,
+        {"options": clvoro.MultilevelOptions(levels=0), "n_cells": 260, "max_steps": 15},
+    ),
+    "solid": (SOLID, {"options": clvoro.MultilevelOptions(levels=1), "max_steps": 42}),
+    "layers": (
+        FLAT,
+        {"layers": clvoro.Layers(0.03, count=2), "options": clvoro.MultilevelOptions(levels=1)},
+    ),
 }
 
 
@@ -131,7 +146,7 @@ def press_anywhere(adapter, kind, times):
     # Seldom before the run has begun, or in what it does once it has ended: those interruptions are the caller's.
     for nth in np.random.default_rng(31).integers(counted.lines, size=times):
         with contextlib.suppress(KeyboardInterrupt), Pressed(int(nth) + 1):
-            result = adapter.run(domain, SIZE, **options)
+            result = adapter.run(domain, SIZE, on_interrupt="return", **options)
             came += 1
             assert result.stop_reason == "interrupted"
             assert result.check(), f"{nth}: {result.check()}"

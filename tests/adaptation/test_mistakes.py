@@ -147,7 +147,12 @@ def test_a_size_function_may_change_its_argument(adapter):
         points *= 2
         return 0.1 + 0.05 * points[:, 0]
 
-    options = {"points": POINTS, "method": "weighted", "max_steps": 3, "tol": 0}
+    options = {
+        "points": POINTS,
+        "method": "weighted",
+        "max_steps": 3,
+        "options": clvoro.PaperOptions(tol=0),
+    }
     spoilt = adapter.run(BOX, spoils, **options)
     clean = adapter.run(BOX, lambda p: 0.1 + 0.05 * (2 * p)[:, 0], **options)
     assert np.array_equal(spoilt.points, clean.points)
@@ -161,7 +166,7 @@ def test_functions_of_other_kinds_are_taken(adapter):
         lambda p: 0.2, signature="(d)->()"
     )):  # fmt: skip
         made = adapter.run(BOX, size, points=POINTS, method="lloyd", max_steps=0)
-        assert (made.size == 0.2).all()
+        assert (made.target_size == 0.2).all()
 
 
 @pytest.mark.parametrize(
@@ -286,13 +291,16 @@ def test_paths(adapter, result, path):
     refused(lambda: clvoro.load(path), "name of a file")
     if path is not None:
         refused(lambda: adapter.run(BOX, 0.2, checkpoint=path), "name of a file")
-        refused(lambda: adapter.run(BOX, 0.2, resume=path), "name of a file")
+        refused(
+            lambda: adapter.run(BOX, 0.2, checkpoint=clvoro.Checkpoint(resume=path)),
+            "name of a file",
+        )
 
 
 def test_versions_of_files(result, tmp_path):
     result.save(tmp_path / "a.npz")
     members = dict(np.load(tmp_path / "a.npz"))
-    for version, remedy in ((99, "newer clvoro"), (0, "expected 1 to 1")):
+    for version, remedy in ((99, "newer clvoro"), (0, "expected 1 to 2")):
         np.savez(tmp_path / "b.npz", **{**members, "version": np.array(version)})
         refused(lambda: clvoro.load(tmp_path / "b.npz"), remedy, kind=InputError)
 
@@ -320,13 +328,13 @@ def test_arrays_are_read_only(result, tmp_path):
     again = pickle.loads(pickle.dumps(result))
     assert again.points is again.diagram.points
     loaded = clvoro.load(tmp_path / "a.npz"), clvoro.load(tmp_path / "a.vtu")
-    replaced = dataclasses.replace(result, error=np.zeros(len(POINTS)))
+    replaced = dataclasses.replace(result, size_error=np.zeros(len(POINTS)))
     for mesh in (result, again, copy.deepcopy(result), copy.copy(result), replaced, *loaded):
         diagram = mesh.diagram
         arrays = {name: getattr(diagram, name) for name in dir(diagram) if name in diagram._NAMES}
         arrays |= {k: a for k, a in vars(mesh).items() if isinstance(a, np.ndarray)}
         arrays |= {} if mesh.final is None else vars(mesh.final)
-        assert {"points", "volumes", "shifts", "error", "history"} <= set(arrays)
+        assert {"points", "volumes", "shifts", "size_error", "history"} <= set(arrays)
         for name, array in arrays.items():
             assert not array.flags.writeable, name
             with pytest.raises(ValueError, match="read-only"):
@@ -335,11 +343,11 @@ def test_arrays_are_read_only(result, tmp_path):
     diagram = clvoro.Diagram(BOX, {"points": given})
     given[0] = 0.5  # the caller's own is left alone
     assert not diagram.points.flags.writeable
-    assert result.error.copy().flags.writeable
+    assert result.size_error.copy().flags.writeable
 
 
 def test_colors(result):
-    refused(lambda: result.plot(result.error), "expected one of error", kind=InputError)
+    refused(lambda: result.plot(result.size_error), "expected one of error", kind=InputError)
 
 
 def test_pictures_without_matplotlib(result, monkeypatch):

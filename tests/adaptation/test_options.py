@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.adaptation.options import METHODS, Options, uses, warn_of_unused
+from clvoro.adaptation.options import (
+    METHODS,
+    Checkpoint,
+    MultilevelOptions,
+    Options,
+    PaperOptions,
+    arguments_of_run,
+    uses,
+    warn_of_unused,
+)
 from clvoro.cli import command as cli
 from clvoro.cli.cases import Case, builtin_cases, load_case
 from clvoro.errors import InputError, InputTypeError, UnusedOptionWarning
@@ -41,9 +50,21 @@ def adapter(ctx):
 
 
 def test_defaults_are_those_of_a_run():
-    parameters = inspect.signature(clvoro.Adapter.run).parameters
+    defaults = {
+        parameter.name: parameter.default
+        for signed in (clvoro.Adapter.run, MultilevelOptions, PaperOptions)
+        for parameter in inspect.signature(signed).parameters.values()
+    }
+    defaults["start"] = defaults["points"]
     for option in fields(Options):
-        assert parameters[option.name].default == option.default, option.name
+        assert defaults[option.name] == option.default, option.name
+
+
+def test_adapt_has_the_defaults_of_a_run():
+    of_run = inspect.signature(clvoro.Adapter.run).parameters
+    for name, parameter in inspect.signature(clvoro.adapt).parameters.items():
+        assert parameter.default == of_run[name].default, name
+        assert parameter.annotation == of_run[name].annotation, name
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -52,14 +73,10 @@ def test_options_are_used_or_warned_of(adapter, method):
 
     def made(**options):
         # From start to end: some options are for the last steps, and a tolerance is looked at after twenty.
-        few = (
-            {"effort": "fast", "max_steps": 70}
-            if uses(method, "effort")
-            else {"max_steps": 30, "tol": 1e-9}
-        )
-        run = adapter.run(BOX, SIZE, method=method, seed=4, **{**few, **options})
+        few = {"effort": "fast", "max_steps": 70} if uses(method, "effort") else {"max_steps": 30}
+        run = adapter.run(BOX, SIZE, method=method, seed=4, **arguments_of_run({**few, **options}))
         history = [run.history[name] for name in run.history.dtype.names if name != "seconds"]
-        return run, [np.asarray(a).tobytes() for a in (run.points, run.error, *history)]
+        return run, [np.asarray(a).tobytes() for a in (run.points, run.size_error, *history)]
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -80,21 +97,54 @@ def test_options_are_used_or_warned_of(adapter, method):
 def test_what_is_done_anyway_is_not_warned_of(adapter):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        adapter.run(BOX, 0.4, effort="fast", tol=0)
-        adapter.run(BOX, 0.4, method="lloyd", max_steps=0, levels=0, effort="default")
+        adapter.run(BOX, 0.4, effort="fast", options=PaperOptions(tol=0))
+        adapter.run(BOX, 0.4, method="lloyd", max_steps=0, options=MultilevelOptions(levels=0))
         adapter.memory_needed(BOX, 0.1, method="lloyd")
     with pytest.warns(UnusedOptionWarning, match="it is for adaptive, exact; leave it out"):
-        adapter.memory_needed(BOX, 0.1, method="lloyd", levels=2)
+        adapter.memory_needed(BOX, 0.1, method="lloyd", options=MultilevelOptions(levels=2))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: PaperOptions(tol=-0.1), InputError, "tol is -0.1"),
+        (lambda: PaperOptions(tol=np.nan), InputError, "tol is nan"),
+        (lambda: PaperOptions(k=-1), InputError, "k is -1, expected a finite number > 0"),
+        (lambda: PaperOptions(k=0), InputError, "k is 0"),
+        (lambda: PaperOptions(k="big"), InputTypeError, "k is 'big'"),
+        (lambda: PaperOptions(alpha=0), InputError, "alpha is 0"),
+        (lambda: PaperOptions(alpha=np.inf), InputError, "alpha is inf"),
+        (lambda: MultilevelOptions(levels=-1), InputError, "levels is -1"),
+        (lambda: MultilevelOptions(levels="many"), InputTypeError, "levels is 'many'"),
+        (lambda: MultilevelOptions(error_target=0), InputError, "error_target is 0"),
+        (lambda: PaperOptions(tol="1e-3"), InputTypeError, "tol is '1e-3' of type str"),
+        (lambda: Checkpoint("file", every=-1), InputError, "every is -1"),
+        (lambda: Checkpoint(resume=True), InputError, r"expected Checkpoint\(path, resume=True\)"),
+    ],
+)
+def test_bad_options(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_options_of_a_kind(adapter):
+    with pytest.raises(InputTypeError, match=r"options is .*expected clvoro.MultilevelOptions"):
+        adapter.run(BOX, 0.3, options={"tol": 0})
+    with pytest.raises(InputError, match="on_interrupt is 'stop', expected one of raise, return"):
+        adapter.run(BOX, 0.3, on_interrupt="stop")
+    with pytest.warns(UnusedOptionWarning, match="no checkpoint is written") as caught:
+        Checkpoint(every=5)
+    assert caught[0].filename == __file__
 
 
 def test_levels(adapter, tmp_path, capsys):
     with pytest.raises(InputTypeError, match="levels is '2' of type str, expected an integer or 'auto'"):  # fmt: skip
-        adapter.run(BOX, 0.1, levels="2")
+        MultilevelOptions(levels="2")
     with pytest.raises(InputError, match="levels is -1, expected at least 0"):
-        adapter.run(BOX, 0.1, levels=-1)
+        MultilevelOptions(levels=-1)
     # Sizes may ask for more cells than 64 bits can count.
     with pytest.raises(InputError, match=r"levels is 50, expected at most 36 for \d{22} cells"):
-        adapter.run(BOX, 1e-11, levels=50)
+        adapter.run(BOX, 1e-11, options=MultilevelOptions(levels=50))
     (tmp_path / "c.toml").write_text(CASE)
     for text in ("two", "-1"):
         assert cli.main(["run", str(tmp_path / "c.toml"), f"--levels={text}"]) == cli.BAD_INPUT
@@ -136,7 +186,7 @@ def test_cases(tmp_path, capsys, run_table, options, told):
 def demand_use(case):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_unused(case.run, [method or Options.method for method in case.methods], 1)
+        warn_of_unused(case.run, [method or Options.method for method in case.methods])
 
 
 @pytest.mark.parametrize("name", builtin_cases())

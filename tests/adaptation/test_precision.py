@@ -66,7 +66,7 @@ def test_what_rounding_adds(ctx, box, h, noise):
     by = np.random.default_rng(3).uniform(-noise, noise, result.points.shape) * h
     moved = adapter.diagram(box, np.clip(result.points + by, box.lower, box.upper))
     length = moved.volumes ** (1 / box.dim)
-    change = np.abs((length - h) / np.minimum(length, h) - result.error).mean()
+    change = np.abs((length - h) / np.minimum(length, h) - result.size_error).mean()
     assert 0.6 * precision.ADDED < change / (2 * noise) < 1.1 * precision.ADDED
 
 

@@ -215,7 +215,7 @@ def test_children(engine, n):
     assert BOX.contains(finer).all()
 
 
-def test_body_centerd_lattice_is_carried_over(double):
+def test_body_centered_lattice_is_carried_over(double):
     """Middles of its edges make the lattice of half the spacing, all cells truncated octahedra."""
     a, box = 1 / 6, Box((0, 0, 0), (1, 1, 1))
     line = np.arange(6)

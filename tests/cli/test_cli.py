@@ -61,7 +61,7 @@ def test_run_writes_everything(here, capsys):
     mesh = load(out / "mesh.npz")
     row = re.search(r"^coupled +(\d+) +(\d+) +([\d.]+)", printed.out, re.MULTILINE)
     assert (int(row[1]), int(row[2])) == (len(mesh.points), 4)
-    assert float(row[3]) == pytest.approx(np.abs(mesh.error).mean(), abs=5e-5)
+    assert float(row[3]) == pytest.approx(np.abs(mesh.size_error).mean(), abs=5e-5)
 
 
 def test_written_case_repeats_the_mesh(here):
@@ -195,8 +195,7 @@ def test_second_interrupt_quits_at_once(here, monkeypatch, capsys):
 def pressing_run(number):
     """Return a stand-in for Adapter.run during which the key is pressed twice."""
 
-    def run(self, domain, size, points=None, method="coupled", n_cells=None, start="density",
-            max_steps=100, tol=1e-3, alpha=None, k=0.5, seed=0, callback=None):  # fmt: skip
+    def run(self, domain, size, **options):
         for _ in range(2):
             signal.raise_signal(number)
 

@@ -53,7 +53,7 @@ def test_layers_of_a_straight_wall_are_rectangles(adapter):
     for i in first:
         assert d.neighbor_starts[i + 1] - d.neighbor_starts[i] == 4
     # The others are what a run without layers gives: of twelve starts between 0.010 and 0.021.
-    error = np.abs(result.error)
+    error = np.abs(result.size_error)
     assert error[:n].max() == 0
     assert error[n:].mean() < 0.025
     assert result.check()
@@ -115,7 +115,7 @@ def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
         assert (np.diff(d.neighbor_starts)[layer] == 4).all()
     assert d.volumes.sum() == pytest.approx(2, rel=1e-12)
     # The others are what a run without layers gives, as in a box; none has come between the rows.
-    assert np.abs(result.error[len(rows) :]).mean() < 0.025
+    assert np.abs(result.size_error[len(rows) :]).mean() < 0.025
     others = result.points[len(rows) :, 1 - axis]
     assert np.minimum(others, 1 - others).min() > layers.rows[-1]
     result.check().demand()
@@ -130,9 +130,9 @@ def test_sizes_grow_from_the_layers(adapter):
     beyond = np.flatnonzero((distance > layers.rows[-1] * 1.01) & (distance < 0.25))
     # Sizes by the distance from the edges; the middles of edges lie a little within the circle.
     expected = layers.width + np.log(1.2) * distance[beyond]
-    assert result.size[beyond] == pytest.approx(expected, abs=1e-3)
+    assert result.target_size[beyond] == pytest.approx(expected, abs=1e-3)
     n = len(place_layers(CHANNEL, [layers]))
-    assert np.abs(result.error[n:]).mean() < 0.02
+    assert np.abs(result.size_error[n:]).mean() < 0.02
     assert CHANNEL.contains(result.points).all()
     assert result.diagram.volumes.sum() == pytest.approx(CHANNEL.measure, rel=1e-12)
 
@@ -140,7 +140,11 @@ def test_sizes_grow_from_the_layers(adapter):
 @pytest.mark.parametrize("method", ["lloyd", "coupled", "weighted", "exact"])
 def test_every_method_leaves_them_where_they_are(adapter, method):
     layers = Layers(0.04, count=2, edges=range(4, 84))
-    options = {"max_steps": 8} if method != "exact" else {"effort": "fast", "levels": 1}
+    options = (
+        {"max_steps": 8}
+        if method != "exact"
+        else {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
+    )
     result = adapter.run(CHANNEL, 0.1, layers=layers, method=method, **options)
     rows, free = place_layers(CHANNEL, [layers]), free_domain(CHANNEL, [layers])
     assert np.abs(result.points[: len(rows)] - rows).max() < 1e-14
@@ -162,17 +166,25 @@ def test_walls_share_corners_and_gaps():
 
 def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
     layers = Layers(0.04, count=2, edges=range(4, 84))
-    options = {"layers": layers, "effort": "fast", "levels": 1}
+    options = {"layers": layers, "effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
     whole = adapter.run(CHANNEL, 0.1, **options)
     steps = []
     adapter.run(
-        CHANNEL, 0.1, checkpoint=tmp_path / "half", checkpoint_every=0,
+        CHANNEL, 0.1, checkpoint=clvoro.Checkpoint(tmp_path / "half", every=0),
         callback=lambda row: steps.append(row) or len(steps) == 9, **options,
     )  # fmt: skip
-    resumed = adapter.run(CHANNEL, 0.1, resume=tmp_path / "half", **options)
+    resumed = adapter.run(
+        CHANNEL, 0.1, checkpoint=clvoro.Checkpoint(resume=tmp_path / "half"), **options
+    )
     assert np.array_equal(whole.points, resumed.points)
     with pytest.raises(InputError, match="layers"):
-        adapter.run(CHANNEL, 0.1, resume=tmp_path / "half", effort="fast", levels=1)
+        adapter.run(
+            CHANNEL,
+            0.1,
+            checkpoint=clvoro.Checkpoint(resume=tmp_path / "half"),
+            effort="fast",
+            options=clvoro.MultilevelOptions(levels=1),
+        )
 
 
 @pytest.mark.parametrize(
@@ -266,7 +278,13 @@ def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
         star = clvoro.Polygon(shores.star(tips, seed, (0.5, 0.5), 0.5))
         layer = clvoro.Layers(0.004, count=2, growth=2.0, spacing=0.03, edges=range(0, tips, 2))
         result = clvoro.Adapter(ctx, dtype).run(
-            star, 0.03, layers=layer, levels=1, effort="fast", max_steps=20, seed=1
+            star,
+            0.03,
+            layers=layer,
+            options=clvoro.MultilevelOptions(levels=1),
+            effort="fast",
+            max_steps=20,
+            seed=1,
         )
         result.check().demand()
         others = result.points[len(place_layers(star, [layer])) :]

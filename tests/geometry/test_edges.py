@@ -163,7 +163,13 @@ def test_runs_stay_inside(ctx, method, real):
     domain = clvoro.Polygon(coast(256))
     size = float(np.sqrt(domain.measure / 100))
     result = clvoro.Adapter(ctx, real).run(
-        domain, size, method=method, max_steps=25, seed=7, tol=0, effort="fast"
+        domain,
+        size,
+        method=method,
+        max_steps=25,
+        seed=7,
+        options=clvoro.PaperOptions(tol=0),
+        effort="fast",
     )
     assert domain.contains(result.points).all()
     assert result.diagram.volumes.sum() == pytest.approx(
@@ -181,5 +187,12 @@ def test_refinement_from_generators_on_a_slanted_edge_far_from_0(ctx):
         points = np.concatenate(
             [vee[0] + t * (vee[1] - vee[0]), vee[1] + (1 - t) * (vee[2] - vee[1])]
         )
-        result = adapter.run(domain, 0.25, points=points, levels=1, max_steps=0, method="exact")
+        result = adapter.run(
+            domain,
+            0.25,
+            points=points,
+            options=clvoro.MultilevelOptions(levels=1),
+            max_steps=0,
+            method="exact",
+        )
         result.check().demand()

@@ -273,7 +273,7 @@ def result_of(domain: clvoro.Polygon) -> clvoro.Result:
         "face_vertex_starts": np.array([0, 2], np.int32), "face_vertices": np.zeros(2, np.int32),
     }  # fmt: skip
     return clvoro.Result(
-        points=arrays["points"], diagram=Diagram(domain, arrays), size=ones, error=ones, quality=ones,
+        points=arrays["points"], diagram=Diagram(domain, arrays), target_size=ones, size_error=ones, quality=ones,
         history=np.zeros(1, HISTORY_DTYPE), converged=True, stop_reason="none",
     )  # fmt: skip
 

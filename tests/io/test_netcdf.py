@@ -92,8 +92,12 @@ def test_faces_are_the_cells(result, mesh):
         # A dozen products of coordinates below 4 relative to a corner.
         assert shoelace(nodes[corners]) == pytest.approx(d.volumes[i], rel=0, abs=1e-14)
     assert np.array_equal(mesh["area"], d.volumes)
-    for name in ("size", "error", "quality"):
-        assert np.array_equal(mesh[name], getattr(result, name))
+    for name, attribute in (
+        ("size", "target_size"),
+        ("error", "size_error"),
+        ("quality", "quality"),
+    ):
+        assert np.array_equal(mesh[name], getattr(result, attribute))
         assert mesh.about[name]["mesh"] == b"mesh"
         assert mesh.about[name]["location"] == b"face"
 

@@ -189,12 +189,12 @@ def test_diagram_of_other_generators_is_found(result) -> None:
     assert "nearest generators" in names
 
 
-@pytest.mark.parametrize("name", ["error", "quality", "size"])
+@pytest.mark.parametrize("name", ["size_error", "quality", "target_size"])
 def test_numbers_of_a_result_are_recomputed(result, name: str) -> None:
     values = getattr(result, name).copy()
     values[17] *= 1.001
     report = dataclasses.replace(result, **{name: values}).check()
-    assert ("error" if name == "size" else name) in {f.name for f in report.findings}
+    assert ("quality" if name == "quality" else "size_error") in {f.name for f in report.findings}
 
 
 # What the boundary looks like to faces.
@@ -614,7 +614,7 @@ def test_boundary_cells_are_reported_apart(result, tmp_path) -> None:
     s = summary(result)
     assert (s["boundary_cells"], s["inner_cells"]) == (sum(touching), 60 - sum(touching))
     for name, which in (("boundary", np.array(touching)), ("inner", ~np.array(touching))):
-        assert s[f"{name}_mean_error"] == pytest.approx(np.abs(result.error[which]).mean())
+        assert s[f"{name}_mean_error"] == pytest.approx(np.abs(result.size_error[which]).mean())
         assert s[f"{name}_mean_quality"] == pytest.approx(result.quality[which].mean())
         assert s[f"{name}_min_quality"] == result.quality[which].min()
     assert f"{sum(touching)} boundary cells: mean |e|" in boundary_line(result)

@@ -183,8 +183,8 @@ def test_vtu_holds_cells_and_data(result, tmp_path, compress):
         **_polyhedra(d),
         "points": d.vertices,
         "types": np.full(len(d), 42, np.uint8),
-        "size": result.size,
-        "error": result.error,
+        "size": result.target_size,
+        "error": result.size_error,
         "quality": result.quality,
         "volume": d.volumes,
         "faces_of_cell": np.diff(d.neighbor_starts),
@@ -207,7 +207,7 @@ def test_vtu_as_vtk_reads_it(result, tmp_path):
     reader.Update()
     grid = reader.GetOutput()
     errors = vtk_to_numpy(grid.GetCellData().GetArray("error"))
-    np.testing.assert_array_equal(errors, result.error)
+    np.testing.assert_array_equal(errors, result.size_error)
     check = vtk.vtkCellValidator()
     check.SetInputData(grid)
     check.Update()

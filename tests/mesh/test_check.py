@@ -223,7 +223,7 @@ def test_right_results_pass(flat, solid):
     for result in (flat, solid):
         report = result.check()
         assert report.ok, report
-        assert {"volumes sum", "nearest generators", "error", "quality"} <= set(report.checked)
+        assert {"volumes sum", "nearest generators", "size_error", "quality"} <= set(report.checked)
         report.demand()
 
 
@@ -336,13 +336,15 @@ def test_diagram_of_other_generators_is_found(ctx, flat):
     assert "nearest generators" in names
 
 
-@pytest.mark.parametrize("name", ["error", "quality", "size"])
+@pytest.mark.parametrize("name", ["size_error", "quality", "target_size"])
 def test_numbers_of_a_result_are_recomputed(flat, solid, name):
     for result in (flat, solid):
         values = getattr(result, name).copy()
         values[17] *= 1.001
         report = dataclasses.replace(result, **{name: values}).check()
-        assert ("error" if name == "size" else name) in {f.name for f in report.findings}
+        assert ("quality" if name == "quality" else "size_error") in {
+            f.name for f in report.findings
+        }
 
 
 @pytest.mark.parametrize("kind", ["flat", "solid"])

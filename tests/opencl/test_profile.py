@@ -17,7 +17,13 @@ from clvoro.opencl.program import Engine
 from clvoro.solvers.multigrid import Multigrid
 
 BOX = clvoro.Box((0, 0), (1.4, 1))
-SETTINGS = {"method": "coupled", "max_steps": 5, "tol": 0, "n_cells": 301, "seed": 6151}
+SETTINGS = {
+    "method": "coupled",
+    "max_steps": 5,
+    "options": clvoro.PaperOptions(tol=0),
+    "n_cells": 301,
+    "seed": 6151,
+}
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,13 @@ def adapter(ctx):
 def results(adapter):
     return {
         method: adapter.run(
-            BOX, size, method=method, start="uniform", max_steps=6, tol=0, seed=4711
+            BOX,
+            size,
+            method=method,
+            points="uniform",
+            max_steps=6,
+            options=clvoro.PaperOptions(tol=0),
+            seed=4711,
         )
         for method in ("lloyd", "coupled")
     }
@@ -68,9 +74,9 @@ def of_kind(figure, kind):
 def test_cells_are_drawn_with_their_values(result, color):
     (cells,) = of_kind(plot_cells(result, color), PolyCollection)
     wanted = {
-        "error": result.error,
+        "error": result.size_error,
         "quality": result.quality,
-        "size": result.size,
+        "size": result.target_size,
         "sides": np.clip(np.diff(result.diagram.cell_vertex_starts), 4, 8),
     }
     assert np.array_equal(cells.get_array(), wanted[color])
@@ -109,7 +115,7 @@ def test_error_scale_is_the_same_on_both_sides_of_zero(result):
     (cells,) = of_kind(plot_cells(result, "error"), PolyCollection)
     low, high = cells.get_clim()
     assert low == -high
-    assert high >= np.quantile(np.abs(result.error), 0.99)
+    assert high >= np.quantile(np.abs(result.size_error), 0.99)
 
 
 @pytest.mark.parametrize("shape", [(3.0, 1.0), (1.0, 1.0), (0.6, 2.0)])
@@ -281,7 +287,7 @@ def test_window_stays_in_the_domain(result):
     lower, upper = window_around_smallest(result, 10)
     assert (lower >= BOX.lower).all()
     assert (upper <= BOX.upper).all()
-    assert (upper - lower) == pytest.approx(np.array([10, 8]) * result.size.min())
+    assert (upper - lower) == pytest.approx(np.array([10, 8]) * result.target_size.min())
     lower, upper = window_around_smallest(result, 1e6)
     assert lower == pytest.approx(BOX.lower)
     assert upper == pytest.approx(BOX.upper)
@@ -321,7 +327,7 @@ def test_report_holds_its_pictures(results, adapter, tmp_path):
     assert "<title>Cells &amp; &lt;size&gt;</title>" in page
     assert "&lt;b&gt;" in page
     for result in results.values():
-        assert f"{np.abs(result.error).mean():.4f}" in page
+        assert f"{np.abs(result.size_error).mean():.4f}" in page
         assert f"{result.quality.min():.3f}" in page
 
 

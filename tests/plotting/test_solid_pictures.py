@@ -99,9 +99,9 @@ def test_slice_is_drawn_with_its_values(result, color):
     (cells,) = (c for c in ax.collections if isinstance(c, PolyCollection))
     section = cut_cells(result.diagram, (0, 1, 0), (0, 0.3, 3))
     values = {
-        "error": result.error,
+        "error": result.size_error,
         "quality": result.quality,
-        "size": result.size,
+        "size": result.target_size,
         "sides": np.clip(np.diff(result.diagram.neighbor_starts), 12, 16),
         "skewness": result.measures.worst_of_cell("skewness"),
     }[color]
@@ -230,14 +230,16 @@ def test_long_domains_are_shown_lengthwise(upper, panels):
 
 def test_focus_is_amid_the_smallest_cells_and_inside(result):
     sizes = np.linalg.norm(result.points - [0.4, 0.6, 2.6], axis=1) + 0.3
-    near = dataclasses.replace(result, size=sizes)
+    near = dataclasses.replace(result, target_size=sizes)
     assert np.linalg.norm(focus(near) - [0.4, 0.6, 2.6]) < 0.2
     # Half of the smallest cell is 0.21 large: planes lie at multiples of a fifth.
     assert 0.4 < sizes.min() < 1
     assert focus(near) * 5 == pytest.approx(np.round(focus(near) * 5), abs=1e-9)
-    corner = dataclasses.replace(result, size=np.linalg.norm(result.points - LOWER, axis=1) ** 3)
+    corner = dataclasses.replace(
+        result, target_size=np.linalg.norm(result.points - LOWER, axis=1) ** 3
+    )
     assert focus(corner) == pytest.approx(np.array(LOWER) + 0.25 * Box(LOWER, UPPER).extent)
-    alike = dataclasses.replace(result, size=np.ones(150))
+    alike = dataclasses.replace(result, target_size=np.ones(150))
     assert focus(alike) == pytest.approx(np.add(LOWER, UPPER) / 2)
 
 
@@ -251,7 +253,7 @@ def test_distributions_are_complete(result):
 
 
 def test_report_of_a_solid(result, tmp_path):
-    first = dataclasses.replace(result, error=2 * result.error)
+    first = dataclasses.replace(result, size_error=2 * result.size_error)
     files = write_report({"lloyd": first, "coupled": result}, tmp_path, initial=first)
     names = {f.stem for f in files}
     assert names == {
@@ -265,7 +267,7 @@ def test_report_of_a_solid(result, tmp_path):
 
 def test_closer_look_at_a_large_mesh(result, monkeypatch):
     monkeypatch.setattr("clvoro.plotting.pictures.MANY_SOLID_CELLS", 100)
-    sharp = dataclasses.replace(result, size=np.where(np.arange(150) == 7, 0.005, 0.2))
+    sharp = dataclasses.replace(result, target_size=np.where(np.arange(150) == 7, 0.005, 0.2))
     (draw,) = (d for name, _, d in pictures_of({"coupled": sharp}) if name == "closer")
     ax = draw().axes[0]
     assert np.ptp(ax.get_xlim()) == pytest.approx(60 * 0.005)

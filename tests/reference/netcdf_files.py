@@ -68,7 +68,7 @@ def result_of(diagram: Diagram) -> Result:
     """A Result with `diagram` and made-up data."""
     rng, n = np.random.default_rng(5), len(diagram)
     return Result(
-        points=diagram.points, diagram=diagram, size=0.1 + rng.random(n), error=rng.standard_normal(n),
+        points=diagram.points, diagram=diagram, target_size=0.1 + rng.random(n), size_error=rng.standard_normal(n),
         quality=rng.random(n), history=np.zeros(0, HISTORY_DTYPE), converged=True, stop_reason="made up",
         settings={"name": "é", "seed": 3},
     )  # fmt: skip

@@ -101,8 +101,8 @@ def solid_result(diagram, size=None, seed=7741):
     return Result(
         points=diagram.points,
         diagram=diagram,
-        size=size,
-        error=error,
+        target_size=size,
+        size_error=error,
         quality=quality,
         history=history,
         converged=True,

@@ -55,7 +55,7 @@ def demand(mesh: clvoro.Result | clvoro.Diagram, real: str) -> None:
 
 def run_by(made_by: clvoro.Adapter, domain: Any, *arguments: Any, **options: Any) -> clvoro.Result:
     """Run; what comes too close to each other by itself is not the caller's fault."""
-    made_by.told = refuse_large
+    made_by.on_memory = refuse_large
     try:
         return made_by.run(domain, *arguments, **options)
     except InputError as error:

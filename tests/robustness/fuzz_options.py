@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import clvoro
+from clvoro.adaptation.options import arguments_of_run
 from tests.robustness.fuzz_inputs import placed, placed_in_polygon
 from tests.robustness.fuzz_sizes import fail, fine_size
 
@@ -60,7 +61,7 @@ def some_options(rng: np.random.Generator, domain: Any, real: str, wild: bool) -
             options.pop("n_cells", None)  # which these methods keep
         elif periods.size:  # few generators are too few across a period, and many levels below
             options.pop("points")
-    return options
+    return arguments_of_run(options)
 
 
 def some_generators(rng: np.random.Generator, domain: Any, real: str, wild: bool) -> np.ndarray:

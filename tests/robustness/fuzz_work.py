@@ -140,7 +140,7 @@ def try_layers(rng: np.random.Generator) -> str:
         parts = shapely.get_parts(free.geometry)
         for k in np.flatnonzero(away > slack):
             nearest = parts[np.argmin(shapely.distance(parts, shapely.Point(others[k])))]
-            small = nearest.area < 4 * result.size[len(rows) + k] ** 2
+            small = nearest.area < 4 * result.target_size[len(rows) + k] ** 2
             away[k] = 0 if small else away[k]
         away = away.max(initial=0)
     demand(result, real)
@@ -191,10 +191,12 @@ def try_resumed(rng: np.random.Generator) -> str:
         if not state.exists():
             return "mesh"  # it had ended
         try:
-            resumed = adapter(real).run(*arguments, resume=state, **options)
+            resumed = adapter(real).run(
+                *arguments, checkpoint=clvoro.Checkpoint(resume=state), **options
+            )
         except InputError as error:
             raise Wrong(f"not resumed after row {left}: {error}") from error
-    for name in ("points", "error", "quality", "size"):
+    for name in ("points", "size_error", "quality", "target_size"):
         if not np.array_equal(getattr(resumed, name), getattr(whole, name)):
             raise Wrong(f"a resumed run has other {name}, stopped after row {left}")
     return "mesh"
@@ -244,24 +246,29 @@ def try_turns(rng: np.random.Generator) -> str:
     with tempfile.TemporaryDirectory() as folder:
         state = Path(folder) / "state"
         between(rng, kept, real)
-        kept.run(*arguments, checkpoint=state, checkpoint_every=0, **options)
+        kept.run(*arguments, checkpoint=clvoro.Checkpoint(state, every=0), **options)
         if not state.exists():
             return "mesh"
         between(rng, kept, real)
         try:
-            resumed = kept.run(*arguments, resume=state, **options)
+            resumed = kept.run(*arguments, checkpoint=clvoro.Checkpoint(resume=state), **options)
         except InputError as error:
             raise Wrong(f"not resumed in the adapter that has done more: {error}") from error
-        for name in ("points", "error", "size"):
+        for name in ("points", "size_error", "target_size"):
             if not np.array_equal(getattr(resumed, name), getattr(whole, name)):
                 raise Wrong(f"in an adapter that has done more a resumed run has other {name}")
         changed: dict[str, Any] = {
-            "seed": options["seed"] + 1, "k": 0.7, "points": whole.points[:3], "n_cells": 7, "method": "lloyd",
-            "tol": 0.3, "max_steps": 1, "effort": "default",
+            "seed": options["seed"] + 1, "options": clvoro.PaperOptions(k=0.7, tol=0.3),
+            "points": whole.points[:3], "n_cells": 7, "method": "lloyd",
+            "max_steps": 1, "effort": "default",
         }  # fmt: skip
         name = str(rng.choice(list(changed)))
         with contextlib.suppress(InputError):  # the state is of another run
-            other = kept.run(*arguments, **{**options, name: changed[name]}, resume=state)
+            other = kept.run(
+                *arguments,
+                **{**options, name: changed[name]},
+                checkpoint=clvoro.Checkpoint(resume=state),
+            )
             demand(other, real)
     return "mesh"
 

@@ -42,8 +42,8 @@ def work(folder: Path) -> None:
         mesh.save(folder / "mesh.vtu")
 
     result = adapter.run(
-        BOX, clvoro.sizing.Expression(SIZE), callback=callback, checkpoint=state, checkpoint_every=0,
-        resume=state if state.exists() else None, **OPTIONS,
+        BOX, clvoro.sizing.Expression(SIZE), callback=callback,
+        checkpoint=clvoro.Checkpoint(state, every=0, resume=True), **OPTIONS,
     )  # fmt: skip
     result.save(folder / "result.npz")
 
@@ -87,7 +87,7 @@ def main(times: int, seed: int, patience: float) -> int:
             if (folder / "result.npz").exists():
                 finished += 1
                 result = clvoro.load(folder / "result.npz")
-                for what in ("points", "size", "error", "quality"):
+                for what in ("points", "target_size", "size_error", "quality"):
                     if not np.array_equal(getattr(result, what), getattr(reference, what)):
                         print(f"{what} of the resumed run is not that of the one left alone")
                         return 1

@@ -86,13 +86,13 @@ def every_step(
                     domain,
                     Expression(size),
                     points,
-                    levels=levels,
+                    options=clvoro.MultilevelOptions(levels=levels),
                     n_cells=n_cells,
                     seed=911,
                     **options,
                 )
             assert len(result.points) == n_cells
-            assert np.isfinite(result.error).all()
+            assert np.isfinite(result.size_error).all()
             return result
 
         first = run(every_action(domain.dim, levels), levels, None)

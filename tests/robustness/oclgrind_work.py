@@ -128,7 +128,7 @@ def method(
 ) -> Callable[[clvoro.Adapter], None]:
     def work(adapter: clvoro.Adapter) -> None:
         result = adapter.run(box, Expression(size), method=name, seed=911, **options)
-        assert np.isfinite(result.error).all()
+        assert np.isfinite(result.size_error).all()
         result.diagram.vertices  # noqa: B018
 
     return work
@@ -254,7 +254,14 @@ def polygon(adapter: clvoro.Adapter) -> None:
     layers = clvoro.Layers(0.05, count=2, spacing=0.2, edges=[0])
     # As many steps as it takes until cells come and go, but not those of layers.
     adapter.run(
-        domain, 0.4, layers=layers, method="exact", levels=0, effort="fast", max_steps=22, seed=911
+        domain,
+        0.4,
+        layers=layers,
+        method="exact",
+        options=clvoro.MultilevelOptions(levels=0),
+        effort="fast",
+        max_steps=22,
+        seed=911,
     )
 
 
@@ -292,7 +299,14 @@ def periodic(adapter: clvoro.Adapter) -> None:
         assert abs(diagram.volumes.sum() - 1) < 1e-4
         assert len(diagram.vertices) > 3
     square = clvoro.Box((0, 0), (1, 1), periodic=True)
-    adapter.run(square, 0.13, effort="fast", levels=0, max_steps=4, seed=911)
+    adapter.run(
+        square,
+        0.13,
+        effort="fast",
+        options=clvoro.MultilevelOptions(levels=0),
+        max_steps=4,
+        seed=911,
+    )
     # The second diagram of a run in 3D begins with the rows of the first, unfolded.
     rod = clvoro.Box((0, 0, 0), (1, 0.4, 0.4), periodic=(True, False, False))
     adapter.run(rod, 0.17, method="coupled", max_steps=2)
@@ -466,9 +480,23 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "coupled": large(method("coupled", max_steps=2)),
     "lloyd": method("lloyd", max_steps=1),
     "weighted": method("weighted", max_steps=2),
-    "adaptive": method("adaptive", levels=1, n_cells=90, effort="fast", max_steps=60),
-    "best": method("adaptive", levels=0, n_cells=150, effort="best", max_steps=20),
-    "exact": large(method("exact", levels=0, effort="fast", max_steps=75)),
+    "adaptive": method(
+        "adaptive",
+        options=clvoro.MultilevelOptions(levels=1),
+        n_cells=90,
+        effort="fast",
+        max_steps=60,
+    ),
+    "best": method(
+        "adaptive",
+        options=clvoro.MultilevelOptions(levels=0),
+        n_cells=150,
+        effort="best",
+        max_steps=20,
+    ),
+    "exact": large(
+        method("exact", options=clvoro.MultilevelOptions(levels=0), effort="fast", max_steps=75)
+    ),
     "solid-coupled": method("coupled", CUBE, SOLID, max_steps=2),
     **RUNS,
     **{

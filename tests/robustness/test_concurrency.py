@@ -36,8 +36,8 @@ def digest(result):
     d = result.diagram
     parts = [
         result.points,
-        result.size,
-        result.error,
+        result.target_size,
+        result.size_error,
         result.quality,
         d.volumes,
         d.neighbors,
@@ -164,7 +164,7 @@ GROWS = {
     ),
     "periodic": (TORUS, 0.05, FEW),
     "space": (CUBE, 0.2, FEW),
-    "adaptive": (BOX, 0.06, {**PLANNED, "levels": 1}),
+    "adaptive": (BOX, 0.06, {**PLANNED, "options": clvoro.MultilevelOptions(levels=1)}),
     "layers": (BOX, 0.1, {**FEW, "layers": clvoro.Layers(0.02, count=2, growth=1.2)}),
     "adaptive in space": (CUBE, 0.2, {"effort": "fast", "max_steps": 3}),
     "resumed": (BOX, 0.06, {"method": "weighted", "max_steps": 3}),
@@ -223,8 +223,8 @@ def runs_of(ctx, name, folder):
     kept, file = clvoro.Adapter(ctx), folder / "state"
     if name == "resumed":
         stopped = {"callback": lambda row: row["step"] == 1, "seed": 1}
-        kept.run(domain, size, checkpoint=file, checkpoint_every=1e9, **options, **stopped)
-        options = {**options, "resume": file, "seed": 1}
+        kept.run(domain, size, checkpoint=clvoro.Checkpoint(file, every=1e9), **options, **stopped)
+        options = {**options, "checkpoint": clvoro.Checkpoint(resume=file), "seed": 1}
 
     def work(k):
         adapter = clvoro.Adapter(ctx) if k % 2 else kept

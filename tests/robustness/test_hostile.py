@@ -591,6 +591,6 @@ def read_state(path):
 
 def read_result(path):
     result = clvoro.load(path)
-    arrays = (result.points, result.size, result.error, result.quality, result.history)
+    arrays = (result.points, result.target_size, result.size_error, result.quality, result.history)
     of_diagram = {name: getattr(result.diagram, name).tobytes() for name in result.diagram._arrays}
     return [*(a.tobytes() for a in arrays), of_diagram, result.settings]

@@ -48,7 +48,7 @@ method = "lloyd"
 max_steps = 3
 tol = 0
 """
-FEW = {"method": "lloyd", "max_steps": 4, "tol": 0.0}
+FEW = {"method": "lloyd", "max_steps": 4, "options": clvoro.PaperOptions(tol=0.0)}
 
 
 @pytest.fixture
@@ -229,14 +229,14 @@ def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before
     adapter, tmp_path, monkeypatch
 ):
     path = tmp_path / "state"
-    options = {**FEW, "checkpoint": path, "checkpoint_every": 0}
+    options = {**FEW, "checkpoint": clvoro.Checkpoint(path, every=0)}
     whole = adapter.run(BOX, 0.15, callback=lambda row: row["step"] == 1, **options)
     before = path.read_bytes()
     monkeypatch.setattr(
         checkpoint.Checkpointer, "write", in_little_room(checkpoint.Checkpointer.write, 1000)
     )
     with pytest.warns(CheckpointWarning, match="File too large.* The run goes on"):
-        result = adapter.run(BOX, 0.15, resume=path, **options)
+        result = adapter.run(BOX, 0.15, checkpoint=clvoro.Checkpoint(resume=path), **options)
     whole = adapter.run(BOX, 0.15, **FEW)
     assert np.array_equal(result.points, whole.points)
     assert path.read_bytes() == before
@@ -252,12 +252,14 @@ def test_checkpoints_replace_nothing_else(adapter, tmp_path, content):
         path.write_bytes(content)
     before = path.read_bytes()
     with pytest.raises(InputError, match="is no checkpoint; choose another name, or remove it"):
-        adapter.run(BOX, 0.15, checkpoint=path, checkpoint_every=0, **FEW)
+        adapter.run(BOX, 0.15, checkpoint=clvoro.Checkpoint(path, every=0), **FEW)
     assert path.read_bytes() == before
     path.write_bytes(b"")  # as mktemp makes it
-    adapter.run(BOX, 0.15, checkpoint=path, checkpoint_every=0, **FEW)
+    adapter.run(BOX, 0.15, checkpoint=clvoro.Checkpoint(path, every=0), **FEW)
     assert Saved(path).state["steps"] == FEW["max_steps"]
-    adapter.run(BOX, 0.2, checkpoint=path, checkpoint_every=0, **FEW)  # another run's checkpoint
+    adapter.run(
+        BOX, 0.2, checkpoint=clvoro.Checkpoint(path, every=0), **FEW
+    )  # another run's checkpoint
 
 
 def test_results_replace_neither_checkpoints_nor_what_a_run_begins_with(here, capsys):
@@ -477,7 +479,7 @@ def test_strict_floating_point_of_the_caller(adapter):
     field = clvoro.sizing.Raster(values, (0, 0), (1, 1))
     with np.errstate(all="raise"), warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert np.isfinite(adapter.run(BOX, field, effort="fast").error).all()
+        assert np.isfinite(adapter.run(BOX, field, effort="fast").size_error).all()
 
 
 def test_callbacks_do_not_write_into_the_history(adapter):

@@ -296,7 +296,7 @@ def test_a_run_on_a_graded_field():
     result = clvoro.Adapter().run(clvoro.Box((0, 0), (2, 1)), size, max_steps=3)
     x = result.points[:, 0]
     ramp = np.minimum(0.05 + math.log(1.3) * np.maximum(x - 1, 0), 0.4)
-    assert np.abs(result.size - ramp).max() < 1.01 * math.log(1.3) / 64  # one spacing
+    assert np.abs(result.target_size - ramp).max() < 1.01 * math.log(1.3) / 64  # one spacing
 
 
 def test_resolution_is_chosen_and_capped(make_engine):

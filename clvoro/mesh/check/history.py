@@ -58,7 +58,7 @@ def check_history(check: Check, result: Result, eps: float) -> None:
         "history", [rows["level"][-1] != 0],
         lambda _: f"the history ends on level {rows['level'][-1]}, expected 0",
     )  # fmt: skip
-    error = np.abs(result.error)
+    error = np.abs(result.size_error)
     told = {
         "mean_error": error.mean(), "max_error": error.max(),
         "mean_quality": result.quality.mean(), "min_quality": result.quality.min(),

@@ -21,15 +21,17 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
     """Check the values of a result, whose diagram is right."""
     d = result.diagram
     n, dim = len(d), d.domain.dim
-    for name in ("size", "error", "quality"):
+    for name in ("target_size", "size_error", "quality"):
         check.shape(name, getattr(result, name), (n,))
     check.shape("points", result.points, (n, dim))
-    h, e, q = result.size, result.error, result.quality
+    h, e, q = result.target_size, result.size_error, result.quality
     check.note(
         "points", (result.points != d.points).any(axis=1),
         lambda i: f"points[{i}] is {result.points[i]}, the diagram's {d.points[i]}",
     )  # fmt: skip
-    check.note("size", ~(h > 0), lambda i: f"size[{i}] is {h[i]}, expected > 0", stop=True)
+    check.note(
+        "target_size", ~(h > 0), lambda i: f"target_size[{i}] is {h[i]}, expected > 0", stop=True
+    )
     eps = float(np.finfo(g.real).eps)
     length = np.maximum(d.volumes, 0) ** (1 / dim)
     with np.errstate(all="ignore"):
@@ -41,8 +43,8 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         else:
             quality = 36 * np.pi * d.volumes**2 / perimeter**3
     check.note(
-        "error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
-        lambda i: f"error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
+        "size_error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
+        lambda i: f"size_error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
     )  # fmt: skip
     # Where measures were made anew from a file's corners they round as positions do, as straightened boundaries do.
     rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter

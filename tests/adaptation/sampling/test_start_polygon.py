@@ -189,7 +189,7 @@ def test_pieces_are_meshed_each_with_its_own_balance(ctx, method: str) -> None:
     assert result.check().ok
     assert np.isin(result.history["iterations"], np.arange(1, 100)).any()
     # A tenth of the cells' size at most: what rounding the number of cells of a piece leaves is a twentieth.
-    assert np.abs(result.error).mean() < 0.1
+    assert np.abs(result.size_error).mean() < 0.1
 
 
 def test_coarse_levels_reach_every_piece(ctx) -> None:
@@ -197,6 +197,8 @@ def test_coarse_levels_reach_every_piece(ctx) -> None:
     corner = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
     pieces = [[corner + np.array([2 * i, 3 * (i % 2)])] for i in range(9)]
     domain = clvoro.Polygon.from_pieces(pieces)
-    result = clvoro.Adapter(ctx).run(domain, 0.3, effort="fast", levels=2, seed=1)
+    result = clvoro.Adapter(ctx).run(
+        domain, 0.3, effort="fast", options=clvoro.MultilevelOptions(levels=2), seed=1
+    )
     assert len(set(domain.piece_of(result.points))) == 9
     assert result.check().ok

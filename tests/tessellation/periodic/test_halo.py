@@ -34,7 +34,7 @@ def adapter(ctx, request):
 
 
 def lattice(box, count, rng):
-    """Places of a body-centerd lattice, each some way off: no four nearly in a plane, or on a circle."""
+    """Places of a body-centered lattice, each some way off: no four nearly in a plane, or on a circle."""
     cubes = np.indices((count,) * box.dim).reshape(box.dim, -1).T
     points = np.concatenate([cubes, cubes + 0.5]) / count
     points += 0.12 / count * rng.uniform(-1, 1, points.shape)
