@@ -255,7 +255,7 @@ OTHERS = {
     "seed": {"seed": 6},
     "method": {"method": "lloyd"},
     "max_steps": {"max_steps": 7},
-    "k": {"options": clvoro.PaperOptions(tol=0.0, k=0.25)},
+    "k": {"options": clvoro.PaperOptions(k=0.25)},
     "n_cells": {"n_cells": 300},
     "points": {"points": np.random.default_rng(4).random((50, 2))},
 }
