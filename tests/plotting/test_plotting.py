@@ -273,7 +273,7 @@ def test_displacements_of_a_large_mesh_are_those_in_a_window(result):
     points = rng.random((n, 2)) * BOX.extent + BOX.lower
     field = clvoro.Displacements(points, 1e-3 * rng.random((n, 2)), 1e-3 * rng.random((n, 2)))
     large = dataclasses.replace(
-        result, points=points, size=np.full(n, 0.004), initial=None, final=field
+        result, points=points, target_size=np.full(n, 0.004), initial=None, final=field
     )
     lower, upper = window_around_smallest(large, 50)
     figure = plot_displacements(large)
