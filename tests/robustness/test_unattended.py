@@ -230,13 +230,14 @@ def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before
 ):
     path = tmp_path / "state"
     options = {**FEW, "checkpoint": clvoro.Checkpoint(path, every=0)}
+    both = clvoro.Checkpoint(path, every=0, resume=True)
     whole = adapter.run(BOX, 0.15, callback=lambda row: row["step"] == 1, **options)
     before = path.read_bytes()
     monkeypatch.setattr(
         checkpoint.Checkpointer, "write", in_little_room(checkpoint.Checkpointer.write, 1000)
     )
     with pytest.warns(CheckpointWarning, match="File too large.* The run goes on"):
-        result = adapter.run(BOX, 0.15, checkpoint=clvoro.Checkpoint(resume=path), **options)
+        result = adapter.run(BOX, 0.15, **{**options, "checkpoint": both})
     whole = adapter.run(BOX, 0.15, **FEW)
     assert np.array_equal(result.points, whole.points)
     assert path.read_bytes() == before
