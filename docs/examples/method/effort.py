@@ -26,12 +26,6 @@ plt.show()
 
 # %%
 for effort, mesh in meshes.items():
-<<<<<<< HEAD
     error, quality, steps = np.abs(mesh.size_error), mesh.quality, mesh.history["step"][-1]
     print(f"{effort:8} {len(mesh.points)} cells after {steps} steps:", end=" ")
     print(f"mean |e| {error.mean():.4f}, mean Q {quality.mean():.4f}, min Q {quality.min():.3f}")
-=======
-    error, quality = np.abs(mesh.size_error), mesh.quality
-    print(f"{effort:8} {len(mesh.points):5} cells, mean |e| {error.mean():.4f}, mean Q {quality.mean():.4f}, "
-          f"min Q {quality.min():.3f}, {mesh.history['step'][-1]} steps")  # fmt: skip
->>>>>>> d06fb40 (Add clvoro.adapt and clvoro.voronoi to the documentation)

@@ -18,16 +18,11 @@ size = sizing.Distance(sizing.Circle((0.9, 0.75), radius=0.3), h_min=0.02, slope
 # These methods repeat one kind of step. They start from the same random points. `tol=0` takes all 100 steps.
 
 adapter = clvoro.Adapter()
-<<<<<<< HEAD
 options = clvoro.PaperOptions(tol=0, k=1)
 runs = {
     method: adapter.run(domain, size, "uniform", method, seed=20251, max_steps=100, options=options)
     for method in ("lloyd", "poisson", "coupled")
 }
-=======
-options = dict(points="uniform", max_steps=100, options=clvoro.PaperOptions(tol=0, k=1), seed=20251)
-runs = {m: adapter.run(domain, size, method=m, **options) for m in ("lloyd", "poisson", "coupled")}
->>>>>>> d06fb40 (Add clvoro.adapt and clvoro.voronoi to the documentation)
 
 # %%
 figure, axes = plt.subplots(3, 1, figsize=(6.4, 11), layout="constrained")
