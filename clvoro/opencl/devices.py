@@ -142,9 +142,9 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
         subject = f"device={device!r}: no working OpenCL device of that name or index"
     failures = []
     for candidate in sorted(wanted, key=lambda c: c.rank):
-        reason = _reason_against(candidate.device, fp64)
-        if not reason:
-            return _context_on(candidate.device)
+        ctx, reason = _try_device(candidate.device, fp64)
+        if ctx is not None:
+            return ctx
         failures.append(f"{candidate.index} {candidate.title}: {reason}")
     chosen = index is not None or "PYOPENCL_CTX" in os.environ
     raise DeviceError(_complaint(subject, found, failures, broken, chosen, fp64))
@@ -331,19 +331,26 @@ def _context_on(device: cl.Device) -> cl.Context:
 
 def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
     """Return a context on exactly this device, or say why it is of no use."""
-    reason = _reason_against(candidate.device, fp64)
-    if reason:
+    ctx, reason = _try_device(candidate.device, fp64)
+    if ctx is None:
         raise DeviceError(
             f"the device {candidate.title} ({candidate.index}) cannot be used: {reason}; "
             "choose another (`clvoro devices` lists them)"
         )
-    return _context_on(candidate.device)
+    return ctx
 
 
-def _reason_against(device: cl.Device, fp64: bool) -> str:
+def _try_device(device: cl.Device, fp64: bool) -> tuple[cl.Context | None, str]:
+    """Return a context on `device`, or None and the reason why it is of no use."""
     if fp64 and not has_fp64(device):
-        return "it has no double precision (use dtype='float32')"
-    return _probe.verdict(device)
+        return None, "it has no double precision (use dtype='float32')"
+    try:
+        ctx = _context_on(device)
+    except cl.Error as error:
+        return None, _probe.failure(error)
+    # In a context of the trial's own PoCL would load what it compiles with once more, which takes 0.4 s.
+    reason = _probe.verdict(device, ctx)
+    return (None, reason) if reason else (ctx, "")
 
 
 def _default_index(

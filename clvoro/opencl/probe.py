@@ -62,23 +62,23 @@ def has_fp64(device: cl.Device) -> bool:
         return False
 
 
-def verdict(device: cl.Device) -> str:
-    """Return why `device` does not work, or an empty string; a device is tried once."""
+def verdict(device: cl.Device, ctx: cl.Context | None = None) -> str:
+    """Return why `device` does not work, or an empty string; a device is tried once, in `ctx` if one is given."""
     key = device.int_ptr
     with _lock:
         if key not in _verdicts:
-            _verdicts[key] = probe(device)
+            _verdicts[key] = probe(device, ctx)
         return _verdicts[key]
 
 
-def probe(device: cl.Device) -> str:
+def probe(device: cl.Device, ctx: cl.Context | None = None) -> str:
     """Build and run a small kernel on `device`; return what went wrong, or an empty string."""
     try:
         if not device.available or not device.compiler_available:
             return "the runtime says that it is not available"
         values = np.arange(_PROBE_SIZE, dtype=np.int32)
         got = np.full_like(values, -1)
-        ctx = cl.Context([device])
+        ctx = cl.Context([device]) if ctx is None else ctx
         queue = cl.CommandQueue(ctx)
         flags = cl.mem_flags
         given = cl.Buffer(ctx, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=values)
@@ -91,10 +91,15 @@ def probe(device: cl.Device) -> str:
         cl.enqueue_copy(queue, got, out)
         queue.finish()
     except Exception as error:  # whatever a broken runtime does, it is that device's verdict
-        return f"it cannot build and run a kernel: {one_line(str(error) or repr(error), 300)}"
+        return failure(error)
     if not np.array_equal(got, 4 * values):
         return "it computes wrong results"
     return ""
+
+
+def failure(error: Exception) -> str:
+    """Return the reason against a device on which `error` was raised."""
+    return f"it cannot build and run a kernel: {one_line(str(error) or repr(error), 300)}"
 
 
 def crashing_platforms(timeout: float = 300.0) -> dict[int, str]:

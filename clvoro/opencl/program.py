@@ -6,11 +6,12 @@ with `#line` directives, so that the complete text is what the driver (and its c
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -33,6 +34,8 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
 _programs: dict[tuple, cl.Program] = {}
 _building = 0.0
+POCL = "Portable Computing Language"
+"""Name of PoCL's platform."""
 _UNTYPED_CALLS = 3
 """Calls of a kernel before PyOpenCL is told the types of its arguments."""
 
@@ -95,26 +98,27 @@ class KernelPool:
 
 
 class Kernels(SimpleNamespace):
-    """Kernels of a program as attributes, taken when first asked for.
+    """Kernels of a program as attributes, taken when first used; the program is built for the first of them.
 
     Each has arguments of its own, and knows its `stage`, for a profile.
     """
 
-    def __init__(self, program: cl.Program, stage: str, pool: KernelPool) -> None:
-        super().__init__(_program=program, _stage=stage, _pool=pool)
+    def __init__(self, build: Callable[[], cl.Program], stage: str, pool: KernelPool) -> None:
+        super().__init__(_build=build, _stage=stage, _pool=pool)
 
     def __getattr__(self, name: str) -> cl.Kernel:
         if name.startswith("_"):
             raise AttributeError(name)
+        program = self._build()
         try:
-            kernel = self._pool.take(self._program, name)
+            kernel = self._pool.take(program, name)
         except cl.LogicError as error:
             if f"void {name}(" in source_text(f"{self._stage}.cl"):
                 raise BuildError(
                     f"cl_kernels/{self._stage}.cl was built without its kernel {name}. {cache_remedy()}"
                 ) from error
             raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
-        kernel.stage = self._stage.rpartition("/")[2]  # type: ignore[attr-defined]
+        kernel.stage = self._stage  # type: ignore[attr-defined]
         setattr(self, name, kernel)
         return kernel
 
@@ -185,20 +189,41 @@ def build_program(
         With the compiler's log, if the source does not compile.
     """
     global _building
-    text = prelude + "\n" + source_text(name)
-    options = tuple(f"-D{key}={value}" for key, value in sorted(defines.items()))
+    text, options = program_text(name, defines, prelude)
     key = (ctx.int_ptr, text, options)
     with _lock:
         if key not in _programs:
             began = time.perf_counter()
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", cl.CompilerWarning)
-                    _programs[key] = cl.Program(ctx, text).build(options=list(options))
+                _programs[key] = _build(ctx, text, options, short=not prelude)
             except cl.Error as error:
                 raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
             _building += time.perf_counter() - began
         return _programs[key]
+
+
+def program_text(
+    name: str, defines: Mapping[str, object], prelude: str
+) -> tuple[str, tuple[str, ...]]:
+    """Return the text of the program in `cl_kernels/<name>` after `prelude`, and its options."""
+    options = tuple(f"-D{key}={value}" for key, value in sorted(defines.items()))
+    return prelude + "\n" + source_text(name), options
+
+
+def _build(ctx: cl.Context, text: str, options: tuple[str, ...], short: bool) -> cl.Program:
+    """Build `text`; where `short`, PoCL reads our declarations of built-in functions instead of its own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", cl.CompilerWarning)
+        if short and ctx.devices[0].platform.name.strip() == POCL:
+            with contextlib.suppress(cl.Error):  # another PoCL may need its own declarations
+                text_of_pocl, more = shortened(text)
+                return cl.Program(ctx, text_of_pocl).build(options=[*options, *more])
+        return cl.Program(ctx, text).build(options=list(options))
+
+
+def shortened(text: str) -> tuple[str, tuple[str, ...]]:
+    """Return `text` with our declarations of built-in functions, and the options for PoCL to leave out its own."""
+    return f"{source_text('opencl/pocl_builtins.h')}\n{text}", ("-D_OPENCL_H_",)
 
 
 def build_seconds() -> float:
@@ -289,17 +314,19 @@ class Engine:
     def kernels(
         self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
     ) -> Kernels:
-        """Build `cl_kernels/<stage>.cl` and return its kernels."""
+        """Return the kernels of `cl_kernels/<stage>.cl`, which is built for the first that is used."""
+        name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
+        return Kernels(lambda: build_program(self.ctx, name, full, prelude), stage, self.pool)
+
+    def all_defines(self, stage: str, defines: Mapping[str, object]) -> dict[str, object]:
+        """Return what `cl_kernels/<stage>.cl` is built with: `defines`, and those of the engine that it names."""
         # What a source does not name would only have it built anew for every domain.
         text = source_text(f"{stage}.cl")
         of_domain = (("FACE", self.name_of(self.face)), *self.domain_defines)
         named = {name: value for name, value in of_domain if name in text}
-        full = {
-            "DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named,
-            **(defines or {}),
+        return {
+            "DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named, **defines,
         }  # fmt: skip
-        program = build_program(self.ctx, f"{stage}.cl", full, prelude)
-        return Kernels(program, stage, self.pool)
 
     def run(
         self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None

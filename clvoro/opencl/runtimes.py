@@ -50,7 +50,7 @@ def provide_cache() -> Path | None:
     if not sys.platform.startswith("linux"):
         return None
     with contextlib.suppress(OSError, RuntimeError):  # no such folder can be made, or nobody's home
-        place = _cache_home()
+        place = cache_home()
         place.mkdir(parents=True, exist_ok=True)
         if _has_room(place):
             return None
@@ -76,7 +76,7 @@ def _has_room(folder: Path | str | None) -> bool:
 def cache_remedy() -> str:
     """Return what to do about kernels in caches that are damaged or full: runtimes do not recover from that."""
     try:
-        home = _cache_home()
+        home = cache_home()
     except RuntimeError:  # nobody's home
         home = Path("~/.cache")
     pocl = os.environ.get("POCL_CACHE_DIR") or home / "pocl"
@@ -86,7 +86,7 @@ def cache_remedy() -> str:
     )
 
 
-def _cache_home() -> Path:
+def cache_home() -> Path:
     """Return the user's cache folder, as PoCL and PyOpenCL see it."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
@@ -155,7 +155,7 @@ def _loader_home(library: Path) -> Path:
         entries[icd.name] = str(own / name) if (own / name).is_file() else name
     text = "\n".join(f"{key}={value}" for key, value in sorted(entries.items()))
     name = "icd-" + hashlib.sha256(text.encode()).hexdigest()[:16]
-    return _write_home(_cache_home() / "clvoro" / name, entries)
+    return _write_home(cache_home() / "clvoro" / name, entries)
 
 
 def _write_home(home: Path, entries: dict[str, str]) -> Path:

@@ -45,7 +45,8 @@ def machine(monkeypatch):
         found = [device._describe(d, f"{i}:0") for i, d in enumerate(devices)]
         monkeypatch.setattr(device, "_candidates", lambda **_: (found, []))
         monkeypatch.setattr(_probe, "crashing_platforms", dict)
-        monkeypatch.setattr(_probe, "verdict", lambda d: "it cannot build" if d in broken else "")
+        reasons = {d.int_ptr: "it cannot build" if d in broken else "" for d in devices}
+        monkeypatch.setattr(_probe, "_verdicts", reasons)
         monkeypatch.setattr(device.cl, "Context", lambda devices: devices)
 
     return install

@@ -457,7 +457,7 @@ def test_caches_go_where_there_is_room(tmp_path, monkeypatch):
 def test_kernels_lost_from_a_cache(ctx, monkeypatch):
     monkeypatch.delenv("POCL_CACHE_DIR", raising=False)
     program = cl.Program(ctx, "kernel void other(global int *x) { x[0] = 0; }").build()
-    lost = Kernels(program, "sizing/size_field", KernelPool())
+    lost = Kernels(lambda: program, "sizing/size_field", KernelPool())
     with pytest.raises(BuildError, match=r"without its kernel evaluate\. If .* remove .*pocl"):
         _ = lost.evaluate
     with pytest.raises(AttributeError, match="has no kernel evalate"):

@@ -1,0 +1,58 @@
+"""Programs are built when they are first needed, and read as few declarations as they can."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from clvoro.opencl import program
+from clvoro.opencl.program import Engine
+
+
+@pytest.fixture
+def engine(ctx):
+    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
+
+
+def test_a_program_is_built_for_its_first_kernel(engine, monkeypatch):
+    built = []
+    build = program.build_program
+    monkeypatch.setattr(program, "build_program", lambda *a: built.append(a[1]) or build(*a))
+    kernels = engine.kernels("opencl/primitives")
+    assert not built
+    assert kernels.gather_rows is kernels.gather_rows
+    assert built == ["opencl/primitives.cl"]
+
+
+def test_pocl_reads_short_declarations(ctx, monkeypatch):
+    if ctx.devices[0].platform.name.strip() != program.POCL:
+        pytest.skip("for PoCL only")
+    texts = []
+    plain = cl.Program
+
+    def noted(ctx, text):
+        texts.append(text)
+        return plain(ctx, text)
+
+    monkeypatch.setattr(program.cl, "Program", noted)
+    ours = "kernel void put(global double *x) { x[0] = sqrt(x[1]); }"
+    program._build(ctx, ours, (), short=True)
+    program._build(ctx, ours, (), short=False)
+    # A function that no kernel of ours calls is found in PoCL's own declarations.
+    other = ours.replace("sqrt", "erfc")
+    program._build(ctx, other, (), short=True)
+    assert [text.endswith(ours) or text.endswith(other) for text in texts] == [True] * 4
+    assert [text in (ours, other) for text in texts] == [False, True, False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch):
+    from tests.robustness.test_portability import programs_of_all_kinds
+
+    if ctx.devices[0].platform.name.strip() != program.POCL:
+        pytest.skip("for PoCL only")
+    built, plain = [], cl.Program
+    monkeypatch.setattr(program.cl, "Program", lambda *a: built.append(a[1]) or plain(*a))
+    programs_of_all_kinds(ctx, dtype, monkeypatch)
+    full = [text for text in built if "DECLARE_REALS" not in text]
+    assert all("size_at" in text for text in full)
