@@ -32,6 +32,7 @@ def test_every_script_runs_from_a_checkout(script, tmp_path):
     assert script in done.stdout.splitlines()[0]
 
 
+@pytest.mark.slow
 def test_interpolation():
     uniform, adapted = records("interpolation.py", "--sizes", "4e3")
     assert uniform["cells"] == adapted["cells"] == 4000
@@ -57,6 +58,7 @@ def test_restart():
     assert all(r["mass"] < 1e-12 for r in moved)
 
 
+@pytest.mark.slow
 def test_clusters():
     rows = records("clusters.py", "--sets", "3")
     rows += records("clusters.py", "--sets", "3", "--dim", "3", "--kinds", "spheres,few-roundings")
@@ -64,6 +66,7 @@ def test_clusters():
     assert all(r["meshes"] == r["sets"] == 3 for r in rows)
 
 
+@pytest.mark.slow
 def test_transfer():
     rows = records("transfer.py", "--sizes", "500,4000", "--dims", "2", "--repeat", "1")
     first, second, free = (r for r in rows if r["rate"] is not None)

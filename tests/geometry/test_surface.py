@@ -165,7 +165,7 @@ def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
     """Number of cells: the thin shell of small ones is found, and is that of the exact sphere."""
     from clvoro.adaptation.sampling.quadrature import DensityTree
 
-    n, m = 40, 60  # rings from pole to pole
+    n, m = 24, 36  # rings from pole to pole
     a, b = np.meshgrid(np.pi * np.arange(n + 1) / n, 2 * np.pi * np.arange(m) / m, indexing="ij")
     ball = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(m), indexing="ij"))
@@ -181,7 +181,7 @@ def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
         DensityTree(sizing.Sizing(engine, DOMAIN, sizing.Distance(s, **law)), DOMAIN, 1e-3).integral
         for s in (surface, sizing.Sphere(center, 0.5))
     ]
-    # The facets' area is short of the sphere's by 0.25 %, and a little more in the shell's cells.
+    # The facets' area is short of the sphere's by 0.7 %, and a little more in the shell's cells.
     assert counts[0] == pytest.approx(counts[1], rel=8e-3)
 
 

@@ -57,23 +57,23 @@ def test_refusals_have_to_be_true():
     ("kind", "seed"),
     [
         ("polygon", 703016),
-        ("polygon-run", 50000082),
+        pytest.param("polygon-run", 50000082, marks=pytest.mark.slow),
         ("hard-polygon", 70000154),
-        ("hard-polygon", 70000338),
-        ("hard-polygon", 71000383),
+        pytest.param("hard-polygon", 70000338, marks=pytest.mark.slow),
+        pytest.param("hard-polygon", 71000383, marks=pytest.mark.slow),
         ("hard-polygon", 120000326),
         ("hard-polygon", 210000134),
-        ("hard-polygon", 210001839),
+        pytest.param("hard-polygon", 210001839, marks=pytest.mark.slow),
         ("polygon", 210001878),
-        ("polygon-run", 410000584),
+        pytest.param("polygon-run", 410000584, marks=pytest.mark.slow),
         ("polygon", 757286782),
         ("hard-polygon", 483733786),
         ("hard-polygon", 483733990),
         ("hard-polygon", 483738857),
-        ("hard-polygon", 530437850),
+        pytest.param("hard-polygon", 530437850, marks=pytest.mark.slow),
         ("hard-polygon", 530440997),
-        ("hard-polygon", 95364880),
-        ("polygon-run", 220638134),
+        pytest.param("hard-polygon", 95364880, marks=pytest.mark.slow),
+        pytest.param("polygon-run", 220638134, marks=pytest.mark.slow),
         ("hard-polygon", 2450810770),
     ],
 )
@@ -87,7 +87,12 @@ def test_polygons_that_failed_once(kind, seed):
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("around", 822841374), ("around", 220865677), ("hard-polygon", 95364499)]
+    ("kind", "seed"),
+    [
+        ("around", 822841374),
+        pytest.param("around", 220865677, marks=pytest.mark.slow),
+        ("hard-polygon", 95364499),
+    ],
 )
 def test_vertices_that_were_elsewhere_once(kind, seed):
     """Near a corner of the box; where very many cells meet in space; at the tip of a needle that sticks out of the
@@ -98,12 +103,12 @@ def test_vertices_that_were_elsewhere_once(kind, seed):
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
-        ("run", 104533427),
+        pytest.param("run", 104533427, marks=pytest.mark.slow),
         ("run", 1359923794),
         ("periodic", 1359924102),
-        ("around", 311905425),
-        ("around", 311906760),
-        ("around", 21192475),
+        pytest.param("around", 311905425, marks=pytest.mark.slow),
+        pytest.param("around", 311906760, marks=pytest.mark.slow),
+        pytest.param("around", 21192475, marks=pytest.mark.slow),
         ("around", 21193788),
     ],
 )
