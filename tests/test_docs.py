@@ -72,7 +72,7 @@ def test_example_runs_and_draws(example, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", sorted(set(re.findall(r"`(--[a-z-]+)", PAGES["guide/command_line.md"])))
+    "option", sorted(set(re.findall(r"`(--[a-z-]+)", PAGES.get("guide/command_line.md", ""))))
 )
 def test_options_of_the_command_exist(option, capsys):
     with pytest.raises(SystemExit):
