@@ -1,4 +1,7 @@
-"""The command `clvoro`: run a case, list devices and built-in cases."""
+"""The command `clvoro`: run a case, convert and check meshes, list devices and built-in cases.
+
+Each command imports what it needs when it starts, so that `clvoro --help` answers at once.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ..errors import (
     Aborted,
@@ -17,6 +21,7 @@ from ..errors import (
     InputTypeError,
     OutputError,
 )
+from .formats import MESH_FILES
 from .streams import steady_streams
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
@@ -25,20 +30,21 @@ _EPILOG = """\
 exit codes:
   0    done
   1    the run failed, or a file could not be written; check: a mesh is wrong
-  2    bad usage or input, also a place where no folder can be made (--out);
+  2    bad usage or input, or the output folder cannot be made;
        check: a file cannot be read
   3    no usable device
-  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; what there was has been
+  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; the mesh so far has been
        written)
 
 examples:
   clvoro run paper                      the paper's validation case, into out/paper
   clvoro run airfoil --device gpu       a wing section on a GPU
   clvoro cases paper > my.toml          a case file to start from
-  clvoro run my.toml --effort fast --out result
-  clvoro run my.toml --checkpoint my.state                   and, should it be killed,
+  clvoro run my.toml --effort fast --out result --format foam
+  clvoro run my.toml --checkpoint my.state                   and, after a crash,
   clvoro run my.toml --checkpoint my.state --resume my.state
-  clvoro check result/mesh.vtu          is the mesh what it claims to be?
+  clvoro convert result/mesh.npz mesh.nc
+  clvoro check result/mesh.vtu          verify the mesh
 """
 
 
@@ -52,19 +58,34 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"clvoro {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    _add_run(commands)
+    _add_convert(commands)
+    _add_check(commands)
+    devices = commands.add_parser("devices", help="list the OpenCL devices and whether they work")
+    devices.set_defaults(work=_devices)
+    cases = commands.add_parser("cases", help="list the built-in cases, or print one")
+    cases.add_argument("case", metavar="NAME", nargs="?", help="print the TOML text of this case")
+    cases.set_defaults(work=_cases)
+    return parser
 
+
+def _add_run(commands: Any) -> None:
     run = commands.add_parser(
         "run",
         help="run a case: mesh, history and report",
         description="Run a case and write mesh.vtu, mesh.npz, history.csv, case.toml, report.html and\n"
-        "pictures/. Options override what the case says.",
+        "pictures/. Options override the case.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    run.add_argument("case", metavar="CASE", help="a TOML file, or a built-in case's name")
-    run.add_argument(
-        "--out", metavar="DIR", type=_path, help="where to write (default: out/NAME of the case)"
-    )
+    run.set_defaults(work=_run)
+    run.add_argument("case", metavar="CASE", help="a TOML file, or the name of a built-in case")
+    _add_settings(run.add_argument_group("settings of the run"))
+    _add_checkpoints(run.add_argument_group("checkpoints"))
+    _add_output(run.add_argument_group("output"))
+
+
+def _add_settings(run: Any) -> None:
     run.add_argument(
         "--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices"
     )
@@ -73,6 +94,16 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="M",
         help="adaptive (the default), exact, or one kind of step: coupled (the paper's), lloyd, "
         "poisson, weighted-lloyd, weighted; or several: lloyd,coupled",
+    )
+    run.add_argument(
+        "--effort",
+        choices=("fast", "default", "best"),
+        help="work against quality (adaptive, exact)",
+    )
+    run.add_argument(
+        "--levels",
+        metavar="N",
+        help="number of coarser levels to start from, or auto (the default; adaptive, exact)",
     )
     run.add_argument(
         "--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform"
@@ -86,33 +117,39 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--k", type=float, metavar="K", help=f"largest displacement over h in a step {repeated}"
     )
-    run.add_argument("--seed", type=int, metavar="S", help="of the random start")
+    run.add_argument("--seed", type=int, metavar="S", help="seed of the random start")
     run.add_argument("--dtype", choices=("float64", "float32"), help="precision on the device")
+
+
+def _add_checkpoints(run: Any) -> None:
     run.add_argument(
-        "--effort",
-        choices=("fast", "default", "best"),
-        help="work against quality (adaptive, exact)",
+        "--checkpoint", metavar="FILE", type=_path, help="write the state of the run there"
     )
     run.add_argument(
-        "--levels",
-        metavar="N",
-        help="coarser levels to begin with, or auto (the default; adaptive, exact)",
+        "--checkpoint-every",
+        metavar="SECONDS",
+        type=float,
+        help="time between checkpoints (default: 60)",
     )
     run.add_argument(
-        "--checkpoint",
-        metavar="FILE",
-        type=_path,
-        help="write the run's state there every so often",
+        "--resume", metavar="FILE", type=_path, help="continue from a checkpoint of the same case"
+    )
+
+
+def _add_output(run: Any) -> None:
+    run.add_argument(
+        "--out", metavar="DIR", type=_path, help="output folder (default: out/NAME of the case)"
     )
     run.add_argument(
-        "--checkpoint-every", metavar="SECONDS", type=float, help="time between (default: 60)"
-    )
-    run.add_argument(
-        "--resume", metavar="FILE", type=_path, help="go on from a checkpoint of the same case"
+        "--format",
+        metavar="LIST",
+        type=_mesh_formats,
+        default=(),
+        help=f"further mesh files, such as foam,nc: {', '.join(MESH_FILES)}",
     )
     run.add_argument("--no-report", action="store_true", help="no pictures and no page")
     run.add_argument(
-        "--format",
+        "--picture-format",
         metavar="KIND",
         action="append",
         choices=("png", "pdf", "svg"),
@@ -124,22 +161,47 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
 
+
+def _add_convert(commands: Any) -> None:
+    convert = commands.add_parser(
+        "convert",
+        help="write a mesh in another format",
+        description="Read a mesh that clvoro wrote and write it in the format that the suffix of OUT names: "
+        ".vtu, .npz, .foam (or a folder polyMesh), .nc, .vtk, .ply, .obj.",
+    )
+    convert.set_defaults(work=_convert)
+    convert.add_argument("mesh", metavar="MESH", help="mesh.npz or mesh.vtu")
+    convert.add_argument("out", metavar="OUT", type=_path, help="file to write")
+    convert.add_argument(
+        "--convention", choices=("ugrid", "mpas"), help="content of a .nc file (default: ugrid)"
+    )
+
+
+def _add_check(commands: Any) -> None:
     check = commands.add_parser(
         "check",
         help="verify meshes: volumes, graph, faces, the Voronoi property, error and quality",
-        description="Verify meshes that clvoro wrote, on the host alone: prints what does not hold, and where. "
+        description="Verify meshes that clvoro wrote, on the host alone, and print each violation with its place. "
         "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
     )
+    check.set_defaults(work=_check)
     check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz or mesh.vtu")
     check.add_argument("--json", action="store_true", help="print one JSON object per file")
-    commands.add_parser("devices", help="list the OpenCL devices and whether they work")
-    cases = commands.add_parser("cases", help="list the built-in cases, or print one")
-    cases.add_argument("case", metavar="NAME", nargs="?", help="print this case's TOML text")
-    return parser
+
+
+def _mesh_formats(text: str) -> tuple[str, ...]:
+    """Return the formats in `text`, separated by commas."""
+    formats = tuple(part.strip().lower() for part in text.split(","))
+    for name in formats:
+        if name not in MESH_FILES:
+            raise argparse.ArgumentTypeError(
+                f"{name!r} is no mesh format, expected some of {', '.join(MESH_FILES)}"
+            )
+    return formats
 
 
 def _path(text: str) -> Path:
-    """Return `text` as a path: an empty one, of a script's variable that is not set, would be the working folder."""
+    """Return `text` as a path. An empty text, as from an unset variable of a script, is an error."""
     if not text:
         raise argparse.ArgumentTypeError("it is empty, expected a name")
     return Path(text)
@@ -157,15 +219,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _carry_out(argv: Sequence[str] | None) -> int:
-    """Do what is asked for, and turn what goes wrong into a message and an exit code."""
+    """Run one command; turn errors into a message and an exit code."""
     try:
         arguments = build_parser().parse_args(argv)
-        command = {"run": _run, "check": _check, "devices": _devices, "cases": _cases}[
-            arguments.command
-        ]
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            return command(arguments)
+            return arguments.work(arguments)
     except (OutputError, BuildError) as error:
         return _complain(error, FAILED)
     except (InputError, InputTypeError) as error:
@@ -182,7 +241,7 @@ def _carry_out(argv: Sequence[str] | None) -> int:
 
 
 def _show_warning(message: Warning | str, *_: object) -> None:
-    """Print a warning without the place in the code, which says nothing to people."""
+    """Print a warning without the place in the code."""
     print(f"clvoro: warning: {message}", file=sys.stderr)
 
 
@@ -221,7 +280,8 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.out or Path("out") / case.name,
         device=arguments.device,
         report=not arguments.no_report,
-        formats=tuple(arguments.format or ["png"]),
+        mesh_formats=arguments.format,
+        picture_formats=tuple(arguments.picture_format or ["png"]),
         quiet=arguments.quiet,
         as_json=arguments.json,
         profile=arguments.profile,
@@ -233,8 +293,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _level_count(text: str | None) -> str | int | None:
-    """Return the number in `text`; what is none is for the case's checks to refuse."""
+    """Return the number in `text`; the checks of the case reject other texts than "auto"."""
     return int(text) if text is not None and text.isdecimal() else text
+
+
+def _readable(name: str) -> str:
+    """Return `name` if its suffix is that of a mesh that `load` reads."""
+    if Path(name).suffix.lower() not in (".npz", ".vtu"):
+        raise InputError(f"{name} cannot be read, expected a .npz or .vtu file of clvoro")
+    return name
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    from ..io import load, save
+
+    save(load(_readable(arguments.mesh)), arguments.out, convention=arguments.convention)
+    print(f"written: {arguments.out}")
+    return OK
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -244,14 +319,9 @@ def _check(arguments: argparse.Namespace) -> int:
 
     code = OK
     for name in arguments.files:
-        path = Path(name)
         try:
-            if path.suffix.lower() not in (".npz", ".vtu"):
-                raise InputError(
-                    f"{name} is no mesh.npz and no mesh.vtu, which are what can be checked"
-                )
-            report = load(path).check()
-        except InputError as error:  # the other files are looked at all the same
+            report = load(_readable(name)).check()
+        except InputError as error:  # the other files are checked all the same
             code = _complain(error, BAD_INPUT)
             continue
         if arguments.json:

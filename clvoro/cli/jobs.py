@@ -25,6 +25,7 @@ from ..mesh.results import Result
 from ..mesh.summary import boundary_line, summary
 from ..opencl.profile import Profile
 from .cases import Case
+from .formats import MESH_FILES, PLANE
 from .outputs import check_folder, do_all, refuse_own_files, require_plots
 from .sequence import frames_line, run_frames
 
@@ -55,7 +56,9 @@ class Job:
         As `clvoro.create_context` takes it.
     report : bool
         Whether to draw pictures and write `report.html`.
-    formats : tuple of str
+    mesh_formats : tuple of str
+        Further mesh files, keys of `MESH_FILES`.
+    picture_formats : tuple of str
         Kinds of picture files.
     quiet, as_json : bool
         No progress and no summary; one JSON object per finished run on the standard output.
@@ -70,7 +73,8 @@ class Job:
     out: Path
     device: str | None = None
     report: bool = True
-    formats: tuple[str, ...] = ("png",)
+    mesh_formats: tuple[str, ...] = ()
+    picture_formats: tuple[str, ...] = ("png",)
     quiet: bool = False
     as_json: bool = False
     profile: bool = False
@@ -94,6 +98,7 @@ class Job:
         arguments, size = self.case.run_arguments(), self.case.size_field()
         self._refuse_unknown(arguments)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
+        self._refuse_formats()
         files = self._checkpoints()
         named = {"checkpoint": self.checkpoint, "resume": self.resume}
         named |= {source.name: source for source in self.case.sources()}
@@ -201,6 +206,14 @@ class Job:
                     "leave it out"
                 )
 
+    def _refuse_formats(self) -> None:
+        """Raise an error before the run if a format cannot hold its mesh."""
+        for kind in self.mesh_formats:
+            if kind in PLANE and self.case.domain.dim != 2:
+                raise InputError(
+                    f"{self.case.name}: format {kind} is for meshes in 2D, and the domain is in 3D; expected foam"
+                )
+
     def _checkpoints(self) -> Checkpoint | None:
         """Return where checkpoints are written and read."""
         given = {
@@ -260,6 +273,9 @@ class Job:
             partial(save, main, self.out / "mesh.npz"),
             partial(write_history, main, self.out / "history.csv"),
         ]
+        for kind in self.mesh_formats:
+            name, convention = MESH_FILES[kind]
+            tasks.append(partial(save, main, self.out / name, convention=convention))
         for other, result in others:
             tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
             tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
@@ -290,7 +306,7 @@ class Job:
             title=self.case.title,
             case=case,
             facts={"device": where, "precision": str(adapter.dtype)},
-            formats=self.formats,
+            formats=self.picture_formats,
         )
 
     def _repeatable(self, results: dict[str, Result]) -> Case:

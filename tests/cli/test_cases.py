@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import clvoro
 from clvoro import Box, sizing
 from clvoro.cli.cases import Case, builtin_cases, load_case, naca4, toml
 from clvoro.errors import InputError
@@ -93,15 +94,14 @@ def test_paper_case_is_the_documented_field():
     assert paper.size_field()(x) == pytest.approx(wanted, rel=1e-12)
 
 
-def test_airfoil_case_grows_by_a_tenth_from_the_outline():
+def test_airfoil_case_leaves_the_section_out_and_resolves_its_wake():
     airfoil = load_case("airfoil")
-    assert tuple(airfoil.domain.extent) == (3, 2)
+    section = clvoro.Polygon(naca4("2412", angle=4.0, n_points=100))
+    assert airfoil.domain.measure == pytest.approx(6 * 3 - section.measure, rel=1e-12)
     size = airfoil.size_field()
-    trailing_edge = naca4("2412", angle=4.0)[0]
-    near = trailing_edge + np.array([[0, 0], [0.01, 0], [5, 0]])
-    assert size(near[:1]) == pytest.approx(0.002)
-    assert size(near[1:2]) == pytest.approx(0.002 + math.log(1.1) * 0.01, rel=1e-3)
-    assert size(near[2:]) == pytest.approx(airfoil.size["h_max"])
+    assert size(np.array([(2.0, -0.085), (-2.0, 1.5)])) == pytest.approx([0.02, 0.12], rel=0.1)
+    (layer,) = airfoil.run_arguments()["layers"]
+    assert layer.edges == ("airfoil",)
 
 
 def test_every_built_in_case_survives_being_written():

@@ -1,6 +1,7 @@
 """Cases with polygonal domains: files, rings, shapes as rings, the boundary as a shape, and the built-in ones."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -143,16 +144,14 @@ def test_the_lake_has_cells_across_its_straits() -> None:
     assert size(points(domain, 2000)).min() >= 0.012 * (1 - 1e-12)
 
 
-def test_the_channel_leaves_its_section_out() -> None:
+def test_the_channel_is_that_of_the_benchmark() -> None:
     case = load_case("channel")
-    section = clvoro.Polygon(naca4("2412", angle=4.0, n_points=100))
-    assert case.domain.measure == pytest.approx(3.5 * 1.2 - section.measure, rel=1e-12)
+    circle = 180 / 2 * math.sin(2 * math.pi / 180) * 0.05**2  # a regular polygon of 180 edges
+    assert case.domain.measure == pytest.approx(2.2 * 0.41 - circle, rel=1e-12)
     size = case.size_field()
-    assert size(np.array([(-1.0, 0.6), (2.5, -0.6)])) == pytest.approx(0.006)
-    # Around the section sizes come from the layers.
+    assert size(np.array([(0.5, 0.2), (2.2, 0.41)])) == pytest.approx([0.005, 0.025])
     (layer,) = case.run_arguments()["layers"]
-    assert layer.edges == ("section",)
-    assert size(np.array([(-1.0, 0.0)])) == pytest.approx(0.06)
+    assert layer.edges == ("cylinder",)
 
 
 def test_cases_run(ctx) -> None:

@@ -64,6 +64,40 @@ def test_run_writes_everything(here, capsys):
     assert float(row[3]) == pytest.approx(np.abs(mesh.size_error).mean(), abs=5e-5)
 
 
+def test_further_formats(here, capsys):
+    options = ["--method", "lloyd", "--no-report", "--quiet", "--format", "foam,nc", "--out", "a"]
+    assert call("run", "small.toml", *options) == cli.OK
+    assert (here / "a/constant/polyMesh/owner").is_file()
+    assert (here / "a/mesh.nc").read_bytes().startswith((b"CDF", b"\x89HDF"))
+    # A second run may replace them.
+    assert call("run", "small.toml", *options) == cli.OK
+
+
+def test_formats_that_are_refused(here, capsys):
+    with pytest.raises(SystemExit) as left:
+        call("run", "small.toml", "--format", "foam,stl")
+    assert left.value.code == cli.BAD_INPUT
+    assert "'stl' is no mesh format, expected some of foam, nc" in capsys.readouterr().err
+    assert call("run", "sphere", "--format", "nc", "--out", "b") == cli.BAD_INPUT
+    assert "format nc is for meshes in 2D" in capsys.readouterr().err
+    assert not (here / "b").exists()
+
+
+def test_convert(here, capsys):
+    assert call("run", "small.toml", "--no-report", "--quiet", "--steps", 1, "--out", "a") == cli.OK
+    capsys.readouterr()
+    for name in ("copy.vtu", "copy.npz", "copy.foam", "copy.nc"):
+        assert call("convert", "a/mesh.npz", name) == cli.OK
+        assert capsys.readouterr().out == f"written: {name}\n"
+        assert (here / name).exists()
+    assert np.array_equal(load(here / "copy.npz").points, load(here / "a/mesh.npz").points)
+    assert call("convert", "copy.vtu", "again.nc", "--convention", "mpas") == cli.OK
+    assert call("convert", "copy.nc", "again.vtu") == cli.BAD_INPUT
+    assert "copy.nc cannot be read, expected a .npz or .vtu file" in capsys.readouterr().err
+    assert call("convert", "copy.npz", "again.xyz") == cli.BAD_INPUT
+    assert not (here / "again.xyz").exists()
+
+
 def test_written_case_repeats_the_mesh(here):
     assert call("run", "small.toml", "--no-report", "--quiet", "--k", "0.7", "--out", "a") == 0
     assert call("run", "a/case.toml", "--no-report", "--quiet", "--out", "b") == 0
@@ -180,7 +214,7 @@ def test_every_file_is_checked(here, capsys):
     files = "small.toml", "nothing.npz", "out/small/mesh.npz"
     assert call("check", *files) == cli.BAD_INPUT
     printed = capsys.readouterr()
-    assert "small.toml is no mesh.npz" in printed.err
+    assert "small.toml cannot be read, expected a .npz" in printed.err
     assert "nothing.npz" in printed.err
     assert "out/small/mesh.npz: " in printed.out
 

@@ -66,7 +66,7 @@ def try_command(rng: np.random.Generator) -> str:
             ["--no-report"],
             ["--no-report"],
             ["--no-report"],
-            ["--format", "svg", "--format", "png"],
+            ["--picture-format", "svg", "--picture-format", "png"],
         ][rng.integers(4)]
         state = folder / "state"
         resumable = rng.random() < 0.4 and not several

@@ -8,7 +8,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 """Where the built-in cases and their files lie."""
 WRITTEN = re.compile(
-    r"(mesh|history)(-.*)?\.(vtu|npz|csv)|case\.toml|report\.html|frames\.csv|frames|pictures"
+    r"(mesh|history)(-.*)?\.(vtu|npz|csv|foam|nc|vtk|ply|obj)|case\.toml|report\.html|frames\.csv|frames|pictures|constant"
 )
 """Names of what a run writes into its folder."""
 

@@ -1,0 +1,15 @@
+"""The mesh files that `clvoro run --format` writes beside mesh.vtu and mesh.npz."""
+
+from __future__ import annotations
+
+MESH_FILES = {
+    "foam": ("mesh.foam", None),
+    "nc": ("mesh.nc", "ugrid"),
+    "mpas": ("mesh-mpas.nc", "mpas"),
+    "vtk": ("mesh.vtk", None),
+    "ply": ("mesh.ply", None),
+    "obj": ("mesh.obj", None),
+}
+"""By the name of the format: the file, and the convention that `save` takes."""
+PLANE = ("nc", "mpas", "vtk", "ply", "obj")
+"""Formats that hold 2D meshes only."""
