@@ -119,7 +119,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
         for ax, (time, result) in zip(axes, shown.items(), strict=False):
             title = f"t = {time:.2f}, {len(result.points)} cells"
             plot_cells(result, "size", ax, limits=limits, key=False, title=title)
-            ax.set(xticks=[], yticks=[])
+            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
         for ax in axes[len(results) :]:
             ax.set_axis_off()
         cells, scheme = axes[0].collections[0], coloring("size")

@@ -1,7 +1,7 @@
-"""A view into a 3D mesh: whole cells are taken out, and what is then to be seen is drawn.
+"""A view into a 3D mesh: whole cells are removed, and the visible faces of the others are drawn.
 
-The picture is a projection along parallel lines. Along any such line the cells of a Voronoi diagram follow each
-other in the order of their generators, so that drawing them by the depth of these covers exactly what is hidden.
+The picture is a parallel projection. Along any line of sight the cells of a Voronoi diagram follow each other in the
+order of their generators. Faces are drawn in that order, so that each covers the faces behind it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def view_axes(view: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def kept_cells(diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Tell which cells stay, (n,) bool: `cut` is "octant", a vector, None, or that array itself."""
+    """Return which cells stay, (n,) bool: `cut` is "octant", a vector, None, or that array itself."""
     if cut is None:
         return np.ones(len(diagram), bool)
     if isinstance(cut, str):  # the corner between the point and the viewer goes
@@ -51,15 +51,14 @@ def kept_cells(diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndar
 def visible_faces(
     diagram: Diagram, kept: np.ndarray, towards: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces (rows of the graph) that bound the cells kept and look at the viewer, and their normals.
-
-    They are in the order in which to draw them, the hindmost first.
-    """
+    """Return the faces (half-faces) of the kept cells that face the viewer, and their normals, the farthest first."""
     owner, neighbor = face_owners(diagram), diagram.neighbors
-    bare = (neighbor < 0) | ~kept[np.maximum(neighbor, 0)]
+    # The cell across the seam of a periodic box lies on the other side of the picture.
+    bare = (neighbor < 0) | ~kept[np.maximum(neighbor, 0)] | diagram.shifts.any(axis=1)
     rows = np.flatnonzero(kept[owner] & bare)
     cell, beyond = owner[rows], neighbor[rows]
     normals = diagram.points[np.maximum(beyond, 0)] - diagram.points[cell]
+    normals += diagram.shifts[rows] * diagram.domain.extent
     walls = np.flatnonzero(beyond < 0)
     wall = -1 - beyond[walls]
     normals[walls] = 0
@@ -99,14 +98,17 @@ def draw_cutaway(
     mappable = ScalarMappable(cell_norm(scheme, limits), color_map)
     mappable.set_array(values)
     colors = mappable.to_rgba(values[cell])
-    # Light falls from above, a little from the left; what looks away keeps most of its color.
+    # The light comes from above, a little from the left.
     light = 0.5 * towards + 0.62 * up - 0.3 * right
     light /= np.linalg.norm(light)
     colors[:, :3] *= (0.72 + 0.28 * np.clip(normals @ light, 0, 1))[:, None]
 
     frame = _outline(diagram)
     drawn = np.stack([frame @ right, frame @ up], axis=-1)
-    lower, upper = drawn.min(axis=(0, 1)), drawn.max(axis=(0, 1))
+    extremes = np.concatenate(
+        [drawn.reshape(-1, 2), flat]
+    )  # cells of periodic boxes reach beyond the box
+    lower, upper = extremes.min(axis=0), extremes.max(axis=0)
     margin = 0.02 * (upper - lower).max()
     ax.set_aspect("equal")
     ax.set_xlim(lower[0] - margin, upper[0] + margin)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -22,8 +23,8 @@ class Section:
         Corners of each polygon, counter-clockwise around the plane's normal.
     edges : (c, 2, 3) float
         Sides of the polygons: where the plane cuts faces of the cells.
-    rows : (c,) int
-        Where in the diagram's graph the face behind each side stands.
+    rows, owners : (c,) int
+        The half-face behind each side, and its cell.
     """
 
     cells: np.ndarray
@@ -31,15 +32,63 @@ class Section:
     corners: np.ndarray
     edges: np.ndarray
     rows: np.ndarray
+    owners: np.ndarray
 
 
 def cut_cells(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Section:
     """Cut all cells of a 3D diagram by the plane through `point` at right angles to `normal`.
 
     A face of the mesh that lies in the plane belongs to the cell behind it, so that the polygons cover the section
-    once.
+    once. In a periodic box the images of cells that reach into the box are cut, too.
     """
     normal = np.asarray(normal, float) / np.linalg.norm(normal)
+    domain = diagram.domain
+    parts = []
+    for step in product(*((0, -1, 1) if p else (0,) for p in domain.periodic)):
+        by = step * domain.extent
+        part = _cut(diagram, normal, point - by)
+        if any(domain.periodic):
+            part = _inside(part, domain.lower - by, domain.upper - by)
+        parts.append((part, by))
+    if len(parts) == 1:
+        return parts[0][0]
+    counts = np.concatenate([np.diff(part.starts) for part, _ in parts])
+    return Section(
+        np.concatenate([part.cells for part, _ in parts]),
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.concatenate([part.corners + by for part, by in parts]),
+        np.concatenate([part.edges + by for part, by in parts]),
+        np.concatenate([part.rows for part, _ in parts]),
+        np.concatenate([part.owners for part, _ in parts]),
+    )
+
+
+def _inside(section: Section, lower: np.ndarray, upper: np.ndarray) -> Section:
+    """Return the polygons of `section` that reach into the box by more than round-off."""
+    if not len(section.cells):
+        return section
+    starts = section.starts[:-1]
+    low = np.minimum.reduceat(section.corners, starts, axis=0)
+    high = np.maximum.reduceat(section.corners, starts, axis=0)
+    slack = 1e-9 * (upper - lower)
+    # A polygon in the plane of a wall has no extent across it.
+    kept = ((high >= lower + slack) & (low <= upper - slack)).all(axis=1)
+    counts = np.diff(section.starts)
+    sides = np.repeat(kept, counts)
+    # `edges` and `rows` are in the order of faces, not of polygons: their cell says whether they stay.
+    seen = np.zeros(section.cells.max() + 1, bool)
+    seen[section.cells[kept]] = True
+    return Section(
+        section.cells[kept],
+        np.concatenate([[0], np.cumsum(counts[kept])]),
+        section.corners[sides],
+        section.edges[seen[section.owners]],
+        section.rows[seen[section.owners]],
+        section.owners[seen[section.owners]],
+    )
+
+
+def _cut(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Section:
     vertices = diagram.vertices
     height = (vertices - point) @ normal
     # What lies in the plane but for rounding is on its upper side, whichever cell asks.
@@ -68,7 +117,8 @@ def cut_cells(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Sectio
     owner = face_owners(diagram)[rows]
     cells, first, counts = np.unique(owner, return_index=True, return_counts=True)
     order = _around(edges.mean(axis=1), owner, first, counts, normal)
-    return Section(cells, np.concatenate([[0], np.cumsum(counts)]), edges[order, 0], edges, rows)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return Section(cells, starts, edges[order, 0], edges, rows, owner)
 
 
 def plane_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -108,7 +108,7 @@ def plot_slice(
         )
     right, up = plane_axes(direction)
     flat = np.stack([section.corners @ right, section.corners @ up], axis=1)
-    lower, upper = (flat.min(axis=0), flat.max(axis=0)) if window is None else window
+    lower, upper = _shown_part(diagram, flat, direction, right, up) if window is None else window
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     values = scheme.values(result)
     with styled():
@@ -121,8 +121,7 @@ def plot_slice(
         frame_domain(ax, lower, upper)
         if edges:
             _draw_sides(ax, diagram, section, (right, up), upper - lower)
-        axis = int(np.argmax(np.abs(direction)))
-        aligned = abs(direction[axis]) > 1 - 1e-9
+        axis, aligned = _axis_of(direction)
         if not aligned and window is None:
             ax.set_axis_off()
         if aligned:
@@ -134,6 +133,23 @@ def plot_slice(
         if key:
             add_key(cells, ax, scheme, values, ends)
     return ax.figure
+
+
+def _axis_of(direction: np.ndarray) -> tuple[int, bool]:
+    """Return the axis nearest to a unit vector, and whether the vector is along it."""
+    axis = int(np.argmax(np.abs(direction)))
+    return axis, bool(abs(direction[axis]) > 1 - 1e-9)
+
+
+def _shown_part(
+    diagram: Diagram, flat: np.ndarray, direction: np.ndarray, right: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the shown rectangle: that of the domain, or of all polygons of an oblique plane."""
+    if not _axis_of(direction)[1]:
+        return flat.min(axis=0), flat.max(axis=0)
+    ends = np.array([diagram.domain.lower, diagram.domain.upper])
+    ends = np.stack([ends @ right, ends @ up], axis=1)
+    return ends.min(axis=0), ends.max(axis=0)
 
 
 def plot_slices(
@@ -252,7 +268,8 @@ def _draw_sides(
     # A face in the plane itself has its sides from one cell alone.
     cut = np.zeros(len(diagram), bool)
     cut[section.cells] = True
-    once = np.flatnonzero(((neighbor < owner) | ~cut[beyond]) & (widths > 0.06))
+    seam = diagram.shifts[section.rows].any(axis=1)
+    once = np.flatnonzero(((neighbor < owner) | ~cut[beyond] | seam) & (widths > 0.06))
     lines = np.stack([section.edges[once] @ axes[0], section.edges[once] @ axes[1]], axis=-1)
     ax.add_collection(
         LineCollection(

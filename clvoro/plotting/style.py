@@ -65,13 +65,16 @@ def nice(value: float, up: bool = True) -> float:
 
 
 def frame_domain(ax: Any, lower: Any, upper: Any, ticks: bool = True) -> None:
-    """Show the rectangle from `lower` to `upper` to scale, framed."""
+    """Show the rectangle from `lower` to `upper` to scale, framed; with `ticks` also name the axes x and y."""
     ax.set_aspect("equal")
     ax.set_xlim(lower[0], upper[0])
     ax.set_ylim(lower[1], upper[1])
     for spine in ax.spines.values():
         spine.set_visible(True)
-    if not ticks:
+    if ticks:
+        ax.set_xlabel("x")
+        ax.set_ylabel("y")
+    else:
         ax.set_xticks([])
         ax.set_yticks([])
 

@@ -4,12 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+import shapely
 from matplotlib import pyplot
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.path import Path
 from scipy.spatial import cKDTree
 
-from clvoro import Box
+from clvoro import Adapter, Box
 from clvoro.errors import InputError
 from clvoro.mesh.connectivity import face_corners, face_owners, following
 from clvoro.plotting import (
@@ -278,3 +279,58 @@ def test_few_cells(tmp_path, n):
     points = np.random.default_rng(6).uniform(LOWER, UPPER, (n, 3))
     few = solids.solid_result(solids.solid_diagram(LOWER, UPPER, points))
     assert write_report(few, tmp_path)[0] == tmp_path / "report.html"
+
+
+@pytest.fixture(scope="module")
+def periodic(ctx):
+    box = Box((-1, 0, 2), (1, 1, 3.5), periodic=(True, True, False))
+    return Adapter(ctx).run(box, 0.2, method="lloyd", max_steps=4, seed=4411)
+
+
+def clipped_area(section, lower, upper, right, up):
+    """Area of the polygons inside of the box, by shapely."""
+    window = shapely.box(lower @ right, lower @ up, upper @ right, upper @ up)
+    flat = np.stack([section.corners @ right, section.corners @ up], axis=1)
+    polygons = [shapely.Polygon(p) for p in np.split(flat, section.starts[1:-1])]
+    return sum(p.intersection(window).area for p in polygons), shapely.union_all(polygons), window
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, 1, 0)])
+def test_section_of_a_periodic_box_covers_its_whole_width(periodic, normal):
+    d = periodic.diagram
+    lower, upper = np.array(d.domain.lower), np.array(d.domain.upper)
+    section = cut_cells(d, np.array(normal), lower + 0.1 * d.domain.extent)
+    area, union, window = clipped_area(section, lower, upper, *plane_axes(np.array(normal)))
+    assert union.buffer(1e-9).covers(window)
+    assert area == pytest.approx(window.area, rel=1e-9)  # and covers it once
+
+
+def test_cutaway_of_a_periodic_box_is_closed(periodic):
+    """Faces at seams are drawn: the visible faces project to the silhouette of all cells."""
+    d = periodic.diagram
+    right, up, towards = view_axes(VIEW)
+    rows, normals = visible_faces(d, np.ones(len(d), bool), towards)
+    assert d.shifts[rows].any(axis=1).any()
+    starts, corners = face_corners(d)
+    faces = [d.vertices[corners[starts[r] : starts[r + 1]]] for r in range(len(starts) - 1)]
+    flat = [
+        shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0) for f in faces if len(f)
+    ]
+    seen = [
+        shapely.Polygon(np.stack([f @ right, f @ up], axis=1)).buffer(0)
+        for f in (faces[r] for r in rows)
+    ]
+    assert shapely.union_all(seen).area == pytest.approx(shapely.union_all(flat).area, rel=1e-9)
+    for row, normal in zip(rows, normals, strict=True):
+        corners = faces[row] - faces[row][0]
+        assert np.abs(corners @ normal).max() < 1e-7
+
+
+def test_cutaway_of_a_periodic_box_is_not_cropped(periodic):
+    (ax, *_) = plot_cutaway(periodic, "quality").axes
+    drawn = np.concatenate([path.vertices for path in ax.collections[1].get_paths()])
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    assert left < drawn[:, 0].min()
+    assert drawn[:, 0].max() < right
+    assert bottom < drawn[:, 1].min()
+    assert drawn[:, 1].max() < top
