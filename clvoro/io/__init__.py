@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
+from typing import Literal
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
@@ -20,6 +21,7 @@ from .history import write_history
 from .mpas import write_mpas
 from .npz import load as load_npz
 from .npz import write_npz
+from .polymesh import PatchType
 from .ugrid import write_ugrid
 from .vtu import write_vtu
 from .vtu_read import load_vtu
@@ -66,34 +68,56 @@ def save(
     path: str | PathLike[str],
     *,
     patches: Mapping[str, Walls] | None = None,
-    convention: str | None = None,
+    types: Mapping[str, PatchType] | None = None,
+    thickness: float | None = None,
+    convention: Literal["ugrid", "mpas"] | None = None,
+    units: str | None = None,
 ) -> None:
     """Write `result` to `path`; the suffix chooses the format.
+
+    ``.npz``
+        Everything; `load` reads it.
+    ``.vtu``
+        For ParaView and other VTK programs, and for `load`: polygons or polyhedra with size, error, quality, boundary
+        and more as cell data; row i is cell i of `result`. VTK's `vtkCellSizeFilter` (PyVista's `compute_cell_sizes`)
+        is wrong for cells that are not convex, as there are along the boundary of a polygon: use the cell data
+        `volume`. meshio 5.3 reads a mesh in 2D as one block of cells for each run of cells with equally many corners;
+        a ``.vtk`` file has one block for each number of corners. In 3D it refuses most files, as its reader assigns
+        cell data to the wrong blocks of polyhedra.
+    ``.../constant/polyMesh`` or ``CASE/name.foam``
+        A folder for OpenFOAM, alone or within a case that ParaView opens, too. In 2D one layer of prisms between
+        patches of type `empty`. Each periodic direction is one pair of cyclic patches.
+    ``.nc``
+        Meshes in 2D as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
+    ``.vtk``, ``.ply``, ``.obj``
+        Meshes in 2D, written by meshio (``pip install "clvoro[formats]"``); the latter two without cell data. Cells are
+        sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in `result`.
 
     Parameters
     ----------
     result : Result
     path : str or path
-        ``.npz`` holds everything and is read back by `load`; ``.vtu`` is for ParaView and other VTK
-        programs (polygons or polyhedra with h, error, quality and more as cell data);
-        ``.../constant/polyMesh`` is a folder for OpenFOAM, and ``CASE/name.foam`` the same within a
-        case, for ParaView, too, both made if need be (2D: one layer of prisms between patches of type `empty`; seams of
-        periodic boxes: pairs of cyclic patches); ``.nc`` holds 2D meshes as netCDF, for models of oceans and
-        atmospheres, QGIS, ParaView and xarray; ``.vtk``, ``.ply`` and ``.obj`` hold 2D meshes and are written
-        through meshio (``pip install "clvoro[formats]"``), the latter two without cell data.
     patches : mapping, optional
         For OpenFOAM: names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls
         that are not mentioned keep the name that the domain gives them.
+    types : mapping, optional
+        For OpenFOAM: type of each patch by name, "wall" (the default), "patch", "symmetry" or "symmetryPlane". Inlets,
+        outlets and far fields need "patch": ``types={"inlet": "patch"}``.
+    thickness : float, optional
+        For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
     convention : {"ugrid", "mpas"}, optional
         For netCDF: what is in the file. With "ugrid", the default, cells as polygons with size, error, quality and
-        area, and for each edge the number of its wall; at seams as in ``.vtu``. With "mpas" what the MPAS mesh
-        specification asks for: cells, edges and vertices with all that models on C grids take, seams joined.
+        area, and for each edge the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas" what the
+        MPAS mesh specification asks for: cells, edges and vertices with all that models on C grids take, seams joined.
+    units : str, optional
+        For netCDF: unit of the coordinates, as UDUNITS writes it. By default "m". In UGRID, "degrees" stands for
+        longitudes and latitudes.
 
     Raises
     ------
-    InputError
-        If the format is unknown or cannot hold the cells, or the file cannot be written. An existing
-        file is then as before.
+    InputError, InputTypeError
+        If the format is unknown or cannot hold the cells, an argument is for another format or wrong, or the file
+        cannot be written. An existing file is then as before.
     """
     if not isinstance(result, Result):
         raise InputTypeError(
@@ -103,24 +127,32 @@ def save(
     path = Path(check_path("path", path))
     suffix = path.suffix.lower()
     is_foam = path.name == "polyMesh" or suffix == ".foam"
-    if patches is not None and not is_foam:
-        raise InputError(
-            f"cannot write patches to {path}: they are for OpenFOAM; save as .foam or leave them out"
-        )
-    if convention is not None and suffix != ".nc":
-        raise InputError(
-            f"cannot write {path} by a convention: they are for netCDF; save as .nc or leave it out"
-        )
+    for_foam = {"patches": patches, "types": types, "thickness": thickness}
+    for_netcdf = {"convention": convention, "units": units}
+    for options, fits, format_, name in (
+        (for_foam, is_foam, "OpenFOAM", ".foam"),
+        (for_netcdf, suffix == ".nc", "netCDF", ".nc"),
+    ):
+        given = [key for key, value in options.items() if value is not None]
+        if given and not fits:
+            raise InputError(
+                f"cannot write {path} with {given[0]}, which is for {format_}; save as {name} or leave it out"
+            )
     if is_foam:
-        write_foam(result, path, patches)
+        write_foam(result, path, **for_foam)
     elif suffix == ".nc":
         check_plane(result, path)
-        _chosen(convention)(result, path)
+        unit = "m" if units is None else units
+        if not isinstance(unit, str) or not unit.isascii() or not unit.strip():
+            raise InputTypeError(
+                f"units is {unit!r:.60}, expected a unit of length, as 'm' or 'km'"
+            )
+        _chosen(convention)(result, path, unit)
     else:
         _WRITERS.get(suffix, write_foreign)(result, path)
 
 
-def _chosen(convention: object) -> Callable[[Result, Path], None]:
+def _chosen(convention: object) -> Callable[[Result, Path, str], None]:
     name = "ugrid" if convention is None else convention
     if not isinstance(name, str) or name not in _CONVENTIONS:
         raise InputError(f"convention is {name!r:.60}, expected 'ugrid' or 'mpas'")

@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry.boundary_names import Walls
 from ..mesh.results import Result
 from .atomic import atomic_file, atomic_folder, make_folder
-from .polymesh import PolyMesh, poly_mesh
+from .polymesh import PatchType, PolyMesh, poly_mesh
 
 _FILES = {
     "points": "vectorField",
@@ -24,7 +24,13 @@ _FILES = {
 _CHUNK = 1 << 16
 
 
-def write_foam(result: Result, path: Path, patches: Mapping[str, Walls] | None = None) -> None:
+def write_foam(
+    result: Result,
+    path: Path,
+    patches: Mapping[str, Walls] | None = None,
+    types: Mapping[str, PatchType] | None = None,
+    thickness: float | None = None,
+) -> None:
     """Write a polyMesh.
 
     Parameters
@@ -33,10 +39,10 @@ def write_foam(result: Result, path: Path, patches: Mapping[str, Walls] | None =
         The folder ``.../constant/polyMesh``, made if need be; its five files are replaced, others there are left.
         Or a case's marker ``CASE/name.foam``, an empty file which ParaView opens, with the mesh in
         ``CASE/constant/polyMesh``; the case's folder is made, too.
-    patches : mapping, optional
+    patches, types, thickness : optional
         See `poly_mesh`.
     """
-    mesh = poly_mesh(result.diagram, patches)
+    mesh = poly_mesh(result.diagram, patches, types, thickness)
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:
@@ -106,11 +112,14 @@ def _boundary(mesh: PolyMesh) -> str:
     for patch in mesh.patches:
         body += f"    {patch.name}\n    {{\n        type            {patch.kind};\n"
         if patch.across:
+            body += f"        neighbourPatch  {patch.across};\n"
             vector = " ".join(repr(x) for x in patch.separation)
             body += (
-                f"        neighbourPatch  {patch.across};\n        transform       translational;\n"
-                f"        separationVector ({vector});\n        matchTolerance  0.0001;\n"
+                f"        transform       translational;\n        separationVector ({vector});\n"
+                if patch.separation
+                else "        transform       noOrdering;\n"
             )
+            body += "        matchTolerance  0.0001;\n"
         body += f"        nFaces          {patch.size};\n        startFace       {start};\n    }}\n"
         start += patch.size
     return body

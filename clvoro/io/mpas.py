@@ -18,22 +18,22 @@ from ..errors import InputError
 from ..mesh.connectivity import neighbor_points
 from ..mesh.results import Diagram, Result
 from .half_edges import HalfEdges, half_edges
-from .netcdf import NetCDF
+from .netcdf import NetCDF, squared
 from .trisk import find_weights
 
 
-def write_mpas(result: Result, path: Path) -> None:
-    """Write the mesh; in a periodic box edges and vertices at the seams are there once, within the box.
+def write_mpas(result: Result, path: Path, unit: str = "m") -> None:
+    """Write the mesh, with coordinates in `unit`; in a periodic box each edge and vertex at a seam is once in the box.
 
     Raises
     ------
     InputError
         If a cell has several loops of edges, or something of it is half a period away: MPAS takes the nearest image.
     """
-    _describe(result, path).write()  # when all that it was made of has been let go of
+    _describe(result, path, unit).write()
 
 
-def _describe(result: Result, path: Path) -> NetCDF:
+def _describe(result: Result, path: Path, unit: str) -> NetCDF:
     diagram, domain = result.diagram, result.diagram.domain
     halves = half_edges(diagram, glued=True)
     _check_loops(halves, path)
@@ -64,12 +64,12 @@ def _describe(result: Result, path: Path) -> NetCDF:
     for name, points in places.items():
         plural = ("nVertices" if name == "Vertex" else f"n{name}s",)
         for axis, values in zip("xy", points.T, strict=True):
-            file.add(f"{axis}{name}", plural, values)
-        for unused in ("z", "lat", "lon"):
-            file.add(f"{unused}{name}", plural, np.zeros(len(points)))
+            file.add(f"{axis}{name}", plural, values, units=unit)
+        for unused, of in (("z", unit), ("lat", "rad"), ("lon", "rad")):
+            file.add(f"{unused}{name}", plural, np.zeros(len(points)), units=of)
         file.add(f"indexTo{name}ID", plural, np.arange(1, len(points) + 1))
     _add_graph(file, halves, around)
-    _add_measures(file, halves, around, shape)
+    _add_measures(file, around, shape, unit)
     weights = find_weights(
         halves, shape.kites / shape.areas[halves.cell], shape.lengths, shape.distances
     )
@@ -101,14 +101,15 @@ def _add_graph(file: NetCDF, halves: HalfEdges, around: _Around) -> None:
         file.add(f"{name}OnVertex", ("nVertices", "vertexDegree"), table)
 
 
-def _add_measures(file: NetCDF, halves: HalfEdges, around: _Around, shape: _Shape) -> None:
+def _add_measures(file: NetCDF, around: _Around, shape: _Shape, unit: str) -> None:
+    area = squared(unit)
     kites = np.where(around.corners >= 0, shape.kites[around.corners], 0.0)
-    file.add("kiteAreasOnVertex", ("nVertices", "vertexDegree"), kites)
-    file.add("areaTriangle", ("nVertices",), kites.sum(axis=1))
-    file.add("areaCell", ("nCells",), shape.areas)
-    values = {"dvEdge": shape.lengths, "dcEdge": shape.distances, "angleEdge": shape.angles}
-    for name, of_edges in values.items():
-        file.add(name, ("nEdges",), of_edges)
+    file.add("kiteAreasOnVertex", ("nVertices", "vertexDegree"), kites, units=area)
+    file.add("areaTriangle", ("nVertices",), kites.sum(axis=1), units=area)
+    file.add("areaCell", ("nCells",), shape.areas, units=area)
+    file.add("dvEdge", ("nEdges",), shape.lengths, units=unit)
+    file.add("dcEdge", ("nEdges",), shape.distances, units=unit)
+    file.add("angleEdge", ("nEdges",), shape.angles, units="rad")
 
 
 @dataclass(frozen=True)

@@ -127,3 +127,8 @@ class NetCDF:
                     variable[...] = given.missing
                     variable[filled] = given.values
             made.flush()  # closing it would write it all once more, and close the file
+
+
+def squared(unit: str) -> str:
+    """Return the square of a unit of length as UDUNITS writes it."""
+    return f"{unit}2" if unit.isalpha() else f"({unit})^2"

@@ -14,7 +14,7 @@ import numpy as np
 from ..mesh.connectivity import cell_corners
 from ..mesh.results import Result
 from .half_edges import half_edges
-from .netcdf import NetCDF
+from .netcdf import NetCDF, squared
 
 _CONNECTIVITY = {
     "face_node": "corners of each face, counter-clockwise",
@@ -32,16 +32,17 @@ _FACE_DATA = {
 """With what programs call them."""
 
 
-def write_ugrid(result: Result, path: Path) -> None:
+def write_ugrid(result: Result, path: Path, unit: str = "m") -> None:
     """Write the cells with size, error, quality and area, and the number and name of the wall at each edge.
 
-    The coordinates of faces are the generators, those of edges their middles. Names of boundaries are the flags of the
+    The coordinates of faces are the generators, those of edges their middles, all in `unit`. With "degrees" they are
+    longitudes and latitudes, otherwise coordinates of a projection. Names of boundaries are the flags of the
     variable `boundary`.
     """
-    _describe(result, path).write()  # when all that it was made of has been let go of
+    _describe(result, path, unit).write()
 
 
-def _describe(result: Result, path: Path) -> NetCDF:
+def _describe(result: Result, path: Path, unit: str) -> NetCDF:
     diagram = result.diagram
     halves = half_edges(diagram, glued=False)
     starts, corners = cell_corners(diagram)
@@ -77,7 +78,7 @@ def _describe(result: Result, path: Path) -> NetCDF:
         for axis, values in zip("xy", points.T, strict=True):
             file.add(
                 f"mesh_{place}_{axis}", (f"mesh_{place}s",), values,
-                standard_name=f"projection_{axis}_coordinate", long_name=f"{axis} of the {what}", axis=axis.upper(),
+                **_coordinate(axis, unit), long_name=f"{axis} of the {what}", axis=axis.upper(),
             )  # fmt: skip
     across = np.where(halves.twin >= 0, halves.cell[halves.twin], -1)
     minus = np.int32(-1)
@@ -100,10 +101,12 @@ def _describe(result: Result, path: Path) -> NetCDF:
         "quality": result.quality,
         "area": diagram.volumes,
     }
+    units = {"size": unit, "area": squared(unit)}
     for name, what in _FACE_DATA.items():
         file.add(
             name, ("mesh_faces",), values[name],
-            long_name=what, mesh="mesh", location="face", coordinates="mesh_face_x mesh_face_y",
+            long_name=what, units=units.get(name, "1"), mesh="mesh", location="face",
+            coordinates="mesh_face_x mesh_face_y",
         )  # fmt: skip
     walls = np.maximum(-1 - diagram.neighbors[halves.rows[first]], -1)
     file.add(
@@ -121,6 +124,14 @@ def _describe(result: Result, path: Path) -> NetCDF:
             flag_meanings=" ".join(names), _FillValue=minus,
         )  # fmt: skip
     return file
+
+
+def _coordinate(axis: str, unit: str) -> dict[str, str]:
+    """Return what CF asks of a horizontal coordinate."""
+    if unit == "degrees":
+        name, direction = ("longitude", "east") if axis == "x" else ("latitude", "north")
+        return {"standard_name": name, "units": f"degrees_{direction}"}
+    return {"standard_name": f"projection_{axis}_coordinate", "units": unit}
 
 
 def _role(name: str) -> dict[str, str | np.generic]:

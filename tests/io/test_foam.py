@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clvoro import io
-from clvoro.errors import InputError
+from clvoro.errors import InputError, InputTypeError
 from clvoro.io import foam
 from tests.io.test_io import make_result
 from tests.reference import solids
@@ -140,7 +140,7 @@ def test_patches_are_the_walls(result, mesh):
         else:
             axis, upper = divmod(number, 2)
             assert name == "xyz"[axis] + ("Max" if upper else "Min")
-            assert kind == "patch"
+            assert kind == "wall"
             plane = (box.upper if upper else box.lower)[axis]
             on_wall = points[sorted({v for f in part for v in f}), axis]
             assert on_wall == pytest.approx(plane, abs=1e-14)  # Qhull's rounding
@@ -222,6 +222,58 @@ def test_as_openfoam_checks_it(result, tmp_path):
     assert "***" not in topology[0]
     for line in ("Boundary openness", "Max cell openness", "Cell volumes", "Face pyramids"):
         assert re.search(f"{line}.*OK", topology[1]), line
+
+
+def test_types_of_patches_are_the_callers(plane, tmp_path):
+    types = {"xMin": "patch", "zone": "symmetryPlane"}
+    io.save(plane, tmp_path / "polyMesh", patches={"zone": ["yMin"]}, types=types)
+    patches = read(tmp_path / "polyMesh")[-1]
+    kinds = {name: patch[0] for name, patch in patches.items()}
+    assert kinds == {
+        "zone": "symmetryPlane", "xMin": "patch", "xMax": "wall", "yMax": "wall", "back": "empty", "front": "empty",
+    }  # fmt: skip
+
+
+def test_thickness_is_the_callers(plane, tmp_path):
+    io.save(plane, tmp_path / "polyMesh", thickness=0.25)
+    assert set(read(tmp_path / "polyMesh")[0][:, 2].tolist()) == {0, 0.25}
+    io.save(plane, tmp_path / "polyMesh")
+    width = np.sqrt(plane.diagram.domain.measure / len(plane.points))
+    assert read(tmp_path / "polyMesh")[0][:, 2].max() == width
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (
+            {"types": {"yMin": "inlet"}},
+            "types has 'inlet' for yMin, expected one of wall, patch, symmetry",
+        ),
+        (
+            {"types": {"floor": "wall"}},
+            "types has 'floor', expected names of patches: xMin, xMax, yMin, yMax",
+        ),
+        ({"types": ["wall"]}, "types is .* of type list, expected a mapping"),
+        ({"thickness": 0}, "thickness is 0, expected a finite number > 0"),
+        ({"thickness": "thin"}, "thickness is 'thin'"),
+        ({"patches": {"front": 0}}, "boundary 'front' has the name of a patch that OpenFOAM needs"),
+    ],
+)
+def test_wrong_options_are_refused(plane, tmp_path, options, says):
+    with pytest.raises((InputError, InputTypeError), match=says):
+        io.save(plane, tmp_path / "polyMesh", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_of_other_meshes_and_formats_are_refused(solid, plane, tmp_path):
+    with pytest.raises(InputError, match="thickness is for meshes in 2D"):
+        io.save(solid, tmp_path / "polyMesh", thickness=1.0)
+    for option in ({"types": {}}, {"thickness": 1}, {"patches": {}}):
+        with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for OpenFOAM"):
+            io.save(plane, tmp_path / "mesh.vtu", **option)
+    for option in ({"units": "m"}, {"convention": "mpas"}):
+        with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for netCDF"):
+            io.save(plane, tmp_path / "mesh.vtu", **option)
 
 
 def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):

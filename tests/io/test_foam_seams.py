@@ -1,12 +1,16 @@
 """OpenFOAM's polyMesh of periodic boxes: what is cut at the seams is joined by cyclic patches."""
 
+import os
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
 
 import clvoro
 from clvoro import io
+from clvoro.errors import InputError
 from tests.io.test_foam import check_mesh, needs_openfoam, read
 from tests.reference import solids
 
@@ -53,41 +57,51 @@ def test_cells_are_whole_and_closed(result, mesh):
     assert volumes.sum() == pytest.approx(box.measure * depth, rel=1e-12)
 
 
+def test_there_is_one_pair_of_patches_for_each_periodic_direction(result, mesh):
+    box = result.diagram.domain
+    axes = [axis for axis, is_periodic in zip("xyz", box.periodic, strict=False) if is_periodic]
+    assert list(cyclic(mesh[-1])) == [f"{axis}{end}" for axis in axes for end in ("Max", "Min")]
+
+
 def test_both_sides_of_a_seam_are_images_in_the_same_order(result, mesh):
     points, faces, owner, _, patches = mesh
-    box = result.diagram.domain
+    box, d = result.diagram.domain, result.diagram
     joined = 0
     for name, (_, size, start, about) in cyclic(patches).items():
-        assert about["transform"] == "translational"
         _, twins, there, back = cyclic(patches)[about["neighbourPatch"]]
         assert twins == size
         assert back["neighbourPatch"] == name
-        away = np.array(about["separationVector"].strip("()").split(), float)
-        assert (away == -np.array(back["separationVector"].strip("()").split(), float)).all()
-        periods = away[: box.dim] / box.extent
-        assert set(periods) <= {-1.0, 0.0, 1.0}
-        assert not periods[~np.array(box.periodic)].any()
-        for axis, step in zip("xyz", periods, strict=False):
-            assert (f"{axis}Max" in name, f"{axis}Min" in name) == (step < 0, step > 0)
+        steps = set()
         for k in range(size):
             face, twin = faces[start + k], faces[there + k]
-            # The other way around, from the same corner on.
+            # In reverse order, but from the same corner on.
             images = points[[twin[0], *twin[:0:-1]]]
-            assert points[face] + away == pytest.approx(images, abs=1e-14)
+            away = np.rint((images - points[face]).mean(axis=0)[: box.dim] / box.extent)
+            steps.add(tuple(away.astype(int).tolist()))
+            moved = points[face] + np.pad(away * box.extent, (0, 3 - box.dim))
+            assert moved == pytest.approx(images, abs=1e-14)
             i, j = owner[start + k], owner[there + k]
-            row = slice(*result.diagram.neighbor_starts[i : i + 2])
-            same = (result.diagram.neighbors[row] == j) & (
-                result.diagram.shifts[row] == -periods
-            ).all(axis=1)
+            row = slice(*d.neighbor_starts[i : i + 2])
+            same = (d.neighbors[row] == j) & (d.shifts[row] == -away).all(axis=1)
             assert same.sum() == 1
             joined += 1
-    assert joined == np.count_nonzero(result.diagram.shifts.any(axis=1))
+        # The first direction in which a face is shifted is that of its patch.
+        axis = "xyz".index(name[0])
+        assert all(step[:axis] == (0,) * axis for step in steps)
+        assert all(step[axis] == (-1 if name.endswith("Max") else 1) for step in steps)
+        if len(steps) == 1:
+            assert about["transform"] == "translational"
+            vector = np.array(about["separationVector"].strip("()").split(), float)
+            assert vector[: box.dim] == pytest.approx(np.array(*steps) * box.extent, abs=1e-15)
+        else:
+            assert about["transform"] == "noOrdering"
+    assert joined == np.count_nonzero(d.shifts.any(axis=1))
 
 
 def test_only_walls_are_patches(result, mesh):
     points, faces, _, _, patches = mesh
     box = result.diagram.domain
-    walls = {name: patch for name, patch in patches.items() if patch[0] == "patch"}
+    walls = {name: patch for name, patch in patches.items() if patch[0] == "wall"}
     wanted = [
         f"{'xyz'[a]}{end}" for a in range(box.dim) if not box.periodic[a] for end in ("Min", "Max")
     ]
@@ -98,6 +112,14 @@ def test_only_walls_are_patches(result, mesh):
         corners = sorted({v for f in faces[start : start + size] for v in f})
         assert size > 0
         assert points[corners, axis] == pytest.approx(plane, abs=1e-14)
+
+
+def test_names_of_cyclic_patches_are_taken(ctx, tmp_path):
+    box = clvoro.Box((0, 0), (1, 1), periodic=(True, False), names={"xMin": "yMin"})
+    points = np.random.default_rng(2).random((30, 2))
+    diagram = clvoro.Adapter(ctx).diagram(box, points)
+    with pytest.raises(InputError, match="boundary 'xMin' has the name of a patch"):
+        io.polymesh.poly_mesh(diagram)
 
 
 @needs_openfoam
@@ -119,3 +141,50 @@ def test_one_cell_is_its_own_neighbor(ctx, tmp_path):
     mesh = io.polymesh.poly_mesh(diagram)
     assert len(mesh.neighbor) == 0
     assert {p.name for p in mesh.patches} == {"xMin", "xMax", "yMin", "yMax", "back", "front"}
+
+
+@needs_openfoam
+@pytest.mark.skipif(shutil.which("laplacianFoam") is None, reason="laplacianFoam is not installed")
+def test_openfoam_conducts_heat_across_the_seams(result, tmp_path):
+    """One implicit step of diffusion is what the diagram's own faces give."""
+    check_mesh(result, tmp_path)
+    d, box = result.diagram, result.diagram.domain
+    n, conductivity = len(d), 0.01
+    before = np.random.default_rng(7).random(n)
+    patches = read(tmp_path / "constant" / "polyMesh")[-1]
+    kinds = {"cyclic": "cyclic", "empty": "empty", "wall": "zeroGradient"}
+    sides = " ".join(f"{name} {{ type {kinds[p[0]]}; }}" for name, p in patches.items())
+    values = "\n".join(map(repr, before.tolist()))
+    files = {
+        "0/T": ("volScalarField", f"dimensions [0 0 0 1 0 0 0]; internalField nonuniform List<scalar> {n} ({values}); "
+                f"boundaryField {{ {sides} }}"),
+        "constant/transportProperties": ("dictionary", f"DT [0 2 -1 0 0 0 0] {conductivity};"),
+        "system/controlDict": ("dictionary", "startTime 0; endTime 1; deltaT 1; writeControl timeStep; "
+                               "writeInterval 1; writePrecision 16;"),
+        "system/fvSchemes": ("dictionary", "ddtSchemes { default Euler; } gradSchemes { default Gauss linear; } "
+                             "divSchemes { default none; } laplacianSchemes { default Gauss linear uncorrected; } "
+                             "interpolationSchemes { default linear; } snGradSchemes { default uncorrected; }"),
+        "system/fvSolution": ("dictionary", "solvers { T { solver PCG; preconditioner DIC; tolerance 1e-14; relTol 0; "
+                              "} } SIMPLE { nNonOrthogonalCorrectors 0; }"),
+    }  # fmt: skip
+    for name, (kind, text) in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        about = f"version 2.0; format ascii; class {kind}; object {name.split('/')[1]};"
+        (tmp_path / name).write_text(f"FoamFile {{ {about} }}\n{text}\n")
+    env = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
+    command = ["laplacianFoam", "-case", str(tmp_path)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    after = re.search(r"List<scalar>\s*\d+\s*\(([^)]*)\)", (tmp_path / "1" / "T").read_text())
+    owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+    inner = d.neighbors >= 0
+    i, j, shift = owner[inner], d.neighbors[inner], d.shifts[inner] * box.extent
+    normal = d.points[j] + shift - d.points[i]
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    along = ((d.centroids[j] + shift - d.centroids[i]) * normal).sum(axis=1)
+    flux = conductivity * d.face_measures[inner] / along
+    matrix = np.diag(d.volumes + np.bincount(i, flux, n))
+    np.add.at(matrix, (i, j), -flux)
+    expected = np.linalg.solve(matrix, d.volumes * before)
+    assert np.array(after[1].split(), float) == pytest.approx(expected, abs=1e-11)
+    assert np.abs(expected - before).max() > 0.1

@@ -185,8 +185,38 @@ def test_as_ugrids_checker_reads_it(result, tmp_path):
     checks = pytest.importorskip("ugrid_checks.check")
     result.save(tmp_path / "mesh.nc")
     said = checks.check_dataset(tmp_path / "mesh.nc", print_summary=False).checking_report()
-    # Coordinates have no units: those of the domain are the caller's.
-    assert set(re.findall(r"(?:WARN|FAIL) (\w+)", said)) == {"A204"}, said
+    assert not re.findall(r"(?:WARN|FAIL) (\w+)", said), said
+
+
+def test_units_are_the_callers(room, tmp_path):
+    """CF asks for units of coordinates; a projection's are lengths, longitudes and latitudes are degrees."""
+    wanted = {
+        None: ("m", "m", "m2", "projection_x_coordinate"),
+        "km": ("km", "km", "km2", "projection_x_coordinate"),
+        "0.3048 m": ("0.3048 m", "0.3048 m", "(0.3048 m)^2", "projection_x_coordinate"),
+        "degrees": ("degrees_east", "degrees", "degrees2", "longitude"),
+    }
+    for unit, (x, size, area, name) in wanted.items():
+        room.save(tmp_path / "mesh.nc", units=unit)
+        about = read(tmp_path / "mesh.nc").about
+        for place in ("node", "edge", "face"):
+            assert about[f"mesh_{place}_x"]["units"].decode() == x
+            assert about[f"mesh_{place}_x"]["standard_name"].decode() == name
+        assert about["size"]["units"].decode() == size
+        assert about["area"]["units"].decode() == area
+        assert about["quality"]["units"] == b"1"
+    room.save(tmp_path / "mesh.nc", units="km", convention="mpas")
+    about = read(tmp_path / "mesh.nc").about
+    found = {
+        name: about[name]["units"].decode()
+        for name in ("xCell", "zVertex", "dcEdge", "areaCell", "latEdge")
+    }
+    assert found == {
+        "xCell": "km", "zVertex": "km", "dcEdge": "km", "areaCell": "km2", "latEdge": "rad",
+    }  # fmt: skip
+    for unit in (3, "", "µm"):
+        with pytest.raises(InputTypeError, match="units is"):
+            room.save(tmp_path / "mesh.nc", units=unit)
 
 
 def test_as_xarray_reads_it(room, tmp_path):

@@ -496,7 +496,7 @@ def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
     depth = points[:, 2].max()
     area = {
         name: sum(np.linalg.norm(solids.loop_area(points[f])) for f in faces[start : start + count])
-        for name, (kind, count, start) in patches.items() if kind == "patch"
+        for name, (kind, count, start) in patches.items() if kind == "wall"
     }  # fmt: skip
     return {name: a / depth for name, a in area.items()}
 
@@ -547,7 +547,7 @@ def test_what_openfoam_cannot_hold_is_refused(result, pond, tmp_path) -> None:
         InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"
     ):
         result.save(tmp_path / "case.foam")
-    with pytest.raises(InputError, match="they are for OpenFOAM"):
+    with pytest.raises(InputError, match="which is for OpenFOAM"):
         pond.save(tmp_path / "mesh.vtu", patches={"a": [1]})
     assert not list(tmp_path.iterdir())
 
