@@ -47,7 +47,7 @@ figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), layout="constrained")
 axes[0].pcolormesh(x, y, vorticity, cmap="RdBu_r", shading="gouraud")
 axes[0].set(aspect="equal", title="vorticity", xticks=[], yticks=[], xlim=(0, 1), ylim=(0, 1))
 mesh.plot("size", ax=axes[1], key=False)
-axes[1].set(title=f"{len(mesh.points):,} cells", xticks=[], yticks=[])
+axes[1].set(title=f"{len(mesh.points):,} cells", xticks=[], yticks=[], xlabel="", ylabel="")
 plt.show()
 
 # %%

@@ -41,9 +41,9 @@ print(mesh)
 # %%
 # The depths, and the mesh.
 
-figure, axes = plt.subplots(2, 1, figsize=(7, 8.6), layout="constrained")
+figure, axes = plt.subplots(2, 1, figsize=(7, 7.6), layout="constrained")
 image = axes[0].pcolormesh(x, y, np.where(away > 0, depth, np.nan), cmap="Blues")
-figure.colorbar(image, ax=axes[0], label="depth [m]")
+figure.colorbar(image, ax=axes[0], label="depth [m]", shrink=0.7)
 axes[0].set(aspect="equal", xlim=(0, 240), ylim=(10, 160), ylabel="y [km]")
 mesh.plot("size", ax=axes[1])
 axes[1].set(xlabel="x [km]", ylabel="y [km]")
