@@ -50,6 +50,6 @@ mesh.plot("size")
 mesh.plot("size", window=((0.78, -0.12), (1.16, 0.1)), key=False)
 
 # %%
-# OpenFOAM reads this folder. The patch of the airfoil has its name.
+# OpenFOAM reads this folder. Patches have the names of the domain, and are walls unless `types` says otherwise.
 
-mesh.save("airfoil/airfoil.foam")
+mesh.save("airfoil/airfoil.foam", types={"outer": "patch"})

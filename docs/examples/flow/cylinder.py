@@ -38,3 +38,8 @@ mesh.plot("size")
 
 print(mesh.measures)
 mesh.plot("quality", window=((0.1, 0.1), (0.4, 0.3)))
+
+# %%
+# OpenFOAM reads this folder.
+
+mesh.save("cylinder/cylinder.foam", types={"inlet": "patch", "outlet": "patch"})
