@@ -2,25 +2,25 @@
 
        u(x) = min over y of f(y) + g |x - y|,
 
-   the solution of the Eikonal equation |grad u| = g from above wherever u < f. At a node with the lesser neighbors a_k
-   and spacings d_k along the axes (Godunov's upwind scheme, first order):
+   the solution of the Eikonal equation |grad u| = g wherever u < f. At a node with the smaller neighbors a_k and
+   spacings d_k along the axes, Godunov's upwind scheme of first order is
 
        sum over k of (max(u - a_k, 0) / d_k)^2 = g^2.
 
-   The grid is cut into tiles of TILE^DIM nodes; work-item i sweeps tile i in all 2^DIM directions, in place, if it is
-   awake. A node sees its neighbors along the axes alone, so tiles of one color of a checkerboard never read what
-   another of that color writes: the two colors take turns, and the result does not depend on the order of the
-   work-items. A tile whose side has changed wakes the tile beyond that side. Tiles wait while all that they could learn
-   lies above a threshold that rises from pass to pass, so that few are swept before their neighbors are final. u only
-   falls, and a fall of a few units in the last place counts as none, so all tiles are asleep at last. */
+   Fast sweeping: the grid is divided into tiles of TILE^DIM nodes. One work-item per tile sweeps it in place in all
+   2^DIM directions, if it is active. Stencils reach along the axes only, so that tiles of one color of a checkerboard
+   do not read each other: the two colors alternate, and the result does not depend on the order of the work-items. A
+   tile that has changed at a side activates the tile across that side. A tile waits while its values and those of its
+   neighbors are above a threshold that rises from pass to pass, so that few tiles are swept before their neighbors are
+   final. u only decreases, and decreases of a few ulps are ignored, so the sweeps end. */
 #include "opencl/real.h"
 
-/* A fall that counts, relative to u. */
-#define NOTABLE (8 * REAL_EPS)
+/* Least decrease that is not ignored, relative to u. */
+#define LEAST_DECREASE (8 * REAL_EPS)
 
-/* The u of the scheme from the lesser neighbors a (REAL_MAX: none) at distances d: in the order of ascending a, as
-   many axes count as have a below the u that those before them give. */
-inline REAL upwind(REAL *a, REAL *d, REAL growth)
+/* u of the scheme from the smaller neighbors a (REAL_MAX: none) at distances d. Axes are used in the order of ascending
+   a, as long as a is below the u from the previous axes. */
+inline REAL upwind_value(REAL *a, REAL *d, REAL growth)
 {
     for (int k = 1; k < DIM; ++k)
         for (int j = k; j > 0 && a[j] < a[j - 1]; --j) {
@@ -48,7 +48,7 @@ inline REAL upwind(REAL *a, REAL *d, REAL growth)
     return a[0] + rise;
 }
 
-/* The least value of each tile. */
+/* lowest[i] = smallest value of tile i. One work-item per tile. */
 kernel void tile_minima(const int size, const int nx, const int ny, const int nz, global const REAL *restrict u,
                         global REAL *restrict lowest)
 {
@@ -69,16 +69,16 @@ kernel void tile_minima(const int size, const int nx, const int ny, const int nz
     lowest[i] = least;
 }
 
-/* awake, wake: for each tile, 1 if it is to be swept now, next. Tiles of the other color than `color` stay awake, and
-   those with nothing below `threshold` in themselves and their neighbors. lowest: the least value of each tile.
-   u: values with x running fastest; nx, ny, nz of them, dx, dy, dz apart. */
+/* One pass over the tiles of one `color`, one work-item per tile. active, next_active: 1 for tiles to sweep now, in the
+   next pass. Tiles of the other color stay active, and so do tiles without a value below `threshold` in themselves and
+   their neighbors. lowest: smallest value of each tile. u: nx ny nz values with x running fastest, dx, dy, dz apart. */
 kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz, const REAL dx, const REAL dy,
                         const REAL dz, const int color, const REAL growth, const REAL threshold,
-                        global const int *restrict awake, global int *restrict wake, global REAL *lowest,
+                        global const int *restrict active, global int *restrict next_active, global REAL *lowest,
                         global REAL *u)
 {
     WORK_ITEM(i);
-    if (!awake[i])
+    if (!active[i])
         return;
     const int count[3] = {nx, ny, nz};
     const REAL spacing[3] = {dx, dy, dz};
@@ -95,7 +95,7 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         jump *= count[a];
     }
     if ((parity & 1) != color) {
-        atomic_or(wake + i, 1);
+        atomic_or(next_active + i, 1);
         return;
     }
     REAL least = lowest[i], around = least;
@@ -106,12 +106,12 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
         jump *= tiles[a];
     }
     if (around > threshold) {
-        atomic_or(wake + i, 1);
+        atomic_or(next_active + i, 1);
         return;
     }
-    /* Bits 2 a and 2 a + 1: the lower and the upper side across axis a has changed. */
+    /* Bits 2 a and 2 a + 1: a node at the lower or upper side along axis a has changed. */
     int changed = 0, sweeps_left = 1 << DIM, direction = 0;
-    /* Until a full round of directions has changed nothing; what a round leaves behind, the next one finds. */
+    /* Sweep until all directions in turn have changed nothing. */
     while (sweeps_left > 0) {
         int moved = 0;
         int nodes = 1;
@@ -134,8 +134,8 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
                 lesser[a] = fmin(below, above);
                 across[a] = spacing[a];
             }
-            const REAL now = u[at], limit = upwind(lesser, across, growth);
-            if (limit < now * (1 - NOTABLE)) {
+            const REAL now = u[at], limit = upwind_value(lesser, across, growth);
+            if (limit < now * (1 - LEAST_DECREASE)) {
                 u[at] = limit;
                 least = fmin(least, limit);
                 moved = 1;
@@ -149,9 +149,9 @@ kernel void sweep_tiles(const int size, const int nx, const int ny, const int nz
     jump = 1;
     for (int a = 0; a < DIM; ++a) {
         if ((changed >> (2 * a) & 1) && tile[a] > 0)
-            atomic_or(wake + i - jump, 1);
+            atomic_or(next_active + i - jump, 1);
         if ((changed >> (2 * a + 1) & 1) && tile[a] < tiles[a] - 1)
-            atomic_or(wake + i + jump, 1);
+            atomic_or(next_active + i + jump, 1);
         jump *= tiles[a];
     }
 }

@@ -1,37 +1,39 @@
-/* The size field at points: h' = h / scale and, on request, grad log h, in normalized coordinates.
-   `size_at` and its data come from the host (see sizing/size_fields.h). Work-item i serves point i;
-   points are (size, DIM). `bad` keeps the smallest index with an h that is not positive, or above MOST_SIZE (NaN, too):
-   a minimum of integers, so the order of the atomics does not matter. */
+/* The size field h' = h / scale and grad log h in normalized coordinates. One work-item per point.
+
+   `size_at` and its data come from the host (see sizing/size_fields.h). points: (size, DIM). invalid: the smallest
+   index with an h that is not positive or above MAX_SIZE (NaN included); integer minima do not depend on the order. */
 #include "geometry/domain.h"
 
-#ifndef MOST_SIZE
-#error "build with -DMOST_SIZE=largest h' whose error and density are numbers"
+#ifndef MAX_SIZE
+#error "build with -DMAX_SIZE=largest h' whose error and density are numbers"
 #endif
 
-inline void note_bad(REAL h, int i, global int *bad)
+inline void record_invalid(REAL h, int i, global int *invalid)
 {
-    if (!(h > 0 && h <= R(MOST_SIZE)))
-        atomic_min(bad, i);
+    if (!(h > 0 && h <= R(MAX_SIZE)))
+        atomic_min(invalid, i);
 }
 
-/* h is noted as it is, and written times a factor. */
-kernel void evaluate(const int size, global const REAL *restrict points, global const REAL *restrict data,
-                     const REAL factor, global REAL *restrict h_out, global int *bad)
+/* h_out = factor h'. The check is without the factor. */
+kernel void evaluate_size(const int size, global const REAL *restrict points, global const REAL *restrict data,
+                          const REAL factor, global REAL *restrict h_out, global int *invalid)
 {
     WORK_ITEM(i);
     REAL x[DIM];
     for (int a = 0; a < DIM; ++a)
         x[a] = points[i * DIM + a];
     const REAL h = size_at(x, data);
-    note_bad(h, i, bad);
+    record_invalid(h, i, invalid);
     h_out[i] = factor * h;
 }
 
-/* grad_a log h = (h(x + s e_a) - h(x - s e_a)) / (2 s h), s = GRADIENT_STEP * h. Both sample points are kept inside
-   the domain, where alone the field must be defined; 2 s is then the distance that was really stepped. */
-kernel void evaluate_with_gradient(const int size, global const REAL *restrict points, global const REAL *restrict data,
+/* grad_a log h = (h(x + s e_a) - h(x - s e_a)) / (2 s h), s = GRADIENT_STEP * h.
+
+   Both sample points are kept inside the domain, because the field need not be defined outside; 2 s is replaced by
+   their distance. */
+kernel void evaluate_size_gradient(const int size, global const REAL *restrict points, global const REAL *restrict data,
                                    DOMAIN_ARGS, global REAL *restrict h_out, global REAL *restrict gradient,
-                                   global int *bad)
+                                   global int *invalid)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);
@@ -39,7 +41,7 @@ kernel void evaluate_with_gradient(const int size, global const REAL *restrict p
     for (int a = 0; a < DIM; ++a)
         x[a] = points[i * DIM + a];
     const REAL h = size_at(x, data);
-    note_bad(h, i, bad);
+    record_invalid(h, i, invalid);
     h_out[i] = h;
     const REAL step = fmax(R(GRADIENT_STEP) * h, 8 * REAL_EPS);
     for (int a = 0; a < DIM; ++a) {

@@ -1,6 +1,6 @@
-/* The bricks of a size field. The host writes `size_at` out of calls to these functions and puts it, with this file,
-   in front of any kernel that needs h (clvoro/sizing/bind.py), so nothing here may lean on another header: only
-   DIM and REAL are known. Lengths and coordinates are the normalized ones, x' = (x - origin) / scale. */
+/* Building blocks of size fields. The host writes `size_at` as calls of these functions and puts it, with this file, in
+   front of every kernel that needs h (clvoro/sizing/codegen.py). No other header is included before: only DIM and REAL
+   are defined. Lengths and coordinates are normalized, x' = (x - origin) / scale. */
 #pragma OPENCL FP_CONTRACT OFF
 #if defined(__OPENCL_C_VERSION__) && __OPENCL_C_VERSION__ < 120 && defined(cl_khr_fp64)
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
@@ -12,7 +12,7 @@
 #define SIZE_LARGEST_float FLT_MAX
 #define SIZE_LARGEST SIZE_JOIN(SIZE_LARGEST_, REAL)
 
-/* Unlike fmin and fmax these hand a NaN on, so that a broken branch is seen and refused. */
+/* Unlike fmin and fmax, these return NaN if an argument is NaN, so that the check of sizes finds it. */
 REAL size_min(REAL a, REAL b)
 {
     return (a < b || a != a) ? a : b;
@@ -23,7 +23,7 @@ REAL size_max(REAL a, REAL b)
     return (a > b || a != a) ? a : b;
 }
 
-/* Multilinear interpolation between the nodes of a grid; outside, the value of the nearest edge.
+/* Multilinear interpolation between the nodes of a grid; outside of it, the value of the nearest edge.
    data: gain (DIM), shift (DIM), then values with x running fastest; the index coordinate is gain * x + shift. */
 REAL size_raster(const REAL *x, __global const REAL *data, int nx, int ny, int nz)
 {
@@ -53,11 +53,11 @@ REAL size_raster(const REAL *x, __global const REAL *data, int nx, int ny, int n
     return sum;
 }
 
-/* An item is a segment a + t d, 0 <= t <= 1, blown up to radius r: a segment has r = 0, a circle d = 0.
-   Stored as a (DIM), d (DIM), 1/|d|^2 (0 for a point), r. The distance is to the curve, from both sides. */
+/* An item is the set of points at distance r from the segment a + t d, 0 <= t <= 1: a segment has r = 0, a circle d =
+   0. Stored as a (DIM), d (DIM), 1/|d|^2 (0 for a point), r. Distances are to the curve, from both sides. */
 #define SIZE_ITEM (2 * DIM + 2)
 
-/* Squared distance to the segment alone: no square root as long as all r are 0. */
+/* Squared distance to the segment, without r. */
 REAL size_segment_distance2(const REAL *x, __global const REAL *item)
 {
     REAL v[DIM], t = 0, sum = 0;
@@ -73,9 +73,9 @@ REAL size_segment_distance2(const REAL *x, __global const REAL *item)
     return sum;
 }
 
-/* A triangle with a corner at a: a (3), its sides b - a and c - a (3 each), the vectors that give the coordinates
-   s and t of a point a + s (b - a) + t (c - a) in its plane (3 each), the unit normal (3; 0 if it is so thin that it is
-   its sides), 1 / length^2 of b - a, c - a and c - b (0 for a point). */
+/* A triangle a, b, c: a (3), its sides b - a and c - a (3 each), the vectors whose products with x - a are the
+   coordinates s and t of a + s (b - a) + t (c - a) (3 each), the unit normal (3; 0 for a degenerate triangle, which is
+   treated as its sides), 1 / length^2 of b - a, c - a and c - b (0 for a point). */
 #define SIZE_TRIANGLE 21
 
 #if DIM == 3
@@ -84,7 +84,7 @@ REAL size_dot(const REAL *a, __global const REAL *b)
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-/* Squared distance to a side of which v = x - begin, its vector d and 1 / |d|^2 are known. */
+/* Squared distance to a side, from v = x - begin, its vector d and 1 / |d|^2. */
 REAL size_side_distance2(const REAL *v, const REAL *d, REAL inverse)
 {
     REAL t = v[0] * d[0] + v[1] * d[1] + v[2] * d[2], sum = 0;
@@ -96,9 +96,9 @@ REAL size_side_distance2(const REAL *v, const REAL *d, REAL inverse)
     return sum;
 }
 
-/* Where the foot of the perpendicular lies inside, s, t >= 0 and s + t <= 1, the nearest point is that foot. Else it
-   lies on a side that has the foot on its outer side: at the nearest point the way to the foot is a sum of outward
-   normals of the sides there, so the foot is beyond at least one of these. */
+/* Squared distance to a triangle. If the foot of the perpendicular lies inside (s, t >= 0, s + t <= 1), it is the
+   nearest point. Otherwise the nearest point is on a side that the foot is beyond: the vector from the nearest point to
+   the foot is a sum of outward normals of the sides there. */
 REAL size_triangle_distance2(const REAL *x, __global const REAL *item)
 {
     REAL v[3], side[3], best2 = SIZE_LARGEST;
@@ -132,7 +132,7 @@ REAL size_triangle_distance2(const REAL *x, __global const REAL *item)
 }
 #endif
 
-/* What the kinds of items are; always a literal, so only one branch is compiled in. */
+/* Kinds of items. The argument `kind` is a literal, so that only one branch is compiled. */
 #define SIZE_STRAIGHT 0
 #define SIZE_ROUND 1
 #define SIZE_FLAT 2
@@ -151,7 +151,7 @@ REAL size_item_distance2(const REAL *x, __global const REAL *items, int i, int k
     return d * d;
 }
 
-/* The least of best2 and the squared distances to n items, by looking at all. data: the items. */
+/* The minimum of best2 and of the squared distances to n items, without a tree. data: the items. */
 REAL size_nearest_few(const REAL *x, __global const REAL *data, int n, int kind, REAL best2)
 {
     for (int i = 0; i < n; ++i)
@@ -159,9 +159,9 @@ REAL size_nearest_few(const REAL *x, __global const REAL *data, int n, int kind,
     return best2;
 }
 
-/* h = min(h_min + slope * distance, h_max), the law all distances end in. law: h_min, slope, h_max, and the square of
-   the distance at which h_max takes over, where the search begins. */
-REAL size_law(REAL distance2, __global const REAL *law)
+/* h = min(h_min + slope distance, h_max). law: h_min, slope, h_max, and the square of the distance at which h reaches
+   h_max, where searches start. */
+REAL size_of_distance(REAL distance2, __global const REAL *law)
 {
     return fmin(law[0] + law[1] * sqrt(distance2), law[2]);
 }
@@ -176,9 +176,9 @@ REAL size_box_distance2(const REAL *x, __global const REAL *box)
     return sum;
 }
 
-/* The same through a binary tree of bounding boxes with 2^levels leaves: leaf l holds the items
+/* The same with a binary tree of bounding boxes and 2^levels leaves: leaf l holds the items
    [l n / 2^levels, (l + 1) n / 2^levels), node k has the children 2 k + 1 and 2 k + 2. The nearer child is visited
-   first; a box that is farther than the best found so far is skipped.
+   first; boxes farther than the best distance so far are skipped.
    data: the boxes (lower, upper) of 2^(levels + 1) - 1 nodes, the items. */
 REAL size_nearest_tree(const REAL *x, __global const REAL *data, int n, int levels, int kind, REAL best2)
 {

@@ -37,7 +37,7 @@ def warn_of_misfits(field: Field, domain: Domain, layers: Sequence[Layers]) -> N
     -----
     MisfitWarning
     """
-    found = field.misfits(domain)
+    found = field.warnings(domain)
     for k, layer in enumerate(layers):
         found += misfits_of_layer(f"layers[{k}]", layer, field, domain)
     for text in found:

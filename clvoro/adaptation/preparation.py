@@ -13,7 +13,7 @@ from ..geometry.box import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.polygon import Polygon
 from ..sizing import Sizing, as_field
-from ..sizing.beside_layers import bounded_by_layers
+from ..sizing.layers import limit_beside_layers
 from .diagnostics import warn_of_misfits
 from .estimates import check_memory, memory_needed
 from .forecast import images_expected, shore_expected, surplus_expected
@@ -97,7 +97,7 @@ class Preparation:
                     f"n_cells is {n_cells}, of which layers take {len(self.rows)}, expected at least "
                     f"{len(self.rows) + self.free.n_pieces}; leave n_cells out, or make the layers' cells wider"
                 )
-            field = bounded_by_layers(given_field, domain, options.layers)
+            field = limit_beside_layers(given_field, domain, options.layers)
         self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
         self._tree: DensityTree | None = None
         if points is not None and given:
@@ -134,13 +134,13 @@ class Preparation:
         if any(domain.periodic) and self._tree is not None:
             free = most * self._tree.integral / asked
             images = images_expected(domain, self.sizing, free, self._tree)
-        held = self.sizing.held + self.sizing.taken_for(most)
+        held = self.sizing.device_bytes + self.sizing.bytes_for(most)
         self._check_memory(most, images, held=held, shore=0.0)
         if isinstance(domain, Polygon) and not given:
             shore = shore_expected(domain, lambda p: (asked / most) ** 0.5 * self.sizing(p))
         needed = self._check_memory(most, images, surplus, held, shore)
         # Of few cells, what has been done so far may take more than the run.
-        self.memory = max(needed, float(self.sizing.taken))
+        self.memory = max(needed, float(self.sizing.peak_bytes))
 
     def _count_levels(self) -> int:
         """Return the number of coarser levels that lead to the cells, from the caller's points or from a sample."""

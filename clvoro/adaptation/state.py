@@ -359,7 +359,7 @@ class Mesh:
         SizeFieldError
             If the size of a generator is not positive and finite, and `update` has not looked.
         """
-        summaries, first = self.summaries.read_with(self.sizing.noted)
+        summaries, first = self.summaries.read_with(self.sizing.invalid_index)
         self.sizing.check(self.points, self.h, self.coarsening, first)
         return summaries
 

@@ -1,16 +1,25 @@
-"""Size fields h(x), the wanted edge length of a cell, and the stage that evaluates them."""
+"""Size fields h(x), the target edge length of a cell, and their evaluation.
+
+`Sizing.evaluate` (evaluation.py, kernel `evaluate_size` in size_field.cl) evaluates h on the device.
+
+How to add a size field:
+
+1. Derive a class from `Field` and implement ``_evaluate(points)`` in NumPy.
+2. Implement ``_emit(writer)`` with the same formula in OpenCL, or set ``on_device = False``. `Distance` is an example.
+3. Export the class below and test both forms against each other, as in tests/sizing/test_sizing.py.
+"""
 
 from ..geometry.shapes import Circle, Edges, Polygon, Polyline, Segment, Sphere
 from ..geometry.surface import Surface
-from .bind import bind
+from .codegen import generate_code
 from .distance import Distance
+from .evaluation import Sizing
 from .expression import Expression
 from .feature import FeatureSize
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
 from .raster import Raster, Scattered
 from .solution import gradient_size, hessian_size
-from .stage import Sizing
 
 __all__ = [
     "Circle",
@@ -31,7 +40,7 @@ __all__ = [
     "Sphere",
     "Surface",
     "as_field",
-    "bind",
+    "generate_code",
     "gradient_size",
     "hessian_size",
     "maximum",

@@ -1,4 +1,4 @@
-"""Numbers that size fields are given."""
+"""Checks of the numbers that define size fields."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ import numpy as np
 
 from ..errors import InputError, InputTypeError
 
-_MOST_GROWTH = 10  # more is meant as a percentage
+_MAX_GROWTH = 10  # a larger value is meant as a percentage
 
 
-def positive(what: str, value: object) -> float:
-    """Return `value` as a float, or raise the error that `what` must be positive and finite."""
+def check_positive(what: str, value: object) -> float:
+    """Return `value` as a float.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If it is not a positive, finite number.
+    """
     if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
         raise InputTypeError(f"{what} is {value!r}, expected a positive number")
     try:
@@ -25,18 +31,24 @@ def positive(what: str, value: object) -> float:
     return number
 
 
-def slope_of(what: str, growth: object, slope: object) -> float:
-    """Return dh/dx from exactly one of a growth rate per cell, ln(growth), and itself."""
+def check_slope(what: str, growth: object, slope: object) -> float:
+    """Return the slope dh/dx, which is given itself or by the growth rate per cell as ln(growth).
+
+    Raises
+    ------
+    InputError
+        If both or none are given, or the value is out of range.
+    """
     if (growth is None) == (slope is None):
         raise InputError(
             f"{what} got growth={growth} and slope={slope}, expected exactly one of them"
         )
     if growth is not None:
-        rate = positive(f"{what} growth", growth)
-        if not 1 <= rate <= _MOST_GROWTH:
+        rate = check_positive(f"{what} growth", growth)
+        if not 1 <= rate <= _MAX_GROWTH:
             raise InputError(
-                f"{what} growth is {growth}, expected 1 to {_MOST_GROWTH}: the ratio of neighboring cells, such as "
-                "1.2 where each is a fifth larger; write slope= for dh/dx"
+                f"{what} growth is {growth}, expected 1 to {_MAX_GROWTH}: the ratio of the sizes of neighboring "
+                "cells, such as 1.2; write slope= for dh/dx"
             )
         return math.log(rate)
     if not (isinstance(slope, Real) and 0 <= float(slope) < math.inf):

@@ -16,16 +16,16 @@ from ..geometry.polygon import Polygon as PolygonalDomain
 from ..geometry.shapes import Circle, Edges, Polygon, Polyline, Segment
 from ..geometry.surface import Surface, box_surface
 from ..geometry.triangles import segment_distance2
-from .arguments import positive, slope_of
+from .arguments import check_positive, check_slope
 from .field import Field
 
 if TYPE_CHECKING:
-    from .bind import Binder
+    from .codegen import CodeWriter
 
-_FEW = 8  # up to so many items are faster looked at one by one than through a tree
-_LANDMARKS = 1 << 14  # about so many landmarks at most, beside one per piece
-_FAR = 100  # diagonals of the domain, from which on a shape is in another place or unit
-# Kinds of items that the device knows: see size_item_distance2.
+_FEW = 8  # items up to which a tree does not pay
+_LANDMARKS = 1 << 14  # landmarks, roughly, besides one per item
+_FAR = 100  # diagonals of the domain beyond which a shape is probably in another unit
+# Kinds of items on the device: see size_item_distance2.
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
 Curve = Circle | Segment | Polyline | Edges
@@ -46,12 +46,12 @@ class Distance(Field):
         Size on the shapes.
     growth : float, optional
         Geometric growth rate g >= 1, the ratio of the sizes of neighboring cells (the paper's
-        section 4: 1.3). A row of cells of sizes h_min, h_min g, h_min g^2, ... has log h growing by
-        ln g over each h, so dh/dx = ln g: the slope is ln(growth).
+        section 4: 1.3). In a row of cells of sizes h_min, h_min g, h_min g^2, ... log h grows by ln g over each h, so
+        the slope is dh/dx = ln(growth).
     h_max : float, optional
         Upper bound of h.
     slope : float, optional
-        dh/dx itself, in place of `growth`; 0.3 is a plain h = h_min + 0.3 * distance.
+        dh/dx, in place of `growth`; 0.3 means h = h_min + 0.3 * distance.
 
     Raises
     ------
@@ -89,8 +89,8 @@ class Distance(Field):
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")
-        self.slope = slope_of("Distance", growth, slope)
-        self.h_min = positive("Distance h_min", h_min)
+        self.slope = check_slope("Distance", growth, slope)
+        self.h_min = check_positive("Distance h_min", h_min)
         if not (isinstance(h_max, Real) and h_max >= self.h_min):
             raise InputError(f"Distance h_max is {h_max!r}, expected at least h_min = {self.h_min}")
         self.h_max = float(h_max)
@@ -106,7 +106,7 @@ class Distance(Field):
         self._begin, self._end, self._radius = (np.concatenate(p) for p in zip(*parts, strict=True))
 
     def landmarks(self, domain: Domain) -> np.ndarray:
-        """Return points on the shapes, 1/64 of the domain's shorter side apart or so."""
+        """Return points on the shapes, about 1/64 of the domain's shorter side apart."""
         spacing = domain.extent.min() / 64
         found = [s.landmarks(spacing, _LANDMARKS) for s in self.surfaces]
         if len(self._begin):
@@ -134,19 +134,19 @@ class Distance(Field):
             offset = np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
         return np.concatenate([points + radius[item, None] * offset, self._end])
 
-    def misfits(self, domain: Domain) -> list[str]:
-        """Return what is to be said of shapes that change nothing on `domain`, and of surfaces that are specks."""
-        found, same = [], "are shapes and domain in the same unit and place?"
+    def warnings(self, domain: Domain) -> list[str]:
+        """Return warnings for shapes without effect on `domain` and for surfaces smaller than a cell."""
+        found, same = [], "do shapes and domain have the same unit and origin?"
         away, diagonal = self._away(domain), float(np.linalg.norm(domain.extent))
         reach = (self.h_max - self.h_min) / self.slope if self.slope > 0 else math.inf
         if 0 < reach <= away:
             found.append(
-                f"the shapes of {self!r} are {away:.3g} or more away from the domain, and from {reach:.3g} on h is "
-                f"h_max: they change nothing; {same}"
+                f"the shapes of {self!r} are at least {away:.3g} away from the domain and change nothing, because h is "
+                f"h_max from {reach:.3g} on; {same}"
             )
         elif away > _FAR * diagonal:
             found.append(
-                f"the shapes of {self!r} are {away:.3g} or more away from the domain, {away / diagonal:.3g} times its "
+                f"the shapes of {self!r} are at least {away:.3g} away from the domain, {away / diagonal:.3g} times its "
                 f"diagonal; {same}"
             )
         for surface in self.surfaces:
@@ -158,7 +158,7 @@ class Distance(Field):
         return found
 
     def _away(self, domain: Domain) -> float:
-        """Return a lower bound of the distance from the domain to the shapes, by the boxes that hold them."""
+        """Return a lower bound of the distance from the domain to the shapes, by their bounding boxes."""
         low, high = np.array(domain.lower), np.array(domain.upper)
 
         def gap(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -168,7 +168,7 @@ class Distance(Field):
         if len(self._begin):
             begin, end, radius = self._begin, self._end, self._radius
             outside = gap(np.minimum(begin, end), np.maximum(begin, end)) - radius
-            # A circle may also lie all around the domain.
+            # A circle may also enclose the domain.
             farthest = np.linalg.norm(np.maximum(high - begin, begin - low), axis=1)
             inside = np.where((begin == end).all(axis=1), radius - farthest, 0)
             least.append(np.maximum(outside, inside).min())
@@ -188,7 +188,7 @@ class Distance(Field):
             radius = self._radius[item]
             return np.where(radius != 0, (np.sqrt(d2) - radius) ** 2, d2)
 
-        # The nearest of a few items spread over all of them is a first bound.
+        # A few items give a first bound.
         for item in np.unique(np.linspace(0, len(self._begin) - 1, 16).astype(int)):
             best2 = np.minimum(best2, away2(points, np.full(len(points), item)))
         tree = Tree(*_item_boxes(self._begin, self._end, self._radius))
@@ -197,35 +197,35 @@ class Distance(Field):
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return np.minimum(self.h_min + self.slope * self.distance(points), self.h_max)
 
-    def _emit(self, binder: Binder) -> str:
-        h_min, h_max = self.h_min / binder.scale, self.h_max / binder.scale
-        # Beyond this distance h is h_max whatever the shape; the margin covers rounding.
+    def _emit(self, writer: CodeWriter) -> str:
+        h_min, h_max = self.h_min / writer.scale, self.h_max / writer.scale
+        # Beyond this distance h is h_max. The margin covers round-off.
         reach = 1.01 * (h_max - h_min) / self.slope if self.slope > 0 else math.inf
-        law = binder.store(h_min, self.slope, h_max, reach * reach)
+        law = writer.store(h_min, self.slope, h_max, reach * reach)
         best2 = f"data[{law + 3}]"
-        groups = [(_TRIANGLE, *s.packed(binder.origin, binder.scale, binder.real))
+        groups = [(_TRIANGLE, *s.packed(writer.origin, writer.scale, writer.real))
                   for s in self.surfaces]  # fmt: skip
         if len(self._begin):
-            groups.insert(0, self._packed_curves(binder))
+            groups.insert(0, self._packed_curves(writer))
         for kind, items, tree in groups:
             if tree.n <= _FEW:
-                at = binder.store(items)
+                at = writer.store(items)
                 call = f"size_nearest_few(x, data + {at}, {tree.n}, {kind}, {best2})"
             else:
-                at = binder.store(tree.boxes, items)
+                at = writer.store(tree.boxes, items)
                 call = (
                     f"size_nearest_tree(x, data + {at}, {tree.n}, {tree.levels}, {kind}, {best2})"
                 )
-            best2 = binder.variable(call)
-        return binder.variable(f"size_law({best2}, data + {law})")
+            best2 = writer.variable(call)
+        return writer.variable(f"size_of_distance({best2}, data + {law})")
 
-    def _packed_curves(self, binder: Binder) -> tuple[int, np.ndarray, Tree]:
-        """Return the kind, the items (m, 2 d + 2) in the tree's order, and the tree.
+    def _packed_curves(self, writer: CodeWriter) -> tuple[int, np.ndarray, Tree]:
+        """Return the kind, the items (m, 2 d + 2) in the order of the tree, and the tree.
 
-        An item is its begin, vector, 1 / length^2 (0 for a point) and radius.
+        An item has begin, vector, 1 / length^2 (0 for a point) and radius.
         """
-        begin, end = (binder.normalize(p).astype(binder.real) for p in (self._begin, self._end))
-        radius = (self._radius / binder.scale).astype(binder.real)
+        begin, end = (writer.normalize(p).astype(writer.real) for p in (self._begin, self._end))
+        radius = (self._radius / writer.scale).astype(writer.real)
         tree = Tree(*_item_boxes(begin, end, radius))
         begin, end, radius = begin[tree.order], end[tree.order], radius[tree.order]
         vector = end - begin
@@ -257,7 +257,7 @@ def _plain(shape: Shape) -> Curve | Surface:
 def _item_boxes(
     begin: np.ndarray, end: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    # What a negative radius adds is not in a box, and need not be: distances to boxes stay lower bounds.
-    # Rounding of center -+ radius may cut a circle's box by an ulp: widen those.
+    # Negative radii are left out: distances to boxes stay lower bounds. Round-off of center -+ radius can shorten the
+    # box of a circle by an ulp, so boxes are widened.
     wide = (np.maximum(radius, 0) * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]
     return np.minimum(begin, end) - wide, np.maximum(begin, end) + wide

@@ -1,4 +1,4 @@
-"""A size field written as a formula: a small, closed language parsed here alone."""
+"""A size field from a formula in a small language, which is parsed here."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..errors import InputError, InputTypeError
 from .field import Field
 
 if TYPE_CHECKING:
-    from .bind import Binder
+    from .codegen import CodeWriter
 
-_LONGEST = 4096  # characters
-_DEEPEST = 40  # brackets and ?: inside one another
-_OPERATIONS = 32  # that count as a part
+_MAX_LENGTH = 4096  # characters
+_MAX_DEPTH = 40  # of nested brackets and ?:
+_OPERATIONS = 32  # per part of a combined field
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\w.])"
@@ -67,8 +67,8 @@ _FUNCTIONS = {
     "smoothstep": _Function(3, "smoothstep", _smoothstep),
 }  # fmt: skip
 
-# Binding strength of the binary operators, as in C.
-_STRENGTH = {
+# Precedence of the binary operators, as in C.
+_PRECEDENCE = {
     "||": 1, "&&": 2, "==": 3, "!=": 3, "<": 4, ">": 4, "<=": 4, ">=": 4,
     "+": 5, "-": 5, "*": 6, "/": 6,
 }  # fmt: skip
@@ -82,7 +82,7 @@ _NUMPY = {
 
 
 class _Node(NamedTuple):
-    """One operation; `arguments` are indices of earlier nodes, so a list is read in order."""
+    """One operation. `arguments` are indices of earlier nodes, so that a list is evaluated in order."""
 
     kind: str  # "number", "axis", "negate", "not", "choose", "binary", "call"
     value: Any
@@ -92,7 +92,7 @@ class _Node(NamedTuple):
 class Expression(Field):
     """A formula in x, y (and z): ``Expression("0.02 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")``.
 
-    The formula is written as in OpenCL C, in this language and no larger one::
+    The formula is written as in OpenCL C, with this grammar::
 
         formula = truth [ "?" formula ":" formula ]
         truth   = sums joined by  < > <= >=  == !=  (not chained)  &&  ||
@@ -105,18 +105,16 @@ class Expression(Field):
     tanh floor ceil pow hypot fmod min fmin max fmax clamp mix step smoothstep. Precedence is that
     of C.
 
-    *Every number is real*: ``1/2`` is 0.5. A comparison is 1 or 0; anything but 0 is true. Both
-    sides of ``?:``, ``&&`` and ``||`` are computed. x, y, z are physical coordinates; in float32
-    they carry 7 digits of the distance to the origin of the coordinates, so put the origin near the
-    domain.
+    *All numbers are real*: ``1/2`` is 0.5. A comparison is 1 or 0; any number but 0 is true. Both sides of ``?:``,
+    ``&&`` and ``||`` are evaluated. x, y, z are physical coordinates; in float32 they have 7 digits, so the origin
+    should be near the domain.
 
-    The text is parsed here into a list of operations; what the device compiles is written from that
-    list, never from the text.
+    The text is parsed into a list of operations, and the OpenCL code is generated from that list, never from the text.
 
     Raises
     ------
     InputError
-        With the column, if the text is not a formula.
+        If the text is not a formula; the message has the column.
     """
 
     def __init__(self, text: str):
@@ -152,8 +150,8 @@ class Expression(Field):
                 values.append(result)
         return np.array(np.broadcast_to(values[-1], (len(points),)), dtype=float)
 
-    def _emit(self, binder: Binder) -> str:
-        frame = binder.store(binder.scale, 1.0 / binder.scale, binder.origin)
+    def _emit(self, writer: CodeWriter) -> str:
+        frame = writer.store(writer.scale, 1.0 / writer.scale, writer.origin)
         names: list[str] = []
         for kind, value, arguments in self._nodes:
             a = [names[i] for i in arguments]
@@ -173,8 +171,8 @@ class Expression(Field):
                 code = f"(REAL)({a[0]} {value} {a[1]})"
             else:
                 code = f"{a[0]} {value} {a[1]}"
-            names.append(binder.variable(code))
-        return binder.variable(f"{names[-1]} * data[{frame + 1}]")
+            names.append(writer.variable(code))
+        return writer.variable(f"{names[-1]} * data[{frame + 1}]")
 
     def __repr__(self) -> str:
         short = self.text if len(self.text) <= 60 else self.text[:57] + "..."
@@ -182,13 +180,13 @@ class Expression(Field):
 
 
 class _Parser:
-    """Recursive descent with precedence climbing; the last node of the result is the value."""
+    """Recursive descent with precedence climbing. The last node of the result is the value."""
 
     def __init__(self, text: str):
         self.text = text
-        if len(text) > _LONGEST:
+        if len(text) > _MAX_LENGTH:
             raise InputError(
-                f"Expression has {len(text)} characters, expected at most {_LONGEST}; "
+                f"Expression has {len(text)} characters, expected at most {_MAX_LENGTH}; "
                 "use a Raster instead"
             )
         self.tokens = self._tokens()
@@ -210,18 +208,18 @@ class _Parser:
             if match is None:
                 rest = self.text[position:]
                 column = position + len(rest) - len(rest.lstrip())
-                self._refuse(column)
+                self._reject(column)
             kind = match.lastgroup or ""
             found.append((kind, match[kind], match.start(kind)))
             position = match.end()
         found.append(("end", "", end))
         return found
 
-    def _refuse(self, column: int) -> NoReturn:
+    def _reject(self, column: int) -> NoReturn:
         rest = self.text[column:]
         number = re.match(r"\.?\d[\w.]*", rest, re.ASCII)
         if number:
-            self._fail(f"{number[0]!r} is no number; write 0.5 or 5e-1, without suffix", column)
+            self._fail(f"{number[0]!r} is not a number; write 0.5 or 5e-1, without suffix", column)
         power = "; write pow(a, b) for a power" if rest[0] == "^" else ""
         self._fail(f"unexpected character {rest[0]!r}{power}", column)
 
@@ -258,8 +256,8 @@ class _Parser:
 
     def _formula(self) -> int:
         self.depth += 1
-        if self.depth > _DEEPEST:
-            self._fail(f"nested more than {_DEEPEST} deep; simplify it, or use a Raster")
+        if self.depth > _MAX_DEPTH:
+            self._fail(f"nested more than {_MAX_DEPTH} deep; simplify it, or use a Raster")
         result = self._binary(1)
         if self._take("?"):
             yes = self._formula()
@@ -272,15 +270,15 @@ class _Parser:
     def _binary(self, least: int) -> int:
         left = self._unary()
         compared = False
-        while self._kind() == "operator" and _STRENGTH.get(self._word(), 0) >= least:
+        while self._kind() == "operator" and _PRECEDENCE.get(self._word(), 0) >= least:
             word = self._word()
-            comparison = _STRENGTH[word] in (3, 4)
+            comparison = _PRECEDENCE[word] in (3, 4)
             if comparison and compared:
                 self._fail("comparisons cannot be chained; write a < b && b < c")
             self.at += 1
             if word == "*" and self._kind() == "operator" and self._word() == "*":
                 self._fail("there is no operator **; write pow(a, b)")
-            right = self._binary(_STRENGTH[word] + 1)
+            right = self._binary(_PRECEDENCE[word] + 1)
             left = self._add("binary", word, left, right)
             compared = comparison
         return left

@@ -1,4 +1,4 @@
-"""A size field that follows the shape of a polygonal domain: its narrow places and its curves."""
+"""A size field from the local features of a polygonal domain: its gaps and its curvature."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import numpy as np
 from ..errors import InputError, InputTypeError
 from ..geometry.polygon import Polygon
 from ..geometry.shapes import Edges
-from .arguments import positive, slope_of
-from .covering import covered_share
+from .advice import covered_share
+from .arguments import check_positive, check_slope
 from .distance import Distance
 from .field import Constant, Field
-from .gaps import gaps, radii_of_curvature
+from .gaps import find_gaps, radii_of_curvature
 
 if TYPE_CHECKING:
     from ..geometry.box import Domain
-    from .bind import Binder
+    from .codegen import CodeWriter
 
 _FINEST, _COARSEST = 1e-3, 0.1  # of the domain's longest side, by default
-_MOST_LANDMARKS = 1 << 14  # sources that have any
-_THIN = 16  # of sources that are nearer than 1/16 of their size or so one stays
+_MAX_LANDMARKS = 1 << 14  # sources with landmarks
+_THINNING = 16  # of sources closer than about 1/16 of their size only one is kept
 
 
 @dataclass(frozen=True, eq=False)
-class _Sources(Edges):
-    """Segments each with a size of its own; a radius of -r makes a distance d count as d + r."""
+class _SizedSegments(Edges):
+    """Segments with individual sizes. A radius of -r replaces a distance d by d + r."""
 
     extra: np.ndarray
 
@@ -40,12 +40,11 @@ class FeatureSize(Field):
 
     ``h(x) = min over k of size_k + slope * (distance of x to segment k)``, at most `h_max`. The segments are
 
-    - chords across narrow places, from wall to wall, with their length / `cells_across` as size: gaps between walls
-      that face each other, as in channels, straits or beside an island. Walls that meet in a corner of more than
-      45 degrees do not face each other: corners alone ask for no small cells. In a sharper one the gap goes to zero
-      towards its tip, and the size to `h_min`.
+    - chords across gaps, with their length / `cells_across` as size. A gap lies between walls that face each other, as
+      in channels, straits or beside an island. The walls of a corner of more than 45 degrees do not face each other. In
+      a sharper corner the gap goes to zero towards the tip, and the size to `h_min`.
     - edges of curved parts of the boundary, with the radius of curvature / `curvature` as size. Turns of more than
-      30 degrees are corners, and do not count as curved.
+      30 degrees are corners, not curves.
 
     Parameters
     ----------
@@ -60,9 +59,9 @@ class FeatureSize(Field):
     h_max : float, optional
         Upper bound of h; by default a tenth of the domain's longest side.
     curvature : float
-        Number of cells per radius of curvature, as many as per radian; 0 looks at gaps only.
+        Number of cells per radius of curvature, which is the number per radian; 0 leaves out curvature.
     slope : float, optional
-        dh/dx itself, in place of `growth`.
+        dh/dx, in place of `growth`.
 
     Attributes
     ----------
@@ -72,7 +71,7 @@ class FeatureSize(Field):
     Raises
     ------
     InputError, InputTypeError
-        If a number is out of range or the domain is no Polygon.
+        If a number is out of range or the domain is not a Polygon.
 
     Examples
     --------
@@ -99,31 +98,35 @@ class FeatureSize(Field):
                 f"FeatureSize domain is a {type(domain).__name__}, expected a clvoro.Polygon"
             )
         self.domain, longest = domain, float(domain.extent.max())
-        self.cells_across = positive("FeatureSize cells_across", cells_across)
-        self.slope = slope_of(
+        self.cells_across = check_positive("FeatureSize cells_across", cells_across)
+        self.slope = check_slope(
             "FeatureSize", 1.2 if growth is None and slope is None else growth, slope
         )
         if self.slope == 0:
             raise InputError("FeatureSize got no growth, expected growth above 1 or slope above 0")
-        self.h_min = positive("FeatureSize h_min", _FINEST * longest if h_min is None else h_min)
+        self.h_min = check_positive(
+            "FeatureSize h_min", _FINEST * longest if h_min is None else h_min
+        )
         usual = max(_COARSEST * longest, self.h_min)
-        self.h_max = positive("FeatureSize h_max", usual if h_max is None else h_max)
+        self.h_max = check_positive("FeatureSize h_max", usual if h_max is None else h_max)
         if self.h_max < self.h_min:
             raise InputError(
                 f"FeatureSize h_max is {self.h_max:g}, expected at least h_min = {self.h_min:g}"
             )
-        self.curvature = 0.0 if curvature == 0 else positive("FeatureSize curvature", curvature)
+        self.curvature = (
+            0.0 if curvature == 0 else check_positive("FeatureSize curvature", curvature)
+        )
         self.sources = self._find()
         begin, end, size = self.sources
         if len(size):
-            shape = _Sources(begin, end, (size - self.h_min) / self.slope)
+            shape = _SizedSegments(begin, end, (size - self.h_min) / self.slope)
             self._field: Field = Distance(shape, self.h_min, slope=self.slope, h_max=self.h_max)
         else:
             self._field = Constant(self.h_max)
 
     def _find(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         domain, across = self.domain, self.cells_across
-        begin, end = gaps(domain, across * self.h_min, across * self.h_max)
+        begin, end = find_gaps(domain, across * self.h_min, across * self.h_max)
         size = np.hypot(*(end - begin).T) / across
         if self.curvature:
             radius = radii_of_curvature(domain)
@@ -135,29 +138,29 @@ class FeatureSize(Field):
         size = np.maximum(size, self.h_min)
         kept = size < self.h_max
         begin, end, size = begin[kept], end[kept], size[kept]
-        kept = _thinned(domain, 0.5 * (begin + end), size)
+        kept = _thin_sources(domain, 0.5 * (begin + end), size)
         return begin[kept], end[kept], size[kept]
 
     def landmarks(self, domain: Domain) -> np.ndarray:
-        """Return the ends and middles of the sources, of which the least come first if there are many."""
+        """Return the ends and midpoints of the sources, of those with the smallest sizes if there are many."""
         begin, end, size = self.sources
-        least = np.argsort(size, kind="stable")[:_MOST_LANDMARKS]
+        least = np.argsort(size, kind="stable")[:_MAX_LANDMARKS]
         points = np.concatenate([begin[least], 0.5 * (begin[least] + end[least]), end[least]])
         return points if len(points) else np.zeros((0, domain.dim))
 
-    def misfits(self, domain: Domain) -> list[str]:
-        """Return what is to be said if the polygon lies beside `domain`."""
+    def warnings(self, domain: Domain) -> list[str]:
+        """Return a warning if the polygon does not overlap `domain`."""
         if covered_share(domain, self.domain.lower, self.domain.upper) > 0:
             return []
         return [
-            f"{self!r} lies beside the domain {domain!r}; expected the size of the domain that is meshed"
+            f"{self!r} does not overlap the domain {domain!r}; expected a FeatureSize of the domain that is meshed"
         ]
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self._field._evaluate(points)
 
-    def _emit(self, binder: Binder) -> str:
-        return self._field._emit(binder)
+    def _emit(self, writer: CodeWriter) -> str:
+        return self._field._emit(writer)
 
     def __repr__(self) -> str:
         return (
@@ -166,12 +169,13 @@ class FeatureSize(Field):
         )
 
 
-def _thinned(domain: Polygon, middle: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return which sources to keep: of those with middles in the same small square the one of least size.
+def _thin_sources(domain: Polygon, middle: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the sources to keep: the smallest one of those with midpoints in the same small square.
 
-    The squares' edges are the power of two next below 1/16 of the size, so what is lost is at most slope / 11 of it.
+    The edge of a square is the power of two below 1/16 of the size, so sizes change by at most slope / 11 of
+    themselves.
     """
-    level = np.floor(np.log2(size / _THIN))
+    level = np.floor(np.log2(size / _THINNING))
     place = np.floor((middle - domain.lower) / 2.0 ** level[:, None])
     order = np.lexsort((size, place[:, 1], place[:, 0], level))
     key = np.column_stack([level, place])[order]

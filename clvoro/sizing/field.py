@@ -1,4 +1,4 @@
-"""The base of all size fields, the simplest ones, and what combines them."""
+"""The base class of size fields, constants, callables, and combinations of fields."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ import numpy as np
 
 from ..arguments import check_callable
 from ..errors import ClvoroError, InputError, InputTypeError, SizeFieldError
-from .arguments import positive
+from .arguments import check_positive
 
 if TYPE_CHECKING:
     from ..geometry.box import Domain
-    from .bind import Binder
+    from .codegen import CodeWriter
 
-_MOST_PARTS = 256  # the time to build kernels grows faster than they do: 3 s for 200, 20 s for 400
+_MAX_PARTS = 256  # kernels of 200 parts take 3 s to build, kernels of 400 parts 20 s
 
 
 class Field:
     """A size field h(x): called with points it gives sizes.
 
-    Every field is evaluated on the host by calling it, in float64: slow, and the reference. Fields
-    with ``on_device`` true are also turned into OpenCL by `bind`. Fields combine with each other,
-    with positive numbers and with callables: ``f + g``, ``f * g``, ``f / g``, ``2 * f``, ``1 / f``,
-    `minimum`, `maximum`. The combination is itself one function on the device, so that the gradient
-    of h is taken of it as a whole. Numbers are multiplied and divided as they stand, in the unit of
-    the coordinates: one of the factors is a plain number, such as a weight from a `Raster`.
+    Calling a field evaluates it on the host in float64, which is slow and the reference. Fields with ``on_device`` are
+    also evaluated on the device, as OpenCL from `generate_code`. Fields combine with each other, with positive numbers
+    and with callables: ``f + g``, ``f * g``, ``f / g``, ``2 * f``, ``1 / f``, `minimum`, `maximum`. A combination is
+    one function on the device. Values are multiplied and divided in the unit of the coordinates: one factor of a
+    product is a plain number, such as a weight from a `Raster`.
 
     Attributes
     ----------
@@ -37,7 +36,7 @@ class Field:
     on_device : bool
         Whether the field has a device form.
     parts : int
-        Number of fields that it is combined from, itself among them; long formulas count more than once.
+        Number of fields in the combination, itself included; long formulas count more than once.
     """
 
     dim: int | None = None
@@ -78,33 +77,33 @@ class Field:
         return self._evaluate(array)
 
     def check_dim(self, dim: int) -> None:
-        """Raise InputError if the field cannot serve `dim` dimensions."""
+        """Raise InputError if the field is not for `dim` dimensions."""
         if self.dim is not None and self.dim != dim:
             raise InputError(
                 f"the size field {self!r} is for {self.dim} dimensions, got a domain or points "
                 f"of {dim}; build it with {dim} coordinates"
             )
 
-    def with_parts(self, change: Callable[[Field], Field]) -> Field:
-        """Return the field with `change` applied to each of the fields that it combines, if any."""
+    def map_parts(self, change: Callable[[Field], Field]) -> Field:
+        """Return the field with `change` applied to each field that it combines."""
         return self
 
     def landmarks(self, domain: Domain) -> np.ndarray:
-        """Return points (m, d) at which h is likely to be least, for those who must see it.
+        """Return points (m, d) at which h is likely to be smallest, so that sampling does not miss small features.
 
-        They may lie outside `domain`, whose size tells how dense they should be. By default none.
+        Their density follows the size of `domain`; they may lie outside of it. By default there are none.
         """
         return np.zeros((0, domain.dim))
 
-    def misfits(self, domain: Domain) -> list[str]:
-        """Return what in the field is a mistake on `domain`, most likely: sentences, each with a remedy."""
+    def warnings(self, domain: Domain) -> list[str]:
+        """Return warnings for plausible mistakes in the field on `domain`, each with a remedy."""
         return []
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         raise NotImplementedError
 
-    def _emit(self, binder: Binder) -> str:
-        """Add the field to `binder` and return the name of the variable that holds h'."""
+    def _emit(self, writer: CodeWriter) -> str:
+        """Add the field to `writer` and return the name of the variable with h' = h / scale."""
         raise NotImplementedError
 
     def __mul__(self, other: object) -> Field:
@@ -119,7 +118,7 @@ class Field:
 
     def __truediv__(self, other: object) -> Field:
         if isinstance(other, Real):
-            return Scaled(self, 1.0 / positive("a divisor of a size field", other))
+            return Scaled(self, 1.0 / check_positive("a divisor of a size field", other))
         return self._combine("/", self, other)
 
     def __rtruediv__(self, other: object) -> Field:
@@ -135,11 +134,11 @@ class Field:
     def _combine(operation: str, *operands: object) -> Field:
         if not all(isinstance(f, (Field, Real)) or callable(f) for f in operands):
             return NotImplemented
-        return _folded(operation, [as_field(f) for f in operands])
+        return _fold_constants(operation, [as_field(f) for f in operands])
 
     def __sub__(self, other: object) -> NoReturn:
         raise InputTypeError(
-            f"{self!r} is subtracted from or negated, and sizes are positive: size fields have no -; write one "
+            f"{self!r} is subtracted or negated, but size fields have no -, because sizes are positive; write an "
             "Expression, or a function such as lambda points: field(points) - 0.1 * points[:, 0]"
         )
 
@@ -150,24 +149,24 @@ class Field:
 
     def __pow__(self, other: object) -> NoReturn:
         raise InputTypeError(
-            f"{self!r} is raised to a power, and size fields have no **; write one Expression, or a function such as "
+            f"{self!r} is raised to a power, but size fields have no **; write an Expression, or a function such as "
             "lambda points: field(points) ** 0.5"
         )
 
     def __lt__(self, other: object) -> NoReturn:
         raise InputTypeError(
-            f"{self!r} is compared with {other!r:.60}, and neither is smaller everywhere; write "
-            "clvoro.sizing.minimum(...) or maximum(...), which choose at each point"
+            f"{self!r} is compared with {other!r:.60}, but fields differ from point to point; write "
+            "clvoro.sizing.minimum(...) or maximum(...), which compare at each point"
         )
 
     __gt__ = __le__ = __ge__ = __lt__
 
-    # NumPy leaves operators between its arrays and a field to the field, which then refuses them.
+    # With None, NumPy passes operators between arrays and a field to the field, which rejects them.
     __array_ufunc__ = None
 
 
 class Constant(Field):
-    """The same size everywhere; a plain number given as size field becomes one.
+    """A constant size. A number that is given as a size field becomes one.
 
     Raises
     ------
@@ -176,13 +175,13 @@ class Constant(Field):
     """
 
     def __init__(self, value: float):
-        self.value = positive("a constant size h", value)
+        self.value = check_positive("a constant size h", value)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return np.full(len(points), self.value)
 
-    def _emit(self, binder: Binder) -> str:
-        return binder.variable(f"data[{binder.store(self.value / binder.scale)}]")
+    def _emit(self, writer: CodeWriter) -> str:
+        return writer.variable(f"data[{writer.store(self.value / writer.scale)}]")
 
     def __repr__(self) -> str:
         return f"Constant({self.value!r})"
@@ -191,14 +190,11 @@ class Constant(Field):
 class Function(Field):
     """A vectorized Python callable ``h(points (n, d)) -> (n,)``, evaluated on the host.
 
-    Each evaluation brings the points to the host and takes the sizes back (8 to 16 bytes per
-    coordinate both ways, and the queue waits meanwhile), and runs at the speed of the callable,
-    1 + 2 d times where the gradient of h is needed too. A field combined with a `Function` is
-    combined on the host. Where a `Raster`, `Distance` or `Expression` can say the same, it is much
-    faster.
+    Each evaluation copies the points to the host and the sizes back, while the device waits, and calls the function
+    once, or 1 + 2 d times for the gradient of h. Combinations with a `Function` are evaluated on the host. A `Raster`,
+    `Distance` or `Expression` is much faster.
 
-    The callable gets C-contiguous float64 points in physical coordinates, inside the domain or on
-    its walls.
+    The callable gets C-contiguous float64 points in physical coordinates, inside the domain or on its walls.
     """
 
     on_device = False
@@ -218,28 +214,28 @@ class Function(Field):
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         n = len(points)
         try:
-            # A copy: what the function does to its argument is its own affair.
+            # A copy, because the function may change its argument.
             given = self.function(np.array(points, dtype=float, order="C"))
         except (TypeError, ValueError) as error:
             if isinstance(error, ClvoroError):
                 raise
-            # Formulas for a single point end so, most likely.
+            # Functions of a single point typically fail like this.
             kind = InputTypeError if isinstance(error, TypeError) else InputError
             raise kind(
                 f"{self!r} failed for points of shape {points.shape} ({error}), expected sizes of shape ({n},); it "
-                "must be vectorized: points[:, 0] are all x, numpy.sqrt takes arrays, and numpy.where stands for if"
+                "must be vectorized: points[:, 0] are all x, numpy.sqrt takes arrays, and numpy.where replaces if"
             ) from error
         try:
             sizes = np.asarray(given)
-        except Exception as error:  # whatever an array of another library says
+        except Exception as error:  # arrays of other libraries raise errors of their own
             raise InputTypeError(
-                f"{self!r} returned a {type(given).__name__} that is no array ({error}), expected real numbers of "
+                f"{self!r} returned a {type(given).__name__} that is not an array ({error}), expected real numbers of "
                 f"shape ({n},)"
             ) from error
         if np.ma.is_masked(given):
             raise SizeFieldError(
-                f"{self!r} returned {np.ma.count_masked(given)} masked sizes for {n} points, expected all to be there; "
-                "fill them, by numpy.ma.filled(sizes, value)"
+                f"{self!r} returned {np.ma.count_masked(given)} masked sizes for {n} points, expected none; "
+                "fill them with numpy.ma.filled(sizes, value)"
             )
         if sizes.dtype.kind not in "fiu":
             what = "None" if given is None else f"values of type {sizes.dtype}"
@@ -247,7 +243,7 @@ class Function(Field):
         if sizes.shape != (n,):
             hint = "it must be vectorized, h(points (n, d)) -> (n,)"
             if sizes.shape == ():
-                hint = "it must be vectorized; of a size that is the same everywhere give the number itself"
+                hint = "it must be vectorized; for a constant size give the number itself"
             elif sizes.shape == (n, 1):
                 hint = "return its only column, sizes[:, 0]"
             elif sizes.shape == points.shape[1:]:
@@ -257,7 +253,7 @@ class Function(Field):
             )
         return sizes.astype(float)
 
-    def _emit(self, binder: Binder) -> str:
+    def _emit(self, writer: CodeWriter) -> str:
         raise InputError(
             f"{self!r} runs on the host and has no device form; use Expression, Raster or Distance"
         )
@@ -267,31 +263,31 @@ class Function(Field):
 
 
 class Scaled(Field):
-    """A field times a positive number; made by ``2 * field``."""
+    """A field times a positive number: ``2 * field``."""
 
     def __init__(self, field: Field, factor: float):
-        self.field, self.factor = field, positive("a factor of a size field", factor)
+        self.field, self.factor = field, check_positive("a factor of a size field", factor)
         self.dim, self.on_device = field.dim, field.on_device
-        self.parts = counted(field)
+        self.parts = count_parts(field)
 
     def check_dim(self, dim: int) -> None:  # noqa: D102
         self.field.check_dim(dim)
 
-    def with_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
+    def map_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
         return Scaled(change(self.field), self.factor)
 
     def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return self.field.landmarks(domain)
 
-    def misfits(self, domain: Domain) -> list[str]:  # noqa: D102
-        return self.field.misfits(domain)
+    def warnings(self, domain: Domain) -> list[str]:  # noqa: D102
+        return self.field.warnings(domain)
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self.factor * self.field._evaluate(points)
 
-    def _emit(self, binder: Binder) -> str:
-        inner = self.field._emit(binder)
-        return binder.variable(f"data[{binder.store(self.factor)}] * {inner}")
+    def _emit(self, writer: CodeWriter) -> str:
+        inner = self.field._emit(writer)
+        return writer.variable(f"data[{writer.store(self.factor)}] * {inner}")
 
     def __repr__(self) -> str:
         return f"{self.factor!r} * {self.field!r}"
@@ -308,7 +304,7 @@ _COMBINE = {
 
 
 class Combined(Field):
-    """Two or more fields under one of ``+``, ``*``, ``/``, ``min``, ``max``, from left to right."""
+    """Two or more fields, combined by one of ``+``, ``*``, ``/``, ``min``, ``max`` from left to right."""
 
     def __init__(self, operation: str, *fields: Field):
         dims = {f.dim for f in fields if f.dim is not None}
@@ -320,20 +316,20 @@ class Combined(Field):
         self.operation, self.fields = operation, fields
         self.dim = dims.pop() if dims else None
         self.on_device = all(f.on_device for f in fields)
-        self.parts = counted(*fields)
+        self.parts = count_parts(*fields)
 
     def check_dim(self, dim: int) -> None:  # noqa: D102
         for f in self.fields:
             f.check_dim(dim)
 
-    def with_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
+    def map_parts(self, change: Callable[[Field], Field]) -> Field:  # noqa: D102
         return Combined(self.operation, *map(change, self.fields))
 
     def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return np.concatenate([f.landmarks(domain) for f in self.fields])
 
-    def misfits(self, domain: Domain) -> list[str]:  # noqa: D102
-        return [text for f in self.fields for text in f.misfits(domain)]
+    def warnings(self, domain: Domain) -> list[str]:  # noqa: D102
+        return [text for f in self.fields for text in f.warnings(domain)]
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         combine = _COMBINE[self.operation][0]
@@ -343,12 +339,12 @@ class Combined(Field):
                 result = combine(result, f._evaluate(points))
         return result
 
-    def _emit(self, binder: Binder) -> str:
+    def _emit(self, writer: CodeWriter) -> str:
         template = _COMBINE[self.operation][1]
-        name = self.fields[0]._emit(binder)
-        scale = binder.store(binder.scale) if "scale" in template else None
+        name = self.fields[0]._emit(writer)
+        scale = writer.store(writer.scale) if "scale" in template else None
         for f in self.fields[1:]:
-            name = binder.variable(template.format(name, f._emit(binder), scale=scale))
+            name = writer.variable(template.format(name, f._emit(writer), scale=scale))
         return name
 
     def __repr__(self) -> str:
@@ -358,12 +354,12 @@ class Combined(Field):
 
 
 def minimum(*fields: object) -> Field:
-    """Return the least of `fields` (fields, numbers or callables) at each point, as a field."""
+    """Return the pointwise minimum of `fields` (fields, numbers or callables) as a field."""
     return _combined("min", fields)
 
 
 def maximum(*fields: object) -> Field:
-    """Return the greatest of `fields` (fields, numbers or callables) at each point, as a field."""
+    """Return the pointwise maximum of `fields` (fields, numbers or callables) as a field."""
     return _combined("max", fields)
 
 
@@ -375,14 +371,14 @@ def _combined(operation: str, fields: tuple[object, ...]) -> Field:
         alike = isinstance(f, Combined) and f.operation == operation
         made += f.fields if alike else [f]  # type: ignore[attr-defined]
     constants = [f for f in made if isinstance(f, Constant)]
-    if len(constants) > 1:  # one does for all
+    if len(constants) > 1:
         others = [f for f in made if not isinstance(f, Constant)]
-        made = [*others, _folded(operation, constants)]
+        made = [*others, _fold_constants(operation, constants)]
     return made[0] if len(made) == 1 else Combined(operation, *made)
 
 
-def _folded(operation: str, fields: Sequence[Field]) -> Field:
-    """Return `fields` combined; constants alone make a constant, where it is one that a size may have."""
+def _fold_constants(operation: str, fields: Sequence[Field]) -> Field:
+    """Return `fields` combined. Constants combine to a constant, if that is a valid size."""
     if all(isinstance(f, Constant) for f in fields):
         value = fields[0].value  # type: ignore[attr-defined]
         with np.errstate(over="ignore", under="ignore"):
@@ -393,18 +389,18 @@ def _folded(operation: str, fields: Sequence[Field]) -> Field:
     return Combined(operation, *fields)
 
 
-def counted(*fields: Field) -> int:
-    """Return the number of parts of a field that stands on `fields`.
+def count_parts(*fields: Field) -> int:
+    """Return the number of parts of a combination of `fields`.
 
     Raises
     ------
     InputError
-        If they are too many for compilers of kernels, and for Python to go through.
+        If there are too many to build kernels.
     """
     parts = sum(f.parts for f in fields)
-    if parts > _MOST_PARTS:
+    if parts > _MAX_PARTS:
         raise InputError(
-            f"a size field is combined from {parts} parts, expected at most {_MOST_PARTS}: kernels of more take "
+            f"a size field is combined from {parts} parts, expected at most {_MAX_PARTS}, because larger kernels take "
             "minutes to build; put many shapes into one Distance, many values into a Raster, or write a callable "
             "of NumPy arrays"
         )
@@ -427,15 +423,13 @@ def as_field(size: object) -> Field:
         return Constant(size)  # type: ignore[arg-type]
     if callable(size):
         return Function(size)
-    from .distance import Shape  # which stands on this
+    from .distance import Shape  # imports this module
 
     hint = ""
     if isinstance(size, str):
         hint = f"; write sizing.Expression({size!r})"
     elif isinstance(size, (np.ndarray, list, tuple)):
-        hint = (
-            "; write sizing.Raster(values, lower, upper), and points= for generators to start from"
-        )
+        hint = "; write sizing.Raster(values, lower, upper), or points= for initial generators"
     elif isinstance(size, Shape):
         hint = "; write sizing.Distance(shape, h_min, growth) for cells that grow away from it"
     raise InputTypeError(

@@ -1,4 +1,4 @@
-"""How wide a polygonal domain is at its boundary, and how its boundary turns."""
+"""Gaps between the walls of a polygonal domain, and the curvature of its boundary."""
 
 from __future__ import annotations
 
@@ -9,45 +9,45 @@ import numpy as np
 from ..geometry.polygon import Polygon
 
 FACING = math.radians(135)
-"""Least angle between the directions from the middle of a gap to its walls: two walls that meet in a corner of
-more than 45 degrees do not face each other."""
+"""Least angle between the directions from the center of a gap to its walls: the walls of a corner of more than 45
+degrees do not face each other."""
 CORNER = math.radians(30)
-"""Turns of more than this are corners, and not parts of a curve."""
-_FAN = math.radians(7.5)  # between the directions that a corner looks in
-_PER_RADIUS = 4  # samples of an edge per radius of the balls beside it
-_MOST_SAMPLES = 2048  # of one edge
+"""Turns of more than this are corners, not curves."""
+_FAN = math.radians(7.5)  # between the directions from a corner
+_PER_RADIUS = 4  # samples of an edge per radius of the balls at it
+_MAX_SAMPLES = 2048  # of one edge
 _ROUNDS = 40
 _CLOSE = 1e-9
 
 
-def gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return chords across the narrow places of a domain, from wall to wall.
+def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return chords across the gaps of a domain, from wall to wall.
 
-    From places on the boundary a ball grows inwards, touching it there, until it touches it a second time: a ball of
-    the medial axis. It is found by shrinking a large one onto the nearest place of the boundary in it, again and
-    again (Ma, Bae, Choi 2012). If both walls face each other, their distance is the width of a gap. Corners
-    that stand out into the domain look in all directions between those of their edges.
+    A ball of the medial axis touches the boundary at two points. For a point on the boundary it is found by shrinking a
+    large ball repeatedly until it contains no other boundary point (Ma, Bae, Choi 2012). If both walls face each other,
+    their distance is the width of a gap. At reentrant corners balls start in all directions between the normals of the
+    two edges.
 
     Parameters
     ----------
     domain : Polygon
     least : float
-        Width below which gaps need not be told apart: bounds the work.
+        Smallest width to resolve; it bounds the work.
     most : float
-        Width beyond which gaps do not matter.
+        Largest width of a gap.
 
     Returns
     -------
     begin, end : (m, 2) float64
-        Where the balls touch.
+        The points where the balls touch the boundary.
     """
     start = domain.oriented.vertices
     edge = start[domain.oriented.next_vertex] - start
     length = np.hypot(*edge.T)
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
     found = [_from_corners(domain, normal, most)]
-    # Edges are sampled as finely as the gaps beside them are narrow.
-    counts = np.clip(np.ceil(length / (most / 2)), 1, _MOST_SAMPLES).astype(np.int64)
+    # Edges are sampled more finely at narrower gaps.
+    counts = np.clip(np.ceil(length / (most / 2)), 1, _MAX_SAMPLES).astype(np.int64)
     rows = np.arange(len(counts))
     while rows.size:
         row = np.repeat(rows, counts[rows])
@@ -57,11 +57,11 @@ def gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, np.nda
         narrowest = np.full(len(counts), math.inf)
         np.minimum.at(narrowest, row[np.isfinite(radius)], radius[np.isfinite(radius)])
         finer = np.ceil(_PER_RADIUS * length[rows] / np.maximum(narrowest[rows], least / 2))
-        finer = np.minimum(finer, _MOST_SAMPLES).astype(np.int64)
+        finer = np.minimum(finer, _MAX_SAMPLES).astype(np.int64)
         again = finer > 1.5 * counts[rows]
         done = np.isin(row, rows[~again]) & np.isfinite(radius)
         found.append((begin[done], end[done]))
-        # Step by step, as an edge may leave the narrow place soon.
+        # In steps, because a gap may be narrow at a short part of an edge only.
         counts[rows[again]] = np.minimum(finer[again], 4 * counts[rows[again]])
         rows = rows[again]
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
@@ -70,7 +70,7 @@ def gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, np.nda
 def _from_corners(
     domain: Polygon, normal: np.ndarray, most: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return chords from corners whose angle inside the domain is more than 180 degrees."""
+    """Return chords from reentrant corners (more than 180 degrees inside the domain)."""
     before = np.empty(len(normal), np.int64)
     before[domain.oriented.next_vertex] = np.arange(len(normal))
     first = normal[before]
@@ -92,12 +92,12 @@ def _from_corners(
 def _balls(
     domain: Polygon, points: np.ndarray, normal: np.ndarray, most: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where balls touch the boundary, at `points` and elsewhere, and their radii.
+    """Return the two points where balls touch the boundary, `points` and another one, and their radii.
 
     The radius is infinite where the walls do not face each other, or are farther apart than `most`.
     """
     n = len(points)
-    # A gap is at least as wide as its ball's radius times 2 sin(FACING / 2).
+    # The width of a gap is at least the radius of its ball times 2 sin(FACING / 2).
     radius = np.full(n, most / (2 * math.sin(FACING / 2)))
     touched = points.copy()
     met = np.zeros(n, bool)
@@ -123,10 +123,10 @@ def _balls(
 
 
 def radii_of_curvature(domain: Polygon) -> np.ndarray:
-    """Return the radius of the curve that each oriented edge is part of, (k,); infinite beside corners or if straight.
+    """Return the radius of curvature at each oriented edge, (k,); infinite beside corners and for straight lines.
 
-    At a vertex where the boundary turns by an angle a between edges of lengths p and q, the radius is that of the
-    circle that touches both at half the shorter one's length, ``min(p, q) / (2 tan(a / 2))``.
+    Between edges of lengths p and q that turn by the angle a, the radius is ``min(p, q) / (2 tan(a / 2))``: that of the
+    circle that touches both edges at half the length of the shorter one.
     """
     following = domain.oriented.next_vertex
     edge = domain.oriented.vertices[following] - domain.oriented.vertices

@@ -1,4 +1,4 @@
-"""The stage that bounds how fast sizes grow, on a regular grid (`gradation.cl`)."""
+"""Gradation: limit the growth of sizes on a regular grid (`gradation.cl`)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from ..opencl.program import Engine
 
 _TILE = {2: 16, 3: 8}  # nodes along a side
-_PASSES = 16  # between two looks at which tiles are awake
+_PASSES = 16  # between two reads of the active tiles by the host
 
 
 class Gradation:
-    """Lower values on a grid until none rises faster than a bound."""
+    """Lower the values on a grid until their gradient is bounded."""
 
     def __init__(self, engine: Engine):
         self.engine = engine
@@ -28,9 +28,9 @@ class Gradation:
     def sweep_tiles(
         self, values: cla.Array, counts: Sequence[int], spacing: Sequence[float], slope: float
     ) -> int:
-        """Replace `values` by the largest ones below them with |grad| <= `slope`, to first order.
+        """Replace `values` by the largest values below them with |grad| <= `slope`, to first order.
 
-        Fast sweeping within tiles, a front of tiles between them, that of the least values first.
+        Fast sweeping within tiles, which become active in the order of their values.
 
         Parameters
         ----------
@@ -39,49 +39,51 @@ class Gradation:
         counts : d ints
             Number of nodes along x, y (, z).
         spacing : d floats
-            Distance of the nodes along each, in the unit of the values.
+            Distance of the nodes along each axis, in the unit of the values.
         slope : float
             Not negative.
 
         Returns
         -------
         int
-            Passes made over the tiles.
+            Passes over the tiles.
         """
         engine, kernels = self.engine, self._kernels
         tiles = tuple(-(-n // self._tile) for n in counts)
         n = math.prod(tiles)
-        awake, wake = engine.empty(n, np.int32), engine.empty(n, np.int32)
-        awake.fill(np.int32(1))
-        wake.fill(np.int32(0))
+        active, next_active = engine.empty(n, np.int32), engine.empty(n, np.int32)
+        active.fill(np.int32(1))
+        next_active.fill(np.int32(0))
         lowest = engine.empty(n)
         nodes = [np.int32(c) for c in [*counts, 1][:3]]
         steps = [engine.real.type(s) for s in [*spacing, 1.0][:3]]
         engine.run_each(kernels.tile_minima, n, *nodes, values, lowest)
-        # u rises by so much across a tile: the front moves on by a tile per pass of both colors.
+        # Increase of u across a tile: the front moves by one tile per pass of both colors.
         rise = slope * self._tile * max(spacing)
         passes = 0
         while True:
-            begin = self._least_awake(awake.get(), lowest.get(), tiles)
+            begin = self._least_active(active.get(), lowest.get(), tiles)
             if begin is None:
                 return passes
-            # What is beyond the precision's range is infinite, and bounds nothing.
+            # A threshold out of range of the precision is infinite.
             with np.errstate(over="ignore"):
                 growth = engine.real.type(slope)
                 front = [engine.real.type(begin + (1 + k // 2) * rise) for k in range(_PASSES)]
             for k in range(_PASSES):
                 engine.run_each(
                     kernels.sweep_tiles, n, *nodes, *steps, np.int32(k % 2), growth, front[k],
-                    awake, wake, lowest, values,
+                    active, next_active, lowest, values,
                 )  # fmt: skip
-                awake.fill(np.int32(0))
-                awake, wake = wake, awake
+                active.fill(np.int32(0))
+                active, next_active = next_active, active
             passes += _PASSES
 
     @staticmethod
-    def _least_awake(awake: np.ndarray, lowest: np.ndarray, tiles: tuple[int, ...]) -> float | None:
-        """Return the least value in tiles that are awake and their neighbors, None if all sleep."""
-        if not awake.any():
+    def _least_active(
+        active: np.ndarray, lowest: np.ndarray, tiles: tuple[int, ...]
+    ) -> float | None:
+        """Return the smallest value in active tiles and their neighbors; None if no tile is active."""
+        if not active.any():
             return None
         around = lowest = lowest.reshape(tiles, order="F")
         for axis in range(lowest.ndim):
@@ -90,4 +92,4 @@ class Gradation:
             for first in (0, 2):
                 beside = np.take(wide, range(first, first + tiles[axis]), axis)
                 around = np.minimum(around, beside)
-        return float(around.ravel(order="F")[awake > 0].min())
+        return float(around.ravel(order="F")[active > 0].min())

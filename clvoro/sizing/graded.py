@@ -1,4 +1,4 @@
-"""The largest size field below a given one that grows no faster than wanted."""
+"""A size field with bounded growth."""
 
 from __future__ import annotations
 
@@ -13,58 +13,55 @@ from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.host_memory import host_memory
-from .arguments import slope_of
-from .covering import uncovered
-from .field import Field, as_field, counted
+from .advice import coverage_warnings
+from .arguments import check_slope
+from .field import Field, as_field, count_parts
 from .raster import Raster
 
 if TYPE_CHECKING:
     from ..opencl.program import Engine
-    from .bind import Binder
+    from .codegen import CodeWriter
 
-_MOST = 1 << 22  # nodes
-_MOST_GIVEN = 2**31 - 1  # nodes of a resolution that the caller gives
-_BATCH = 1 << 18  # nodes evaluated at once
-_NODE = 48  # bytes of a node on the host, at most, while values go to and from the device and into a raster
-_PROBES = {2: 129, 3: 33}  # nodes along the longest side of the grid that looks for the least size
+_MAX_NODES = 1 << 22  # by default
+_MAX_NODES_GIVEN = 2**31 - 1  # of a resolution that the caller gives
+_BATCH = 1 << 18  # nodes that are evaluated at once
+_BYTES_PER_NODE = 48  # on the host, at most
+_PROBES = {2: 129, 3: 33}  # nodes along the longest side of the grid that samples the smallest size
 
 
 class Graded(Field):
     """A field with its growth limited: the largest one below it with ``|grad h| <= slope``.
 
-    ``h(x) = min over y of field(y) + slope |x - y|``: small sizes stay, and from each the size
-    grows no faster than wanted. It is computed once for each domain, on a grid of nodes over it,
-    when it is first needed, as the solution of the Eikonal equation by a first-order upwind scheme;
-    between nodes it is a `Raster`. The scheme is off by a spacing's growth or so, mostly to the
-    larger side: slopes of the result stay below the bound along the axes, and come to a few per
-    cent above it elsewhere. At a node the result is never above `field`. Dips narrower than the spacing count
-    where the field names them (the shapes of a `Distance`, the least values of a `Raster`), and
-    where a node meets them.
+    ``h(x) = min over y of field(y) + slope |x - y|``: small sizes stay, and sizes grow from them with bounded slope.
+    It is computed once per domain, on a grid, when it is first needed: a first-order upwind scheme solves the Eikonal
+    equation. Between nodes it is a `Raster`. The error of the scheme is about the growth over one spacing, mostly
+    towards larger sizes: slopes of the result are within the bound along the axes, and up to a few per cent above it
+    in other directions. At a node the result is never above `field`. Minima narrower than the spacing are included if
+    they are landmarks of the field (shapes of a `Distance`, minima of a `Raster`) or at a node.
 
     Parameters
     ----------
     field : Field, number or callable
     growth : float, optional
-        Geometric growth rate g >= 1, the ratio of the sizes of neighboring cells: the slope is
-        ln(growth), as for `Distance`.
+        Geometric growth rate g >= 1, the ratio of the sizes of neighboring cells. The slope is ln(growth), as for
+        `Distance`.
     slope : float, optional
-        The bound of |grad h| itself, in place of `growth`. 0 gives the least size everywhere.
+        Bound of |grad h|, in place of `growth`. 0 gives the smallest size everywhere.
     box : Box or Polygon, optional
-        What the grid covers; by default the domain. Outside, the nearest value holds on. In a polygon `field` is
-        asked for inside only; sizes also grow straight across what the polygon leaves out.
+        Region of the grid; by default the domain. Outside, the nearest value is used. In a polygon `field` is
+        evaluated inside only; sizes also grow straight across the outside.
     resolution : int or sequence of d ints, optional
-        Number of nodes along the box's longest side, or along each. By default as many as put the
-        nodes one smallest size apart (the least of field on a coarse grid and at what it names), at
-        least 129 along the longest side (33 in 3D) and at most 2^22 in all (2048 x 2048, 161^3; 32
-        MiB in float64). A coarser grid costs accuracy of the growth, of the order of slope times
-        the spacing.
+        Number of nodes along the longest side of the box, or along each axis. By default the spacing is the smallest
+        size (of the field on a coarse grid and at its landmarks), with at least 129 nodes along the longest side (33 in
+        3D) and at most 2^22 in total (2048 x 2048, 161^3; 32 MiB in float64). The error of the growth is about slope
+        times the spacing.
 
     Raises
     ------
     InputError, InputTypeError
         If an argument is out of range or of the wrong kind.
     MemoryLimitError
-        When it is computed, if host or device have no room for as many nodes as `resolution` makes.
+        When it is computed, if host or device have not enough memory for the nodes of `resolution`.
     SizeFieldError
         When it is computed, if `field` is not positive and finite at a node.
 
@@ -87,8 +84,8 @@ class Graded(Field):
         resolution: int | Sequence[int] | None = None,
     ):
         self.field = as_field(field)
-        self.parts = counted(self.field)
-        self.slope = slope_of("Graded", growth, slope)
+        self.parts = count_parts(self.field)
+        self.slope = check_slope("Graded", growth, slope)
         if box is not None and not isinstance(box, Domain):
             raise InputTypeError(
                 f"Graded box is {type(box).__name__}, expected a clvoro.Box or clvoro.Polygon"
@@ -96,23 +93,23 @@ class Graded(Field):
         if box is not None:
             self.field.check_dim(box.dim)
         self.box, self.dim = box, self.field.dim if box is None else box.dim
-        self.resolution = None if resolution is None else _checked(resolution, self.dim)
+        self.resolution = None if resolution is None else _check_resolution(resolution, self.dim)
         self._rasters: dict[tuple, Raster] = {}
         self._latest: Domain | None = box
-        self._taken = 0  # bytes on the device, for the latest of these
+        self._peak_bytes = 0  # device memory of the latest computation
 
     def raster(self, domain: Domain | None = None, engine: Engine | None = None) -> Raster:
-        """Return the field as a `Raster` over its box, or else over `domain`, computing it if need be.
+        """Return the field as a `Raster` over its box, or over `domain`. It is computed once.
 
         Raises
         ------
         InputError
-            If neither is known.
+            If there is neither.
         """
         box = self.box or domain or self._latest
         if box is None:
             raise InputError(
-                f"{self!r} has no domain yet, on which it could be computed; pass box=, such as "
+                f"{self!r} has no domain to be computed on; pass box=, such as "
                 "Graded(field, 1.2, box=domain)"
             )
         self._latest = box
@@ -132,10 +129,10 @@ class Graded(Field):
     def landmarks(self, domain: Domain) -> np.ndarray:  # noqa: D102
         return self.raster(domain).landmarks(domain)
 
-    def misfits(self, domain: Domain) -> list[str]:  # noqa: D102
-        found = self.field.misfits(domain if self.box is None else self.box)
+    def warnings(self, domain: Domain) -> list[str]:  # noqa: D102
+        found = self.field.warnings(domain if self.box is None else self.box)
         if self.box is not None:
-            found += uncovered(
+            found += coverage_warnings(
                 repr(self), domain, self.box.lower, self.box.upper, "give a larger box"
             )
         return found
@@ -143,16 +140,16 @@ class Graded(Field):
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         return self.raster()._evaluate(points)
 
-    def _emit(self, binder: Binder) -> str:
+    def _emit(self, writer: CodeWriter) -> str:
         known = len(self._rasters)
-        raster = self.raster(binder.domain, binder.engine)
+        raster = self.raster(writer.domain, writer.engine)
         if len(self._rasters) > known:
-            binder.taken = max(binder.taken, self._taken)
-        return raster._emit(binder)
+            writer.peak_bytes = max(writer.peak_bytes, self._peak_bytes)
+        return raster._emit(writer)
 
     def _compute(self, box: Domain, engine: Engine) -> Raster:
+        from .evaluation import Sizing
         from .gradation import Gradation
-        from .stage import Sizing
 
         evaluate = Sizing(engine, box, self.field)
         marks = self.field.landmarks(box)
@@ -167,16 +164,16 @@ class Graded(Field):
             places = np.unravel_index(flat, counts, order="F")
             nodes = np.column_stack([axis[i] for axis, i in zip(axes, places, strict=True)])
             values[flat] = self._at_nodes(box, evaluate, nodes, axes)
-        # Where nobody may ask: more than can be reached from anywhere else.
+        # Nodes outside of the domain: above all values that sizes can grow to.
         far = np.isinf(values)
         values[far] = values[~far].max(initial=0) + self.slope * box.extent.sum()
         self._seed(values, counts, axes, marks, at_marks)
         scale = box.frame[1]
-        # One after the other, so that there is room.
-        taken = evaluate.taken
+        # Free the memory of the evaluation first.
+        peak_bytes = evaluate.peak_bytes
         del evaluate
         on_device = engine.upload(values / scale)
-        self._taken = max(taken, on_device.nbytes)
+        self._peak_bytes = max(peak_bytes, on_device.nbytes)
         spacing = box.extent / (counts - 1)
         Gradation(engine).sweep_tiles(
             on_device, counts.tolist(), (spacing / scale).tolist(), self.slope
@@ -193,8 +190,8 @@ class Graded(Field):
     ) -> np.ndarray:
         """Return the field at nodes (n, d); infinite at those outside the domain.
 
-        One that is a spacing away at most gets what the nearest place inside allows it: so no strait is lost between
-        the nodes.
+        A node at most one spacing outside gets the value that the nearest point inside allows, so that no narrow strait
+        is lost between the nodes.
         """
         if not isinstance(box, Polygon):
             return evaluate(nodes)
@@ -215,16 +212,16 @@ class Graded(Field):
     def _counts(
         self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray
     ) -> np.ndarray:
-        """Return the number of nodes along each axis."""
+        """Return the numbers of nodes along the axes."""
         if isinstance(self.resolution, tuple):
             return np.array(self.resolution)
         longest = box.extent.max()
         if self.resolution is not None:
             counts = _along(box, longest / (self.resolution - 1))
-            if np.prod(counts, dtype=float) > _MOST_GIVEN:
+            if np.prod(counts, dtype=float) > _MAX_NODES_GIVEN:
                 raise InputError(
                     f"Graded resolution is {self.resolution}, which makes {np.prod(counts, dtype=float):.3g} nodes of "
-                    f"{box!r}, expected fewer than 2^31; leave it out, or give less"
+                    f"{box!r}, expected fewer than 2^31; leave it out, or give a smaller one"
                 )
             return counts
         coarse = longest / (_PROBES[box.dim] - 1)
@@ -235,25 +232,25 @@ class Graded(Field):
             inner = np.array([box.inner_point(piece) for piece in range(box.n_pieces)])
             probes = np.concatenate([probes[box.contains(probes)], inner])
         least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))
-        finest = (box.measure / _MOST) ** (1 / box.dim)
+        finest = (box.measure / _MAX_NODES) ** (1 / box.dim)
         spacing = min(max(least, finest), coarse)
-        while np.prod(_along(box, spacing), dtype=float) > _MOST:
+        while np.prod(_along(box, spacing), dtype=float) > _MAX_NODES:
             spacing *= 1.02
         return _along(box, spacing)
 
     def _check_room(self, n: int, engine: Engine) -> None:
-        """Raise if host or device have no room for `n` nodes."""
+        """Raise if host or device have not enough memory for `n` nodes."""
         device = engine.queue.device
         name, own = device.name.strip(), n * engine.real.itemsize
         for where, needed, has in (
-            ("the host", n * _NODE, host_memory()),
+            ("the host", n * _BYTES_PER_NODE, host_memory()),
             (name, own, device.global_mem_size),
             (f"{name} in one piece", own, device.max_mem_alloc_size),
         ):
             if needed > has:
                 raise MemoryLimitError(
                     f"Graded resolution is {self.resolution}, which makes {n:.3g} nodes and needs "
-                    f"{needed / 2**30:.3g} GiB; {where} has {has / 2**30:.3g} GiB. Give less, or leave it out"
+                    f"{needed / 2**30:.3g} GiB; {where} has {has / 2**30:.3g} GiB. Give a smaller one, or leave it out"
                 )
 
     def _seed(
@@ -264,7 +261,7 @@ class Graded(Field):
         marks: np.ndarray,
         at_marks: np.ndarray,
     ) -> None:
-        """Lower the nodes around each landmark to what it allows them."""
+        """Lower the nodes around each landmark to the values that it allows."""
         first = [
             np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
             for axis, x in zip(axes, marks.T, strict=True)
@@ -288,11 +285,11 @@ def _axes(box: Domain, counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _along(box: Domain, spacing: float) -> np.ndarray:
-    """Return how many nodes put them at most `spacing` apart on each axis, at least two."""
+    """Return the numbers of nodes along the axes for a spacing of at most `spacing`, at least two."""
     return np.maximum(np.ceil(box.extent / spacing * (1 - 1e-12)).astype(np.int64), 1) + 1
 
 
-def _checked(resolution: int | Sequence[int], dim: int | None) -> int | tuple[int, ...]:
+def _check_resolution(resolution: int | Sequence[int], dim: int | None) -> int | tuple[int, ...]:
     given = np.asarray(resolution)
     if given.dtype.kind not in "iu":
         raise InputTypeError(f"Graded resolution is {resolution!r}, expected integers")
@@ -300,7 +297,7 @@ def _checked(resolution: int | Sequence[int], dim: int | None) -> int | tuple[in
         raise InputError(
             f"Graded resolution has shape {given.shape}, expected one number of nodes or one per axis"
         )
-    if given.min() < 2 or np.prod(given, dtype=float) > _MOST_GIVEN:
+    if given.min() < 2 or np.prod(given, dtype=float) > _MAX_NODES_GIVEN:
         raise InputError(
             f"Graded resolution is {resolution!r}, expected at least 2 nodes along each axis and "
             "fewer than 2^31 in all"

@@ -10,20 +10,20 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.polygon import Polygon
-from .covering import uncovered
+from .advice import coverage_warnings
 from .field import Field
-from .filling import filled, scattered_values
+from .gridding import fill_missing, grid_scattered
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..geometry.box import Domain
-    from .bind import Binder
+    from .codegen import CodeWriter
 
 _MANY, _WITHIN = 8, 0.1
-# A raster of so many values along each axis shows a domain of more than that share of their spacing.
-_ENOUGH = 16  # scattered points, whose box covers most of what they are scattered over
-_ROUNDINGS = 16  # of a coordinate, by which a place may lie beyond a raster
+# A raster of at least _MANY values along each axis is meant for domains of more than _WITHIN of their spacing.
+_ENOUGH = 16  # scattered points from which on their bounding box tells where values are known
+_ROUNDINGS = 16  # ulps by which a point may lie outside of a raster
 
 
 class Raster(Field):
@@ -42,18 +42,17 @@ class Raster(Field):
         ``linspace(lower, upper, nx)``; with "centers" each value is the center of one of nx equal
         pixels.
     missing : "error" or "nearest"
-        Whether values that are missing (NaN, or under a NumPy mask) are refused, or filled with the
-        nearest one that is there.
+        Whether missing values (NaN, or masked by NumPy) are rejected or filled with the nearest value.
     outside : "nearest" or "error", optional
-        Whether a domain that reaches beyond the box is served with the value of the nearest edge of the array, or
-        refused with the place. (With "centers", the nearest value holds within half a pixel of the sides anyway.)
-        By default the nearest, and a run warns (`MisfitWarning`) if less than half of the domain is covered.
+        Whether points outside of the box get the nearest value of the array, or raise an error. (With "centers" the
+        nearest value is used within half a pixel of the sides in any case.) By default "nearest", and a run warns
+        (`MisfitWarning`) if less than half of the domain is covered.
 
     Raises
     ------
     InputError
-        If shape and corners do not fit, or a value is missing or infinite. (Values that are not positive are
-        refused only where the finished field is: a `maximum` may cover them.)
+        If shape and corners do not match, or a value is missing or infinite. (Values that are not positive are an error
+        only if the final field is not positive, because `maximum` may replace them.)
 
     Examples
     --------
@@ -79,16 +78,16 @@ class Raster(Field):
         if outside not in (None, "nearest", "error"):
             raise InputError(f"Raster got outside={outside!r}, expected 'nearest' or 'error'")
         self.outside = outside
-        low, high = check_corners("Raster", np.shape(values), lower, upper, at)
+        low, high = check_box("Raster", np.shape(values), lower, upper, at)
         counts = np.array(np.shape(values)[::-1])
         spacing = (high - low) / np.maximum(counts - (at == "nodes"), 1)
-        self.values = filled("Raster values", values, missing, spacing)
+        self.values = fill_missing("Raster values", values, missing, spacing)
         self.lower, self.upper, self.at = low, high, at
         self.dim = self.values.ndim
 
     @property
     def _counts(self) -> np.ndarray:
-        """Number of values along x, y (, z)."""
+        """Numbers of values along x, y (, z)."""
         return np.array(self.values.shape[::-1])
 
     def _index_map(self) -> tuple[np.ndarray, np.ndarray]:
@@ -99,10 +98,10 @@ class Raster(Field):
         return 1.0 / pixel, self.lower + 0.5 * pixel
 
     def landmarks(self, domain: Domain) -> np.ndarray:
-        """Return the places of the least value in each of at most 64 tiles per axis."""
+        """Return the points of the smallest value in each of at most 64 tiles per axis."""
         low, where = self.values, np.arange(self.values.size).reshape(self.values.shape)
         for axis, count in enumerate(low.shape):
-            # Take the least along one axis after the other, and carry along where it was.
+            # Minimum along one axis after the other, together with its index.
             tile = -(-count // 64)
             pad = [(0, 0)] * low.ndim
             pad[axis] = (0, -count % tile)
@@ -118,8 +117,8 @@ class Raster(Field):
         points = origin + np.divide(index, gain, out=np.zeros(index.shape), where=gain > 0)
         return np.clip(points, self.lower, self.upper)
 
-    def misfits(self, domain: Domain) -> list[str]:
-        """Return what is to be said if the array covers little of `domain`, or all of that lies between two values."""
+    def warnings(self, domain: Domain) -> list[str]:
+        """Return a warning if the array covers little of `domain`, or the domain lies between two of its values."""
         if self.outside is not None:
             return []
         many = self._counts >= _MANY
@@ -127,16 +126,16 @@ class Raster(Field):
         if many.all() and (domain.extent < _WITHIN * spacing).all():
             return [
                 f"the domain, {domain.extent.tolist()} across, lies between two values of {self!r}, which are "
-                f"{spacing.tolist()} apart: sizes hardly vary; are units of raster and domain the same?"
+                f"{spacing.tolist()} apart, so that sizes hardly vary; do raster and domain have the same unit?"
             ]
-        return self._uncovered(domain)
+        return self._coverage_warnings(domain)
 
-    def _uncovered(self, domain: Domain) -> list[str]:
-        remedy = "give a larger raster, or outside='nearest' if that is meant"
-        return uncovered(repr(self), domain, self.lower, self.upper, remedy)
+    def _coverage_warnings(self, domain: Domain) -> list[str]:
+        remedy = "give a larger raster, or outside='nearest' to confirm"
+        return coverage_warnings(repr(self), domain, self.lower, self.upper, remedy)
 
-    def _refuse_outside(self, points: np.ndarray) -> None:
-        """Raise if one of `points` (n, d) lies beyond the box, but for roundings of it, and that is not wanted."""
+    def _check_outside(self, points: np.ndarray) -> None:
+        """Raise if one of `points` (n, d) lies outside of the box by more than round-off and `outside` is "error"."""
         if self.outside != "error":
             return
         far = max(np.abs(self.lower).max(), np.abs(self.upper).max())
@@ -145,12 +144,12 @@ class Raster(Field):
         if out.any():
             where = ", ".join(f"{c:.6g}" for c in points[np.argmax(out)])
             raise InputError(
-                f"{self!r} does not cover the domain: nothing is known at ({where}); give a larger raster, a "
+                f"{self!r} does not cover the domain: it has no value at ({where}); give a larger raster, a "
                 "smaller domain, or outside='nearest'"
             )
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
-        self._refuse_outside(points)
+        self._check_outside(points)
         gain, origin = self._index_map()
         t = np.clip((points - origin) * gain, 0, self._counts - 1)
         first = np.minimum(t.astype(int), np.maximum(self._counts - 2, 0))
@@ -162,21 +161,21 @@ class Raster(Field):
             total += w * self.values[tuple(index.T[::-1])]
         return total
 
-    def _emit(self, binder: Binder) -> str:
-        # A box holds a domain if it holds its corners.
-        domain = binder.domain
+    def _emit(self, writer: CodeWriter) -> str:
+        # A box contains a domain if it contains its corners.
+        domain = writer.domain
         corners = domain.vertices if isinstance(domain, Polygon) else [domain.lower, domain.upper]
-        self._refuse_outside(np.array(corners))
+        self._check_outside(np.array(corners))
         if (self.upper < domain.lower).any() or (self.lower > domain.upper).any():
             raise InputError(
                 f"{self!r} lies beside the domain, from {list(domain.lower)} to {list(domain.upper)}, expected an "
-                "overlap; are units and the order of the coordinates (x, y) the same?"
+                "overlap; do units and the order of the coordinates (x, y) agree?"
             )
         gain, origin = self._index_map()
-        shift = -binder.normalize(origin) * (gain * binder.scale)
-        at = binder.store(gain * binder.scale, shift, self.values / binder.scale)
+        shift = -writer.normalize(origin) * (gain * writer.scale)
+        at = writer.store(gain * writer.scale, shift, self.values / writer.scale)
         counts = ", ".join(map(str, [*self._counts.tolist(), 1][:3]))
-        return binder.variable(f"size_raster(x, data + {at}, {counts})")
+        return writer.variable(f"size_raster(x, data + {at}, {counts})")
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.values.shape))
@@ -184,32 +183,31 @@ class Raster(Field):
 
 
 class Scattered(Raster):
-    """Values at scattered points, laid onto a raster once: measurements, or another mesh's cells.
+    """Values at scattered points, interpolated to a raster: measurements, or the cells of another mesh.
 
     Parameters
     ----------
     points : (n, d) float
-        d = 2 or 3; for the data of a mesh's cells their centroids.
+        d = 2 or 3; for cell data of a mesh the centroids.
     values : (n,) float
     lower, upper : sequences of d floats, optional
-        The box that the raster covers; by default that of the points.
+        The box of the raster; by default the bounding box of the points.
     resolution : int or sequence of d ints, optional
-        Number of nodes along the longest side, or along each. By default two per mean distance of
-        the points, (volume / n)^(1/d), and at most 2^22 in all; where the points are dense in one
-        part, ask for more.
+        Number of nodes along the longest side, or along each axis. By default two per mean distance of the points,
+        (volume / n)^(1/d), and at most 2^22 in total. Points with dense clusters need more.
     method : "linear" or "nearest"
-        Linear interpolation in the Delaunay triangulation of the points, beyond their hull the value
-        of the nearest; or the nearest everywhere.
+        Linear interpolation in the Delaunay triangulation of the points, and the nearest value outside of their hull;
+        or the nearest value everywhere.
 
     Raises
     ------
     InputError, InputTypeError
-        If shapes do not fit, a number is not finite, all points lie beside the box, or (linear) they
-        cannot be triangulated or two of them at the same place disagree.
+        If shapes do not match, a number is not finite, all points lie outside of the box, or (linear) the points cannot
+        be triangulated or two points at the same place have different values.
 
     Examples
     --------
-    The sizes of one mesh, halved, for the next::
+    Half the sizes of another mesh::
 
         size = 0.5 * Scattered(result.diagram.centroids, result.target_size, box.lower, box.upper)
     """
@@ -223,23 +221,29 @@ class Scattered(Raster):
         resolution: int | Sequence[int] | None = None,
         method: str = "linear",
     ):
-        found, low, high = scattered_values(points, values, lower, upper, resolution, method)
+        found, low, high = grid_scattered(points, values, lower, upper, resolution, method)
         super().__init__(found, low, high)
         x = np.asarray(points, float)
         self._known = x.min(axis=0), x.max(axis=0), len(x)
 
-    def _uncovered(self, domain: Domain) -> list[str]:
+    def _coverage_warnings(self, domain: Domain) -> list[str]:
         low, high, count = self._known
         if count < _ENOUGH:
             return []
         remedy = "give points all over the domain"
-        return uncovered(f"Scattered of {count} points", domain, low, high, remedy)
+        return coverage_warnings(f"Scattered of {count} points", domain, low, high, remedy)
 
 
-def check_corners(
+def check_box(
     what: str, shape: tuple[int, ...], lower: ArrayLike, upper: ArrayLike, at: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of a raster of `shape` as arrays (d,), or raise what is wrong with them."""
+    """Return the corners of a raster of `shape` as arrays (d,).
+
+    Raises
+    ------
+    InputError
+        If they do not match the shape, or are not in order.
+    """
     if len(shape) not in (2, 3) or 0 in shape:
         raise InputError(
             f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty"
@@ -253,8 +257,8 @@ def check_corners(
         )
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise InputError(
-            f"{what} got lower {lower} and upper {upper}, expected finite numbers with lower < upper; turn the "
-            "values of an axis that runs downwards round, as in values[::-1]"
+            f"{what} got lower {lower} and upper {upper}, expected finite numbers with lower < upper; "
+            "reverse the values of an axis that runs downwards, as in values[::-1]"
         )
     if at not in ("nodes", "centers"):
         raise InputError(f"{what} got at={at!r}, expected 'nodes' or 'centers'")

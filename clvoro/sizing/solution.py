@@ -1,4 +1,4 @@
-"""Sizes from a solution: by its second derivatives (Hessian) or its gradient, on a raster."""
+"""Sizes from a solution on a raster, by its second derivatives (Hessian) or its gradient."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, InputTypeError
-from .arguments import positive
-from .filling import filled
-from .raster import Raster, check_corners
+from .arguments import check_positive
+from .gridding import fill_missing
+from .raster import Raster, check_box
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-_FLAT = 1e-12  # curvature below this part of the largest is none
+_FLAT = 1e-12  # share of the largest curvature below which curvature counts as 0
 
 
 def hessian_size(
@@ -40,14 +40,14 @@ def hessian_size(
 
         M = D (det |H|)^(-1 / (2 p + d)) |H|,   D = N^(2/d) (integral (det |H|)^(p / (2 p + d)))^(-2/d),
 
-    with the Hessian H of u and |H| = its absolute value. For cells without a direction |H| becomes
-    l times the identity, l the largest of the absolute eigenvalues of H, which bounds the error in
-    all directions; then det |H| = l^d, M = h^-2 times the identity, and
+    with the Hessian H of u and |H| = its absolute value. For isotropic cells |H| is replaced by l times the identity, l
+    the largest absolute eigenvalue of H, which bounds the error in all directions. Then det |H| = l^d, M = h^-2 times
+    the identity, and
 
         h = c l^(-p / (2 p + d)),   c^d = (1 / N) integral l^(p d / (2 p + d)),
 
-    so that the integral of h^-d is N. With p = 2 errors of all places count much; the larger p, the
-    more the largest ones, and for p = inf h = c l^(-1/2) makes the error the same everywhere.
+    so that the integral of h^-d is N. The larger p, the more weight have the largest errors; for p = inf,
+    h = c l^(-1/2) makes the error constant.
 
     Parameters
     ----------
@@ -56,15 +56,14 @@ def hessian_size(
     lower, upper : sequences of 2 or 3 floats
         The box that the array covers.
     n_cells : float, optional
-        Wanted count of cells N in the box, bounds included.
+        Number of cells N in the box, bounds included.
     eps : float, optional
-        In place of `n_cells`: the wanted L^p norm of e = h^2 l / 8 over the box, the error of
-        linear interpolation along an edge h; in the unit of u times length^(d / p). Bounds then
-        apply on top of it.
+        In place of `n_cells`: the L^p norm over the box of e = h^2 l / 8, the error of linear interpolation along an
+        edge h, in the unit of u times length^(d / p). The bounds of h apply afterwards.
     p : float
-        At least 1; `math.inf` too.
+        At least 1, or `math.inf`.
     h_min, h_max : float
-        Bounds. Where u does not curve, h is `h_max`, by default the longest side of the box.
+        Bounds. Where the Hessian is 0, h is `h_max`, by default the longest side of the box.
     at, missing
         As for `Raster`.
 
@@ -98,7 +97,9 @@ def hessian_size(
         size = Graded(hessian_size(u, (0, 0), (1, 1), n_cells=5000, h_max=0.1), growth=1.2)
         clvoro.Adapter().run(clvoro.Box((0, 0), (1, 1)), size, n_cells=5000).plot("size")
     """
-    u, corners, spacing = _solution("hessian_size", values, lower, upper, at, missing, least=3)
+    u, corners, spacing = _check_solution(
+        "hessian_size", values, lower, upper, at, missing, least=3
+    )
     if not (isinstance(p, Real) and p >= 1):
         raise InputError(f"hessian_size p is {p!r}, expected at least 1; math.inf is allowed")
     d = u.ndim
@@ -112,7 +113,7 @@ def hessian_size(
     power = 0.5 if math.isinf(p) else p / (2 * p + d)
     with np.errstate(divide="ignore"):
         profile = shape**-power
-    wanted = _one_of("hessian_size", n_cells, eps)
+    wanted = _check_one_of("hessian_size", n_cells, eps)
     if eps is not None:
         # e = c^2 l^(1 - 2 power) / 8 with c for l / largest: divided by `largest`.
         norm = 1.0
@@ -121,7 +122,9 @@ def hessian_size(
         factor = math.sqrt(8 * wanted / (largest * norm)) if largest > 0 else math.inf
     else:
         factor = None
-    return _sized("hessian_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
+    return _sizes_from_profile(
+        "hessian_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at
+    )
 
 
 def gradient_size(
@@ -136,7 +139,7 @@ def gradient_size(
     at: str = "nodes",
     missing: str = "error",
 ) -> Raster:
-    """Return the size over which a solution changes by the same amount everywhere.
+    """Return the size over which a solution changes by a constant amount.
 
     ``h = eps / |grad u|``, within the bounds.
 
@@ -145,11 +148,11 @@ def gradient_size(
     values, lower, upper, at, missing
         As for `hessian_size`; at least 2 values along each axis.
     eps : float, optional
-        Wanted change of u over a cell, in the unit of u.
+        Change of u over a cell, in the unit of u.
     n_cells : float, optional
-        In place of `eps`: wanted count of cells in the box, bounds included.
+        In place of `eps`: number of cells in the box, bounds included.
     h_min, h_max : float
-        Bounds. Where u does not change, h is `h_max`, by default the longest side of the box.
+        Bounds. Where the gradient is 0, h is `h_max`, by default the longest side of the box.
 
     Returns
     -------
@@ -166,20 +169,24 @@ def gradient_size(
 
         size = gradient_size(temperature, (0, 0), (2, 1), eps=2.0, h_max=0.1)
     """
-    u, corners, spacing = _solution("gradient_size", values, lower, upper, at, missing, least=2)
+    u, corners, spacing = _check_solution(
+        "gradient_size", values, lower, upper, at, missing, least=2
+    )
     slopes = np.gradient(u, *spacing[::-1])
     steep = np.sqrt(sum(s**2 for s in slopes))
     largest = float(steep.max())
     with np.errstate(divide="ignore"):
         profile = 1 / np.where(steep < _FLAT * largest, 0, steep / (largest or 1))
-    wanted = _one_of("gradient_size", n_cells, eps)
+    wanted = _check_one_of("gradient_size", n_cells, eps)
     factor = None
     if eps is not None:
         factor = wanted / largest if largest > 0 else math.inf
-    return _sized("gradient_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at)
+    return _sizes_from_profile(
+        "gradient_size", profile, factor, n_cells, h_min, h_max, corners, spacing, at
+    )
 
 
-def _solution(
+def _check_solution(
     what: str,
     values: ArrayLike,
     lower: ArrayLike,
@@ -188,9 +195,9 @@ def _solution(
     missing: str,
     least: int,
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the checked values, the corners and the distances of the values along x, y (, z)."""
+    """Return the checked values, the corners and the spacing of the values along x, y (, z)."""
     shape = np.shape(values)
-    low, high = check_corners(what, shape, lower, upper, at)
+    low, high = check_box(what, shape, lower, upper, at)
     counts = np.array(shape[::-1])
     if counts.min(initial=least) < least:
         raise InputError(
@@ -198,7 +205,7 @@ def _solution(
             "derivatives need neighbors"
         )
     spacing = (high - low) / (counts - 1 if at == "nodes" else counts)
-    return filled(f"{what} values", values, missing, spacing), (low, high), spacing
+    return fill_missing(f"{what} values", values, missing, spacing), (low, high), spacing
 
 
 def _curvature(u: np.ndarray, spacing: np.ndarray) -> np.ndarray:
@@ -217,7 +224,7 @@ def _curvature(u: np.ndarray, spacing: np.ndarray) -> np.ndarray:
 
 
 def _weights(shape: tuple[int, ...], spacing: np.ndarray, at: str) -> np.ndarray:
-    """Return what volume each value stands for: half a step at the sides if they are nodes."""
+    """Return the volume that each value represents: half a spacing at the sides for nodes."""
     total = np.ones(shape)
     for axis, step in enumerate(spacing[::-1]):
         along = np.full(shape[axis], float(step))
@@ -227,16 +234,16 @@ def _weights(shape: tuple[int, ...], spacing: np.ndarray, at: str) -> np.ndarray
     return total
 
 
-def _one_of(what: str, n_cells: object, eps: object) -> float:
+def _check_one_of(what: str, n_cells: object, eps: object) -> float:
     if (n_cells is None) == (eps is None):
         raise InputError(
             f"{what} got n_cells={n_cells} and eps={eps}, expected exactly one of them"
         )
     name = "eps" if n_cells is None else "n_cells"
-    return positive(f"{what} {name}", eps if n_cells is None else n_cells)
+    return check_positive(f"{what} {name}", eps if n_cells is None else n_cells)
 
 
-def _sized(
+def _sizes_from_profile(
     what: str,
     profile: np.ndarray,
     factor: float | None,
@@ -247,7 +254,7 @@ def _sized(
     spacing: np.ndarray,
     at: str,
 ) -> Raster:
-    """Return factor * profile within the bounds; without a factor, that which gives `n_cells`."""
+    """Return factor * profile within the bounds. Without a factor, find the one that gives `n_cells`."""
     for name, bound in (("h_min", h_min), ("h_max", h_max)):
         if not isinstance(bound, Real) or isinstance(bound, bool):
             raise InputTypeError(f"{what} {name} is {bound!r}, expected a number")
@@ -257,7 +264,7 @@ def _sized(
         )
     if n_cells is not None and not np.isfinite(profile).any():
         raise InputError(
-            f"{what} values have no derivatives that differ from 0, so n_cells={n_cells:g} cannot be "
+            f"{what} values have no derivatives other than 0, so n_cells={n_cells:g} cannot be "
             "distributed; use a number as size"
         )
     low, high = corners
@@ -281,7 +288,7 @@ def _sized(
                 f"{what} n_cells is {n_cells:g}, but sizes from {h_min:g} to {top:g} give "
                 f"{least:.6g} to {most:.6g} cells; change h_min, h_max or n_cells"
             )
-        for _ in range(100):  # the count falls as the factor rises
+        for _ in range(100):  # bisection: the number decreases with the factor
             middle = 0.5 * (begin + end)
             begin, end = (middle, end) if count(middle) > n_cells else (begin, middle)  # type: ignore[operator]
         factor = math.exp(0.5 * (begin + end))

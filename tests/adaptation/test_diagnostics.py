@@ -72,7 +72,7 @@ FIELDS = {
         sizing.Scattered(np.column_stack([2 * SPREAD[:, 0], np.full(50, 0.5)]), SPREAD[:, 0] + 1, BOX.lower, BOX.upper,
                          method="nearest")),
     "features of another domain": (
-        clvoro.Polygon([(5, 0), (6, 0), (6, 1)]), sizing.FeatureSize(SHORE), "lies beside", sizing.FeatureSize(
+        clvoro.Polygon([(5, 0), (6, 0), (6, 1)]), sizing.FeatureSize(SHORE), "does not overlap", sizing.FeatureSize(
             clvoro.Polygon([(5, 0), (6, 0), (6, 1)]))),
 }  # fmt: skip
 
@@ -80,9 +80,9 @@ FIELDS = {
 @pytest.mark.parametrize("name", list(FIELDS))
 def test_fields_that_hardly_meet_the_domain(name):
     domain, wrong, message, right = FIELDS[name]
-    (found,) = wrong.misfits(domain)
+    (found,) = wrong.warnings(domain)
     assert message in found
-    assert right.misfits(domain) == []
+    assert right.warnings(domain) == []
     # What is said is so: the sizes are those of the whole field without the part in question.
     if "change nothing" in message and domain.dim == 2 and not isinstance(wrong, sizing.Graded):
         x = np.random.default_rng(5).uniform(domain.lower, domain.upper, (500, 2))
@@ -102,14 +102,14 @@ def test_far_shapes_are_so_by_a_bound():
         x = np.concatenate(
             [rng.uniform(BOX.lower, BOX.upper, (3000, 2)), [(0, 0), (2, 0), (2, 1), (0, 1)]]
         )
-        if field.misfits(BOX):
+        if field.warnings(BOX):
             said += 1
             assert (field(x) == field.h_max).all()
     assert 20 < said < 280
 
 
 def test_data_beside_their_box_are_refused():
-    with pytest.raises(InputError, match="all beside the box"):
+    with pytest.raises(InputError, match="all outside of the box"):
         sizing.Scattered(SPREAD * 1000 + 5, SPREAD[:, 0] + 1, BOX.lower, BOX.upper)
 
 

@@ -431,6 +431,6 @@ def test_bad_surfaces(vertices, triangles, error, message):
 def test_surface_needs_three_dimensions():
     field = sizing.Distance(sizing.Surface(*CUBE), 0.1, slope=1)
     with pytest.raises(InputError, match="3 dimensions"):
-        sizing.bind(field, Box((0, 0), (1, 1)))
+        sizing.generate_code(field, Box((0, 0), (1, 1)))
     with pytest.raises(InputError, match="2 and of 3"):
         sizing.Distance([sizing.Surface(*CUBE), sizing.Circle((0, 0), 1)], 0.1, slope=1)

@@ -272,9 +272,9 @@ def test_expressions_are_formulas_and_nothing_else(text):
 
 
 def test_what_the_device_compiles_is_written_from_the_list_of_operations():
-    from clvoro.sizing.bind import bind
+    from clvoro.sizing import generate_code
 
-    text = bind(Expression("  0.1+\tfabs( x )*\n2e-1 < y ? min(x,y) : 3 "), BOX).prelude
+    text = generate_code(Expression("  0.1+\tfabs( x )*\n2e-1 < y ? min(x,y) : 3 "), BOX).prelude
     body = text.split('#line 1 "size_at"')[1]
     known = {"REAL", "size_at", "const", "x", "__global", "data", "return", "fabs", "size_min"}
     names = set(re.findall(r"[A-Za-z_]\w*", body)) - known

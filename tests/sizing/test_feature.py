@@ -50,7 +50,7 @@ def test_distance_to_the_boundary_of_the_domain() -> None:
 # --- narrow places -------------------------------------------------------------------------------
 
 
-def test_a_channel_has_so_many_cells_across() -> None:
+def test_number_of_cells_across_a_channel() -> None:
     channel = clvoro.Polygon([(0, 0), (10, 0), (10, 1), (0, 1)])
     for across in (2, 4, 9.5):
         size = sizing.FeatureSize(channel, across, h_max=2)
@@ -63,13 +63,13 @@ def test_a_channel_has_so_many_cells_across() -> None:
             assert 1 / (1 + size.slope * across / 16) <= cells / across <= 1 + 1e-9
 
 
-def test_a_square_has_no_narrow_place_and_no_small_corner() -> None:
+def test_square_has_no_gaps() -> None:
     square = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)])
     assert sizing.FeatureSize(square)(inner(square)).min() == 0.1
     assert sizing.FeatureSize(square, h_max=1)(inner(square)).min() >= 0.25
 
 
-def test_tips_that_face_each_other_are_a_neck() -> None:
+def test_facing_tips_form_a_gap() -> None:
     """No normal of an edge points through a neck between two corners."""
     ring = [(0, 0), (4, 0), (5, 0.45), (6, 0), (10, 0), (10, 1), (6, 1), (5, 0.55), (4, 1), (0, 1)]
     neck = clvoro.Polygon(ring)
@@ -84,7 +84,7 @@ def test_tips_that_face_each_other_are_a_neck() -> None:
     assert 0.02 <= found <= 0.02 / math.cos(math.radians(7.5 / 4)) + size.slope * aside
 
 
-def test_gaps_outside_of_the_domain_do_not_count() -> None:
+def test_gaps_outside_of_the_domain_are_ignored() -> None:
     apart = clvoro.Polygon.from_pieces([[SQUARE], [SQUARE + np.array([4.01, 0])]])
     assert sizing.FeatureSize(apart)(inner(apart)).min() > 0.3
 
@@ -128,7 +128,7 @@ def reference(
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_narrow_places_of_any_polygon(seed: int) -> None:
+def test_gaps_of_random_polygons(seed: int) -> None:
     domain = clvoro.Polygon(ragged(14, seed), [ragged(7, seed + 9, (0.05, 0.0), 0.2)])
     x = inner(domain, 300)
     size = sizing.FeatureSize(domain, 4, slope=0.3, h_min=0.02, h_max=0.5, curvature=0)
@@ -151,7 +151,7 @@ def test_narrow_places_of_any_polygon(seed: int) -> None:
     assert np.ptp(h) > 0.05
 
 
-def test_sizes_grow_no_faster_than_wanted() -> None:
+def test_growth_is_bounded() -> None:
     domain = clvoro.Polygon(ragged(40), [ragged(20, 5, (0.05, 0.0), 0.2)])
     size = sizing.FeatureSize(domain, h_min=0.003, h_max=0.2, growth=1.3)
     rng = np.random.default_rng(4)
@@ -165,7 +165,7 @@ def test_sizes_grow_no_faster_than_wanted() -> None:
 # --- curves --------------------------------------------------------------------------------------
 
 
-def test_curves_have_so_many_cells_per_radius() -> None:
+def test_number_of_cells_per_radius_of_curvature() -> None:
     holes = [0.1 * CIRCLE, 0.5 * CIRCLE + (2, 2)]
     domain = clvoro.Polygon(SQUARE * 2 - 2, holes)
     size = sizing.FeatureSize(domain, cells_across=0.5, curvature=5, h_max=1)
@@ -206,7 +206,7 @@ def test_device_and_host_agree(ctx, dtype: str) -> None:
         ({"curvature": -1}, "curvature is -1"),
     ],
 )  # fmt: skip
-def test_what_is_refused(options: dict, says: str) -> None:
+def test_bad_input(options: dict, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
         sizing.FeatureSize(**{"domain": clvoro.Polygon(SQUARE), **options})
 
@@ -214,7 +214,7 @@ def test_what_is_refused(options: dict, says: str) -> None:
 # --- other fields in polygons --------------------------------------------------------------------
 
 
-def test_graded_fields_ask_inside_only() -> None:
+def test_graded_fields_are_evaluated_inside_only() -> None:
     """A jump becomes a ramp, and what the field says outside is never heard."""
     domain = clvoro.Polygon(ragged(60), [ragged(20, 5, (0.05, 0.0), 0.2)])
 
@@ -233,17 +233,15 @@ def test_graded_fields_ask_inside_only() -> None:
     assert h.max() < 0.4
 
 
-def test_rasters_that_do_not_cover_the_domain_are_named(ctx) -> None:
+def test_rasters_must_cover_the_domain_if_required(ctx) -> None:
     values = np.full((5, 7), 0.1)
     lower, upper = (0, 0), (4, 2.5)
     domain = clvoro.Polygon(SQUARE)  # up to y = 3
     field = sizing.Raster(values, lower, upper, outside="error")
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(float))
-    with pytest.raises(
-        InputError, match=r"does not cover the domain: nothing is known at \(4, 3\)"
-    ):
+    with pytest.raises(InputError, match=r"does not cover the domain: it has no value at \(4, 3\)"):
         sizing.Sizing(engine, domain, sizing.minimum(field, 0.5))
-    with pytest.raises(InputError, match=r"nothing is known at \(1, 2.6\)"):
+    with pytest.raises(InputError, match=r"it has no value at \(1, 2.6\)"):
         field(np.array([(1, 1), (1, 2.6)]))
     with pytest.raises(InputError, match="outside='no'"):
         sizing.Raster(values, lower, upper, outside="no")
@@ -253,7 +251,7 @@ def test_rasters_that_do_not_cover_the_domain_are_named(ctx) -> None:
     assert sizing.Raster(values, lower, upper)(np.array([(9.0, 9)])) == 0.1
 
 
-def test_graded_fields_reach_narrow_places() -> None:
+def test_graded_fields_resolve_narrow_straits() -> None:
     """A canal thinner than the spacing of the nodes."""
     canal = [
         (0, 0),

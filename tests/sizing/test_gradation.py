@@ -92,7 +92,7 @@ def test_scheme_is_solved(make_engine, shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_least_of_each_tile(make_engine, shape):
+def test_minima_of_tiles(make_engine, shape):
     """What tiles wait for; were it wrong, they would be swept too early, or too late, to the same end."""
     engine = make_engine(len(shape))
     stage, counts = Gradation(engine), (*shape[::-1], 1)[:3]
@@ -111,7 +111,7 @@ def test_least_of_each_tile(make_engine, shape):
 @pytest.mark.sparse
 @pytest.mark.parametrize("shape", [(61, 41), (17, 13, 15)])
 @pytest.mark.parametrize("seeds", [1, 5, 400])
-def test_first_order_close_to_the_least_cone(make_engine, shape, seeds):
+def test_result_is_close_to_the_smallest_cone(make_engine, shape, seeds):
     """Against the definition. The scheme errs to the larger side, but where fronts meet."""
     engine = make_engine(len(shape))
     rng = np.random.default_rng(seeds + 29)
@@ -154,7 +154,7 @@ def test_graded_values_stay_as_they_are(make_engine):
 
 
 @pytest.mark.filterwarnings("error")
-def test_any_growth_leaves_all(make_engine):
+def test_large_growth_changes_nothing(make_engine):
     """Also such as single precision has no number for."""
     engine, values = make_engine(2), np.random.default_rng(3).uniform(1e-3, 1, 33 * 20)
     values = values.astype(engine.real)
@@ -164,14 +164,14 @@ def test_any_growth_leaves_all(make_engine):
         assert np.array_equal(u.get(), values)
 
 
-def test_no_growth_at_all_leaves_the_least(make_engine):
+def test_zero_growth_gives_the_minimum(make_engine):
     engine = make_engine(2)
     values = np.random.default_rng(5).uniform(1, 2, (40, 40))
     found = limit(engine, values, (0.1, 0.1), 0.0)
     assert found == pytest.approx(values.min(), rel=200 * float(np.finfo(engine.real).eps))
 
 
-def test_a_long_way_round(make_engine):
+def test_sizes_grow_around_obstacles(make_engine):
     """From corner to corner of a grid of many tiles."""
     engine = make_engine(2)
     values = np.full((300, 500), 9.0)
@@ -219,7 +219,7 @@ def test_slopes_are_bounded(make_engine):
     assert np.median(steep) > 0.2 * 0.97
 
 
-def test_thin_dips_between_nodes_count(make_engine):
+def test_minima_between_nodes_are_included(make_engine):
     """A point source that no node meets: the nodes around it know of it."""
     engine = make_engine(2)
     source = np.array([0.3071, 3.4567])
@@ -237,7 +237,7 @@ def test_thin_dips_between_nodes_count(make_engine):
 
 @settings(max_examples=12)
 @given(st.integers(2, 40), st.integers(2, 40), st.floats(0, 2), st.integers(0, 2**32))
-def test_never_above_and_at_rest(ctx, nx, ny, slope, seed):
+def test_result_is_below_the_field_and_idempotent(ctx, nx, ny, slope, seed):
     import pyopencl as cl
 
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(float))
@@ -256,7 +256,7 @@ def test_never_above_and_at_rest(ctx, nx, ny, slope, seed):
     )
 
 
-def test_in_space_and_within_other_fields(make_engine):
+def test_3d_and_combined_fields(make_engine):
     engine = make_engine(3)
     domain = Box((0, 0, 0), (1, 1, 0.5))
     ball = sizing.Distance(sizing.Sphere((0.5, 0.5, 0.2), 0.2), 0.02, slope=4, h_max=0.3)
@@ -272,7 +272,7 @@ def test_in_space_and_within_other_fields(make_engine):
     assert 2 * hosted(x) == pytest.approx(stage(x), rel=1e-5)
 
 
-def test_computed_once_for_all_who_ask(make_engine, monkeypatch):
+def test_result_is_cached(make_engine, monkeypatch):
     engine = make_engine(2)
     field = sizing.Graded(JUMP, slope=0.25)
     sizing.Sizing(engine, PLANE, field)
@@ -282,7 +282,7 @@ def test_computed_once_for_all_who_ask(make_engine, monkeypatch):
     assert field([(0.0, 3.5)])[0] == pytest.approx(0.02)
 
 
-def test_callables_are_graded_too(make_engine):
+def test_callables_are_graded(make_engine):
     engine = make_engine(2)
     graded = sizing.Graded(lambda p: np.where(p[:, 0] < 0.1, 0.02, 0.5), slope=0.25)
     assert graded.on_device
@@ -326,7 +326,11 @@ def test_resolution_is_chosen_and_capped(make_engine):
         (lambda: sizing.Graded(1.0, 1.2, resolution=1), InputError, "at least 2"),
         (lambda: sizing.Graded(1.0, 1.2, resolution=(5, 5, 5), box=PLANE), InputError, "per axis"),
         (lambda: sizing.Graded(1.0, 1.2, resolution=2.5), InputTypeError, "integers"),
-        (lambda: sizing.Graded(1.0, 1.2)([(0, 0)]), InputError, "no domain yet.*box="),
+        (
+            lambda: sizing.Graded(1.0, 1.2)([(0, 0)]),
+            InputError,
+            "no domain to be computed on.*box=",
+        ),
         (
             lambda: sizing.Graded(sizing.Expression("z + 1"), 1.2, box=PLANE),
             InputError,
@@ -344,7 +348,7 @@ def test_bad_input(make, error, message):
         make()
 
 
-def test_nodes_beyond_memory_are_refused_before_there_are_any(make_engine, monkeypatch):
+def test_too_many_nodes_are_rejected_before_allocation(make_engine, monkeypatch):
     field = sizing.Graded(sizing.Expression("x < 0.5 ? 0.1 : 0.3"), slope=0.2, resolution=200)
     box = Box((0, 0), (1, 0.5))
     n = 200 * 101
@@ -360,7 +364,7 @@ def test_nodes_beyond_memory_are_refused_before_there_are_any(make_engine, monke
     assert field.raster(box, engine).values.size == n
 
 
-def test_memory_of_the_host_is_that_of_the_process():
+def test_host_memory_is_the_limit_of_the_process():
     pytest.importorskip("resource")
     whole = host_memory()
     assert 1e8 < whole < 1e15

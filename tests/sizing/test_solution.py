@@ -68,7 +68,7 @@ def test_sizes_follow_the_formula(d, p):
 
 
 @pytest.mark.parametrize("p", [1, 2, 8])
-def test_no_other_sizes_of_the_same_count_do_better(p):
+def test_sizes_are_optimal_for_their_number(p):
     lower, upper, counts = (0, 0), (2, 1), (61, 41)
     x, y = grid(lower, upper, counts)
     # Bends in one direction alone, so that l = |u_xx| is known without the code under test.
@@ -92,7 +92,7 @@ def test_no_other_sizes_of_the_same_count_do_better(p):
     assert norm(uniform) > 1.3 * norm(h)
 
 
-def test_a_front_is_met_far_better_than_by_equal_cells():
+def test_front_is_interpolated_better_than_by_equal_cells():
     """The interpolation error e = h^2 |u''| / 8 of a tanh layer: its mean over the domain."""
     x, y = grid((0, 0), (1, 1), (401, 401))
     u = np.tanh(60 * (x + 0.5 * y - 0.75))
@@ -103,7 +103,7 @@ def test_a_front_is_met_far_better_than_by_equal_cells():
     assert np.sum(w * curved / 4000) / np.sum(w * curved * size.values**2) > 5
 
 
-def test_bounds_hold_and_still_give_the_count():
+def test_bounds_keep_the_number_of_cells():
     x, y = grid((0, 0), (1, 1), (101, 81))
     u = np.tanh(30 * (x - 0.5)) + 0.01 * y**2
     options = {"h_min": 0.01, "h_max": 0.05}
@@ -117,7 +117,7 @@ def test_bounds_hold_and_still_give_the_count():
     assert np.mean(1 / pixels.values**2) == pytest.approx(2000, rel=1e-9)
 
 
-def test_gradient_size_is_the_length_of_a_given_change():
+def test_gradient_size_gives_a_constant_change_per_cell():
     x, y = grid((0, 0), (2, 1), (81, 41))
     size = sizing.gradient_size(3 * x + 4 * y, (0, 0), (2, 1), eps=0.1)
     assert size.values == pytest.approx(0.1 / 5)
@@ -130,11 +130,11 @@ def test_gradient_size_is_the_length_of_a_given_change():
     assert np.sum(w / counted.values**2) == pytest.approx(900, rel=1e-9)
 
 
-def test_where_nothing_happens_cells_are_as_large_as_allowed():
+def test_constant_solutions_give_h_max():
     flat = np.ones((5, 6))
     assert sizing.hessian_size(flat, (0, 0), (3, 1), eps=0.1).values == pytest.approx(3)
     assert sizing.gradient_size(flat, (0, 0), (3, 1), eps=0.1, h_max=0.5).values.max() == 0.5
-    with pytest.raises(InputError, match=r"differ from 0.*use a number"):
+    with pytest.raises(InputError, match=r"other than 0.*use a number"):
         sizing.hessian_size(flat, (0, 0), (3, 1), n_cells=100)
 
 
@@ -187,7 +187,7 @@ def test_gaps_are_filled_with_the_nearest_value(shape):
     assert np.array_equal(u.values, v.values)
 
 
-def test_linear_data_are_met_exactly():
+def test_linear_data_are_interpolated_exactly():
     rng = np.random.default_rng(64)
     for d in (2, 3):
         points = np.vstack([rng.random((200, d)), np.argwhere(np.ones((2,) * d))]) + 10
@@ -198,7 +198,7 @@ def test_linear_data_are_met_exactly():
         assert field(x) == pytest.approx(1 + x @ np.arange(1, d + 1), rel=1e-9)
 
 
-def test_nearest_and_beyond_the_hull():
+def test_nearest_value_outside_of_the_hull():
     rng = np.random.default_rng(65)
     points, values = rng.random((50, 2)), rng.uniform(1, 2, 50)
     field = sizing.Scattered(

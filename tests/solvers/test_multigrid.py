@@ -80,7 +80,7 @@ GRAPHS = {
 
 
 @pytest.mark.parametrize("name", GRAPHS)
-def test_groups_and_their_graph(make, name):
+def test_aggregates_and_coarse_graph(make, name):
     """Against P^T W P of SciPy, P the groups' indicator."""
     engine, W = make(3 if "3D" in name else 2, np.float32), GRAPHS[name]()
     n = W.shape[0]
@@ -187,9 +187,7 @@ def test_cycle_in_place(make, n):
 @pytest.mark.sparse
 @pytest.mark.parametrize("group_size", [None, 16], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("name", ["random", "random 3D", "star"])
-def test_few_cells_are_gone_through_by_one_group_to_the_same_bits(
-    make, monkeypatch, name, group_size
-):
+def test_levels_of_one_work_group_give_the_same_bits(make, monkeypatch, name, group_size):
     """Against launches of their own for each step of each level, whose cells then fill several work-groups."""
     W, found, plain = GRAPHS[name](), [], cl.enqueue_nd_range_kernel
     right = np.random.default_rng(6).standard_normal(W.shape[0])
@@ -212,7 +210,7 @@ def test_few_cells_are_gone_through_by_one_group_to_the_same_bits(
     assert np.array_equal(*found)
 
 
-def test_walls_count_for_nothing(make):
+def test_walls_are_ignored(make):
     """Negative columns of weight 0, as diagrams have them, anywhere in the rows, in the graph and in the cycle."""
     engine, W = make(real=np.float32), random_weights(300)
     starts, columns, weights = W.indptr, W.indices, W.data
@@ -414,7 +412,7 @@ def test_iterations_graded_and_weighted(make):
 @pytest.mark.parametrize(
     ("name", "most"), [("even", 18), ("decades", 22), ("jump", 22), ("random", 90), ("islands", 70)]
 )
-def test_iterations_whatever_the_weights(make, name, most, mesh, real):
+def test_iterations_with_strongly_varying_weights(make, name, most, mesh, real):
     engine = make(real=real)
     tolerance = 1e-8 if real is np.float64 else 1e-4
     solution, true = solve(engine, weighted_weights(name, 6000, mesh), tolerance=tolerance)
@@ -461,7 +459,7 @@ def test_few_cells(make, n):
 
 
 @pytest.mark.parametrize("fault", ["indefinite", "negative", "not finite", "useless"])
-def test_jacobi_takes_over(make, monkeypatch, fault):
+def test_jacobi_continues_after_a_failure(make, monkeypatch, fault):
     """A preconditioner that is none costs its iterations, and no exception."""
     apply, calls = Multigrid.apply, [0]
 
@@ -500,14 +498,14 @@ def test_disconnected_graphs_end(make):
         assert not solution.converged
 
 
-def test_repeats_bit_by_bit(make):
+def test_repeated_solves_give_the_same_bits(make):
     engine, W = make(), random_weights(3000, seed=75)
     one, two = (solve(engine, W)[0] for _ in range(2))
     assert np.array_equal(one.residuals, two.residuals)
 
 
 @pytest.mark.parametrize("rest", [np.nan, 1e300])
-def test_what_is_behind_the_last_row_counts_for_nothing(make, rest):
+def test_entries_behind_the_last_row_are_ignored(make, rest):
     engine = make()
     n = 500
     starts, columns, weights = upload(engine, random_weights(n, seed=76))
@@ -549,7 +547,7 @@ def neighboring_weights(n, amount, seed=404):
     return weights_of((points, *graphs.voronoi_graph(points))), weights_of(after)
 
 
-def test_renewed_cycle(make):
+def test_updated_cycle(make):
     """The finest level is the new graph's, in the old pairs; groups and coarse graphs are the old ones."""
     engine, n = make(), 900
     before, after = neighboring_weights(n, 0.3)
@@ -576,7 +574,7 @@ def test_renewed_cycle(make):
 
 
 @pytest.mark.parametrize("amount", [0.05, 0.5, 3.0])
-def test_renewed_cycle_is_positive_definite(make, amount):
+def test_updated_cycle_is_positive_definite(make, amount):
     """However little the coarse levels have to do with the new graph."""
     engine, n = make(), 400
     before, after = neighboring_weights(n, amount)
@@ -588,7 +586,7 @@ def test_renewed_cycle_is_positive_definite(make, amount):
     assert np.linalg.eigvalsh((M + M.T) / 2).min() > 0
 
 
-def test_multigrid_is_used_again_while_it_serves(make):
+def test_coarse_levels_are_reused_while_they_converge(make):
     """Cells that move a little: a few more iterations. If they move a lot it is made anew at the next solve."""
     engine, n = make(), 6000
     first, second = neighboring_weights(n, 0.05)

@@ -109,7 +109,7 @@ def test_matrix(make, dim, real, weighted):
 @pytest.mark.sparse
 @pytest.mark.parametrize("start", ["zero", "near"])
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
-def test_rough_solves_are_in_single_precision(make, preconditioner, start):
+def test_large_tolerances_use_single_precision(make, preconditioner, start):
     """The operator is rounded and what the recurrence says is true, at many cells, too."""
     engine, n = make(), 20000
     graph = graphs.random_graph(n, seed=916)
@@ -165,7 +165,7 @@ def test_cells_with_several_faces():
     assert A[1, 2] == pytest.approx(-0.2 / np.hypot(0.1, 0.4), rel=1e-14)
 
 
-def test_faces_measured_differently_are_averaged(make):
+def test_measures_of_a_face_are_averaged(make):
     points = np.array([[0.25, 0.5], [0.75, 0.5]])
     graph = (
         points,
@@ -201,7 +201,7 @@ def test_solution(make, dim, weighted):
 
 
 @pytest.mark.parametrize("real", REALS)
-def test_residuals_are_those_of_the_textbook(make, real):
+def test_residuals_equal_those_of_a_dense_solver(make, real):
     engine = make(real=real)
     graph = graphs.random_graph(900, seed=361)
     poisson, laplacian = assembled(engine, graph)
@@ -219,7 +219,7 @@ def test_residuals_are_those_of_the_textbook(make, real):
     assert residual == pytest.approx(solution.residual, rel=0.5)
 
 
-def test_float32_says_that_it_stagnates(make):
+def test_float32_reports_stagnation(make):
     engine = make(real=np.float32)
     poisson, laplacian = assembled(engine, graphs.random_graph(900, seed=361))
     b = engine.upload(np.random.default_rng(6).standard_normal(900))
@@ -245,7 +245,7 @@ def test_tiny_and_huge_right_sides(make, real, scale):
     assert np.abs(difference).max() <= 1e-2 * np.abs(plain.get()).max()
 
 
-def test_compatible(make):
+def test_mean_of_the_source_is_subtracted(make):
     engine = make()
     points, *_, volumes = graph = graphs.random_graph(400, seed=33)
     poisson, _ = assembled(engine, graph)
@@ -258,7 +258,7 @@ def test_compatible(make):
 
 
 @pytest.mark.parametrize("b", [np.zeros(50), np.full(50, 0.1)])
-def test_nothing_to_solve(make, b):
+def test_zero_right_side(make, b):
     """Zero, and zero once its mean is gone: the start is forgotten."""
     engine = make()
     poisson, laplacian = assembled(engine, graphs.random_graph(50, seed=4))
@@ -285,7 +285,7 @@ def test_one_and_two_cells(make, real):
     assert np.allclose(phi.get(), [0.25, -0.25], rtol=1e-6)
 
 
-def test_auto_takes_what_costs_less(make):
+def test_auto_takes_the_cheaper_preconditioner(make):
     """Jacobi on few cells; from some thousand on, sooner for more digits, multigrid."""
     for dim in (2, 3):
         for tolerance in (1e-1, 1e-2, 1e-5, 1e-8):
@@ -316,7 +316,7 @@ def test_warm_start(make):
     assert again.residual <= 1e-8
 
 
-def test_from_far_away(make):
+def test_start_far_from_the_solution(make):
     """A start may be worse than none: its residual is a thousand times the right side."""
     engine, graph = make(), graphs.random_graph(900, seed=61)
     poisson, laplacian = assembled(engine, graph)
@@ -336,7 +336,7 @@ def test_from_far_away(make):
 @pytest.mark.sparse
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("real", REALS)
-def test_repeats_bit_by_bit(make, real, preconditioner):
+def test_repeated_solves_give_the_same_bits(make, real, preconditioner):
     engine = make(real=real)
     poisson, laplacian = assembled(engine, graphs.random_graph(3000, seed=55))
     b = engine.upload(np.random.default_rng(56).standard_normal(3000))
@@ -351,7 +351,7 @@ def test_repeats_bit_by_bit(make, real, preconditioner):
 @pytest.mark.sparse
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 @pytest.mark.parametrize("left", [np.nan, 1e3])
-def test_what_earlier_solves_have_left_counts_for_nothing(make, preconditioner, left):
+def test_buffers_of_earlier_solves_do_not_matter(make, preconditioner, left):
     """In the sums, the state and the records, which stay."""
     engine, found = make(), []
     b = engine.upload(np.random.default_rng(60).standard_normal(900))
@@ -372,7 +372,7 @@ def test_what_earlier_solves_have_left_counts_for_nothing(make, preconditioner, 
         assert np.array_equal(one, other)
 
 
-def test_result_does_not_depend_on_when_the_host_looks(make):
+def test_result_does_not_depend_on_the_lookahead(make):
     engine = make()
     _, laplacian = assembled(engine, graphs.random_graph(800, seed=57))
     poisson = Poisson(engine)
@@ -388,7 +388,7 @@ def test_result_does_not_depend_on_when_the_host_looks(make):
     assert all(np.array_equal(x, results[0][1]) for _, x in results)
 
 
-def test_no_preconditioning_in_vain(make):
+def test_preconditioner_is_applied_once_per_iteration(make):
     """Where the host looks after each iteration, the preconditioner is applied as often as there are iterations."""
     engine = make()
     _, laplacian = assembled(engine, graphs.random_graph(800, seed=57))
@@ -416,7 +416,7 @@ def test_no_preconditioning_in_vain(make):
     ],  # barriers in loops take long to compile
     ids=["cpu", "gpu"],
 )
-def test_group_alone(n, group_size, monkeypatch):
+def test_one_work_group_solves_alike(n, group_size, monkeypatch):
     """It does what many launches do, but for the order of sums; also of many work-items."""
     ctx, results = create_context(), []
     b = np.random.default_rng(59).standard_normal(n)

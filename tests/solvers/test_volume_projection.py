@@ -197,14 +197,14 @@ def test_tolerance(engine, points, tolerance):
     assert left == pytest.approx(solution.residual, rel=0.05)
 
 
-def test_iterations_end_at_the_most(engine, points):
+def test_max_iterations(engine, points):
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
     _, solution = project(engine, *given, eps=0.02, max_iterations=5, tolerance=1e-9)
     assert (solution.iterations, solution.converged) == (5, False)
     assert solution.reason == "max_iterations"
 
 
-def test_rows_that_nobody_has_written_are_no_numbers_to_warn_of(ctx, points, monkeypatch):
+def test_unwritten_rows_of_the_record_cause_no_warning(ctx, points, monkeypatch):
     """The host reads more rows of the record than there are: fresh memory may hold NaNs that signal, as this does."""
     engine, plain = patch.make_engine(ctx, "float32"), Engine.empty
 
@@ -222,7 +222,7 @@ def test_rows_that_nobody_has_written_are_no_numbers_to_warn_of(ctx, points, mon
     assert solution.converged
 
 
-def test_result_does_not_depend_on_when_the_host_looks(engine, points):
+def test_result_does_not_depend_on_the_lookahead(engine, points):
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points))
     t, results = patch.tessellate(engine, points), []
     for ahead in (1, 2, 7, 40):
@@ -298,7 +298,7 @@ def test_penalty_of_bad_cells(engine, points, assembled):
     assert made.eps == pytest.approx(eps, rel=1e-5)  # of single precision
 
 
-def test_perturbed_mesh_is_mended_quadratically(engine):
+def test_perturbed_mesh_converges_quadratically(engine):
     """Targets are a mesh's own sizes, so that excess arises by the perturbation alone; one projection squares it."""
     points = patch.relaxed_points(N, 607)
     h = np.exp(excess(points, np.ones(N)) / 2)

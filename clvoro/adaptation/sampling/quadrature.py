@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import InputTypeError, SizeFieldError
-from ...sizing.remedy import remedy_for
+from ...sizing.advice import advice_for_size
 from .boxes import Boxes, hilbert_tables
 from .cover import cover_of
 
@@ -143,7 +143,7 @@ class DensityTree:
         return found
 
     def _remedy(self, value: float) -> str:
-        return remedy_for(value, self._domain, getattr(self.field, "on_device", False))
+        return advice_for_size(value, self._domain, getattr(self.field, "on_device", False))
 
     def _integrate(self, chosen: np.ndarray) -> None:
         """Apply the rules to the boxes where `chosen` is true."""

@@ -1,4 +1,4 @@
-"""The stage: h, and the gradient of log h, at points on the device."""
+"""Evaluation of h and of the gradient of log h at points on the device (`size_field.cl`)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import SizeFieldError
-from .bind import bind
+from .advice import advice_for_size
+from .codegen import generate_code
 from .field import Constant, Field, as_field
-from .remedy import remedy_for
 
 if TYPE_CHECKING:
     import pyopencl.array as cla
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from ..geometry.box import Domain
     from ..opencl.program import Engine
 
-_NONE_BAD = np.iinfo(np.int32).max
+_ALL_VALID = np.iinfo(np.int32).max
 
-MOST_SIZE = 1e9
-"""Largest h over the domain's unit of length: beyond, the error (L - h) / L and h^-5 leave float32."""
+MAX_SIZE = 1e9
+"""Largest h over the domain's unit of length: for larger ones the error (L - h) / L and h^-5 are not in range of
+float32."""
 
-AT_ONCE = 1 << 16
-"""Points of the host's whose sizes are evaluated at once: more take no less time, and memory."""
+BATCH = 1 << 16
+"""Points on the host that are evaluated at once. More points take more memory and no less time."""
 
-# Central differences of step s = c h: rounding of h, about eps, shows as eps / (2 c h) in dh/dx,
-# the curvature of h as (c h)^2 h''' / 6. In float32 rounding rules, so the step is wide: 5 % of a
-# cell; dh/dx is then good to 1e-3 for cells down to 1/1000 of the domain. In float64 both are below
-# 1e-7.
+# Central differences of step s = c h have the round-off error eps / (2 c h) and the truncation error (c h)^2 h''' / 6.
+# In float32 round-off dominates, so the step is 5 % of a cell; dh/dx is then accurate to 1e-3 for cells down to 1/1000
+# of the domain. In float64 both errors are below 1e-7.
 _GRADIENT_STEP = {np.dtype(np.float64): 1e-3, np.dtype(np.float32): 5e-2}
 
 
@@ -43,16 +43,16 @@ class Sizing:
     engine : Engine
     domain : Domain
     field : Field, number or callable
-        A callable is evaluated on the host, and so is the combination of a callable with other
-        fields: each evaluation then moves the points to the host and the sizes back.
+        A callable is evaluated on the host, and so is a combination of a callable with other fields: each evaluation
+        then copies the points to the host and the sizes back.
     gradient_step : float, optional
-        Step of the differences that give dh/dx, over h; by default what suits the precision.
+        Step of the differences for dh/dx, over h; the default depends on the precision.
 
     Attributes
     ----------
     field : Field
     prelude : str or None
-        OpenCL text of `size_at` for other stages (see `bind`); None if the field lives on the host.
+        OpenCL text of `size_at` for other kernels (see `generate_code`); None if the field runs on the host.
     data : device array of real, or None
         The argument `data` of `size_at`.
 
@@ -72,23 +72,25 @@ class Sizing:
         self._gradient_step = gradient_step
         self.prelude, self.data, self._kernels = None, None, None
         self._parts: list[Sizing] = []
-        self._taken = 0
+        self._peak_bytes = 0
         if self.field.on_device:
-            self.prelude, numbers, self._taken = bind(self.field, domain, engine.real, engine)
+            self.prelude, numbers, self._peak_bytes = generate_code(
+                self.field, domain, engine.real, engine
+            )
             self.data = engine.upload(numbers)
-            self._bad = engine.upload([_NONE_BAD], np.int32)
+            self._invalid = engine.upload([_ALL_VALID], np.int32)
             step = self._step(engine.real)
             self._kernels = engine.kernels(
-                "sizing/size_field", defines={"GRADIENT_STEP": repr(step), "MOST_SIZE": repr(MOST_SIZE)},
+                "sizing/size_field", defines={"GRADIENT_STEP": repr(step), "MAX_SIZE": repr(MAX_SIZE)},
                 prelude=self.prelude,
             )  # fmt: skip
         else:
-            # The callable itself is exact in float64; its fellows are not, if the device is not.
+            # A callable is evaluated in float64, the fields that it is combined with in the device's precision.
             self._host_step = self._step(np.float64)
             self._host_field = self._with_device_parts(self.field)
 
     def _step(self, real: object) -> float:
-        """Step of the differences over h."""
+        """Return the step of the differences over h."""
         own = _GRADIENT_STEP[np.dtype(real)]  # type: ignore[call-overload]
         return own if self._gradient_step is None else self._gradient_step
 
@@ -104,8 +106,7 @@ class Sizing:
     def evaluate(self, points: cla.Array, n: int, h_out: cla.Array, factor: float = 1.0) -> None:
         """Write `factor` h' at the first `n` of `points` (>= n, d) into `h_out` (>= n,).
 
-        A value of h that is not positive and finite is noted, and raised by the next `check`; on the
-        host at once.
+        The next `check` raises if a value of h is not positive and finite. A field on the host raises at once.
         """
         real = self.engine.real.type
         if self._kernels is None:
@@ -113,7 +114,7 @@ class Sizing:
             h_out[:n].set(real(factor) * h.astype(self.engine.real))
             return
         self.engine.run_each(
-            self._kernels.evaluate, n, points, self.data, real(factor), h_out, self._bad
+            self._kernels.evaluate_size, n, points, self.data, real(factor), h_out, self._invalid
         )
 
     def evaluate_with_gradient(
@@ -121,8 +122,7 @@ class Sizing:
     ) -> None:
         """Write h' into `h_out` (>= n,) and the normalized grad log h into `grad_out` (>= n, d).
 
-        Central differences over a small part of h; both sample points stay inside the domain's
-        bounding box.
+        Central differences over a small share of h. Both sample points stay inside the domain's bounding box.
         """
         if self._kernels is None:
             x = points[:n].get().astype(float)
@@ -144,39 +144,43 @@ class Sizing:
             grad_out[:n].set(gradient.astype(self.engine.real))
             return
         self.engine.run_each(
-            self._kernels.evaluate_with_gradient, n, points, self.data,
-            *self.domain.device_args(self.engine), h_out, grad_out, self._bad,
+            self._kernels.evaluate_size_gradient, n, points, self.data,
+            *self.domain.device_args(self.engine), h_out, grad_out, self._invalid,
         )  # fmt: skip
 
     @property
-    def noted(self) -> cla.Array | None:
-        """What `check` reads, one integer, if there is anything to read."""
-        return None if self._kernels is None else self._bad
+    def invalid_index(self) -> cla.Array | None:
+        """The integer on the device that `check` reads: the first point with an invalid size. None on the host."""
+        return None if self._kernels is None else self._invalid
 
     def check(
         self, points: cla.Array, h: cla.Array, factor: float = 1.0, first: int | None = None
     ) -> None:
-        """Raise if an evaluation since the last check met a value that is not positive and finite.
+        """Raise if an evaluation since the last check gave a value that is not positive and finite.
 
-        Reads one integer from the device, unless the caller has: `first`, from `noted`. `points` and `h` are those of
-        the last evaluation, `h` times `factor`.
+        Parameters
+        ----------
+        points, h, factor : device arrays, and float
+            Those of the last evaluation; `h` includes `factor`.
+        first : int, optional
+            Content of `invalid_index`, if the caller has read it.
 
         Raises
         ------
         SizeFieldError
-            Naming the place, in physical coordinates, and the value.
+            With the point, in physical coordinates, and the value.
         """
         if self._kernels is None:
             return
-        first = int(self._bad.get()[0]) if first is None else first
-        if first == _NONE_BAD:
+        first = int(self._invalid.get()[0]) if first is None else first
+        if first == _ALL_VALID:
             return
-        self._bad.fill(np.int32(_NONE_BAD))
+        self._invalid.fill(np.int32(_ALL_VALID))
         place = self._physical(points[first : first + 1].get())[0]
         raise self._error(place, float(h[first : first + 1].get()[0]) / factor * self._scale)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Return h at physical `points` (n, d), host to host, (n,) float64, by the device.
+        """Return h (n,) float64 at physical `points` (n, d) on the host, computed on the device.
 
         Raises
         ------
@@ -188,74 +192,78 @@ class Sizing:
         return self._values(np.asarray(points, dtype=float), check=True)
 
     def _physical(self, normalized: np.ndarray) -> np.ndarray:
-        """Return physical coordinates, kept inside the domain's bounding box against rounding."""
+        """Return physical coordinates, clipped to the domain's bounding box because of round-off."""
         x = normalized.astype(float) * self._scale + self._origin
         return np.clip(x, self.domain.lower, self.domain.upper)
 
     def _with_device_parts(self, field: Field) -> Field:
-        """Return a field of the host with the parts that have a device form on the device."""
+        """Return a host field whose parts with a device form are evaluated on the device."""
         if isinstance(field, Constant):
             return field
         if field.on_device:
             self._host_step = self._step(self.engine.real)
             self._parts.append(Sizing(self.engine, self.domain, field))
             return _DevicePart(self._parts[-1])
-        return field.with_parts(self._with_device_parts)
+        return field.map_parts(self._with_device_parts)
 
     @property
-    def held(self) -> int:
-        """Bytes that the field has on the device."""
+    def device_bytes(self) -> int:
+        """Device memory of the field, in bytes."""
         own = 0 if self.data is None else self.data.nbytes
-        return own + sum(part.held for part in self._parts)
+        return own + sum(part.device_bytes for part in self._parts)
 
     @property
-    def taken(self) -> int:
-        """Bytes that it has taken there at most so far, for points of the host's."""
-        return max(self._taken, *(self.held - p.held + p.taken for p in self._parts), self.held)
+    def peak_bytes(self) -> int:
+        """Largest device memory so far, in bytes, evaluations at points on the host included."""
+        return max(
+            self._peak_bytes,
+            *(self.device_bytes - p.device_bytes + p.peak_bytes for p in self._parts),
+            self.device_bytes,
+        )
 
-    def taken_for(self, n: int) -> int:
-        """Return the bytes that evaluating it at `n` generators takes, beside what it holds."""
+    def bytes_for(self, n: int) -> int:
+        """Return the additional device memory for an evaluation at `n` generators, in bytes."""
         each = (self.domain.dim + 1) * self.real.itemsize
-        return min(n, AT_ONCE) * each if self._parts else 0
+        return min(n, BATCH) * each if self._parts else 0
 
     def _values(self, points: np.ndarray, check: bool = False) -> np.ndarray:
-        """Return h at physical `points` by the device; they need not be sizes where nobody is to `check`."""
+        """Return h at physical `points`, computed on the device. Without `check` any numbers are valid."""
         found = np.empty(len(points))
-        for first in range(0, len(points), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
+        for first in range(0, len(points), BATCH):
+            part = slice(first, first + BATCH)
             normalized = (points[part] - self._origin) / self._scale
             x, h = self.engine.upload(normalized), self.engine.empty(len(normalized))
-            self._taken = max(self._taken, self.held + x.nbytes + h.nbytes)
+            self._peak_bytes = max(self._peak_bytes, self.device_bytes + x.nbytes + h.nbytes)
             self.evaluate(x, len(normalized), h)
             if check:
                 self.check(x, h)
             found[part] = h.get().astype(float) * self._scale
-            del x, h  # before there are others
+            del x, h  # free the memory before the next batch
         return found
 
     def _on_host(self, points: np.ndarray) -> np.ndarray:
         sizes = self._host_field(points)
-        self._refuse(points, sizes)
+        self._check_sizes(points, sizes)
         return sizes
 
-    def _refuse(self, points: np.ndarray, sizes: np.ndarray) -> None:
+    def _check_sizes(self, points: np.ndarray, sizes: np.ndarray) -> None:
         with np.errstate(over="ignore"):
             working = (sizes / self._scale).astype(self.engine.real)
-        bad = np.flatnonzero(~((working > 0) & (working <= MOST_SIZE)))
+        bad = np.flatnonzero(~((working > 0) & (working <= MAX_SIZE)))
         if bad.size:
             raise self._error(points[bad[0]], float(sizes[bad[0]]))
 
     def _error(self, place: np.ndarray, value: float) -> SizeFieldError:
-        where, most = ", ".join(f"{c:.6g}" for c in place), MOST_SIZE * self._scale
+        where, most = ", ".join(f"{c:.6g}" for c in place), MAX_SIZE * self._scale
         return SizeFieldError(
             f"the size field {self.field!r} is {value:g} at ({where}), expected a positive, finite "
             f"size on the whole domain, at most {most:.3g} here; "
-            f"{remedy_for(value, self.domain, self.field.on_device, most)}"
+            f"{advice_for_size(value, self.domain, self.field.on_device, most)}"
         )
 
 
 class _DevicePart(Field):
-    """A part of a field of the host that is evaluated on the device; it need not be positive."""
+    """A part of a host field that is evaluated on the device; its values need not be positive."""
 
     def __init__(self, stage: Sizing):
         self._stage, self.dim = stage, stage.field.dim

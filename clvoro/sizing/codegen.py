@@ -1,4 +1,4 @@
-"""From a tree of fields to OpenCL: the text of a function `size_at`, and its numbers."""
+"""Generate OpenCL from a size field: the text of a function `size_at`, and the numbers that it reads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .field import Field
 
 
-class Binder:
+class CodeWriter:
     """Collects the statements of `size_at` and the numbers that they read.
 
     Attributes
@@ -30,16 +30,16 @@ class Binder:
         Precision in which the device reads the numbers.
     domain : Domain
     engine : Engine or None
-        Where a field that has to be computed first is computed; None for the default device.
-    taken : int
-        Bytes that this has taken there.
+        Engine for fields that are computed in advance; None for the default device.
+    peak_bytes : int
+        Device memory that this computation took at most.
     """
 
     def __init__(self, domain: Domain, real: np.dtype, engine: Engine | None = None):
         self.dim, self.domain, self.engine = domain.dim, domain, engine
         self.origin, self.scale = domain.frame
         self.real = np.dtype(real)
-        self.taken = 0
+        self.peak_bytes = 0
         self.statements: list[str] = []
         self._numbers: list[np.ndarray] = []
         self._stored = 0
@@ -50,7 +50,7 @@ class Binder:
         return (points - self.origin) / self.scale
 
     def store(self, *numbers: object) -> int:
-        """Append `numbers` (scalars and arrays, flattened) to the data; return where they begin."""
+        """Append `numbers` (scalars and arrays, flattened) to the data; return the index of the first one."""
         begin = self._stored
         for part in numbers:
             flat = np.ravel(np.asarray(part, dtype=float))
@@ -59,7 +59,7 @@ class Binder:
         return begin
 
     def name(self) -> str:
-        """Return a fresh variable name."""
+        """Return an unused variable name."""
         self._names += 1
         return f"s{self._names}"
 
@@ -70,39 +70,38 @@ class Binder:
         return name
 
     def data(self) -> np.ndarray:
-        """Return all numbers in the device's precision, cut to its largest number."""
+        """Return all numbers in the device's precision, clipped to its range."""
         packed = np.concatenate([*self._numbers, np.zeros(1)])
         largest = float(np.finfo(self.real).max)
         return np.clip(packed, -largest, largest).astype(self.real)
 
 
-class Bound(NamedTuple):
+class DeviceCode(NamedTuple):
     """A size field as OpenCL.
 
     Attributes
     ----------
     prelude : str
-        OpenCL text that defines ``REAL size_at(const REAL *x, __global const REAL *data)``, h' = h
-        / scale at x' = (x - origin) / scale. Give it to `Engine.kernels(stage, prelude=...)`; it
-        needs DIM and REAL only.
+        OpenCL text that defines ``REAL size_at(const REAL *x, __global const REAL *data)``: h' = h / scale at
+        x' = (x - origin) / scale. It is an argument of `Engine.kernels` and needs only DIM and REAL.
     data : (m,) real
-        What to pass as `data`.
-    taken : int
-        Bytes that the device has had taken to compute it.
+        The argument `data` of `size_at`.
+    peak_bytes : int
+        Device memory that the computation took at most.
     """
 
     prelude: str
     data: np.ndarray
-    taken: int
+    peak_bytes: int
 
 
-def bind(
+def generate_code(
     field: Field, domain: Domain, real: DTypeLike = np.float64, engine: Engine | None = None
-) -> Bound:
+) -> DeviceCode:
     """Return `field` as OpenCL for the normalized coordinates of `domain`.
 
-    Geometry is converted to those coordinates in float64, so that float32 is as accurate far from
-    the origin as near it. `Expression` alone computes in physical coordinates.
+    Geometry is converted to these coordinates in float64, so that float32 is as accurate far from the origin as near
+    it. Only `Expression` computes in physical coordinates.
 
     Parameters
     ----------
@@ -111,8 +110,7 @@ def bind(
     real : dtype
         The engine's precision.
     engine : Engine, optional
-        Where a field that has to be computed first (`Graded`) is computed; by default a new one on
-        the default device.
+        Engine for fields that are computed in advance (`Graded`); by default a new one on the default device.
 
     Raises
     ------
@@ -120,17 +118,17 @@ def bind(
         If the field is of another dimension than the domain, or has no device form.
     """
     field.check_dim(domain.dim)
-    binder = Binder(domain, np.dtype(real), engine)
-    result = field._emit(binder)
-    if binder._stored >= 2**31:
+    writer = CodeWriter(domain, np.dtype(real), engine)
+    result = field._emit(writer)
+    if writer._stored >= 2**31:
         raise InputError(
-            f"the size field holds {binder._stored} numbers, expected fewer than 2^31; "
+            f"the size field holds {writer._stored} numbers, expected fewer than 2^31; "
             "use a coarser Raster"
         )
-    body = "\n".join(f"    {line}" for line in binder.statements)
+    body = "\n".join(f"    {line}" for line in writer.statements)
     prelude = (
         f'{source_text("sizing/size_fields.h")}\n#line 1 "size_at"\n'
         "REAL size_at(const REAL *x, __global const REAL *data)\n"
         f"{{\n{body}\n    return {result};\n}}\n"
     )
-    return Bound(prelude, binder.data(), binder.taken)
+    return DeviceCode(prelude, writer.data(), writer.peak_bytes)

@@ -1,4 +1,4 @@
-"""Values where there are none yet: gaps in rasters, and rasters from scattered points."""
+"""Rasters from incomplete data: fill missing values, and interpolate scattered points to a grid."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from ..errors import InputError, InputTypeError
 from ..geometry.shapes import coordinates
 
-_MOST = 1 << 22  # nodes of a raster whose size nobody has asked for
+_MAX_NODES = 1 << 22  # of a raster, by default
 
 
-def filled(what: str, values: Any, missing: str, spacing: np.ndarray) -> np.ndarray:
-    """Return `values` as floats without gaps.
+def fill_missing(what: str, values: Any, missing: str, spacing: np.ndarray) -> np.ndarray:
+    """Return `values` as floats without missing ones.
 
     Parameters
     ----------
     what : str
-        What errors call the values.
+        Name of the values in errors.
     values : array of real numbers, (ny, nx) or (nz, ny, nx)
-        NaN, or what a NumPy mask covers, is missing.
+        NaN and masked values are missing.
     missing : "error" or "nearest"
-        Whether gaps are refused or filled with the nearest value that there is.
+        Whether missing values are rejected or filled with the nearest value.
     spacing : (d,) float
-        Distances of the values along x, y (, z), by which "nearest" is meant.
+        Spacing of the values along x, y (, z), for the nearest value.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def filled(what: str, values: Any, missing: str, spacing: np.ndarray) -> np.ndar
     return array[tuple(found)]
 
 
-def scattered_values(
+def grid_scattered(
     points: object,
     values: object,
     lower: Sequence[float] | None,
@@ -105,13 +105,14 @@ def scattered_values(
         )
     if ((x.max(axis=0) < low) | (x.min(axis=0) > high)).any():
         raise InputError(
-            f"Scattered got points from {x.min(axis=0).tolist()} to {x.max(axis=0).tolist()}, all beside the box from "
-            f"{low.tolist()} to {high.tolist()}; are units and the order of the coordinates (x, y) the same?"
+            f"Scattered got points from {x.min(axis=0).tolist()} to {x.max(axis=0).tolist()}, all outside of the box "
+            f"from {low.tolist()} to {high.tolist()}; do units and the order of the coordinates (x, y) agree?"
         )
     extent = high - low
     if resolution is None:
         spacing = max(
-            0.5 * (np.prod(extent) / len(x)) ** (1 / d), 1.05 * (np.prod(extent) / _MOST) ** (1 / d)
+            0.5 * (np.prod(extent) / len(x)) ** (1 / d),
+            1.05 * (np.prod(extent) / _MAX_NODES) ** (1 / d),
         )
         counts = np.maximum(np.ceil(extent / spacing).astype(int), 1) + 1
     else:
@@ -135,7 +136,7 @@ def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: s
 
     found = np.full(len(nodes), np.nan)
     if method == "linear":
-        _refuse_doubles(x, values)
+        _check_duplicates(x, values)
         try:
             found = LinearNDInterpolator(x, values)(nodes)
         except QhullError as error:
@@ -149,7 +150,7 @@ def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: s
     return found
 
 
-def _refuse_doubles(x: np.ndarray, values: np.ndarray) -> None:
+def _check_duplicates(x: np.ndarray, values: np.ndarray) -> None:
     order = np.lexsort(x.T)
     same = (np.diff(x[order], axis=0) == 0).all(axis=1) & (np.diff(values[order]) != 0)
     first = np.flatnonzero(same)

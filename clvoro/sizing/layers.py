@@ -13,11 +13,12 @@ from ..geometry.shapes import Edges
 from .distance import Distance
 from .field import Field, as_field, minimum
 
-_GROWTH = 1.2  # of sizes beyond layers whose heights do not grow
+_GROWTH = 1.2
+"""Growth of sizes beyond layers of constant height."""
 
 
-def bounded_by_layers(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
-    """Return the field that is nowhere larger than what grows from the layers into the domain."""
+def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
+    """Return `size`, limited to sizes that grow from the width of the layers into the domain."""
     field = as_field(size)
     for layer in layers:
         walls = Edges(*np.moveaxis(chosen_segments(domain, layer), 1, 0))
