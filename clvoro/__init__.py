@@ -27,7 +27,8 @@ from .geometry.boundary_layers import Layers
 from .geometry.box import Box
 from .geometry.polygon import Polygon
 from .io import load
-from .mesh.results import Diagram, Displacements, Result
+from .mesh.diagram import Diagram
+from .mesh.results import Displacements, Result
 from .opencl import profile
 from .opencl.devices import create_context, list_devices
 

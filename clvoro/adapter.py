@@ -31,7 +31,8 @@ from .arguments import Naming, check_callable, check_choice, check_points
 from .errors import DeviceError, InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.box import Domain
-from .mesh.results import Diagram, Result
+from .mesh.diagram import Diagram
+from .mesh.results import Result
 from .opencl import devices as device
 from .opencl.probe import check_process
 from .opencl.program import Engine

@@ -25,7 +25,11 @@ ORDER = (
     "adaptation", "remapping", "plotting", "adapter", "__init__", "cli", "__main__",
 )  # fmt: skip
 """Packages and root modules: each imports only from those before it."""
-UPWARD = {("mesh.results", "io"), ("mesh.results", "plotting"), ("mesh.results", "remapping")}
+UPWARD = {
+    ("mesh.results", "io"),
+    ("mesh.results", "plotting"),
+    ("mesh.diagram", "remapping"),
+}
 """Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""

@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.box import Domain
-from ..mesh.results import Diagram
+from ..mesh.diagram import Diagram
 from ..opencl.primitives import Summaries, Summary
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ClvoroError
-from ..mesh.connectivity import Faces, face_corners, face_keys, face_owners, take_rows
-from ..mesh.results import Diagram
+from ..mesh.connectivity import FaceTopology, face_corners, face_keys, face_owners, take_rows
+from ..mesh.diagram import Diagram
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,9 @@ class CyclicPair:
         return turned
 
 
-def add_cyclic_faces(diagram: Diagram, faces: Faces) -> tuple[Faces, list[CyclicPair]]:
+def add_cyclic_faces(
+    diagram: Diagram, faces: FaceTopology
+) -> tuple[FaceTopology, list[CyclicPair]]:
     """Return `faces` with those across seams at the end: pair by pair, the upper side first.
 
     Raises
@@ -131,10 +133,11 @@ def add_cyclic_faces(diagram: Diagram, faces: Faces) -> tuple[Faces, list[Cyclic
     kept = np.flatnonzero(~shifts[faces.rows].any(axis=1))
     kept_starts, kept_corners = take_rows(faces.starts, faces.corners, kept)
     seam_starts, seam_corners = take_rows(starts, corners, rows)
-    return Faces(
+    return FaceTopology(
         np.concatenate([faces.owner[kept], face_owners(diagram)[rows]]),
         np.concatenate([faces.neighbor[kept], np.full(len(rows), -1, np.int32)]),
         np.concatenate([faces.rows[kept], rows]),
         np.concatenate([kept_starts, kept_starts[-1] + seam_starts[1:]]),
         np.concatenate([kept_corners, seam_corners]),
+        np.concatenate([faces.flipped[kept], np.zeros(len(rows), bool)]),
     ), pairs

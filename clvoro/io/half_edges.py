@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ClvoroError
-from ..mesh.connectivity import face_keys, face_owners
-from ..mesh.outlines import face_ends, next_faces
-from ..mesh.results import Diagram
+from ..mesh.connectivity import face_ends, face_keys, face_owners, next_faces
+from ..mesh.diagram import Diagram
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError
 from ..mesh.connectivity import neighbor_points
-from ..mesh.results import Diagram, Result
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from .half_edges import HalfEdges, half_edges
 from .netcdf import NetCDF, squared
 from .trisk import find_weights

@@ -21,7 +21,8 @@ import numpy as np
 from ..files import open_plain
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
-from ..mesh.results import HISTORY_DTYPE, Diagram, Displacements, Result
+from ..mesh.diagram import Diagram
+from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
 
 FORMAT, VERSION = "clvoro-result", 2

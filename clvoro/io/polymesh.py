@@ -16,12 +16,12 @@ from ..arguments import check_number
 from ..errors import InputError, InputTypeError
 from ..geometry.boundary_names import Walls
 from ..mesh.connectivity import (
-    Faces,
+    FaceTopology,
     cell_corners,
-    faces_once,
+    face_topology,
     take_rows,
 )
-from ..mesh.results import Diagram
+from ..mesh.diagram import Diagram
 from .cyclic import CyclicPair, Patch, add_cyclic_faces
 
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
@@ -85,7 +85,7 @@ def poly_mesh(
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
     kinds = _kinds(parts.names, types)
-    faces = _by_group(faces_once(diagram), parts.index)
+    faces = _by_group(face_topology(diagram), parts.index)
     walls = -1 - faces.neighbor[faces.inner :]
     counts = np.bincount(parts.index[walls], minlength=len(parts.names)).tolist()
     made = [Patch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
@@ -147,14 +147,21 @@ def _height(diagram: Diagram, thickness: float | None) -> float:
     return check_number("thickness", thickness, above=0)
 
 
-def _by_group(faces: Faces, groups: np.ndarray) -> Faces:
+def _by_group(faces: FaceTopology, groups: np.ndarray) -> FaceTopology:
     """Return `faces` with those on the boundary in the order of their groups."""
     outer = np.argsort(groups[-1 - faces.neighbor[faces.inner :]], kind="stable") + faces.inner
     if (np.diff(outer) > 0).all():
         return faces
     order = np.concatenate([np.arange(faces.inner), outer])
     starts, corners = take_rows(faces.starts, faces.corners, order)
-    return Faces(faces.owner[order], faces.neighbor[order], faces.rows[order], starts, corners)
+    return FaceTopology(
+        faces.owner[order],
+        faces.neighbor[order],
+        faces.rows[order],
+        starts,
+        corners,
+        faces.flipped[order],
+    )
 
 
 def _extruded(

@@ -17,9 +17,10 @@ import numpy as np
 
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
-from ..mesh.connectivity import face_corners, face_owners
-from ..mesh.outlines import count_sides, next_faces
-from ..mesh.results import Diagram, Result
+from ..mesh.connectivity import face_corners, face_owners, next_faces
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
+from ..mesh.straightening import count_sides
 from .atomic import atomic_file
 
 NAMES = "clvoro names: "

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_owners
-from ..mesh.outlines import count_sides
-from ..mesh.results import Diagram
+from ..mesh.diagram import Diagram
+from ..mesh.straightening import count_sides
 
 
 def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:

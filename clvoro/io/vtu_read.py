@@ -25,7 +25,8 @@ from ..files import open_plain
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
 from ..mesh.check.rebuilt import rebuild
-from ..mesh.results import HISTORY_DTYPE, Diagram, Result
+from ..mesh.diagram import Diagram
+from ..mesh.results import HISTORY_DTYPE, Result
 from .arrays import EXPANSION, LEAST
 from .vtu import NAMES
 from .vtu_more import check_repeated

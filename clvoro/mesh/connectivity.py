@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.polygon import Polygon
-from .outlines import face_ends
-from .results import Diagram
+from .diagram import Diagram
 
 
 def face_owners(diagram: Diagram) -> np.ndarray:
@@ -43,6 +42,31 @@ def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     numbers = np.empty(len(order), np.int64)
     numbers[order] = np.cumsum(new)
     return numbers[: len(faces)], numbers[len(faces) :]
+
+
+def face_ends(diagram: Diagram) -> np.ndarray:
+    """Return the vertices that each face of the graph runs from and to, (m, 2); its cell is on the left."""
+    if isinstance(diagram.domain, Polygon):
+        return diagram.face_vertices.reshape(-1, 2)
+    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
+    return np.stack([corners, corners[following(starts)]], axis=1)
+
+
+def next_faces(diagram: Diagram) -> np.ndarray:
+    """Return the face that comes after each face in its loop around the cell, (m,).
+
+    In a row the loops stand one after the other, and each goes on until its vertices do not.
+    """
+    ends, starts = face_ends(diagram), diagram.neighbor_starts
+    m = len(ends)
+    last = np.zeros(m, bool)
+    last[starts[1:][starts[1:] > starts[:-1]] - 1] = True
+    breaks = last.copy()
+    breaks[:-1] |= ends[:-1, 1] != ends[1:, 0]
+    places = np.arange(1, m + 1)
+    stops = np.flatnonzero(breaks)
+    places[stops] = np.concatenate([[0], stops[:-1] + 1])[: len(stops)]
+    return places
 
 
 def following(starts: np.ndarray) -> np.ndarray:
@@ -104,7 +128,7 @@ def cell_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Faces:
+class FaceTopology:
     """Every face once: those between two cells first, in the order of (owner, neighbor), then the walls'.
 
     Attributes
@@ -117,6 +141,8 @@ class Faces:
     starts : (f + 1,) int, corners : int
         Vertices of each face; in 2D from the first to the second with the owner to the left, in 3D
         counter-clockwise as seen from the neighbor.
+    flipped : (f,) bool
+        Whether only the neighbor's half-face is there, so that `rows` leads to that one.
     """
 
     owner: np.ndarray
@@ -124,6 +150,7 @@ class Faces:
     rows: np.ndarray
     starts: np.ndarray
     corners: np.ndarray
+    flipped: np.ndarray
 
     @property
     def inner(self) -> int:
@@ -131,7 +158,7 @@ class Faces:
         return int(np.count_nonzero(self.neighbor >= 0))
 
 
-def faces_once(diagram: Diagram) -> Faces:
+def face_topology(diagram: Diagram) -> FaceTopology:
     """Return every face of `diagram` that has a measure, once."""
     owner, neighbor = face_owners(diagram), diagram.neighbors
     starts, corners = face_corners(diagram)
@@ -151,10 +178,11 @@ def faces_once(diagram: Diagram) -> Faces:
     rows = np.concatenate([inner[order], outer])
     backwards = np.concatenate([flipped[order], np.zeros(len(outer), bool)])
     taken, vertices = take_rows(starts, corners, rows, backwards)
-    return Faces(
+    return FaceTopology(
         np.concatenate([low[order], owner[outer]]).astype(np.int32),
         np.concatenate([high[order], neighbor[outer]]).astype(np.int32),
         rows,
         taken,
         vertices,
+        backwards,
     )

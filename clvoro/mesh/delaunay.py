@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import InputError
-from .results import Diagram
+from .diagram import Diagram
 
 
 def dual_triangles(diagram: Diagram) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 from ..geometry.boundary import wall_planes
 from ..geometry.polygon import Polygon
 from .connectivity import face_owners
-from .outlines import straighten
-from .results import Diagram
+from .diagram import Diagram
+from .straightening import straighten
 
 
 @dataclass(frozen=True, repr=False)

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
-from ..mesh.connectivity import face_owners
-from ..mesh.outlines import face_ends
-from ..mesh.results import Diagram, Result
+from ..mesh.connectivity import face_ends, face_owners
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from .boundary import clip_to_domain, frame_part
 from .colors import COLORINGS, Coloring, cell_norm, coloring, without_ends
 from .legends import add_color_bar, add_key, round_numbers

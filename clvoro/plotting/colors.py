@@ -17,8 +17,8 @@ from matplotlib.colors import (
 )
 
 from ..errors import InputError
-from ..mesh.outlines import count_sides
 from ..mesh.results import Result
+from ..mesh.straightening import count_sides
 from .style import nice
 
 # Up to four, five, six, seven, eight and more sides: neutral for six, warm below, cool above.

@@ -16,7 +16,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Colormap
 
 from ..mesh.connectivity import face_corners, face_owners, take_rows
-from ..mesh.results import Diagram, Result
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from .cells import edge_style
 from .colors import Coloring, cell_norm
 

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from ..mesh.connectivity import face_corners, face_owners, following
-from ..mesh.results import Diagram
+from ..mesh.diagram import Diagram
 
 
 @dataclass(frozen=True)

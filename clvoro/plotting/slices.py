@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from ..mesh.connectivity import face_owners
-from ..mesh.results import Diagram, Result
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from .cells import edge_style
 from .colors import Coloring, cell_norm, coloring, without_ends
 from .cutaway import draw_cutaway

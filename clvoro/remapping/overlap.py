@@ -6,13 +6,13 @@ Of polygons, where cells need not be convex, and of periodic boxes in 2D, where 
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
 
 import numpy as np
 import shapely
 
-from ..mesh.outlines import face_ends, next_faces
-from ..mesh.results import Diagram
+from ..mesh.connectivity import face_ends
+from ..mesh.diagram import Diagram
+from ..mesh.shapes import cell_shapes
 
 _PAIRS = 1 << 20  # of cells that are intersected at a time
 _LEAST = 1e-300  # stands for 0 where it divides
@@ -35,8 +35,8 @@ def transfer_on_host(
     least = most = columns
     if order == 2:
         slopes, least, most = fit_slopes(source, columns, limited)
-    new = outlines(target)
-    old, image, away = _images(source, outlines(source), shapely.total_bounds(new))
+    new = cell_shapes(target)
+    old, image, away = _images(source, cell_shapes(source), shapely.total_bounds(new))
     here, there = shapely.STRtree(old).query(new, predicate="intersects")
     by = np.lexsort((there, here))
     here, there = here[by], there[by]
@@ -76,55 +76,6 @@ def _images(
         rows.append(near)
         away.append(np.tile(shift, (len(near), 1)))
     return np.concatenate(shapes), np.concatenate(rows), np.concatenate(away)
-
-
-def outlines(diagram: Diagram) -> np.ndarray:
-    """Return each cell as a shapely geometry, (n,)."""
-    ends, following = face_ends(diagram), next_faces(diagram)
-    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
-    # Loops are kept one after the other, and end where they lead back to their first face.
-    begins = np.concatenate([[True], following[:-1] != np.arange(1, len(following))])
-    loop = np.cumsum(begins) - 1
-    sizes = np.bincount(loop)
-    ring = np.repeat(np.arange(len(sizes)), sizes + 1)
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    # The first corner comes again at the end.
-    place = np.arange(len(ring)) - ring
-    place = np.where(place == starts[ring + 1], starts[ring], place)
-    of = owner[starts[:-1]]
-    cells = np.empty(len(diagram), object)
-    usable = sizes >= 3
-    rings = np.full(len(sizes), None, object)
-    kept = usable[ring]
-    numbers = np.cumsum(usable) - 1
-    rings[usable] = shapely.linearrings(
-        diagram.vertices[ends[place[kept], 0]], indices=numbers[ring[kept]]
-    )
-    lone = np.bincount(of[usable], minlength=len(diagram))[of] == 1
-    cells[of[usable & lone]] = shapely.polygons(rings[usable & lone])
-    several = np.flatnonzero(usable & ~lone)
-    for i in np.unique(of[several]):
-        cells[i] = _joined(rings[several[of[several] == i]])
-    cells[[cell is None for cell in cells]] = shapely.Polygon()
-    bad = ~shapely.is_valid(cells)  # outlines that cross themselves by a rounding, or touch
-    cells[bad] = [_areas(shapely.make_valid(cell)) for cell in cells[bad]]
-    return cells
-
-
-def _joined(rings: np.ndarray) -> Any:
-    """Return what lies on the left of all `rings`."""
-    outer = shapely.is_ccw(rings)
-    parts = [_areas(shapely.make_valid(part)) for part in np.asarray(shapely.polygons(rings))]
-    whole = shapely.union_all([p for p, o in zip(parts, outer, strict=True) if o])
-    return shapely.difference(
-        whole, shapely.union_all([p for p, o in zip(parts, outer, strict=True) if not o])
-    )
-
-
-def _areas(shape: Any) -> Any:
-    """Return what of a shape has an area."""
-    flat = [p for p in shapely.get_parts(shape) if p.geom_type in ("Polygon", "MultiPolygon")]
-    return shapely.union_all(flat) if flat else shapely.Polygon()
 
 
 def fit_slopes(

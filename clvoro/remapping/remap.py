@@ -12,7 +12,8 @@ import pyopencl as cl
 from ..adaptation.estimates import available_memory, in_bytes
 from ..errors import ClvoroError, InputError, InputTypeError, MemoryLimitError
 from ..geometry.polygon import Polygon
-from ..mesh.results import Diagram, Result
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from ..opencl.devices import create_context
 from ..opencl.program import Engine
 from ..tessellation.bins import Bins

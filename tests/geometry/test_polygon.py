@@ -263,7 +263,8 @@ def test_damaged_descriptions_are_refused(name: str, value: object) -> None:
 
 def result_of(domain: clvoro.Polygon) -> clvoro.Result:
     """A result with a single cell, whatever it holds."""
-    from clvoro.mesh.results import HISTORY_DTYPE, Diagram
+    from clvoro.mesh.diagram import Diagram
+    from clvoro.mesh.results import HISTORY_DTYPE
 
     ones, starts = np.ones(1), np.array([0, 1], np.int32)
     arrays = {

@@ -22,7 +22,8 @@ from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.box import Box
 from clvoro.io import formats, npz
 from clvoro.io.vtu import write_vtu
-from clvoro.mesh.results import HISTORY_DTYPE, Diagram, Displacements, Result
+from clvoro.mesh.diagram import Diagram
+from clvoro.mesh.results import HISTORY_DTYPE, Displacements, Result
 from tests.reference import diagrams as reference
 
 BOX = Box((-1.0, 0.5), (1.5, 2.0))

@@ -13,7 +13,7 @@ import clvoro
 from clvoro import io
 from clvoro.errors import InputError, InputTypeError
 from clvoro.io import netcdf
-from clvoro.mesh.outlines import next_faces
+from clvoro.mesh.connectivity import next_faces
 from tests.reference import netcdf_files, solids
 from tests.reference.netcdf_files import MESHES, made, read, result_of, shoelace
 

@@ -8,7 +8,7 @@ import pytest
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.mesh.outlines import face_ends
+from clvoro.mesh.connectivity import face_ends
 from tests.io.test_io import BOX, make_diagram
 from tests.reference import netcdf_files
 from tests.reference.netcdf_files import MESHES, made, read, result_of, shoelace

@@ -14,7 +14,8 @@ from clvoro.geometry.boundary import boundary_measure, wall_planes
 from clvoro.geometry.polygon import Polygon
 from clvoro.io import vtu
 from clvoro.io.vtu_read import load_vtu
-from clvoro.mesh.outlines import count_sides, face_ends, next_faces
+from clvoro.mesh.connectivity import face_ends, next_faces
+from clvoro.mesh.straightening import count_sides
 from tests.io import test_foam
 from tests.mesh.test_check import add, put, spoilt, swap
 from tests.reference import solids

@@ -12,8 +12,8 @@ import pytest
 from clvoro import io
 from clvoro.errors import InputError
 from clvoro.io.vtu import _polyhedra, largest_boundary, write_vtu
-from clvoro.mesh.connectivity import face_corners, face_owners, faces_once, take_rows
-from clvoro.mesh.results import Diagram
+from clvoro.mesh.connectivity import face_corners, face_owners, face_topology, take_rows
+from clvoro.mesh.diagram import Diagram
 from tests.io.test_io import assert_equal_results, assert_same_array, rewrite
 from tests.reference import solids
 
@@ -96,7 +96,7 @@ def test_faces_without_measure_are_left_out(lattice):
     for name, array in _polyhedra(lattice).items():
         assert_same_array(_polyhedra(d)[name], array)
     assert [len(loop) for loop in loops_of(d)[5:9]] == [4, 0, 0, 4]
-    assert len(faces_once(d).owner) == len(faces_once(lattice).owner)
+    assert len(face_topology(d).owner) == len(face_topology(lattice).owner)
 
 
 def test_take_rows_forwards_and_backwards():
@@ -107,7 +107,7 @@ def test_take_rows_forwards_and_backwards():
 
 
 def test_every_face_once(diagram):
-    faces, owner = faces_once(diagram), face_owners(diagram)
+    faces, owner = face_topology(diagram), face_owners(diagram)
     pairs = {
         (min(i, j), max(i, j)) if j >= 0 else (i, j)
         for i, j in zip(owner.tolist(), diagram.neighbors.tolist(), strict=True)
@@ -134,7 +134,7 @@ def test_a_face_that_one_cell_alone_describes_is_turned(diagram):
         face_vertex_starts=np.cumsum([0] + [len(loop) for loop in loops]).astype(np.int32),
         face_vertices=np.concatenate(loops).astype(np.int32),
     )
-    whole, partial = faces_once(diagram), faces_once(d)
+    whole, partial = face_topology(diagram), face_topology(d)
     assert_same_array(whole.owner, partial.owner)
     assert_same_array(whole.neighbor, partial.neighbor)
     (k,) = np.flatnonzero((whole.owner == 20) & (whole.neighbor == neighbor[lost]))

@@ -12,7 +12,7 @@ from clvoro.io.vtu_read import load_vtu
 from clvoro.mesh.check.findings import CheckError
 from clvoro.mesh.check.rebuilt import Rebuilt
 from clvoro.mesh.check.values import borders_on_lost_faces
-from clvoro.mesh.results import Diagram
+from clvoro.mesh.diagram import Diagram
 from tests.reference.solids import solid_diagram, solid_result
 
 BOX = clvoro.Box((-3.0, 7.0), (-0.5, 8.5))

@@ -6,7 +6,7 @@ import pytest
 import clvoro
 from clvoro.errors import InputError
 from clvoro.mesh.check.rebuilt import Rebuilt
-from clvoro.mesh.results import Diagram
+from clvoro.mesh.diagram import Diagram
 from tests.reference.shores import UNIT, scattered, slit
 
 REALS = ("float64", "float32")

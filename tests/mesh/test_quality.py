@@ -8,8 +8,8 @@ import pytest
 import clvoro
 from clvoro.geometry.box import Box
 from clvoro.mesh.connectivity import face_corners, face_owners
+from clvoro.mesh.diagram import Diagram
 from clvoro.mesh.quality import measure_mesh
-from clvoro.mesh.results import Diagram
 from tests.io.test_io import BOX, make_diagram
 from tests.reference import solids
 

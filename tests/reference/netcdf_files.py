@@ -6,7 +6,8 @@ import numpy as np
 from scipy.io import netcdf_file
 
 import clvoro
-from clvoro.mesh.results import HISTORY_DTYPE, Diagram, Result
+from clvoro.mesh.diagram import Diagram
+from clvoro.mesh.results import HISTORY_DTYPE, Result
 from tests.reference.shores import scattered, slit, star
 
 ROOM = clvoro.Box((-1, 3), (1, 4))

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.spatial import Voronoi, cKDTree
 
 from clvoro.geometry.box import Box
-from clvoro.mesh.results import HISTORY_DTYPE, Diagram, Result
+from clvoro.mesh.diagram import Diagram
+from clvoro.mesh.results import HISTORY_DTYPE, Result
 
 
 def loop_area(corners):

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 import clvoro
 from clvoro import Box
 from clvoro.errors import ClvoroError, InputError, InputTypeError
-from clvoro.mesh.results import Diagram
+from clvoro.mesh.diagram import Diagram
 from tests.reference.diagrams3d import polygon
 
 BOXES = {2: Box((-0.3, 0.2), (1.7, 1.1)), 3: Box((-0.3, 0.2, 5), (0.8, 1.1, 5.9))}

@@ -8,8 +8,7 @@ import numpy as np
 
 from ...geometry.boundary import wall_planes
 from ...geometry.polygon import Polygon
-from ..connectivity import face_keys, take_rows
-from ..outlines import face_ends
+from ..connectivity import face_ends, face_keys, take_rows
 from .findings import ROUNDINGS
 
 if TYPE_CHECKING:

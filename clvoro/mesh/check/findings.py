@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ...errors import ClvoroError
 
 if TYPE_CHECKING:
-    from ..results import Diagram
+    from ..diagram import Diagram
 
 ROUNDINGS = 256
 """How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be

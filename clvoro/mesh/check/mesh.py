@@ -23,7 +23,8 @@ from .rebuilt import Doubts, Rebuilt
 from .values import check_values
 
 if TYPE_CHECKING:
-    from ..results import Diagram, Result
+    from ..diagram import Diagram
+    from ..results import Result
 
 
 def check_diagram(diagram: Diagram) -> Report:

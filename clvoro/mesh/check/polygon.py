@@ -9,11 +9,11 @@ import shapely
 from scipy.spatial import KDTree
 
 from ...geometry.polygon import BOUNDARY_SHIFTS
-from ..outlines import face_ends, next_faces
+from ..connectivity import face_ends, next_faces
 
 if TYPE_CHECKING:
     from ...geometry.polygon import Polygon
-    from ..results import Diagram
+    from ..diagram import Diagram
     from .findings import Check
     from .rebuilt import Rebuilt
 

@@ -11,11 +11,10 @@ from scipy.spatial import KDTree
 
 from ...geometry.boundary import wall_planes
 from ...geometry.polygon import Polygon
-from ..connectivity import neighbor_points
-from ..outlines import face_ends, next_faces
+from ..connectivity import face_ends, neighbor_points, next_faces
 
 if TYPE_CHECKING:
-    from ..results import Diagram
+    from ..diagram import Diagram
 
 ADOPTED = 1024
 """Roundings of a position by which a face may be off the bisector of its generators and still be a part of it."""

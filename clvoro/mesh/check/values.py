@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...geometry.polygon import Polygon
-from ..outlines import straighten
+from ..straightening import straighten
 from .findings import ROUNDINGS
 from .history import check_history
 
 if TYPE_CHECKING:
-    from ..results import Diagram, Result
+    from ..diagram import Diagram
+    from ..results import Result
     from .findings import Check
     from .rebuilt import Rebuilt
 

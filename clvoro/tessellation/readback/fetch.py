@@ -10,7 +10,7 @@ import pyopencl.array as cla
 
 from ...geometry.box import Box, Domain
 from ...geometry.polygon import Polygon
-from ...mesh.results import Diagram
+from ...mesh.diagram import Diagram
 from ...opencl.program import Engine
 from ..device_diagram import CloseError, Tessellation
 from ..periodic.torus import Unfolded

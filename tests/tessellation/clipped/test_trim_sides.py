@@ -6,7 +6,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation.stages import Stages
-from clvoro.mesh.outlines import SIDE_TURN, straighten
+from clvoro.mesh.straightening import SIDE_TURN, straighten
 from clvoro.opencl.program import Engine
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.shores import DIAMOND, POLYGONS, TOUCHING, UNIT, comb, scattered

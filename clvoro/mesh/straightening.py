@@ -1,4 +1,4 @@
-"""Outlines of cells in 2D, on the host: ends of faces, loops, sides. Cells of polygons may have several loops."""
+"""Cells in 2D as polygons with straight sides: along the boundary several faces make one side."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..geometry.polygon import Polygon
+from .connectivity import face_ends
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
-    from .results import Diagram
+    from .diagram import Diagram
 
 SIDE_TURN = np.pi / 6 * (1 + 2.0**-10)
 """A side of a cell on the boundary turns by no more than this: 30 degrees, and a little so that it is never met.
@@ -20,34 +21,6 @@ SIDE_TURN = np.pi / 6 * (1 + 2.0**-10)
 Sums of turns round, by some roundings each; yet an arc of 2 x 15 degrees shall be one side in any precision. Regular
 rings turn by a fraction of 360 degrees with a denominator that is no more than their number of edges.
 """
-
-
-def face_ends(diagram: Diagram) -> np.ndarray:
-    """Return the vertices that each face of the graph runs from and to, (m, 2); its cell is on the left."""
-    if isinstance(diagram.domain, Polygon):
-        return diagram.face_vertices.reshape(-1, 2)
-    starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
-    places = np.arange(1, len(corners) + 1)
-    filled = starts[1:] > starts[:-1]
-    places[starts[1:][filled] - 1] = starts[:-1][filled]
-    return np.stack([corners, corners[places]], axis=1)
-
-
-def next_faces(diagram: Diagram) -> np.ndarray:
-    """Return the face that comes after each face in its loop around the cell, (m,).
-
-    In a row the loops stand one after the other, and each goes on until its vertices do not.
-    """
-    ends, starts = face_ends(diagram), diagram.neighbor_starts
-    m = len(ends)
-    last = np.zeros(m, bool)
-    last[starts[1:][starts[1:] > starts[:-1]] - 1] = True
-    breaks = last.copy()
-    breaks[:-1] |= ends[:-1, 1] != ends[1:, 0]
-    places = np.arange(1, m + 1)
-    stops = np.flatnonzero(breaks)
-    places[stops] = np.concatenate([[0], stops[:-1] + 1])[: len(stops)]
-    return places
 
 
 def count_sides(diagram: Diagram) -> np.ndarray:

@@ -1,0 +1,394 @@
+"""A Voronoi diagram as NumPy arrays, in the caller's order and units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..opencl.probe import check_process
+from .read_only import read_only, seal
+
+if TYPE_CHECKING:
+    import scipy.sparse
+    from numpy.typing import ArrayLike
+
+    from ..adapter import Adapter
+    from ..geometry.box import Domain
+    from .cell import Cell
+    from .check.findings import Report
+    from .faces import Faces
+    from .locate import Locator
+    from .quality import Measures
+    from .results import Result
+
+
+class Diagram:
+    """A Voronoi diagram clipped to its domain, as `clvoro.voronoi` and `Adapter.diagram` return it.
+
+    Row i belongs to the i-th generator of the caller. Arrays are read from the device when they are first used. They
+    are read-only; take a ``copy()`` to change one.
+
+    The graph is stored by cells: the row of a cell lists its faces, each with the neighbor behind it. A face between
+    two cells is in the rows of both (two half-faces). `faces` has each face once.
+
+    In a polygonal domain a cell is the part of its generator's Voronoi region (all that is nearer to it than to the
+    others, as the crow flies) that lies in the domain and is connected to the generator there. Parts of the region that
+    the boundary cuts off go to the cell beside them with which they share the longest face, and stay with their
+    generator if there is none. A cell need not be convex, may go around holes and then has several loops of faces, and
+    may have several faces in common with one neighbor, which its row then names as often.
+
+    Attributes
+    ----------
+    domain : Box or Polygon
+    points : (n, d) float
+        Generators.
+    volumes : (n,) float
+        Areas in 2D.
+    centroids : (n, d) float
+    neighbor_starts : (n + 1,) int32
+        Row i of the graph is ``neighbors[neighbor_starts[i]:neighbor_starts[i + 1]]``.
+    neighbors : (m,) int32
+        A generator's index, or ``-1 - k`` for wall k of the domain: in a box wall 2 a is the lower side of axis a,
+        wall 2 a + 1 the upper one; in a polygon wall k is the edge from vertex k on, as the caller gave them. Its name
+        is ``domain.boundary_names[domain.boundary_index[k]]``. In 2D in counter-clockwise order around the cell, in a
+        polygon loop by loop, clockwise around holes.
+    shifts : (m, d) int8
+        In a periodic box: face k of cell i lies towards the image of its neighbor j at
+        ``points[j] + shifts[k] * domain.extent``. Zeros in other domains, and towards walls.
+    face_measures : (m,) float
+        Lengths in 2D, areas in 3D.
+    face_centroids : (m, d) float
+    vertices : (v, d) float
+        Each Voronoi vertex once. In a periodic box cells are not cut at the seams: their faces and corners lie around
+        their generators, partly outside of the box. A vertex is there once for each of its images that is a corner of
+        a cell: cells on both sides of a seam have vertices of their own.
+    cell_vertex_starts : (n + 1,) int32, 2D only
+    cell_vertices : (m,) int32, 2D only
+        Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1. In a
+        polygonal domain a cell of several loops has them joined to one by bridges there and back: it has more corners
+        than faces, and `face_vertices` tells which are whose.
+    face_vertex_starts : (m + 1,) int32, in 3D and in polygonal domains
+    face_vertices : (k,) int32, in 3D and in polygonal domains
+        Corners of face f of the graph, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``.
+        In 3D counter-clockwise as seen from outside of the cell to whose row the face belongs; the other cell has
+        them in the opposite order. Empty where the face is as narrow as its vertices round. In a polygonal domain the
+        two ends, the cell on the left on the way from the first to the second.
+
+
+    Raises
+    ------
+    AttributeError
+        For arrays that diagrams of such a domain do not have.
+
+    Examples
+    --------
+    >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]
+    >>> d = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points)
+
+    The corners of a cell, and the Delaunay triangles:
+
+    >>> d.cell(0).vertices.round(2).tolist()
+    [[0.0, 0.0], [0.4, 0.0], [0.49, 0.44], [0.0, 0.56]]
+    >>> d.triangles().tolist()
+    [[0, 1, 3], [1, 2, 3]]
+
+    The flux out of each cell for the velocity (1, 0), which has no sources:
+
+    >>> import numpy as np
+    >>> f = d.faces
+    >>> flux = f.area * f.normal[:, 0]
+    >>> inner = f.neighbor >= 0
+    >>> out = np.bincount(f.owner, flux, len(d)) - np.bincount(f.neighbor[inner], flux[inner], len(d))
+    >>> bool(abs(out).max() < 1e-15)
+    True
+    """
+
+    _NAMES = (
+        "points", "volumes", "centroids", "neighbor_starts", "neighbors", "shifts",
+        "face_measures", "face_centroids", "vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts",
+        "face_vertices",
+    )  # fmt: skip
+
+    def __init__(
+        self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]
+    ) -> None:
+        self.domain = domain
+        self._arrays = {n: a if callable(a) else read_only(a) for n, a in arrays.items()}
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        if name not in Diagram._NAMES:
+            # A copy under construction has no arrays yet, and is asked for private names.
+            there = "" if name.startswith("_") else f"; it has {', '.join(self._there())}"
+            raise AttributeError(f"a Diagram has no {name!r}{there}", name=name, obj=self)
+        if name == "shifts" and name not in self._arrays:
+            self._arrays[name] = read_only(
+                np.zeros((len(self.neighbors), self.domain.dim), np.int8)
+            )
+        if name not in self._arrays:
+            raise AttributeError(
+                f"{name}: a diagram in {self.domain.dim}D has none; it has {', '.join(self._there())}"
+            )
+        value = self._arrays[name]
+        if callable(value):
+            check_process()  # it may be on a device still
+            value = self._arrays[name] = read_only(value())
+        return value
+
+    def _there(self) -> list[str]:
+        return [n for n in Diagram._NAMES if n == "shifts" or n in self._arrays]
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self._there()]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Arrays that may still be on a device are read.
+        return _rebuilt, (self.domain, {n: getattr(self, n) for n in self._arrays})
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        return f"Diagram({len(self)} cells in {self.domain})"
+
+    # The graph.
+
+    @cached_property
+    def faces(self) -> Faces:
+        """Every face once, seams and walls included: owner, neighbor, boundary, area, normal, center, distance.
+
+        See `clvoro.mesh.faces.Faces` for the arrays. They are computed when first used.
+
+        Examples
+        --------
+        >>> d = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> f = d.faces
+        >>> f.owner[0], f.neighbor[0], f.area[0], f.normal[0].tolist(), f.center[0].tolist(), f.distance[0]
+        (np.int32(0), np.int32(1), np.float64(1.0), [1.0, 0.0], [1.0, 0.5], np.float64(1.0))
+        >>> [d.domain.boundary_names[k] for k in f.boundary[f.n_inner:]]
+        ['xMin', 'xMax', 'yMin', 'yMin', 'yMax', 'yMax']
+        """
+        from .faces import make_faces
+
+        return make_faces(self)
+
+    @cached_property
+    def adjacency(self) -> scipy.sparse.csr_array:
+        """The graph of the cells: a symmetric sparse array (n, n) with the area (2D: length) that two cells share.
+
+        A cell that borders on its own periodic image has an entry on the diagonal.
+
+        Examples
+        --------
+        >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]
+        >>> graph = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).adjacency
+        >>> graph.nnz, graph.sum(axis=1).round(3).tolist()
+        (10, [0.952, 0.997, 0.894, 1.123])
+        """
+        import scipy.sparse
+
+        f, k = self.faces, self.faces.n_inner
+        i, j, area = f.owner[:k], f.neighbor[:k], f.area[:k]
+        both = np.concatenate([i, j]), np.concatenate([j, i])
+        graph = scipy.sparse.coo_array((np.concatenate([area, area]), both), (len(self), len(self)))
+        return graph.tocsr()
+
+    def cell(self, i: int) -> Cell:
+        """Return one cell: generator, centroid, volume, neighbors, vertices and faces.
+
+        Parameters
+        ----------
+        i : int
+            Row of the cell; a negative one counts from the end.
+
+        Returns
+        -------
+        Cell
+            See `clvoro.mesh.cell.Cell`.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `i` is no integer, or there is no such cell.
+
+        Examples
+        --------
+        >>> d = clvoro.voronoi(clvoro.Box((0, 0, 0), (2, 1, 1)), [(0.5, 0.5, 0.5), (1.5, 0.5, 0.5)])
+        >>> cell = d.cell(0)
+        >>> cell.volume, len(cell.vertices), len(cell.faces), sorted(cell.neighbors.tolist())
+        (1.0, 8, 6, [-6, -5, -4, -3, -1, 1])
+        """
+        from .cell import make_cell
+
+        return make_cell(self, i)
+
+    def locate(self, points: ArrayLike) -> np.ndarray:
+        """Return the cell that holds each of some points.
+
+        A point on a face is in one of the cells that meet there.
+
+        Parameters
+        ----------
+        points : (k, d) array of float
+            In the domain's unit of length. In periodic directions any coordinate is inside.
+
+        Returns
+        -------
+        (k,) int32
+            Rows of cells; -1 for points outside of the domain.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `points` is no array of real numbers of this shape.
+
+        Examples
+        --------
+        >>> d = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> d.locate([(0.1, 0.9), (1.2, 0.5), (2.1, 0.5)]).tolist()
+        [0, 1, -1]
+        """
+        return self._locator.find(points)
+
+    @cached_property
+    def _locator(self) -> Locator:
+        from .locate import Locator
+
+        return Locator(self)
+
+    def triangles(self) -> np.ndarray:
+        """Return the dual triangulation in the plane: triples of generators whose cells meet in a vertex.
+
+        They are the Delaunay triangles whose circumcenter lies in the domain (those of others, between cells that meet
+        only beyond a wall, are not there). Where more than three cells meet, as in a square lattice, their generators'
+        polygon is cut into triangles.
+
+        Returns
+        -------
+        (t, 3) int32
+            Counter-clockwise, sorted by vertex.
+
+        Raises
+        ------
+        InputError
+            In 3D, and in periodic boxes, where a triangle's corners may be images.
+        """
+        from .delaunay import dual_triangles
+
+        return dual_triangles(self)
+
+    # Measures and checks.
+
+    @cached_property
+    def measures(self) -> Measures:
+        """Quality, skewness, angles and ratios that matter to finite-volume methods; computed when first used."""
+        from .quality import measure_mesh
+
+        return measure_mesh(self)
+
+    def check(self) -> Report:
+        """Verify the diagram on the host: graph, faces, volumes, and that it is the Voronoi diagram of its generators.
+
+        Returns
+        -------
+        Report
+            True if nothing is wrong; ``print`` it, or call its ``demand()`` to have an error raised.
+        """
+        from .check import check_diagram
+
+        return check_diagram(self)
+
+    def transfer(
+        self,
+        values: ArrayLike,
+        onto: Result | Diagram,
+        order: int = 1,
+        *,
+        limited: bool = True,
+        adapter: Adapter | None = None,
+    ) -> np.ndarray:
+        """Carry cell data over to another mesh of the same domain, conservatively.
+
+        A new cell gets the mean over its parts, each of which it has in common with one old cell. With `order` 1 an
+        old cell has its value everywhere; with 2 it has a linear function about its centroid, whose slope fits the
+        neighbors' values by least squares, limited as by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the
+        cell beyond the values of cell and neighbors.
+
+        Parameters
+        ----------
+        values : (n,) or (n, k) array of real numbers
+            Means over the cells of this mesh, in the order of its points.
+        onto : Result or Diagram
+            The new mesh.
+        order : 1 or 2
+        limited : bool
+            With False slopes are as they are: linear functions stay exact (to rounding) at walls and extrema too,
+            wherever a cell has d neighbors in different directions, and values may leave the bounds of the old ones.
+        adapter : Adapter, optional
+            The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
+            has it. Between meshes of a polygonal domain, whose cells need not be convex, the host does it.
+
+        Returns
+        -------
+        (n_new,) or (n_new, k) float64
+            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values, and every new
+            value lies between the least and the largest old one nearby (unless `limited` is False). Rounding leaves
+            the mass off by little; that is made up for in proportion to the room up to those bounds. Between float32
+            meshes, whose volumes are rounded, bounds take precedence: the mass of a constant is off as the sums of
+            volumes are.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If the meshes have different domains or a periodic one in 3D, `values` has another shape or is not finite (a
+            mean with a NaN is none), or `order` is neither 1 nor 2.
+        ClvoroError
+            If one of the meshes is not the Voronoi diagram of its points.
+        """
+        from ..remapping.remap import transfer_values
+
+        return transfer_values(self, values, onto, order, limited, adapter)
+
+    # Other libraries.
+
+    def to_shapely(self) -> np.ndarray:
+        """Return the cells of a diagram in 2D as polygons of shapely.
+
+        Returns
+        -------
+        (n,) array of shapely.Polygon
+            Around the generators; in a periodic box the polygons are not cut at the seams. A cell around an island has
+            a hole. A cell may also be a MultiPolygon where it touches itself.
+
+        Raises
+        ------
+        InputError
+            In 3D.
+
+        Examples
+        --------
+        >>> d = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> [cell.bounds for cell in d.to_shapely()]
+        [(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 2.0, 1.0)]
+        """
+        if self.domain.dim != 2:
+            raise InputError(
+                "shapely has polygons in the plane, and this diagram is in 3D; use to_pyvista() or to_meshio()"
+            )
+        return self._shapes.copy()
+
+    @cached_property
+    def _shapes(self) -> np.ndarray:
+        from .shapes import cell_shapes
+
+        return cell_shapes(self)
+
+
+def _rebuilt(domain: Domain, arrays: dict[str, np.ndarray]) -> Diagram:
+    """Return an unpickled diagram."""
+    for array in arrays.values():
+        seal(array)
+    return Diagram(domain, arrays)

@@ -1,0 +1,59 @@
+"""Which cell holds a point."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from ..arguments import check_rows
+from ..geometry.polygon import Polygon
+
+if TYPE_CHECKING:
+    from .diagram import Diagram
+
+
+class Locator:
+    """Finds the cells that hold points.
+
+    In a box the cell is that of the nearest generator, across seams, too. In a polygonal domain it can be another one,
+    as a cell ends where the boundary cuts it off; there the shape of the cell decides.
+    """
+
+    def __init__(self, diagram: Diagram) -> None:
+        self.diagram, self.domain = diagram, diagram.domain
+        self.origin = np.array(self.domain.lower)
+        periods = np.where(self.domain.periodic, self.domain.extent, 0.0)
+        self.last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
+        self.tree = cKDTree(self._place(diagram.points), boxsize=periods)
+
+    def _place(self, points: np.ndarray) -> np.ndarray:
+        """Return positions relative to the lower corner, in periodic directions within one period."""
+        return np.minimum(self.domain.wrap(points) - self.origin, self.last)
+
+    def find(self, points: object) -> np.ndarray:
+        """Return the cell that holds each of `points` (k, d), (k,) int32; -1 outside."""
+        x = check_rows("points", points, self.domain.dim)
+        found = np.full(len(x), -1, np.int32)
+        inside = np.flatnonzero(self.domain.contains(x))
+        x = x[inside]
+        if not len(x):
+            return found
+        found[inside] = self.tree.query(self._place(x))[1]
+        if isinstance(self.domain, Polygon):
+            found[inside] = self._corrected(x, found[inside])
+        return found
+
+    def _corrected(self, x: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """Return the cells whose shape holds the points `x`, of which the nearest generators are those of `cells`."""
+        shapes = self.diagram.to_shapely()
+        rest = np.flatnonzero(~shapely.intersects_xy(shapes[cells], x[:, 0], x[:, 1]))
+        if rest.size:
+            places = shapely.points(x[rest])
+            # In a crack between two shapes, as wide as round-off, the nearest shape counts.
+            row, cell = shapely.STRtree(shapes).query_nearest(places, all_matches=False)
+            cells = cells.copy()
+            cells[rest[row]] = cell
+        return cells
