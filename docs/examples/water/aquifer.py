@@ -42,22 +42,20 @@ print(mesh)
 
 # %%
 # Steady flow of a confined aquifer: the transmissivity times the gradient of the head flows through each face; rain comes in,
-# wells take out, and the river has a given head. `faces` lists each face once.
+# wells take out, and the river has a given head. `faces` lists each face once, those between cells first.
 
 cells = mesh.diagram
 faces = cells.faces
-inner = faces.neighbor >= 0
+inner = slice(faces.n_inner)
 i, j = faces.owner[inner], faces.neighbor[inner]
-distance = np.linalg.norm(cells.points[j] - cells.points[i], axis=1)
-conductance = 0.01 * faces.area[inner] / distance
+conductance = 0.01 * faces.area[inner] / faces.distance[inner]
 
 n = len(cells)
 upper = scipy.sparse.coo_array((conductance, (i, j)), shape=(n, n))
 matrix = scipy.sparse.diags_array((upper + upper.T).sum(axis=1)) - upper - upper.T
 
 water = 6e-9 * cells.volumes  # m3/s of recharge
-nearest = np.array([np.argmin(np.linalg.norm(cells.points - w, axis=1)) for w in wells])
-water[nearest] -= pumping
+water[cells.locate(wells)] -= pumping
 
 leak = np.where(
     sizing.Distance(sizing.Polyline(river), h_min=1, slope=1)(cells.points) < 21, 1e-2, 0
