@@ -34,6 +34,7 @@ from .geometry.box import Domain
 from .mesh.diagram import Diagram
 from .mesh.results import Result
 from .opencl import devices as device
+from .opencl.build_notice import BuildNotice, noticed_builds
 from .opencl.probe import check_process
 from .opencl.program import Engine
 from .tessellation.readback.fetch import fetch_diagram
@@ -63,6 +64,9 @@ class Adapter:
     dtype : numpy.dtype
     on_memory : callable, optional
         Called by a run, before it begins, with the bytes that it needs on the device; see `memory_needed`.
+    on_build : callable, optional
+        Called by a first run with the number of kernels that are built, and of those that it needs. Without it such a
+        run shows a line on the terminal, if the standard error is one.
 
     Raises
     ------
@@ -107,6 +111,7 @@ class Adapter:
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
         self.on_memory: Callable[[float], object] | None = None
+        self.on_build: Callable[[int, int], object] | None = None
 
     def __repr__(self) -> str:
         return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
@@ -154,18 +159,19 @@ class Adapter:
                 self.queue, self._stages, self._watch = kept
 
     def _shown(
-        self, callback: Callable[[np.void], object] | None
+        self, callback: Callable[[np.void], object] | None, notice: BuildNotice | None
     ) -> Callable[[np.void], object] | None:
         """Return what to call with each row."""
-        watch = self._watch
-        if watch is None:
+        watches = [watch for watch in (notice and notice.clear, self._watch) if watch is not None]
+        if not watches:
             return callback
 
-        def both(row: np.void) -> object:
-            watch(row)
+        def all_of_them(row: np.void) -> object:
+            for watch in watches:
+                watch(row)
             return callback is not None and callback(row)
 
-        return both
+        return all_of_them
 
     def _stages_for(self, domain: Domain) -> Stages:
         if not isinstance(domain, Domain):
@@ -332,9 +338,17 @@ class Adapter:
                 kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)
-            result = carry_out(
-                stages, domain, size, host, merged, files, self._shown(callback), self.on_memory
-            )
+            with noticed_builds(stages.engine, self.on_build) as notice:
+                result = carry_out(
+                    stages,
+                    domain,
+                    size,
+                    host,
+                    merged,
+                    files,
+                    self._shown(callback, notice),
+                    self.on_memory,
+                )
         if result.stop_reason == INTERRUPTED and on_interrupt == "raise":
             raise Interrupted(result)
         if merged.multilevel and result.converged:

@@ -172,13 +172,17 @@ class Job:
                     there = in_bytes(available_memory(adapter.ctx.devices[0]))
                     shown.tell(f"{title}: takes {in_bytes(needed)} of the device's {there}")
 
-            adapter.on_memory = announce
+            def show_builds(built: int, total: int) -> None:
+                if shown is not None:
+                    shown.show_builds(built, total)
+
+            adapter.on_memory, adapter.on_build = announce, show_builds
             try:
                 result: Result = adapter.run(
                     self.case.domain, size, callback=callback, checkpoint=files, on_interrupt="return", **arguments
                 )  # fmt: skip
             finally:
-                adapter.on_memory = None
+                adapter.on_memory = adapter.on_build = None
         if result.stop_reason == INTERRUPTED:
             self.interrupted = True
         return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result

@@ -42,12 +42,10 @@ class Progress:
         self.live = self._status is not None or self.stream.isatty()
 
     def __enter__(self) -> Progress:
-        text = f"{self.title}: preparing (a first run builds its kernels)"
         if self._status is not None:
             self._status.start()
-            self._status.update(text)
-        elif self.live:
-            self._replace(text)
+        self._change(f"{self.title}: preparing")
+        if self.live:
             self._shown = time.monotonic() - REFRESH
         return self
 
@@ -73,13 +71,14 @@ class Progress:
             return  # a short run needs no lines of progress in a log
         self._shown = now
         text = self.line(row)
-        if self._status is not None:
-            self._status.update(text)
-        elif self.live:
-            self._replace(text)
-        else:
+        self._change(text)
+        if not self.live:
             self.stream.write(text + "\n")
-        self.stream.flush()
+            self.stream.flush()
+
+    def show_builds(self, built: int, total: int) -> None:
+        """Show that so many of the kernels that a first run needs are built."""
+        self._change(f"{self.title}: building kernels, once for this device: {built} of {total}")
 
     def tell(self, text: str) -> None:
         """Write a line that stays, above the one that changes."""
@@ -88,6 +87,13 @@ class Progress:
             return
         self.stream.write(f"\r{text}\x1b[K\n" if self.live else f"{text}\n")
         self.stream.flush()
+
+    def _change(self, text: str) -> None:
+        """Replace the text of the line, if it can change."""
+        if self._status is not None:
+            self._status.update(text)
+        elif self.live:
+            self._replace(text)
 
     def _replace(self, text: str) -> None:
         columns = shutil.get_terminal_size().columns

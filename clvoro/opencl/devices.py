@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike
 from ..errors import DeviceError, InputTypeError
 from . import probe as _probe
 from . import runtimes as _runtimes
+from .prebuild import start_workers
 from .probe import has_fp64, one_line
 
 _runtimes.prepare()
@@ -344,6 +345,7 @@ def _try_device(device: cl.Device, fp64: bool) -> tuple[cl.Context | None, str]:
     """Return a context on `device`, or None and the reason why it is of no use."""
     if fp64 and not has_fp64(device):
         return None, "it has no double precision (use dtype='float32')"
+    start_workers(device)
     try:
         ctx = _context_on(device)
     except cl.Error as error:

@@ -7,13 +7,13 @@ import signal
 import subprocess
 import sys
 import threading
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
 
 from ..errors import DeviceError
+from .program import compile_text
 
 _PROBE = """
 #if PROBE_FP64
@@ -83,10 +83,7 @@ def probe(device: cl.Device, ctx: cl.Context | None = None) -> str:
         flags = cl.mem_flags
         given = cl.Buffer(ctx, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=values)
         out = cl.Buffer(ctx, flags.WRITE_ONLY | flags.COPY_HOST_PTR, hostbuf=got)
-        with warnings.catch_warnings():
-            # Some compilers greet on every build; real messages arrive as errors.
-            warnings.simplefilter("ignore", cl.CompilerWarning)
-            program = cl.Program(ctx, _PROBE).build([f"-DPROBE_FP64={int(has_fp64(device))}"])
+        program = compile_text(ctx, _PROBE, (f"-DPROBE_FP64={int(has_fp64(device))}",))
         program.clvoro_probe(queue, (_PROBE_SIZE,), None, given, out)
         cl.enqueue_copy(queue, got, out)
         queue.finish()

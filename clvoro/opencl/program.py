@@ -81,11 +81,17 @@ class KernelPool:
     def __init__(self) -> None:
         self._free: dict[tuple[int, str], list[cl.Kernel]] = {}
         self._taken: list[tuple[tuple[int, str], cl.Kernel]] = []
+        self.on_kernel: Callable[[int], object] | None = None
+        """Called with the number of kernels that have been taken, when there is a new one."""
 
     def take(self, program: cl.Program, name: str) -> cl.Kernel:
         """Return a kernel that nobody else has, until all are taken back."""
         key = program.int_ptr, name
-        free = self._free.setdefault(key, [])
+        if key not in self._free:
+            self._free[key] = []
+            if self.on_kernel is not None:
+                self.on_kernel(len(self._free))
+        free = self._free[key]
         kernel = free.pop() if free else cl.Kernel(program, name)
         self._taken.append((key, kernel))
         return kernel
@@ -118,7 +124,7 @@ class Kernels(SimpleNamespace):
                     f"cl_kernels/{self._stage}.cl was built without its kernel {name}. {cache_remedy()}"
                 ) from error
             raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
-        kernel.stage = self._stage  # type: ignore[attr-defined]
+        kernel.stage = self._stage.rpartition("/")[2]  # type: ignore[attr-defined]
         setattr(self, name, kernel)
         return kernel
 
@@ -195,7 +201,7 @@ def build_program(
         if key not in _programs:
             began = time.perf_counter()
             try:
-                _programs[key] = _build(ctx, text, options, short=not prelude)
+                _programs[key] = compile_text(ctx, text, options, short=not prelude)
             except cl.Error as error:
                 raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
             _building += time.perf_counter() - began
@@ -210,8 +216,10 @@ def program_text(
     return prelude + "\n" + source_text(name), options
 
 
-def _build(ctx: cl.Context, text: str, options: tuple[str, ...], short: bool) -> cl.Program:
-    """Build `text`; where `short`, PoCL reads our declarations of built-in functions instead of its own."""
+def compile_text(
+    ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
+) -> cl.Program:
+    """Build `text`; if `short`, PoCL reads our declarations of built-in functions instead of its own."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", cl.CompilerWarning)
         if short and ctx.devices[0].platform.name.strip() == POCL:

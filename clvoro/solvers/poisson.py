@@ -206,7 +206,8 @@ class Poisson:
             s, V and the result, which is also returned.
         """
         size = np.int32(len(rhs))
-        partial, kernels = self._conjugate_gradient.partial, self._kernels_in(self.engine.real)
+        # These kernels are the same for both precisions of the weights, which are mostly single.
+        partial, kernels = self._conjugate_gradient.partial, self._kernels_in(np.dtype(np.float32))
         self.engine.run_blocks(kernels.sum_sources, size, source, volumes, partial)
         self.engine.run_blocks(kernels.subtract_mean_source, size, source, volumes, rhs, partial)
         return rhs

@@ -47,6 +47,7 @@ def machine(monkeypatch):
         monkeypatch.setattr(_probe, "crashing_platforms", dict)
         reasons = {d.int_ptr: "it cannot build" if d in broken else "" for d in devices}
         monkeypatch.setattr(_probe, "_verdicts", reasons)
+        monkeypatch.setattr(device, "start_workers", lambda _: None)
         monkeypatch.setattr(device.cl, "Context", lambda devices: devices)
 
     return install

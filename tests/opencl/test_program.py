@@ -35,11 +35,11 @@ def test_pocl_reads_short_declarations(ctx, monkeypatch):
 
     monkeypatch.setattr(program.cl, "Program", noted)
     ours = "kernel void put(global double *x) { x[0] = sqrt(x[1]); }"
-    program._build(ctx, ours, (), short=True)
-    program._build(ctx, ours, (), short=False)
+    program.compile_text(ctx, ours, ())
+    program.compile_text(ctx, ours, (), short=False)
     # A function that no kernel of ours calls is found in PoCL's own declarations.
     other = ours.replace("sqrt", "erfc")
-    program._build(ctx, other, (), short=True)
+    program.compile_text(ctx, other, ())
     assert [text.endswith(ours) or text.endswith(other) for text in texts] == [True] * 4
     assert [text in (ours, other) for text in texts] == [False, True, False, True]
 

@@ -1,0 +1,173 @@
+"""How long the first run takes: processes of their own, with empty kernel caches.
+
+    python bench/first_run.py [--repeat N] [--warm] [--json]
+    python bench/first_run.py --record
+
+A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options. Printed are the medians
+of the seconds that a process takes to import the package, to make an adapter, and to run. The processor time of the
+process tells what others on the machine cannot disturb. `--warm` repeats the runs with full caches. `--record` writes
+`clvoro/opencl/first_kernels.json`: which kernels a first run needs, in which order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+KINDS = {
+    "2D box": ("clvoro.Box((0, 0), (1, 1))", 0.04),
+    "3D box": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1),
+}
+RECORDED = {
+    **KINDS,
+    "2D polygon": (
+        "clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])",
+        0.04,
+    ),
+    "2D periodic": ("clvoro.Box((0, 0), (1, 1), periodic=True)", 0.04),
+    "3D periodic": ("clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)", 0.1),
+}
+RUN = """
+import json, resource, time
+def clocks():
+    own, ended = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return time.perf_counter(), own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
+marks = [clocks()]
+import clvoro
+marks.append(clocks())
+adapter = clvoro.Adapter()
+marks.append(clocks())
+adapter.run({domain}, {size})
+marks.append(clocks())
+names = "import", "adapter", "run"
+spent = {{n: [b[i] - a[i] for i in (0, 1)] for n, a, b in zip(names, marks, marks[1:])}}
+print(json.dumps(spent))
+"""
+RECORDER = """
+import json, sys
+import numpy as np, pyopencl as cl
+import clvoro
+from clvoro.opencl import prebuild, program
+made, launches, programs, kinds = {{}}, {{}}, [], []
+plain = program.Engine.kernels, program.KernelPool.take, cl.Kernel.set_args, cl.enqueue_nd_range_kernel
+def kernels(engine, stage, defines=None, prelude=""):
+    taken = plain[0](engine, stage, defines, prelude)
+    kinds.append(prebuild.kind_of(engine))
+    made[id(taken)] = taken, (stage, {{k: str(v) for k, v in (defines or {{}}).items()}}), prelude
+    return taken
+def getattribute(taken, name):
+    kernel = old(taken, name)
+    if isinstance(kernel, cl.Kernel):
+        kernel.made = made[id(taken)][1:]
+    return kernel
+old = program.Kernels.__getattr__
+def set_args(kernel, *args):
+    kernel.sizes = [a.nbytes if isinstance(a, (np.generic, np.ndarray)) else 0 for a in args]
+    plain[2](kernel, *args)
+def enqueue(queue, kernel, size, group, *args, **options):
+    program_of, prelude = getattr(kernel, "made", (None, "x"))
+    if not prelude:
+        if list(program_of) not in programs:
+            programs.append(list(program_of))
+        key = programs.index(list(program_of)), kernel.function_name, group[0]
+        launches.setdefault(key, kernel.sizes)
+    return plain[3](queue, kernel, size, group, *args, **options)
+program.Engine.kernels, program.Kernels.__getattr__ = kernels, getattribute
+cl.Kernel.set_args, cl.enqueue_nd_range_kernel = set_args, enqueue
+prebuild._is_new = lambda *_: False
+clvoro.Adapter().run({domain}, {size})
+rows = [[*key, sizes] for key, sizes in launches.items()]
+print(json.dumps([kinds[-1], {{"programs": programs, "launches": rows}}]))
+"""
+ROOT = Path(__file__).parent.parent
+PLACE = ROOT / "clvoro" / "opencl" / "first_kernels.json"
+
+
+def in_process(code: str, cache: str | None) -> object:
+    """Run `code` in a process of its own, with kernel caches in `cache`; return what it prints."""
+    env = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
+    if cache is not None:
+        env |= {
+            "POCL_CACHE_DIR": f"{cache}/pocl",
+            "XDG_CACHE_HOME": cache,
+            "CUDA_CACHE_PATH": f"{cache}/cuda",
+        }
+        Path(cache, "pocl").mkdir(exist_ok=True)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], env=env, check=True, capture_output=True, text=True
+    )
+    return json.loads(ended.stdout.splitlines()[-1])
+
+
+def record_kind(kind: str) -> tuple[str, dict[str, list]]:
+    """Return the name of a kind of run, and its programs and launches in the order of their first use."""
+    domain, size = RECORDED[kind]
+    name, found = in_process(RECORDER.format(domain=domain, size=size), None)  # type: ignore[misc]
+    return name, found
+
+
+def write_record() -> None:
+    """Write the record, one program or launch in a line."""
+    kinds = []
+    for kind, entry in map(record_kind, RECORDED):
+        parts = [
+            f'  "{name}": [\n' + ",\n".join(f"   {json.dumps(row)}" for row in rows) + "\n  ]"
+            for name, rows in entry.items()
+        ]
+        kinds.append(f' "{kind}": {{\n' + ",\n".join(parts) + "\n }")
+    PLACE.write_text("{\n" + ",\n".join(kinds) + "\n}\n")
+
+
+def main() -> None:
+    """Print the medians, or write the record."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeat", type=int, default=3, help="processes for each kind (3)")
+    parser.add_argument("--warm", action="store_true", help="with full caches as well")
+    parser.add_argument("--record", action="store_true", help="write the record of kernels")
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object per line instead"
+    )
+    options = parser.parse_args()
+    if options.record:
+        write_record()
+        return
+    if not options.json:
+        print("kind     cache  import  adapter    run   adapter + run: seconds, of processor time")
+    for kind, (domain, size) in KINDS.items():
+        found: dict[str, list] = {"empty": [], "full": []}
+        for _ in range(options.repeat):
+            with tempfile.TemporaryDirectory() as cache:
+                code = RUN.format(domain=domain, size=size)
+                found["empty"].append(in_process(code, cache))
+                if options.warm:
+                    found["full"].append(in_process(code, cache))
+        for state, runs in found.items():
+            if not runs:
+                continue
+            wall, busy = (
+                {name: statistics.median(r[name][i] for r in runs) for name in runs[0]}
+                for i in (0, 1)
+            )
+            total, used = (sum(x[name] for name in ("adapter", "run")) for x in (wall, busy))
+            if options.json:
+                print(json.dumps({"kind": kind, "cache": state, **wall, "processor": used}))
+            else:
+                print(
+                    f"{kind}   {state:5}  {wall['import']:6.2f}  {wall['adapter']:7.2f}  {wall['run']:5.2f}   "
+                    f"{total:20.2f}  {used:17.2f}"
+                )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""A process that builds kernels into PoCL's cache; `prebuild` starts it.
+
+It is run as a file, so that it need not import the package. PoCL compiles a kernel when it is first launched, for that
+size of a work-group. So each kernel is launched once, with all its numbers zero: it is to work on no items.
+"""
+
+import contextlib
+import pickle
+import sys
+
+import numpy as np
+import pyopencl as cl
+
+_BUFFER_BYTES = 1 << 20
+
+
+def work(platform: int, device: int) -> None:
+    """Build the programs, and launch the kernels, that the standard input lists: see `prebuild.Work`."""
+    ctx = cl.Context([cl.get_platforms()[platform].get_devices()[device]])
+    queue = cl.CommandQueue(ctx)
+    # The first program takes the longest. It is built while the parent process finds out what is needed.
+    cl.Program(ctx, "kernel void nothing(void) {}").build(["-D_OPENCL_H_"])
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+    zeros = cl.Buffer(ctx, flags, hostbuf=np.zeros(_BUFFER_BYTES, np.uint8))
+    programs, launches = pickle.load(sys.stdin.buffer)
+    built: dict[int, cl.Program] = {}
+    for index, name, group, sizes in launches:
+        if index not in built:
+            text, options = programs[index]
+            built[index] = cl.Program(ctx, text).build(options=list(options))
+        with contextlib.suppress(cl.Error):  # the record may be of another version
+            kernel = cl.Kernel(built[index], name)
+            kernel.set_args(*(np.zeros(size, np.uint8) if size else zeros for size in sizes))
+            cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
+            queue.finish()
+
+
+if __name__ == "__main__":
+    work(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,171 @@
+"""Before a first run: let other processes build kernels that this one needs soon.
+
+PoCL builds one program or kernel at a time in a process, however many threads ask for it. So, if a device of PoCL is
+used for the first time, processes of its own (`build_worker`) build into PoCL's cache what a run of the same kind has
+been recorded to need (`first_kernels.json`, written by `bench/first_run.py --record`). They begin with what is needed
+last. What they have not built when this process needs it, this process builds itself.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import json
+import os
+import pickle
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import pyopencl as cl
+
+from .program import POCL, program_text, shortened
+from .runtimes import cache_home
+
+if TYPE_CHECKING:
+    from .program import Engine
+
+MOST_WORKERS = 3
+"""Processes beside this one."""
+_RECORD = Path(__file__).with_name("first_kernels.json")
+_workers: list[subprocess.Popen[bytes]] = []
+_waiting: list[subprocess.Popen[bytes]] = []
+"""Workers that have no work yet."""
+
+
+class Launch(NamedTuple):
+    """The first launch of a kernel: index of its program, size of its group, bytes of its arguments (0: a buffer)."""
+
+    program: int
+    kernel: str
+    group: int
+    sizes: list[int]
+
+
+class Work(NamedTuple):
+    """What a worker builds: text and options of programs, and launches in the order of building."""
+
+    programs: list[tuple[str, tuple[str, ...]]]
+    launches: list[Launch]
+
+
+def start_workers(device: cl.Device) -> None:
+    """Start workers for `device` if nothing has been built for it; they prepare to compile, and wait for work."""
+    if _is_new("device", device):
+        _start(device)
+
+
+def build_ahead(engine: Engine) -> int:
+    """Let workers build what a run on `engine` needs, if none of this kind has been built for.
+
+    Returns
+    -------
+    int
+        Kernels that the run will need, by the record; 0 if they are built already, or nothing is recorded.
+    """
+    kind = kind_of(engine)
+    recorded = _record().get(kind)
+    device = engine.queue.device
+    if recorded is None or not _is_new(kind, device):
+        return 0
+    work = _work(engine, recorded)
+    if not _waiting:
+        _start(device)
+    for index, worker in enumerate(_waiting):
+        _send(worker, Work(work.programs, _share(work.launches, index, len(_waiting))))
+    _waiting.clear()
+    return len(work.launches)
+
+
+def kind_of(engine: Engine) -> str:
+    """Return by what runs are told apart: dimension, precision and kind of domain."""
+    names = [name for name, _ in engine.domain_defines if "_" not in name]
+    return " ".join([f"{engine.dim}D", engine.real.name, *names])
+
+
+@cache
+def _record() -> dict[str, dict]:
+    return json.loads(_RECORD.read_text())
+
+
+def _work(engine: Engine, recorded: dict) -> Work:
+    """Return the programs and launches that were `recorded`, as they are on `engine`."""
+    programs = []
+    for stage, defines in recorded["programs"]:
+        text, options = program_text(f"{stage}.cl", engine.all_defines(stage, defines), "")
+        text, more = shortened(text)
+        programs.append((text, (*options, *more)))
+    return Work(programs, [Launch(*launch) for launch in recorded["launches"]])
+
+
+def _share(launches: list[Launch], index: int, count: int) -> list[Launch]:
+    """Return the launches that worker `index` of `count` builds for: whole programs, the last needed first."""
+    order = list(dict.fromkeys(launch.program for launch in reversed(launches)))
+    mine = order[index::count]
+    return [launch for launch in reversed(launches) if launch.program in mine]
+
+
+def _is_new(what: str, device: cl.Device) -> bool:
+    """Tell whether a marker for `what` on `device` is missing in the cache, and put it there."""
+    if device.platform.name.strip() != POCL or os.environ.get("POCL_KERNEL_CACHE") == "0":
+        return False
+    with contextlib.suppress(OSError, RuntimeError):
+        folder = Path(os.environ.get("POCL_CACHE_DIR") or cache_home() / "pocl" / "kcache")
+        version = _RECORD.read_bytes(), device.version, device.driver_version, device.name, what
+        name = hashlib.sha256(repr(version).encode()).hexdigest()[:16]
+        marker = folder / "clvoro" / name
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            marker.open("x").close()
+            return True
+    return False
+
+
+def _start(device: cl.Device) -> None:
+    """Start workers, as many as there are idle cores; none if this process may not start others."""
+    name = Path(sys.executable or "").name
+    if not name.startswith(("python", "pypy")):  # an application with Python inside
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    index = _index_of(device)
+    code = f"import runpy; runpy.run_path({str(Path(__file__).with_name('build_worker.py'))!r}, run_name='__main__')"
+    for _ in range(min((cores or 1) - 1, MOST_WORKERS)):
+        with contextlib.suppress(OSError, ValueError):
+            worker = subprocess.Popen(
+                [sys.executable, "-c", code, *map(str, index)],
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            _workers.append(worker)
+            _waiting.append(worker)
+    if _workers:
+        atexit.unregister(_stop_workers)
+        atexit.register(_stop_workers)
+
+
+def _index_of(device: cl.Device) -> tuple[int, int]:
+    for p, platform in enumerate(cl.get_platforms()):
+        if platform == device.platform:
+            return p, platform.get_devices().index(device)
+    raise ValueError("the device is of no platform")
+
+
+def _send(worker: subprocess.Popen[bytes], work: Work) -> None:
+    """Give `worker` its work; one that has ended gets none."""
+    assert worker.stdin is not None
+    with contextlib.suppress(OSError):
+        pickle.dump((work.programs, [tuple(launch) for launch in work.launches]), worker.stdin)
+        worker.stdin.close()
+
+
+def _stop_workers() -> None:
+    """End the workers; what they have not built is built when it is needed."""
+    for worker in _workers:
+        if worker.poll() is None:
+            worker.kill()
+        worker.wait()
+        if worker.stdin is not None:
+            with contextlib.suppress(OSError):
+                worker.stdin.close()
