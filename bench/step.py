@@ -70,7 +70,7 @@ KINDS = kinds()
 NEEDS = {
     # kernel: (reals, integers, operations) per cell of six faces
     "incremental.check_rows": (2, 6 + 3, 6 * 40),
-    "cells.match_faces": (0, 4, 0),
+    "cells.match_polygon_faces": (0, 4, 0),
     "cells.measure_cells": (2 + 1 + 2 + 3, 6 + 6 + 4 + 6 + 12, 6 * 75 + 40),
     "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
     "metric.compare_neighbors": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),

@@ -33,11 +33,7 @@ UPWARD = {
 """Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
-TWICE = {
-    "count_children", "keep_inside", "reflect_inside", "add_run", "corner_of", "cross8", "fold_rows",
-    "choose_lanes", "wrap_cells", "clip_cells", "match_faces", "clip_cell", "clip_by_row", "find_owners",
-    "add_face", "start_cell", "clip_by_bins", "place_vertices",
-}  # fmt: skip
+TWICE = {"keep_inside", "reflect_inside"}
 """Names of kernels and device functions that are still in two files."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")
 """An expression in Python that stands for the kernels of a file."""
@@ -293,6 +289,20 @@ def test_kernels_are_those_that_python_asks_for():
     for stage in stages():
         assert kernels_of(stage), stage
         assert kernels_of(stage) <= asked[stage], f"{stage}: nobody asks for these"
+
+
+def test_kernels_that_tests_name_exist():
+    """Lists of "file.kernel" in tests, most of them slow ones."""
+    stems = {path.stem: path for path in KERNELS.rglob("*.cl")}
+    named = {
+        (stem, kernel)
+        for path in (HERE / "robustness/test_oclgrind.py", HERE / "robustness/test_sanitizers.py")
+        for stem, kernel in re.findall(r'"(\w+)\.(\w+)"', text_of(path))
+        if stem not in ("file", "tests", "trap")
+    }
+    assert len(named) > 30, "the pattern finds nothing any more"
+    known = {stem: kernels_of(name_of(path)[:-3]) for stem, path in stems.items()}
+    assert {f"{s}.{k}" for s, k in named if k not in known.get(s, ())} == set()
 
 
 def test_no_kernel_returns_before_a_barrier():

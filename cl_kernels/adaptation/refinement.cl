@@ -57,9 +57,9 @@ inline REAL room_inwards(int i, REAL most, REAL gap, const REAL *n, global const
 }
 
 /* Per generator i: how many new generators it brings. */
-kernel void count_children(const int size, global const int *starts, global const int *neighbors,
-                           global const FACE *face_measures, global const REAL *volumes, global const int *labels,
-                           const int fixed, global int *counts)
+kernel void count_new_generators(const int size, global const int *starts, global const int *neighbors,
+                                 global const FACE *face_measures, global const REAL *volumes, global const int *labels,
+                                 const int fixed, global int *counts)
 {
     WORK_ITEM(i);
     int count = 0;

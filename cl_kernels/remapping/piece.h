@@ -76,7 +76,7 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     cell_t cell;
-    start_cell(&cell, i, x, lower, upper);
+    start_polygon(&cell, i, x, lower, upper);
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbors[k];
         if (j < 0)
@@ -85,7 +85,7 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
         const REAL d2 = d[0] * d[0] + d[1] * d[1];
         if (d2 == 0)
             return PIECE_BROKEN;
-        if (!clip_cell(&cell, d, d2, j, false, points))
+        if (!clip_polygon(&cell, d, d2, j, false, points))
             return PIECE_FULL;
     }
     piece->n = cell.n;
@@ -186,8 +186,8 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
                        global const REAL *points, REAL4 box_lower, REAL4 box_upper)
 {
     const REAL4 x = load_vector(points, i);
-    start_cell(piece, x, box_lower, box_upper, true);
-    const int what = clip_by_row(piece, i, x, starts, neighbors, points);
+    start_polyhedron(piece, x, box_lower, box_upper, true);
+    const int what = clip_polyhedron_by_row(piece, i, x, starts, neighbors, points);
     if (what >= CLIP_FULL)
         return what == CLIP_FULL ? PIECE_FULL : PIECE_BROKEN;
     for (EACH_FACE(piece, f))
@@ -195,8 +195,8 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
     return PIECE_WHOLE;
 }
 
-/* Keep what has y.normal <= level, but for a strip of `depth`. The new face gets the label. Unlike clip_cell this takes
-   any plane, and new vertices by interpolation only: the edges are no longer than the cell. */
+/* Keep what has y.normal <= level, but for a strip of `depth`. The new face gets the label. Unlike clip_polyhedron this
+   takes any plane, and new vertices by interpolation only: the edges are no longer than the cell. */
 inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
     const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);

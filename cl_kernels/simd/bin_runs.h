@@ -12,7 +12,7 @@ typedef struct {
 } runs_t;
 
 /* Add the generators at places first .. end - 1. False if there is no room. */
-inline bool add_run(runs_t *runs, int first, int end)
+inline bool add_bin_run(runs_t *runs, int first, int end)
 {
     runs->total += end - first;
     if (runs->n > 0) {
@@ -127,7 +127,7 @@ inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, doub
                 global const int2 *row_bins = bins + offsets[pair - first_pair];
                 while (next <= right && child < 0) {
                     const int2 run = next_run(row_bins, &next, right, WHOLE, &child);
-                    if (child < 0 && (!add_run(runs, run.s0, run.s1) || runs->total > limit))
+                    if (child < 0 && (!add_bin_run(runs, run.s0, run.s1) || runs->total > limit))
                         return false;
                 }
                 if (child >= 0)

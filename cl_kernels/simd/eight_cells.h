@@ -55,7 +55,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
     }
     outlines_t corners;
     const double8 x = vload8(0, xs), y = vload8(0, ys);
-    fold_rows(behind, most, x, y);
+    fold_eight_rows(behind, most, x, y);
     find_corners(&corners, behind, most, x, y);
 
     FACE8 lengths[ROW_CAPACITY];
@@ -71,7 +71,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
         middles[k].even = CONVERT_FACE8(sx / 2);
         middles[k].odd = CONVERT_FACE8(sy / 2);
         /* As `add_triangle` has it. */
-        const double8 cross = here ? cross8(vx, wy, vy, wx) : 0;
+        const double8 cross = here ? cross_in_plane(vx, wy, vy, wx) : 0;
         area += cross;
         cx += cross * sx;
         cy += cross * sy;

@@ -3,7 +3,7 @@
 #include "tessellation/face_rows.h"
 #include "simd/lanes.h"
 
-inline double8 cross8(double8 a, double8 b, double8 c, double8 d)
+inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
 {
     const double8 cd = c * d;
     return fma(a, b, -cd) + fma(-c, d, cd);
@@ -12,7 +12,7 @@ inline double8 cross8(double8 a, double8 b, double8 c, double8 d)
 #ifdef FOLD_0
 /* Have rows of points, up to number `most`, as the images of them that are nearest to the points (x, y): there all
    differences are as `corner` takes them. */
-inline void fold_rows(double2 *behind, int most, double8 x, double8 y)
+inline void fold_eight_rows(double2 *behind, int most, double8 x, double8 y)
 {
     const double8 even = (double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6);
     const double8 odd = (double8)(x.s1, y.s1, x.s3, y.s3, x.s5, y.s5, x.s7, y.s7);
@@ -27,7 +27,7 @@ inline void fold_rows(double2 *behind, int most, double8 x, double8 y)
         }
 }
 #else
-#define fold_rows(behind, most, x, y)
+#define fold_eight_rows(behind, most, x, y)
 #endif
 
 /* Points along outlines, relative to the generators. */
@@ -52,8 +52,8 @@ inline void find_corners(outlines_t *corners, const double2 *behind, int most, d
         const long8 apart = w2 > 1e-3 * u2;
         const double8 px = apart ? ux : wx, py = apart ? uy : wy, p2 = apart ? u2 : w2;
         const double8 qx = apart ? vx : -ux, qy = apart ? vy : -uy, q2 = apart ? v2 : u2;
-        const double8 inverse = 0.5 / cross8(px, qy, py, qx);
-        const double8 cx = cross8(p2, qy, q2, py) * inverse, cy = cross8(q2, px, p2, qx) * inverse;
+        const double8 inverse = 0.5 / cross_in_plane(px, qy, py, qx);
+        const double8 cx = cross_in_plane(p2, qy, q2, py) * inverse, cy = cross_in_plane(q2, px, p2, qx) * inverse;
         corners->x[k] = apart ? cx : cx + ux;
         corners->y[k] = apart ? cy : cy + uy;
         ax = bx;

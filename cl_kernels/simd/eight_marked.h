@@ -72,7 +72,7 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
         }
     const double8 x = vload8(0, xs), y = vload8(0, ys);
     const long8 lanes = vload8(0, wanted), known = convert_long8(vload8(0, counts));
-    fold_rows(near, most - 1, x, y);
+    fold_eight_rows(near, most - 1, x, y);
     list.length = 0;
     list.largest2 = 0;
     list.nearest = 0;

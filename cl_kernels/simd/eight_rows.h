@@ -50,7 +50,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
     }
     outlines_t corners;
     const double8 x = vload8(0, xs), y = vload8(0, ys);
-    fold_rows(behind, most, x, y);
+    fold_eight_rows(behind, most, x, y);
     find_corners(&corners, behind, most, x, y);
 
     const long8 ends = vload8(0, counts), last = max(ends - 1, (long8)(0));

@@ -58,7 +58,7 @@ inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 f
     return chosen;
 }
 
-/* Write the rows of some lanes, whose first place is `own`; see `clip_cells`. */
+/* Write the rows of some lanes, whose first place is `own`; see `clip_polygons`. */
 inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, global const int *items,
                        global float *reach, global int *rows, global int *row_counts)
 {
@@ -108,14 +108,14 @@ inline double first_look(needs_t *needs, double most)
     return min(mean + WIDTH * sqrt(variance), most);
 }
 
-/* Per eight places in bin order: the rows of the generators there (see `clip_cells`), or row_counts[i] = 0 where a cell
-   is left to be clipped. `first_reach` is how far the first lists go at most, in units of the spacing. Only the first
-   `rows_wanted` generators get rows. */
-kernel void wrap_cells(const int size, const int n, const int rows_wanted, global const double *binned,
-                       global const int *items, global const float *spacing, global float *reach,
-                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       const double4 box_lower, const double4 box_upper, const double first_reach, global int *rows,
-                       global int *row_counts, global int *places)
+/* Per eight places in bin order: the rows of the generators there (see `clip_polygons`), or row_counts[i] = 0 where a
+   cell is left to be clipped. `first_reach` is how far the first lists go at most, in units of the spacing. Only the
+   first `rows_wanted` generators get rows. */
+kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, global const double *binned,
+                           global const int *items, global const float *spacing, global float *reach,
+                           global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                           const double4 box_lower, const double4 box_upper, const double first_reach, global int *rows,
+                           global int *row_counts, global int *places)
 {
     WORK_ITEM(group);
     needs_t needs = {0, 0, 0};

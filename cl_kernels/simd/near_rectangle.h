@@ -11,7 +11,7 @@ typedef struct {
     int places[NEAR_CAPACITY + NEAR_STEP];
 } near_t;
 
-inline bool add_run(near_t *near, int first, int end)
+inline bool add_near_run(near_t *near, int first, int end)
 {
     const int count = near->count + end - first;
     if (count > NEAR_CAPACITY)
@@ -48,7 +48,7 @@ inline bool collect_near(near_t *near, double2 lower, double2 upper, global cons
             global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
             while (next <= right && child < 0) {
                 const int2 run = next_run(row_bins, &next, right, WHOLE, &child);
-                if (child < 0 && !add_run(near, run.s0, run.s1))
+                if (child < 0 && !add_near_run(near, run.s0, run.s1))
                     return false;
             }
             if (next > right && child < 0) {

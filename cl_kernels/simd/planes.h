@@ -222,8 +222,8 @@ typedef struct {
 } search_t;
 
 /* Choose from the lanes to do those near that of the least rank; the box holds them, r is their greatest radius. */
-inline long8 choose_lanes(long8 todo, const int *ranks, const double *xs, const double *ys, const double *zs,
-                          double8 radii, double spread, double4 *lower, double4 *upper, double *r)
+inline long8 choose_planes(long8 todo, const int *ranks, const double *xs, const double *ys, const double *zs,
+                           double8 radii, double spread, double4 *lower, double4 *upper, double *r)
 {
     long wanted[LANES], chosen[LANES];
     double rs[LANES];
@@ -256,7 +256,7 @@ inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, lon
     double spread = SPREAD;
     int guesses = 0;
     for (int attempt = 0;; ++attempt) {
-        *chosen = choose_lanes(todo, ranks, xs, ys, zs, *r, spread, lower, upper, widest);
+        *chosen = choose_planes(todo, ranks, xs, ys, zs, *r, spread, lower, upper, widest);
         const double8 collected = *chosen ? *r : -1;
         const balls_t balls = {x, y, z, collected};
         const bool fits = collect_runs(runs, &balls, (double4)(-INFINITY), (double4)(INFINITY), NEAR_CAPACITY, in->bins,

@@ -143,7 +143,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
     const long8 usable = list->nearest2 > 0;
     stop_t stop;
     double8 inverse;
-    y = walk_ray(&stop, &inverse, list, y, cross8(a, axis), chosen & usable);
+    y = walk_ray(&stop, &inverse, list, y, cross_in_space(a, axis), chosen & usable);
     vstore8(chosen & ~usable, 0, cells->doubt);
     vstore8(stop.at, 0, second);
     for (int lane = 0; lane < LANES; ++lane) {
@@ -156,14 +156,14 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
     }
     vstore8(chosen & usable & ~vload8(0, cells->lost), 0, walk->active);
     a = planes_at(cells->planes, walk->a);
-    vectors_t b = planes_at(cells->planes, walk->b), ab = cross8(a, b);
+    vectors_t b = planes_at(cells->planes, walk->b), ab = cross_in_space(a, b);
     long8 active = vload8(0, walk->active);
     for (int corner = 0; any(active) && corner < CORNER_CAPACITY; ++corner) {
         const vectors_t end = walk_ray(&stop, &inverse, list, y, ab, active);
         long entries[LANES], certain[LANES], now[LANES];
         vstore8(stop.at < 0 ? 0 : stop.at, 0, entries);
         const vectors_t c = planes_at(list->planes, entries);
-        const vectors_t bc = cross8(b, c), ca = cross8(c, a);
+        const vectors_t bc = cross_in_space(b, c), ca = cross_in_space(c, a);
         const double8 a2 = dot8(a, a), b2 = dot8(b, b), c2 = dot8(c, c);
         /* What rounding has left over from step to step does not add up. */
         y = along8(end, (0.5 - dot8(a, end)) * inverse, bc);
@@ -208,7 +208,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         y = planes_at(walk->corners, walk->from);
         a = planes_at(cells->planes, walk->a);
         b = planes_at(cells->planes, walk->b);
-        ab = cross8(a, b);
+        ab = cross_in_space(a, b);
     }
     /* All edges have two sides, and Euler's formula holds. */
     for (int lane = 0; lane < LANES; ++lane)

@@ -17,7 +17,7 @@ inline double8 dot8(vectors_t a, vectors_t b)
     return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
 }
 
-inline vectors_t cross8(vectors_t a, vectors_t b)
+inline vectors_t cross_in_space(vectors_t a, vectors_t b)
 {
     const vectors_t c = {fma(a.y, b.z, -a.z * b.y), fma(a.z, b.x, -a.x * b.z), fma(a.x, b.y, -a.y * b.x)};
     return c;

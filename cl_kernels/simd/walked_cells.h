@@ -9,7 +9,7 @@
 #define CERTAIN_NEAREST2 1e-7
 #define CERTAIN_AREA 1e-8
 
-/* Where cells are written to, in the layout of `clip_cells` (polyhedra.cl). */
+/* Where cells are written to, in the layout of `clip_polyhedra` (polyhedra.cl). */
 typedef struct {
     int room;
     global const int *items;

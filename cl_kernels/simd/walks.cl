@@ -80,16 +80,16 @@ kernel void order_places(const int size, const int rows, global const int *items
     }
 }
 
-/* Per stretch of that order: the cells of the generators there (see `clip_cells`), or row_counts[i] =
+/* Per stretch of that order: the cells of the generators there (see `clip_polyhedra`), or row_counts[i] =
    UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in units of
    `spacing`. In a periodic box the balls around the vertices of the generators' own cells are looked at. */
-kernel void wrap_cells(const int size, const int rows, global const int *order, global const double *binned,
-                       global const int *items, global const float *spacing, global float *reach,
-                       global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                       const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
-                       global int *row_places, global int *row_counts, global int *labels, global double *measures,
-                       global double *centroids, global double *volumes, global double *offsets,
-                       global double *covariances, global int *report SEAM_ARGS)
+kernel void walk_all_cells(const int size, const int rows, global const int *order, global const double *binned,
+                           global const int *items, global const float *spacing, global float *reach,
+                           global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                           const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
+                           global int *row_places, global int *row_counts, global int *labels, global double *measures,
+                           global double *centroids, global double *volumes, global double *offsets,
+                           global double *covariances, global int *report SEAM_ARGS)
 {
     WORK_ITEM(stretch);
     output_t out = {room,   items,    reach,     row_places, row_counts, labels,

@@ -88,9 +88,9 @@ kernel void make_grids(const int size, global const int2 *bins, global const int
 }
 
 /* Per generator i whose bin was divided: count it into its new bin. */
-kernel void count_children(const int size, global const REAL *points, global const int2 *bins,
-                           global const FRAME *grid_frames, global const int4 *grid_shapes, global int *keys,
-                           global int *ranks, global int *counts)
+kernel void count_in_child_bins(const int size, global const REAL *points, global const int2 *bins,
+                                global const FRAME *grid_frames, global const int4 *grid_shapes, global int *keys,
+                                global int *ranks, global int *counts)
 {
     WORK_ITEM(i);
     const int g = bins[keys[i]].s1;

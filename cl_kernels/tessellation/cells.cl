@@ -18,11 +18,11 @@
    rows[s * SLOT ...]  neighbors j, or -1 - wall; |row_counts[s]| of them, negative if rounding leaves a doubt
 
    If `some`, rows that have faces are there already (`hulls.cl`, or where others had too many). */
-kernel void clip_cells(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
-                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
-                       global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
-                       const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
-                       global int *places, global int *flags)
+kernel void clip_polygons(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
+                          global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                          global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                          const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
+                          global int *places, global int *flags)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -32,11 +32,11 @@ kernel void clip_cells(const int size, const int rows_wanted, global const REAL 
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     cell_t cell;
-    start_cell(&cell, i, x, lower, upper);
+    start_polygon(&cell, i, x, lower, upper);
     int flag = 0;
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     while (flag == 0) {
-        flag = clip_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
+        flag = clip_polygon_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = sqrt(cutting_distance2(&cell));
         if (!(need > w)) /* ends with a NaN, too */
             break;
@@ -74,10 +74,11 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
    flagged. What borders on a generator without a row is not looked at.
 
    If `repaired`, fits[i] tells of rows to whose neighbors i stands between the same two; of others it is not read. */
-kernel void match_faces(const int size, global const int *places, global const int *slots,
-                        global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
-                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const int repaired,
-                        const REAL share, global int *fits, global uint *keep, global int *counts, global int *flags)
+kernel void match_polygon_faces(const int size, global const int *places, global const int *slots,
+                                global const int *slot_counts, global const int *old_starts,
+                                global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
+                                const REAL4 box_upper, const int repaired, const REAL share, global int *fits,
+                                global uint *keep, global int *counts, global int *flags)
 {
     WORK_ITEM(i);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);

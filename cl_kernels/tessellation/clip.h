@@ -121,9 +121,9 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
         const int v = rim->vertices[k];
         const INDEX4 f = cell->faces[v];
         const int a = f.s0, b = f.s1, c = f.s2;
-        add_face(touched, a);
-        add_face(touched, b);
-        add_face(touched, c);
+        add_polyhedron_face(touched, a);
+        add_polyhedron_face(touched, b);
+        add_polyhedron_face(touched, c);
         const int ab = cell->at[b * FACE_CAPACITY + a];
         rim->before[n] = a;
         rim->after[n] = b;
@@ -148,7 +148,7 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
     rim->n = n;
     SHORT_LOOP
     for (int k = 0; k < n; ++k)
-        add_face(around, rim->before[k]);
+        add_polyhedron_face(around, rim->before[k]);
     int faces = 0, dead = 0;
     for (int w = 0; w < FACE_WORDS; ++w) {
         rim->dead[w] = touched[w] & ~around[w];
@@ -180,7 +180,7 @@ inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
         cell->alive[w] &= ~rim->dead[w];
     const int face = first_spare(cell->alive);
     if (face < FACE_CAPACITY) {
-        add_face(cell->alive, face);
+        add_polyhedron_face(cell->alive, face);
         cell->labels[face] = label;
     }
     return face;
@@ -285,7 +285,7 @@ inline bool any_beyond(const cell_t *cell, REAL depth)
 
 /* Cut off what is nearer to the neighbor at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before`
    the neighbor may be a face of the cell already. */
-inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
+inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
     const REAL level = d2 / 2;
     const int blocks = (cell->n + 7) / 8;
@@ -351,8 +351,8 @@ inline int clip_cell(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before
 }
 
 /* Clip by the generators in row i of a graph; one of CLIP_*, or CLIP_COINCIDE. */
-inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
-                       global const REAL *points)
+inline int clip_polyhedron_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
+                                  global const REAL *points)
 {
     const int end = starts[i + 1];
     for (int k = starts[i]; k < end; ++k) {
@@ -361,7 +361,7 @@ inline int clip_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, g
             continue;
         const REAL4 d = (REAL4)(points[3 * j] - x.s0, points[3 * j + 1] - x.s1, points[3 * j + 2] - x.s2, 0);
         const REAL d2 = d.s0 * d.s0 + d.s1 * d.s1 + d.s2 * d.s2;
-        const int what = d2 == 0 ? CLIP_COINCIDE : clip_cell(cell, d, d2, j, false, points);
+        const int what = d2 == 0 ? CLIP_COINCIDE : clip_polyhedron(cell, d, d2, j, false, points);
         if (what >= CLIP_FULL)
             return what;
     }

@@ -58,8 +58,8 @@ inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, REAL2 v,
 
 /* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from
    the directions, which are at hand, where both are generators. */
-inline REAL2 corner_of(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
-                       const REAL *lower, const REAL *upper)
+inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
+                        const REAL *lower, const REAL *upper)
 {
     if (a < 0 || b < 0)
         return corner(i, x, a, b, points, lower, upper);
@@ -82,7 +82,7 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
     /* Face k, its direction, and the corners u before it and v behind it; face `before` lies before it. */
     int before = row[n - 1], face = row[0];
     REAL2 d = face_direction(face, x, points);
-    REAL2 u = corner_of(i, x, before, face, face_direction(before, x, points), d, points, lower, upper);
+    REAL2 u = row_corner(i, x, before, face, face_direction(before, x, points), d, points, lower, upper);
     REAL reach2 = 0, least2 = REAL_MAX;
     int turns = 0;
     bool bad = false, fit = true;
@@ -90,7 +90,7 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
     for (int k = 0; k < n; ++k) {
         const int after = row[k == n - 1 ? 0 : k + 1];
         const REAL2 d_after = face_direction(after, x, points);
-        const REAL2 v = corner_of(i, x, face, after, d, d_after, points, lower, upper);
+        const REAL2 v = row_corner(i, x, face, after, d, d_after, points, lower, upper);
         const REAL2 e = v - u;
         const REAL r2 = dot(v, v);
         reach2 = fmax(reach2, r2);
@@ -171,7 +171,7 @@ kernel void list_marked(const int size, global const int *marks, global const in
 }
 
 /* Clip by the generators of row i that are near enough. */
-inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n, global const REAL *points)
+inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *row, int n, global const REAL *points)
 {
     for (int k = 0; k < n; ++k) {
         const int j = row[k];
@@ -183,7 +183,7 @@ inline int clip_by_row(cell_t *cell, const REAL *x, global const int *row, int n
             continue;
         if (d2 == 0)
             return FLAG_COINCIDE;
-        if (!clip_cell(cell, d, d2, j, true, points))
+        if (!clip_polygon(cell, d, d2, j, true, points))
             return FLAG_FULL;
     }
     return 0;
@@ -219,14 +219,14 @@ kernel void clip_marked(const int size, global const int *listed, const int base
     const REAL upper[2] = {box_upper.s0, box_upper.s1};
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
     cell_t cell;
-    start_cell(&cell, i, x, lower, upper);
+    start_polygon(&cell, i, x, lower, upper);
     int n, m;
     global const int *row = face_row(&rows, i, &n);
-    int flag = clip_by_row(&cell, x, row, n, points);
+    int flag = clip_polygon_by_row(&cell, x, row, n, points);
     for (int k = 0; k < n && flag == 0; ++k)
         if (row[k] >= 0) {
             global const int *other = face_row(&rows, row[k], &m);
-            flag = clip_by_row(&cell, x, other, m, points);
+            flag = clip_polygon_by_row(&cell, x, other, m, points);
         }
 #ifdef FOLD_0
     /* There is no wall across a period: whoever is left with one has lost his neighbors. */

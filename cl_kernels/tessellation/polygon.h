@@ -31,7 +31,7 @@ inline REAL cutting_distance2(const cell_t *cell)
 }
 
 /* The whole box around generator x. */
-inline void start_cell(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
+inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
 {
     cell->generator = i;
     for (int a = 0; a < 2; ++a) {
@@ -104,7 +104,8 @@ inline void copy_corner(cell_t *cell, int to, int from)
 }
 
 /* Cut off what is nearer to the neighbor at x + d: the points y with y.d > d.d / 2. False if the cell is full. */
-inline bool clip_cell(cell_t *cell, const REAL *d, REAL d2, int neighbor, bool seen_before, global const REAL *points)
+inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, bool seen_before,
+                         global const REAL *points)
 {
     const int n = cell->n;
     const REAL doubt = IN_DOUBT * sqrt(d2 * fmax(d2, cell->reach2));

@@ -49,14 +49,14 @@ inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *
                                  order, the next kernels bring them into it
    labels, measures, centroids   of the faces
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
-kernel void clip_cells(const int size, const int rows, global const REAL *binned, global const int *items,
-                       global float *reach, global const int2 *bins, global const FRAME *grid_frames,
-                       global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
-                       const REAL4 box_upper, const int warm, global const int *old_starts,
-                       global const int *old_neighbors, const int again, const int from_near, const int room,
-                       const REAL share, global int *row_places, global int *row_counts, global int *labels,
-                       global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
-                       global REAL *covariances, global int *report SEAM_ARGS)
+kernel void clip_polyhedra(const int size, const int rows, global const REAL *binned, global const int *items,
+                           global float *reach, global const int2 *bins, global const FRAME *grid_frames,
+                           global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                           const REAL4 box_upper, const int warm, global const int *old_starts,
+                           global const int *old_neighbors, const int again, const int from_near, const int room,
+                           const REAL share, global int *row_places, global int *row_counts, global int *labels,
+                           global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
+                           global REAL *covariances, global int *report SEAM_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -65,15 +65,15 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
     const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
     cell_t cell;
-    start_cell(&cell, x, box_lower, box_upper, from_near);
+    start_polyhedron(&cell, x, box_lower, box_upper, from_near);
     int flag = 0;
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     if (warm) {
-        flag = flag_of(clip_by_row(&cell, i, x, old_starts, old_neighbors, points));
+        flag = flag_of(clip_polyhedron_by_row(&cell, i, x, old_starts, old_neighbors, points));
         w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
     }
     while (flag == 0) {
-        flag = clip_by_bins(&cell, x, p, w, inner, warm, &in);
+        flag = clip_polyhedron_by_bins(&cell, x, p, w, inner, warm, &in);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
         if (!(need > w)) /* ends with a NaN, too */
             break;
@@ -197,10 +197,10 @@ kernel void clip_cells(const int size, const int rows, global const REAL *binned
 
    A bisector of generators d apart rounds by eps R / d of the distance R from them, along all of its face: by
    eps R³ / d, where that is little beside the cell. The area of all faces stands for R². */
-kernel void match_faces(const int size, global const int *row_places, global const int *row_counts,
-                        global const int *labels, global const REAL *measures, global const REAL *volumes,
-                        global const REAL *points, const REAL share, const int some_doubtful, global uchar *kept,
-                        global int *counts, global int *report)
+kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
+                                   global const int *labels, global const REAL *measures, global const REAL *volumes,
+                                   global const REAL *points, const REAL share, const int some_doubtful,
+                                   global uchar *kept, global int *counts, global int *report)
 {
     WORK_ITEM(i);
     const int n = COUNT_OF(row_counts[i]);

@@ -29,7 +29,7 @@
 #define FACE_WORDS (FACE_CAPACITY / 64)
 #define WORD_OF(f) (FACE_WORDS == 1 ? 0 : (f) >> 6)
 
-inline void add_face(ulong *set, int f)
+inline void add_polyhedron_face(ulong *set, int f)
 {
     set[WORD_OF(f)] |= (ulong)1 << (f & 63);
 }
@@ -98,7 +98,7 @@ inline void find_reach(cell_t *cell)
 }
 
 /* The whole box around generator x. Face w is wall w. */
-inline void start_cell(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper, bool from_near)
+inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper, bool from_near)
 {
     cell->n = 8;
     cell->from_near = from_near;

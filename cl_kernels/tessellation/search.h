@@ -16,7 +16,7 @@
 #define BATCH 256 /* generators that are sorted by distance at a time */
 #define SHELLS 32
 
-/* The flag that tells of an outcome of clip_cell or clip_by_row, or 0. */
+/* The flag that tells of an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
 inline int flag_of(int what)
 {
     return what < CLIP_FULL
@@ -69,7 +69,7 @@ inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, 
             return FLAG_COINCIDE;
         const REAL4 d =
             (REAL4)(in->binned[3 * q] - x.s0, in->binned[3 * q + 1] - x.s1, in->binned[3 * q + 2] - x.s2, 0);
-        const int what = clip_cell(cell, d, d2, in->items[q], warm, in->points);
+        const int what = clip_polyhedron(cell, d, d2, in->items[q], warm, in->points);
         if (what >= CLIP_FULL)
             return flag_of(what);
     }
@@ -123,7 +123,7 @@ typedef struct {
 /* Clip the cell of the generator at place `own` by every generator in the bins that the cube of half-width w covers
    and the cube of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
    the farthest vertex. Returns FLAG_* or 0. */
-inline int clip_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
+inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
 {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
     const REAL per_shell = SHELLS / (6 * w * w);

@@ -8,8 +8,8 @@
    point. */
 
 /* Per generator i: owners[c] of each of its corners. */
-kernel void find_owners(const int size, global const int *starts, global const int *neighbors, global int *owners,
-                        global int *is_owner)
+kernel void find_vertex_owners(const int size, global const int *starts, global const int *neighbors,
+                               global int *owners, global int *is_owner)
 {
     WORK_ITEM(i);
     const int begin = starts[i], end = starts[i + 1], most = starts[size];
@@ -25,9 +25,10 @@ kernel void find_owners(const int size, global const int *starts, global const i
 
 /* Per generator i: cell_vertices[c] = number of the vertex at corner c; the owner writes its position, relative to the
    box's frame. ids are the prefix sums of is_owner. */
-kernel void place_vertices(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
-                           global const int *starts, global const int *neighbors, global const int *owners,
-                           global const int *ids, global int *cell_vertices, global REAL *vertices)
+kernel void place_polygon_vertices(const int size, global const REAL *points, const REAL4 box_lower,
+                                   const REAL4 box_upper, global const int *starts, global const int *neighbors,
+                                   global const int *owners, global const int *ids, global int *cell_vertices,
+                                   global REAL *vertices)
 {
     WORK_ITEM(i);
     const REAL x[2] = {points[2 * i], points[2 * i + 1]};

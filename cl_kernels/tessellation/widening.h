@@ -26,9 +26,9 @@ inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
    and the square of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than
    twice the farthest corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or
    0. */
-inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, global const REAL *points,
-                        global const REAL *binned, global const int *items, global const int2 *bins,
-                        global const FRAME *grid_frames, global const int4 *grid_shapes)
+inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, global const REAL *points,
+                                global const REAL *binned, global const int *items, global const int2 *bins,
+                                global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
     /* Through rows in outward order, parts of rows, bins; and whether the grid's own bin was opened for the inner
        square. */
@@ -107,7 +107,7 @@ inline int clip_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner
                         continue;
                     if (d2 == 0)
                         return FLAG_COINCIDE;
-                    if (!clip_cell(cell, d, d2, items[q], false, points))
+                    if (!clip_polygon(cell, d, d2, items[q], false, points))
                         return FLAG_FULL;
                 }
             }

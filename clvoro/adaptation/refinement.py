@@ -75,7 +75,7 @@ class Refinement:
         """Return the prefix sums (n + 1,) int32 of how many new generators each one brings."""
         firsts = self.engine.empty(t.n + 1, np.int32)
         self.engine.run_each(
-            self._kernels.count_children, t.n, t.starts, t.neighbors, t.face_measures, t.volumes,
+            self._kernels.count_new_generators, t.n, t.starts, t.neighbors, t.face_measures, t.volumes,
             labels, fixed, firsts,
         )  # fmt: skip
         self._scan.exclusive(firsts, firsts, t.n)

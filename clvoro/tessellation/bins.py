@@ -193,7 +193,7 @@ class Bins:
                 child_firsts, self._grid_of, self._frames, self._shapes, self._grid_items,
             )  # fmt: skip
             engine.run_each(
-                k.count_children, n, points, self._bins, self._frames, self._shapes,
+                k.count_in_child_bins, n, points, self._bins, self._frames, self._shapes,
                 self._keys, self._ranks, self._counts,
             )  # fmt: skip
             begin, size, grids = end, new_bins, grids + new_grids

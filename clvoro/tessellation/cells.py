@@ -72,7 +72,7 @@ class Cells:
         self._wrap = None
         if self.lanes > 1 and self.searches:
             hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
-            self._wrap = engine.kernels("simd/hulls", hulls).wrap_cells
+            self._wrap = engine.kernels("simd/hulls", hulls).wrap_all_hulls
 
     @property
     def defines(self) -> dict[str, object]:
@@ -207,7 +207,7 @@ class Cells:
             )  # fmt: skip
         while True:
             engine.run_each(
-                self._kernels.clip_cells, total, np.int32(n), binned.points, binned.items, *search,
+                self._kernels.clip_polygons, total, np.int32(n), binned.points, binned.items, *search,
                 points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags,
             )  # fmt: skip
             # Every row is new: there are none from before.
@@ -273,7 +273,7 @@ class Cells:
         """Make the rows symmetric; return the flags and the number of faces."""
         engine, starts = self.engine, rows.starts
         engine.run_each(
-            self._kernels.match_faces, n, rows.places, rows.slots, rows.counts, old_starts,
+            self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
             old_neighbors, points, *box.device_corners(engine.real),
             np.int32(fits is not None), self._share(exact), rows.places if fits is None else fits,
             rows.keep, starts, rows.flags,

@@ -47,7 +47,7 @@ FIRST_REACH = 2.0
 
 @dataclass(frozen=True)
 class _CutCells:
-    """Cells as they are cut, each by itself, on the device; see `clip_cells` in `polyhedra.cl`.
+    """Cells as they are cut, each by itself, on the device; see `clip_polyhedra` in `polyhedra.cl`.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Polyhedra:
                 "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **seam_defines(engine),
             }  # fmt: skip
             self._walks = engine.kernels("simd/walks", defines)
-            self._wrap = self._walks.wrap_cells
+            self._wrap = self._walks.walk_all_cells
         self._report = engine.empty(2, np.int32)
         self._capacity = self._room = self._n = 0
 
@@ -256,7 +256,7 @@ class Polyhedra:
                     )  # fmt: skip
             how = np.int32(again or walk is not None), np.int32(from_near)
             engine.run_each(
-                self._kernels(capacity).clip_cells, n, np.int32(rows), binned.points, binned.items,
+                self._kernels(capacity).clip_polyhedra, n, np.int32(rows), binned.points, binned.items,
                 *search, points, lower, upper, np.int32(warm), *old, *how, room, share, *written, *seams,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
@@ -290,7 +290,7 @@ class Polyhedra:
         starts, neighbors = engine.scratch(rows + 1, np.int32), engine.scratch(m, np.int32)
         kept = engine.scratch(m, np.uint8)
         engine.run_each(
-            k.match_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cells["volumes"],
+            k.match_polyhedron_faces, rows, cut.places, cut.counts, cut.labels, cut.measures, cells["volumes"],
             points, share, doubt, kept, starts, self._report,
         )  # fmt: skip
         flags = int(self._report.get()[0])

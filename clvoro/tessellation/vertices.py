@@ -38,12 +38,12 @@ class VertexNumbering:
         engine, k = self.engine, self._kernels
         m = int(t.starts[t.n].get())
         owners, ids = engine.empty(m, np.int32), engine.empty(m + 1, np.int32)
-        engine.run_each(k.find_owners, t.n, t.starts, t.neighbors, owners, ids)
+        engine.run_each(k.find_vertex_owners, t.n, t.starts, t.neighbors, owners, ids)
         self._scan.exclusive(ids, ids, m)
         count = int(ids[m].get())
         cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, 2))
         engine.run_each(
-            k.place_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
+            k.place_polygon_vertices, t.n, t.points, *box.device_corners(engine.real), t.starts,
             t.neighbors, owners, ids, cell_vertices, positions,
         )  # fmt: skip
         return Vertices(count, positions, cell_vertices)

@@ -34,7 +34,8 @@ TRAPS = {
 USEFUL = [name for name in WORK if not name.startswith("broken")]
 VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
 LANES = {
-    "hulls.wrap_cells", "repair.wrap_marked", "walks.count_cubes", "walks.order_places", "walks.wrap_cells",
+    "hulls.wrap_all_hulls", "incremental.wrap_marked", "walks.count_cubes", "walks.order_places",
+    "walks.walk_all_cells",
 }  # fmt: skip
 """Kernels that find eight cells at a time in the vector lanes of a CPU, in float64, or choose the eight."""
 NOT_IN = {
@@ -49,25 +50,29 @@ NOT_IN = {
 """Kernels that have no place in a variant; all others run in it."""
 ALIKE = {
     "aggregation", "conjugate_gradient", "copy", "gradation", "multigrid", "primitives", "transfer",
-    "bins.count_children", "bins.make_grids", "cells.drop_loops", "poisson.apply_laplacian",
+    "bins.count_in_child_bins", "bins.make_grids", "cells.drop_loops", "poisson.apply_laplacian",
     "poisson.apply_laplacian_full", "volume_projection.project_by_group",
 }  # fmt: skip
 """Files, and kernels of others, that work alike whatever the domain: that they run in any is enough."""
 IN_PLANE = {
-    "cells", "hulls", "repair", "shape", "vertices", "population.average_strain", "population.flag_sites",
-    "population.mark_flaws", "population.mark_nuclei", "population.mark_pairs", "population.measure_strain",
-    "population.score_flaws", "population.score_pairs", "population.score_strain", "population.tally_pairs",
+    "cells", "hulls", "incremental", "quality_descent", "vertices", "insertion_deletion.average_strain",
+    "insertion_deletion.flag_sites", "insertion_deletion.mark_flaws", "insertion_deletion.mark_nuclei",
+    "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_flaws",
+    "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.tally_pairs",
 }  # fmt: skip
-IN_SPACE = {"agreement", "corners", "loops", "polyhedra", "walks"}
-AT_POLYGONS = {"chords", "trim"}
-AT_LAYERS = {"metric.hold_sizes", "motion.hold_generators", "population.exempt_fixed"}
+IN_SPACE = {"face_matching", "corners", "loops", "polyhedra", "walks"}
+AT_POLYGONS = {"boundary_crossings", "trim"}
+AT_LAYERS = {"metric.hold_sizes", "motion.hold_generators", "insertion_deletion.exempt_fixed"}
 NOT_FOR = {
-    "plane": IN_SPACE | AT_POLYGONS | {"seam"},
-    "polygon": IN_SPACE | {"seam", "cells.measure_faces"},
+    "plane": IN_SPACE | AT_POLYGONS | {"ghost_images"},
+    "polygon": IN_SPACE | {"ghost_images", "cells.measure_faces"},
     # Repaired cells are folded, and found one by one; only in space do diagrams begin with the one before.
-    "torus": IN_SPACE | AT_POLYGONS | AT_LAYERS | {"repair.wrap_marked", "seam.unfold_rows"},
-    "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"seam"},
-    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"seam.measure_margins"},
+    "torus": IN_SPACE
+    | AT_POLYGONS
+    | AT_LAYERS
+    | {"incremental.wrap_marked", "ghost_images.unfold_rows"},
+    "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images"},
+    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images.measure_margins"},
 }
 """Files and kernels that a kind of domain does not take; all others but those `ALIKE` run in it, in every variant."""
 PATIENCE = 20
@@ -210,8 +215,9 @@ def test_nothing_is_found(trusted, name, variant):
 def all_kernels():
     """Return the kernels of every file, those of its headers too, as "file.kernel"."""
     found = set()
-    for path in kernel_folder().glob("*.cl"):
-        text = re.sub(r"/\*.*?\*/|//[^\n]*", "", source_text(path.name), flags=re.DOTALL)
+    for path in kernel_folder().rglob("*.cl"):
+        source = source_text(path.relative_to(kernel_folder()).as_posix())
+        text = re.sub(r"/\*.*?\*/|//[^\n]*", "", source, flags=re.DOTALL)
         text = re.sub(r"^\s*#.*(?:\\\n.*)*", "", text, flags=re.MULTILINE)
         found |= {f"{path.stem}.{name}" for name in re.findall(r"\bkernel\b[^(]*?(\w+)\s*\(", text)}
     return found

@@ -88,17 +88,18 @@ def test_other_results_are_found(harmless, built):
 
 
 FUNCTIONS = {
-    "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "population.mark_excess",
-    "population.mark_flaws", "projection.assemble", "shape.load_cells", "sizing.evaluate",
-    "sizing.evaluate_with_gradient",
+    "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "insertion_deletion.mark_excess",
+    "insertion_deletion.mark_flaws", "volume_projection.assemble_projection", "quality_descent.load_cells",
+    "size_field.evaluate_size", "size_field.evaluate_size_gradient",
 }  # fmt: skip
 """Kernels with functions that OpenCL does not ask to be rounded correctly (log, pow, cbrt, hypot): libraries differ."""
 ROUNDINGS = 64
 """Of the largest number of an array: errors of sizes that are met, and slopes, are differences of numbers so near."""
-IN_SINGLE = {"projection.assemble"}
+IN_SINGLE = {"volume_projection.assemble_projection"}
 """Of these kernels those that work in single precision whatever the generators are in."""
 ORDERED = {
-    "bins.count_root", "bins.count_children", "chords.count_chords", "polyhedra.clip_cells", "walks.wrap_cells",
+    "bins.count_root", "bins.count_in_child_bins", "boundary_crossings.count_chords", "polyhedra.clip_polyhedra",
+    "walks.walk_all_cells",
 }  # fmt: skip
 """Kernels whose work-items take places in the order in which they come; what follows sorts."""
 

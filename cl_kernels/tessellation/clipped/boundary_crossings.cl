@@ -30,8 +30,8 @@ inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
 /* Per vertex: the generator in whose cell it lies, the nearest one, from neighbor to neighbor: as long as one is
    nearer; then, among those as near but for rounding, by the bisectors. `inner` are the vertices a few roundings
    further inside, so that what lies on faces counts to the cells within. */
-kernel void find_owners(const int size, global const REAL2 *inner, global const int *starts,
-                        global const int *neighbors, global const REAL *points, global int *owners)
+kernel void find_boundary_owners(const int size, global const REAL2 *inner, global const int *starts,
+                                 global const int *neighbors, global const REAL *points, global int *owners)
 {
     WORK_ITEM(v);
     const REAL2 y = inner[v];

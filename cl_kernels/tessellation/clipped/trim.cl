@@ -359,9 +359,9 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const
             if (!is_face(&s, k, home, i, slots, roots, &other))
                 continue;
             if (other >= 0)
-                add_face(&o, p, q);
+                add_wall_face(&o, p, q);
             else if (begins_run(&shore, s.from[k], i))
-                add_run(&o, &shore, s.from[k], i, points[i]);
+                add_wall_sides(&o, &shore, s.from[k], i, points[i]);
             perimeter += sqrt(dot(e, e));
             new_neighbors[at] = other;
             new_measures[at] = sqrt(dot(e, e));

@@ -49,7 +49,7 @@ inline void add_straight(outline_t *o, REAL2 p, REAL2 q)
 }
 
 /* A face between cells. */
-inline void add_face(outline_t *o, REAL2 p, REAL2 q)
+inline void add_wall_face(outline_t *o, REAL2 p, REAL2 q)
 {
     o->sides += 1;
     add_straight(o, p, q);
@@ -94,7 +94,7 @@ inline bool begins_run(const shore_t *s, int chord, int i)
 }
 
 /* The run of generator i, at x, that begins with `first`. */
-inline void add_run(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
+inline void add_wall_sides(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
 {
     const bool is_hole = s->c.shells[s->c.edges[first]] >= 0 && is_ring(s, first, i);
     REAL2 begin = chord_begin(&s->c, first) - x;

@@ -18,8 +18,8 @@ inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lowe
                       global const int *starts, global const int *neighbors)
 {
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
-    start_cell(cell, x, lower, upper, true);
-    return clip_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
+    start_polyhedron(cell, x, lower, upper, true);
+    return clip_polyhedron_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
 }
 
 inline bool is_in_row(int label, int begin, int end, global const int *labels)

@@ -141,7 +141,7 @@ class Boundary:
         if t.n < self._known:
             self.owners.fill(0)
         self._known = t.n
-        engine.run_each(k.find_owners, edges, inner, *graph, self.owners)
+        engine.run_each(k.find_boundary_owners, edges, inner, *graph, self.owners)
         firsts = room("firsts", size=edges + 1, dtype=np.int32)
         intruders = room.zeros("intruders", size=max(1, t.n - generators), dtype=np.int32)
         self._flags.fill(0)
