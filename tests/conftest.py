@@ -11,6 +11,8 @@ from hypothesis import settings
 from tests.grids import points_to_leave
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Dense references are small: more threads of a BLAS library only take the cores of other tests.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Examples are the same in every run, and the first build of a kernel may take its time.
 settings.register_profile("clvoro", derandomize=True, deadline=None, database=None)

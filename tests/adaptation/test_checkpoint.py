@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -107,15 +108,14 @@ LONG_LIVED = {
     ),
     "adaptive in 3D": (BOX_3D, SIZE_3D, {"method": "adaptive", "effort": "fast"}),
 }
+QUICK = ("coupled", "multigrid"), ("adaptive", "jacobi"), ("weighted in 3D", "multigrid")
 
 
-# Every kind has one of the two by default.
 @pytest.mark.parametrize(
     ("kind", "solver"),
     [
-        pytest.param(kind, solver, marks=() if (k + s) % 2 == 0 else pytest.mark.slow)
-        for k, kind in enumerate(LONG_LIVED)
-        for s, solver in enumerate(("multigrid", "jacobi"))
+        pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow)
+        for case in product(LONG_LIVED, ("multigrid", "jacobi"))
     ],
 )
 def test_resumed_runs_go_on_with_the_same_solver(ctx, tmp_path, monkeypatch, kind, solver):

@@ -282,8 +282,9 @@ def test_few_cells_hold_what_is_told(bench, n, real):
     assert min(0.85 * told, told - 32 * 2**10) <= held <= 1.1 * told
 
 
+@pytest.mark.slow
 @needs_bench
-@pytest.mark.parametrize("real", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
+@pytest.mark.parametrize("real", ["float64", "float32"])
 def test_jumps_at_seams_hold_what_is_told(bench, real):
     """The diagram that a run ends with is made anew, when nothing is left of the one before."""
     box = clvoro.Box((0, 0), (1, 1), periodic=True)

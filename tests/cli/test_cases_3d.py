@@ -158,7 +158,10 @@ def test_gap_is_closed_by_join(here):
     assert load_case("mine.toml").size_field().shapes[0].closed
 
 
-@pytest.mark.parametrize(("old", "new"), [("0.25", "1e-4"), ("slope = 0.3", "slope = 1e-9")])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [pytest.param("0.25", "1e-4", marks=pytest.mark.slow), ("slope = 0.3", "slope = 1e-9")],
+)
 def test_more_cells_than_memory(here, capsys, old, new):
     """What a run would need is said before it begins."""
     (here / "part.off").write_text(off(CORNERS, TRIANGLES))

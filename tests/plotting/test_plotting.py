@@ -354,7 +354,9 @@ def test_a_picture_that_fails_costs_no_other(result, tmp_path, monkeypatch):
     assert text.count("src=") == len(list(tmp_path.glob("pictures/*.png"))) == len(drawn) - 1
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize(
+    "n", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_few_cells_and_no_steps(adapter, tmp_path, n):
     tiny = adapter.run(BOX, 1.0, n_cells=n, max_steps=0, seed=99)
     assert tiny.initial is None

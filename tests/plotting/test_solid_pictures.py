@@ -274,7 +274,7 @@ def test_closer_look_at_a_large_mesh(result, monkeypatch):
     assert np.ptp(ax.get_xlim()) == pytest.approx(60 * 0.005)
 
 
-@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("n", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_few_cells(tmp_path, n):
     points = np.random.default_rng(6).uniform(LOWER, UPPER, (n, 3))
     few = solids.solid_result(solids.solid_diagram(LOWER, UPPER, points))

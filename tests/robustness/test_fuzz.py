@@ -58,7 +58,7 @@ def test_refusals_have_to_be_true():
     [
         ("polygon", 703016),
         pytest.param("polygon-run", 50000082, marks=pytest.mark.slow),
-        ("hard-polygon", 70000154),
+        pytest.param("hard-polygon", 70000154, marks=pytest.mark.slow),
         pytest.param("hard-polygon", 70000338, marks=pytest.mark.slow),
         pytest.param("hard-polygon", 71000383, marks=pytest.mark.slow),
         ("hard-polygon", 120000326),
@@ -109,7 +109,7 @@ def test_vertices_that_were_elsewhere_once(kind, seed):
         pytest.param("around", 311905425, marks=pytest.mark.slow),
         pytest.param("around", 311906760, marks=pytest.mark.slow),
         pytest.param("around", 21192475, marks=pytest.mark.slow),
-        ("around", 21193788),
+        pytest.param("around", 21193788, marks=pytest.mark.slow),
     ],
 )
 def test_generators_that_were_told_to_coincide_once(kind, seed):
@@ -119,7 +119,7 @@ def test_generators_that_were_told_to_coincide_once(kind, seed):
     assert fuzz.attempt(kind, seed)[0] == "mesh"
 
 
-@pytest.mark.parametrize("seed", [5, 300])
+@pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 300])
 def test_parts_that_were_cut_off_pass_the_check(seed):
     """Around corners of holes, and in a cell with two faces towards one neighbor: both were refused once."""
     assert fuzz.attempt("layers", seed)[0] == "mesh"
