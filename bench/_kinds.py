@@ -1,4 +1,4 @@
-"""Every kind of run that a user can ask for, by name: domain, size field and options for a number of cells."""
+"""All kinds of runs by name: domain, size field and options for a number of cells."""
 
 from __future__ import annotations
 

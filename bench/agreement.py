@@ -1,12 +1,12 @@
-"""Two devices, the same input: by how much the results differ.
+"""Differences between the results of two devices for the same input.
 
     python bench/agreement.py [--devices pocl,Intel(R) OpenCL] [--cells 2e4] [--dtype float32] [--no-runs] [--json]
 
-A diagram of random generators must have the same graph and volumes to rounding ("off": largest difference over the
-mean volume, in units of eps). So must some steps of a run, "off" then being how far generators are apart over h.
-Rounding decides, in the end, which of two equal things is done (a defect climbs this way or that), so whole runs
-drift apart: of them the figures are compared. Exits with 1 where a difference is larger than `ROUNDINGS`, `STEPPED`,
-`COUNTS` or `FIGURES` allow, which say why.
+A diagram of random generators must have the same graph, and the same volumes up to round-off. "off" is the largest
+difference over the mean volume, in units of eps. After a few steps of a run "off" is the largest distance of the
+generators over h. Over a whole run, round-off decides between equally good moves of a defect, and the meshes differ;
+their errors, qualities and counts are compared. The script returns 1 if a difference exceeds `ROUNDINGS`, `STEPPED`,
+`COUNTS` or `FIGURES`.
 """
 
 from __future__ import annotations

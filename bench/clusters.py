@@ -1,18 +1,18 @@
-"""Generators near each other, or cocircular: how many sets become meshes that `check` passes.
+"""Nearly coincident or cocircular generators: how many sets give meshes that pass `check`.
 
     python bench/clusters.py [--dim 3] [--sets 60] [--kinds circles,arcs] [--dtype float32]
         [--device NAME] [--json]
 
-In the unit square, in both precisions if none is named. `clusters`: 3 to 40 generators within 1e-13
-to 1e-3 of each other (1e-5 in float32), at random, on lines or circles, beside fewer anywhere.
+In the unit square, in both precisions unless one is given. `clusters`: 3 to 40 generators within 1e-13
+to 1e-3 of each other (1e-5 in float32), at random, on lines or circles, beside a few others.
 `circles` and `arcs`: 400 at random on one. `lines`: 20 to 150 on a line 1e-4 to 5e-4 apart, beside 40.
-`one rounding`: 3 to 81 places next to each other, beside 300; `across seams`: the same in a
-periodic box. `alone`: 50 to 300 places within 15 to 60 roundings, without others, in a periodic
-box. Places are rounded to the precision beforehand, and those that fall together are one.
+`one rounding`: 3 to 81 points one unit of round-off apart, beside 300; `across seams`: the same in a
+periodic box. `alone`: 50 to 300 points within 15 to 60 units of round-off, without others, in a periodic
+box. Points are rounded to the precision first, and duplicates are removed.
 
 In the unit cube: `clusters` and `lines` likewise; `spheres`: 100 at random on one; `rings`: 60 on a
-circle; `few roundings`: two groups of 2 to 16, each within 40 roundings of a place, beside 60;
-`lattices`: 3 to 60 places of one of five each way, a rounding apart, beside 200.
+circle; `few roundings`: two groups of 2 to 16, each within 40 units of round-off, beside 60;
+`lattices`: 3 to 60 points of a 5 x 5 x 5 lattice with the spacing of one unit of round-off, beside 200.
 """
 
 from __future__ import annotations

@@ -1,19 +1,18 @@
-"""How far a few steps go: size, shape and work of each method on seven fields, against targets.
+"""Size error, quality and work of each method on seven size fields, against targets.
 
     python bench/convergence.py [--fields F1,F3] [--rows default,exact] [--seeds 3] [--large]
                                 [--device NAME] [--dtype float32] [--json]
 
-Prints a Markdown table; every row is one method on one field with its target beside what is
-measured, over `--seeds` random starts as median (least .. largest). A row holds if it does for
-every start. `--large` adds the rows with a million cells. Exits with 1 if a row does not hold.
+The output is a Markdown table. A row is one method on one field, with the median (smallest .. largest) over
+`--seeds` random starts and the target. A row holds if all starts meet the target. `--large` adds the rows with
+a million cells. The script returns 1 if a row does not hold.
 
-Quality and the share of six-sided cells count the cells off the walls; "all Q" is mean and min of
-every cell. Work is counted in steps of the finest level (a step on a quarter of the cells counts
-a quarter). The size field is absolute: no factor is taken out of the error.
+Quality and the share of six-sided cells are those of cells away from the walls; "all Q" is mean and minimum of
+all cells. Work is in steps of the finest level: a step on a quarter of the cells counts a quarter. Errors are
+absolute: no common factor is removed.
 
-The fields S1, S2 and S3 are in three dimensions and have a table of their own: quality is the
-isoperimetric quotient 36 pi V^2 / S^3 (.753 for the truncated octahedron), and the finest level's
-steps are counted alone.
+The 3D fields S1, S2 and S3 have a table of their own. Quality is the isoperimetric quotient 36 pi V^2 / S^3
+(.753 for the truncated octahedron), and "finest steps" counts the steps of the finest level alone.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@
 
 With `--dim 3` the unit cube: "uniform", "cubed", "radial" with sizes 1 : 1000 around an empty
 ball, "core", the same with the ball filled, and "bcc", the body-centered cubic lattice, jittered
-likewise. Cells at the empty ball are cones to its center, each near hundreds of others; "core" is
-what grading alone costs. Areas and moments are then part of "clip", and a
-warm row bins the moved generators and clips by the neighbors of the diagram before first.
+likewise. Cells at the empty ball are cones to its center, each near hundreds of others; "core" has the
+cost of grading alone. Areas and moments are then part of "clip". A warm row bins the moved generators and clips by the
+neighbors of the diagram before first.
 
 Point sets in the unit square, random with a fixed seed: "uniform"; "cubed", uniform with x -> x^3
 in both coordinates; "radial", spacing in proportion to the distance from the center, sizes
@@ -20,8 +20,8 @@ milliseconds:
   bins     the binning of ordered generators, where they have moved
   diagram  clipping, matching, scan, areas, centroids, faces, graph
 "clip", "match" and "measure" are the device's own times of the kernels in "diagram", by its
-events. Warm rows: the generators moved by up to a tenth of the distance to the nearest other, and
-the diagram before is repaired ("clip": checking which neighbors stay, clipping the others);
+events. Warm rows: the generators move by up to a tenth of the distance to the nearest other, and
+the diagram is updated ("clip": check which cells keep their neighbors, clip the others);
 there is no binning. Rates are millions of cells per second: of clipping alone; from binning to
 graph; and from "order" to graph, which is a diagram of points in any order: these need no further
 binning. With `--scipy`
@@ -29,8 +29,8 @@ SciPy's Voronoi of the same points runs too (vertices and regions, no areas), up
 `--scipy-up-to` cells; "x SciPy" compares it with the last of the rates. The table ends with the
 rates of graded sets over the uniform one and with the slope of time against count.
 
-With `--processor-time` seconds are those that this process has had of the processors, over the
-device's compute units (SciPy: over one): what a CPU would take if no other work ran on it.
+With `--processor-time`, seconds are the processor time of this process over the device's compute units (SciPy: over
+one): the time of an idle CPU.
 """
 
 from __future__ import annotations

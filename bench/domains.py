@@ -2,8 +2,8 @@
 
     python bench/domains.py [--effort default] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
-Writes `domains.png` into `bench/pictures` or `--out`, and prints what each mesh came to: a lake with an island,
-eight cells across its straits; a wing section in a channel, with layers around it; a box that is periodic in both
+Writes `domains.png` into `bench/pictures` or `--out`, and prints the error and quality of each mesh: a lake with an
+island, eight cells across its straits; a wing section in a channel, with layers around it; a box that is periodic in both
 directions, with refined spots across its seams.
 """
 

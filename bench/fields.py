@@ -2,10 +2,10 @@
 
     python bench/fields.py [--effort default] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
-Writes `fields.png` into `bench/pictures` or `--out`, and prints what each mesh came to. Six fields on one
-box, one scale of colors: the distance to a polygon with a law of growth, a raster with gaps, a jump that
-`Graded` makes a ramp, sizes from the second derivatives and from the gradient of a solution, and a
-composition. Lines show what a field was made from; dashed ones are the gaps, the jump, the layer, the wake.
+Writes `fields.png` into `bench/pictures` or `--out`, and prints the error and quality of each mesh. Six fields on one
+box with one color scale: the distance to a polygon, a raster with gaps, a jump that `Graded` makes a ramp, sizes
+from the second derivatives and from the gradient of a solution, and a combination of fields. Lines show the sources
+of a field; dashed lines are the gaps, the jump, the layer, the wake.
 """
 
 from __future__ import annotations

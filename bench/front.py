@@ -8,12 +8,11 @@ prints a table, and draws `front.png` (mean |e| against 1 - mean Q of the cells 
 `defects.png` (cells by number of sides) into `bench/pictures` or `--out`. The runs of effort
 "best" take most of the time; `--no-best` leaves them out.
 
-Gmsh is measured too if it is installed (see `peers.py`). The points of JIGSAW and MMG are given,
-not measured here: the figures of the project's notes for the same field, e after one global
-factor on h. The picture says so.
+Gmsh is measured if it is installed (see `peers.py`). The points of JIGSAW and MMG are not measured here. They are
+constants of this script, for the same field, with e after one global factor on h. The picture says so.
 
-`--records FILE` keeps the points (one JSON object per line) and, if the file exists, draws the
-front from it without running anything; `defects.png` is then left as it is.
+`--records FILE` writes the points, one JSON object per line. If the file exists, the front is drawn
+from it without any runs, and `defects.png` is not changed.
 """
 
 from __future__ import annotations

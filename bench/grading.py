@@ -1,4 +1,4 @@
-"""What grading costs: diagrams of graded sets beside uniform ones, in turn, so that a machine's moods meet them all.
+"""The cost of grading: diagrams of graded and uniform sets by turns, so that changes of the machine's speed cancel.
 
     python bench/grading.py [--sizes 1e6] [--sizes-3d 1e5,5e5] [--repeat 7] [--device NAME] [--dtype float32]
                             [--json]

@@ -1,28 +1,27 @@
-"""Interpolation: how well a mesh made from the Hessian of a function holds it, against a uniform one.
+"""Interpolation error on a mesh from the Hessian of a function, against a uniform mesh.
 
     python bench/interpolation.py [--sizes 1e3,4e3,16e3,64e3] [--steepness 60] [--p 2] [--growth 1.3]
                                   [--h-max 0.2] [--effort fast] [--device NAME] [--dtype float32] [--json]
 
-u = tanh(k d) in the unit square, d the distance to a circle of radius 0.6 about (0.2, 0.1) that leaves by
-two walls: a layer of width 1 / k between two plateaus. Both meshes have exactly N cells; the adapted one is
-made for Graded(hessian_size(u, n_cells=N, p, h_max), growth) with u on a raster of 1001 x 1001 values.
-The error is that of the piecewise linear interpolant on the Delaunay triangulation dual to the cells, with
-u given at the generators, at the centroids of the cells' faces on walls, and in the corners of the square
-(so that it covers the square). It is integrated by three points on each part of a triangle, the parts at most half
-a layer's width long. "factor" is the uniform mesh's error over the adapted one's, at least 5 wanted
-from 4000 cells on; "order" the rate at which the error falls with N^(-1/2), from one row of its kind
-to the next: 2 is what linear interpolation can do.
+The function is u = tanh(k d) in the unit square, with the distance d to a circle of radius 0.6 about (0.2, 0.1): a
+layer of width 1 / k between two plateaus. Both meshes have exactly N cells. The adapted mesh has the size field
+Graded(hessian_size(u, n_cells=N, p, h_max), growth), with u on a raster of 1001 x 1001 values.
+The error is that of piecewise linear interpolation on the dual Delaunay triangulation, with the values of u at the
+generators, at the centroids of the faces on walls, and in the corners of the square. Triangles are divided into parts
+of at most half the layer's width, and three points on each part integrate the error. "factor" is the error of the
+uniform mesh over that of the adapted mesh; the target is 5 from 4000 cells on. "order" is the rate at which the error
+decreases with N^(-1/2), from one row to the next; linear interpolation can have 2.
 
-What does best (k = 60, N = 4000 and 16000, growth 1.1 to 2, p = 1, 2, 4 and infinity, h_max 0.05 to 0.2):
+The best options (k = 60, N = 4000 and 16000, growth 1.1 to 2, p = 1, 2, 4 and infinity, h_max 0.05 to 0.2):
 
-- `Graded`, always: the Hessian vanishes in the middle of the layer, and without grading the cells there are
-  large. The growth matters little, 1.2 to 1.4 is best (L2 factor 8.8 to 10.6; at 1.1 few cells are left for the
-  layer, at 2 cells lose shape);
-- p = 2 for both norms; p = 1 gains 4 % in L1 at most, p = infinity costs 10 to 20 % of it for the least
-  largest error;
-- h_max of 0.1 or more: cells are few on the plateaus anyway. 0.05 wastes them;
-- h_min only against noise in the raster: 0;
-- the effort hardly matters: the error depends on sizes, not on the last percent of shape.
+- always `Graded`: the Hessian is zero in the middle of the layer, and without grading the cells there are large.
+  Growth of 1.2 to 1.4 is best (L2 factor 8.8 to 10.6). With 1.1 few cells are left for the layer, with 2 the cells
+  are of poor shape;
+- p = 2 for both norms. p = 1 gains at most 4 % in L1. p = infinity has the smallest largest error and costs 10 to
+  20 % in L1;
+- h_max of 0.1 or more. With 0.05, many cells are on the plateaus;
+- h_min = 0, unless the raster has noise;
+- any effort: the error depends on sizes, hardly on shape.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""A constant size in 3D: from a random start, and from a body-centered cubic lattice, coarse to fine.
+"""A constant size in 3D, from a random start and from a body-centered cubic lattice, coarse to fine.
 
     python bench/lattice.py [--cubes 10] [--levels 1] [--efforts default] [--device NAME]
                             [--dtype float32] [--json]
 
-The lattice's cells, truncated octahedra, have the quotient 36 pi V^2 / S^3 = .7534 and 14 faces;
-no random start comes to it. Refinement by midpoints carries the lattice over; the layers that it
-makes at walls, and the count that they leave to be settled, disturb it. The coarsest lattice has
-`--cubes` cubes along each side of the unit cube and is refined `--levels` times; the other starts
-are of the finest level's count. Quality and faces count cells off the walls; "all Q" every cell.
+The cells of the lattice are truncated octahedra with the quotient 36 pi V^2 / S^3 = .7534 and 14 faces. No random
+start reaches it. Refinement by midpoints keeps the lattice, except in the layers at walls and where generators are
+deleted afterwards to meet the count. The coarsest lattice has `--cubes` cubes along each side of the unit cube and is
+refined `--levels` times. The other starts have as many cells as the finest level. Quality and faces are those of cells
+away from the walls; "all Q" is that of all cells.
 """
 
 from __future__ import annotations

@@ -1,20 +1,18 @@
-"""Device memory of a whole run: what each stage holds at the moment when most is held.
+"""Device memory of a whole run at its peak, by stage.
 
     python bench/memory.py [--sizes 1e5] [--fields F2,S1] [--methods exact] [--efforts default]
                            [--device NAME] [--dtype float32] [--json]
     python bench/memory.py --sizes 1e4 --fields jump,stripes,disc,kink,chequers,wall
     python bench/memory.py --sizes 300,6000 --kinds all
 
-Every buffer that is made meanwhile is counted until it is freed, by the module of clvoro that
-asked for it (`mesh`: what a generator carries; `_workspace`: what stages use in turn; `fetch` and
-`loops`: the finished diagram). Each field is scaled to the count. The figures are bytes per cell of
-the finished mesh; "output" is the peak while all arrays of the diagram are fetched, which comes
-after the run's own; "estimate" is that of `Adapter.memory_needed`, and "held" the larger of the
-two over it. In the fields of the second line sizes change several-fold from one cell to the next.
+Each buffer is counted from its allocation until it is freed, by the module of clvoro that allocated it. Each field is
+scaled to the number of cells. The figures are bytes per cell of the finished mesh. "output" is the peak while all
+arrays of the diagram are read, after the run; "estimate" is that of `Adapter.memory_needed`, and "held" the
+larger of the two over it. In the fields of the second line sizes change several-fold from one cell to the next.
 The third line has all kinds of runs (`_kinds.py`, or some of them by their first word), one that is
 resumed and a transfer: shares of the estimate that are in use while the run is prepared, in the run,
 and while its diagram is read.
-`clvoro.adaptation.estimates.PEAK` holds the sums that a run is refused by, in reals and 32-bit integers.
+`clvoro.adaptation.estimates.PEAK` holds the estimates, in reals and 32-bit integers.
 """
 
 from __future__ import annotations
@@ -158,7 +156,7 @@ def measure(options: Any, name: str, n: int, method: str, effort: str) -> dict[s
 
 
 def measure_kind(options: Any, kind: Kind) -> dict[str, Any]:
-    """Run once and return what was told, bytes per cell, and shares of it that were held."""
+    """Run once; return the estimate in bytes per cell, and the shares of it that were in use."""
     domain, size, given = kind
     ledger, told, before = Ledger(), [], []
     with counted_buffers(ledger):

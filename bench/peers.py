@@ -1,4 +1,4 @@
-"""Against peers, in the same run: diagrams by SciPy and Voro++, graded meshes by Gmsh.
+"""Comparison with SciPy and Voro++ (diagrams) and Gmsh (graded meshes) in the same run.
 
     python bench/peers.py [--sizes 1e5,1e6] [--sets uniform,cubed] [--factors 1,0.5]
                           [--dim 3] [--skip diagrams|meshes] [--device NAME] [--dtype float32]

@@ -1,18 +1,17 @@
-"""What periods cost: diagrams, steps and runs of a periodic box beside those of the same box with walls.
+"""The cost of periodic boxes: diagrams, steps and runs beside those of the same box with walls.
 
     python bench/periodic.py [--sizes 1e4,1e5,1e6] [--sizes-3d 1e4,1e5] [--repeat 5] [--runs]
                              [--device NAME] [--dtype float32] [--json]
 
-Generators are uniform random. "cold" is a diagram from nothing, "whole" one with the cells of images,
-too, as vertices take them; "warm" the next one after every generator has moved by up to a hundredth
+Generators are uniform random. "cold" is a diagram from nothing, "whole" one that has the cells of ghost images as well,
+as vertices need them; "warm" is the next diagram after all generators have moved by up to a hundredth
 of the spacing. Microseconds of processor time per cell, over the device's compute units: medians of
 `--repeat`. "images" is their number over that of the generators. With `--runs` whole runs at
-effort "fast" towards one size, too.
+effort "fast" with a constant size follow.
 
 The second table has channels, periodic but for walls at y = 0 and y = 1, with sizes ten times
-(in space four times) as large in the middle: the images of the finished mesh, what is expected of
-them before a run ("expected"), and how many there would be if all were taken that lie as near to a
-seam as the farthest of them ("one margin").
+(in space four times) as large in the middle: the number of ghost images of the finished mesh, the estimate of it before
+a run ("expected"), and the number with the same margin at all places of a seam ("one margin").
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ Right side: white noise of mean zero; relative residual 1e-8 (1e-5 in float32). 
 solves on a running process (kernels built), the peers' the best of one or two. Peers run where installed, up to
 `--peers-up-to` cells; direct solves up to a tenth of that.
 
-With `--processor-time` seconds are those that this process has had of the processors, ours over the device's compute
-units: what the wall clock shows on a machine without other work.
+With `--processor-time`, seconds are the processor time of this process, clvoro's over the device's compute units: the
+time of an idle machine.
 """
 
 from __future__ import annotations

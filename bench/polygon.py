@@ -1,15 +1,15 @@
-"""What a polygonal domain costs, and how good its meshes are.
+"""The cost of polygonal domains, and the quality of their meshes.
 
     python bench/polygon.py [--cells 1e6] [--edges 10000] [--runs 5] [--only cost,meshes]
                             [--device NAME] [--dtype float32] [--json]
 
-The first table sets the diagram of a polygon of so many edges, a coast with an island, beside that
-of a box with as many generators: made anew, and repaired after no motion, where only the boundary
-is cut again. Process time over the number of cores, medians of several runs in turn.
+The first table compares the diagram of a polygon of `--edges` edges, a coast with an island, with that of a box with
+as many generators: from nothing, and updated without motion, where only the boundary is clipped again. Times are
+processor times over the number of cores, medians of several runs by turns.
 
 The second table runs the fields F2 and F3 of `bench/convergence.py` on such a polygon, against one
-and a half times the errors and .01 less than the mean Q that are asked for in the box. Quality
-counts the cells that have no face on the boundary; those that have are given apart.
+and a half times the error targets of the box, and its mean quality less .01. Quality is that of cells
+without a face on the boundary; the others have columns of their own.
 """
 
 from __future__ import annotations

@@ -1,18 +1,18 @@
-"""Single against double precision: how much less near to its size field a mesh of float32 is.
+"""Single against double precision: how much float32 adds to the size error.
 
     python bench/precision.py [--fields circle,point,sphere] [--sizes 1e4,1e6] [--grading 1000]
                               [--efforts fast] [--seeds 3] [--device NAME] [--json]
     python bench/precision.py --noise
 
-The size grows linearly, by the grading from its least value to its largest one: away from the circle of radius
-0.3 about (0.9, 0.75) in the box 2.5 x 1.5, from that circle's center alone ("point"), or from the sphere
+The size grows linearly from its smallest to its largest value, whose ratio is the grading: away from the circle of
+radius 0.3 about (0.9, 0.75) in the box 2.5 x 1.5, from that circle's center alone ("point"), or from the sphere
 of radius 0.25 about (0.5, 0.5, 0.4) in the unit cube; it is scaled to the count. h and e are evaluated on the host, in
 float64, at the generators as they are; medians over the starts. "spacing" is that of positions in
-float32 over h, at the least size and as a mean over the cells. "more" is what float32 adds to the mean
-error, "scatter" the range of float64's over the starts; exits with 1 where more is above 1e-3 and the
-scatter, and no warning came beforehand.
-`--noise` moves the generators of uniform meshes by a little at random, and prints how much of it the
-error changes by: `clvoro.adaptation.precision.ADDED`.
+float32 over h, at the smallest size and as a mean over the cells. "more" is what float32 adds to the mean
+error, "scatter" the range of the error in float64 over the starts. The script returns 1 if "more" exceeds 1e-3 and the
+scatter without a warning before the run.
+`--noise` moves the generators of uniform meshes at random by a small distance, and prints the change of the error over
+that distance: `clvoro.adaptation.precision.ADDED`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Restarts: a mesh adapted again and again, from where it is, while its size field moves on.
+"""Restarts: adaptations of one mesh, each from the mesh before, while the size field moves.
 
     python bench/restart.py [--moves 10] [--by 2] [--factors 1] [--effort default] [--cold]
                             [--device NAME] [--dtype float32] [--json]
@@ -6,13 +6,13 @@
 The field is F2 times a factor, h = 0.002 + 0.08 d with d the distance to a circle, which moves along x by
 two of its smallest cells at a time. Each run begins with the points of the one before. "to tolerance" is
 the number of steps after which mean |e| <= 0.004, max |e| <= 0.04 and mean Q >= 0.985 (0.975 with --effort
-fast), which a mesh of ten thousand cells or more can meet; five or fewer are wanted. "carried" is how much
-of a peak of height 1 and width 0.05 beside the circle is left after all transfers of second order, "mass"
-how far its mass is off.
+fast). A mesh of ten thousand cells or more can meet these; the target is five steps. "carried" is the height
+after all transfers of second order of a peak of height 1 and width 0.05 beside the circle, "mass" the relative error
+of its mass.
 
-A mesh is corrected in these few steps where its mean |e| is up to 0.15 and its count within 2 % of what the
-field asks for; else the run takes the way of any points. So a field that moves far is better followed in
-steps of some five cells.
+A mesh is corrected in a few steps if its mean |e| is at most 0.15 and its count within 2 % of that of the size field.
+Otherwise the run starts as from any points. A field that moves far is therefore better followed in steps of about five
+cells.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whole runs, from nothing to a finished mesh: time per cell, its scaling, and where it goes.
+"""Whole runs, from nothing to a finished mesh: time per cell, its growth, and its parts.
 
     python bench/run.py [--sizes 1e4,1e5,1e6] [--efforts fast,default] [--methods adaptive]
                         [--no-profile] [--device NAME] [--dtype float32] [--json]
@@ -61,7 +61,7 @@ def run_once(
     field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
     start = time.perf_counter()
     result = adapter.run(BOX, field, effort=effort, method=method, seed=FIRST_SEED)
-    result.diagram.neighbors  # noqa: B018  fetched when asked for
+    result.diagram.neighbors  # noqa: B018  reads it from the device
     result.diagram.vertices  # noqa: B018
     result.diagram.cell_vertices  # noqa: B018
     return result, time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""Time against cells of all that a run is made of, log-log, with slopes and peers, in one picture.
+"""Time against cells of diagrams, solves and runs, and of other tools, in one picture with slopes.
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python bench/scaling.py [--sizes 1e4,1e5,1e6,4e6]
                         [--solid-sizes 1e4,1e5,1e6] [--run-sizes 1e4,1e5,1e6] [--processor-time]
@@ -6,10 +6,10 @@
 
 Writes `scaling.png` into `bench/pictures` or `--out`, and prints the slopes. Seconds come from the scripts that measure
 each part (`diagram.py`, `poisson.py`, `run.py`), which it calls; `scaling.jsonl` beside the picture holds them, and
-`--from` draws them again. A slope is that of the line through the logarithms from 1e5 cells on: below, what
-a call costs whatever its size shows. 1 means that time grows as the number of cells does.
+`--from` draws them again. A slope is that of the line through the logarithms from 1e5 cells on; below, the
+fixed cost of a call is visible. With 1, time is proportional to the number of cells.
 
-The same machine serves all, so it should be quiet; `--processor-time` helps where it is not, but runs take the clock.
+The machine should be idle. `--processor-time` helps otherwise, except for runs, which use the clock.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""One step of a run, taken apart: displacing, moving, repairing the diagram, judging it; and the machine's limits.
+"""One step of a run by its parts: displacement, motion, update of the diagram, evaluation; and the machine's limits.
 
     python bench/step.py [--sizes 1e5,1e6] [--kinds weighted,glide,polish] [--repeat 7]
                          [--processor-time] [--device NAME] [--dtype float32] [--json]
 
-A mesh of F2 scaled to the count (see `convergence.py`) is made by a fast run, and given a few steps
-of each kind, as a default run takes them: "weighted" couples weighted centroids and Poisson, "glide"
-and "polish" project onto the cells' sizes. Times are medians over `--repeat` further steps, from an
+A fast run makes a mesh of F2 scaled to the count (see `convergence.py`). A few steps of each kind of a default run
+follow: "weighted" couples weighted centroids and the Poisson correction, "glide" and "polish" project onto the cells'
+sizes. Times are medians over `--repeat` further steps, from an
 idle queue to an idle queue, in milliseconds: "displace" finds the displacement ("solve" is the
-device's time of its linear solver), "diagram" repairs the tessellation, "rest" moves, evaluates h,
-error, quality and their sums. "diagram M/s" is cells per second of the repaired diagram with all its measures,
-"to host" the bytes that the host reads. "cold" makes the same diagram anew, from binning on.
+device's time of its linear solver), "diagram" updates the tessellation, "rest" moves, evaluates h,
+error, quality and their sums. "diagram M/s" is cells per second of the updated diagram with all its measures,
+"to host" the bytes that the host reads. "cold" makes the same diagram from nothing, from binning on.
 
 The second table holds kernels against the machine: bytes that must move per cell (each array that
 the kernel needs, once) over what copying moves per second, and operations that must be done per

@@ -1,14 +1,14 @@
-"""Cell data from mesh to mesh: cells per second, what is left of mass, bounds and a smooth function.
+"""Transfer of cell data between meshes: speed, errors of mass and bounds, order.
 
     python bench/transfer.py [--sizes 1e3,1e4,1e5] [--dims 2,3] [--random] [--repeat 3]
                              [--device NAME] [--dtype float32] [--json]
 
 Two uniform meshes of about as many cells ("fast" effort from two seeds; --random: random generators) in the
-unit box. f = sin(3 x + 1) cos(2 y) (1 + z^2) is given by its values at the centroids of one, which are its
-means but for second order, carried over to the other and compared there; "L1 error" is the mean of |error|,
-"order" its slope in the mesh width, from one row to the one above. "1" is the first order, "2" the second with
-the limiter, "2 free" without. "mass" is the defect of the sum of V f over that of V |f|, "beyond" how far values
-leave the bounds of the old ones. "new cells/s" is the median of whole calls, copies to and from the device included.
+unit box. The values of f = sin(3 x + 1) cos(2 y) (1 + z^2) at the centroids of one mesh are transferred to the other
+and compared there. "L1 error" is the mean of |error|, "order" its rate in the mesh width from one row to the next. "1"
+is the first order, "2" the second with the limiter, "2 free" without it. "mass" is the error of the sum of V f over the
+sum of V |f|, "beyond" the distance of new values from the bounds of the old ones. "new cells/s" is the median of whole
+calls, with copies to and from the device.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ WORDS_OF_OTHERS = {
 PLAIN = (
     "cl_kernels/solvers/",
     "clvoro/solvers/",
-    "bench/RESULTS.md",
+    "bench/",
     "docs/",
     "README.md",
     "CONTRIBUTING.md",
