@@ -52,7 +52,7 @@ def layered(domain: Any) -> Callable[[int], Kind]:
 
 
 def from_points(factor: float, **options: Any) -> Callable[[int], Kind]:
-    """From random points, `factor` times as many as cells are asked for."""
+    """From random points, `factor` times as many as the mesh shall have cells."""
 
     def kind(n: int) -> Kind:
         points = np.random.default_rng(1).random((round(factor * n), 2))

@@ -3,8 +3,8 @@
     python bench/domains.py [--effort default] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
 Writes `domains.png` into `bench/pictures` or `--out`, and prints the error and quality of each mesh: a lake with an
-island, eight cells across its straits; a wing section in a channel, with layers around it; a box that is periodic in both
-directions, with refined spots across its seams.
+island, eight cells across its straits; a wing section in a channel, with boundary layers; a box that is periodic in
+both directions, with refined spots across its seams.
 """
 
 from __future__ import annotations

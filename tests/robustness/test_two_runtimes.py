@@ -40,7 +40,7 @@ def agreement(monkeypatch):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_diagrams_and_steps(both, dtype):
     """To the tolerances that the script states."""
-    rows = records("agreement.py", "--cells", "2e3", "--no-runs", "--dtype", dtype)
+    rows = records("two_devices.py", "--cells", "2e3", "--no-runs", "--dtype", dtype)
     assert [(r["dim"], r["what"]) for r in rows] == [
         (2, "diagram"), (2, "3 steps"), (3, "diagram"), (3, "3 steps"),
     ]  # fmt: skip
@@ -50,7 +50,7 @@ def test_diagrams_and_steps(both, dtype):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_whole_runs(both, dtype):
-    rows = records("agreement.py", "--cells", "2e3", "--dtype", dtype)
+    rows = records("two_devices.py", "--cells", "2e3", "--dtype", dtype)
     assert [r["what"] for r in rows] == ["diagram", "3 steps", "fast", "default"] * 2
 
 
@@ -85,4 +85,4 @@ def test_what_differs_is_found(agreement, record):
 
 def test_one_device_is_no_second_one(agreement):
     """Intel's processors are called so under any implementation."""
-    records("agreement.py", "--devices", "pocl,pocl", code=1)
+    records("two_devices.py", "--devices", "pocl,pocl", code=1)

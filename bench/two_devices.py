@@ -1,6 +1,6 @@
 """Differences between the results of two devices for the same input.
 
-    python bench/agreement.py [--devices pocl,Intel(R) OpenCL] [--cells 2e4] [--dtype float32] [--no-runs] [--json]
+    python bench/two_devices.py [--devices pocl,Intel(R) OpenCL] [--cells 2e4] [--dtype float32] [--no-runs] [--json]
 
 A diagram of random generators must have the same graph, and the same volumes up to round-off. "off" is the largest
 difference over the mean volume, in units of eps. After a few steps of a run "off" is the largest distance of the
