@@ -50,8 +50,8 @@ def meshed(request, adapter_of_module):
     from clvoro.mesh.results import HISTORY_DTYPE
 
     result = clvoro.Result(
-        points=diagram.points, diagram=diagram, size=np.ones(n), error=np.zeros(n), quality=np.ones(n),
-        history=np.zeros(0, HISTORY_DTYPE), converged=True, stop_reason="none",
+        points=diagram.points, diagram=diagram, target_size=np.ones(n), size_error=np.zeros(n),
+        quality=np.ones(n), history=np.zeros(0, HISTORY_DTYPE), converged=True, stop_reason="none",
     )  # fmt: skip
     return rings, segments(rings), result
 

@@ -64,8 +64,8 @@ def valid_files(adapter: clvoro.Adapter) -> dict[str, bytes]:
     """A right file of each kind by name."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        made = {"checkpoint": folder / "state", "checkpoint_every": 0}
-        result = adapter.run(BOX, 0.2, **RUN, **made)
+        checkpoint = clvoro.Checkpoint(folder / "state", every=0)
+        result = adapter.run(BOX, 0.2, checkpoint=checkpoint, **RUN)
         result.save(folder / "m.npz")
         result.save(folder / "m.vtu")
         np.save(folder / "a.npy", result.points)
