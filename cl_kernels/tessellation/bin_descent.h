@@ -1,4 +1,4 @@
-/* A walk through nested grids of bins: those that are open, from the root down, and where each was left. */
+/* Depth-first traversal of nested grids of bins: a stack of the open grids, with the position reached in each. */
 #include "tessellation/bins.h"
 
 #ifndef MAX_DEPTH
@@ -8,7 +8,7 @@
 typedef struct {
     int depth; /* -1 at the end */
     int grids[MAX_DEPTH];
-    int4 places[MAX_DEPTH]; /* whatever tells where to go on */
+    int4 places[MAX_DEPTH]; /* position at which each grid continues */
 } descent_t;
 
 inline void begin_descent(descent_t *way, int4 start)
@@ -18,9 +18,7 @@ inline void begin_descent(descent_t *way, int4 start)
     way->places[0] = start;
 }
 
-/* Leave the open grid: for the grid `child` of one of its bins, to come back to `place`; or, if that is negative, for
- *
-    good. */
+/* Push the grid `child` of one of the bins, to continue at `place` afterwards; pop the open grid if child < 0. */
 inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
 {
     if (child < 0) {
@@ -33,10 +31,9 @@ inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
     way->places[way->depth] = start;
 }
 
-/* The next run of items in the bins from `*next` to `right` of a row, which lie beside each other: all of them if none
-   is divided, or if they hold no more than `whole`, for which looking into divided bins costs more than it saves; else
-   one bin. `*next` is then what comes behind. Where that one bin is divided and holds more, `*child` is its grid, and
-   nothing is in the run. */
+/* The next range of items in the bins from `*next` to `right` of a row; `*next` moves behind it. It spans all these bins
+   if none is divided or they hold at most `whole` items, for which opening divided bins does not pay. Otherwise it is
+   one bin; if that bin is divided and holds more, the range is empty and `*child` is its grid. */
 inline int2 next_run(global const int2 *row_bins, int *next, int right, int whole, int *child)
 {
     const int2 first = row_bins[*next];

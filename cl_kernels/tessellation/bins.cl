@@ -1,8 +1,8 @@
 #include "tessellation/bins.h"
 #include "opencl/sort.h"
 
-/* Generators are counted into bins, level by level, then placed by a counting sort. The order in which atomics arrive
-   only decides ranks within a bin, and the last pass sorts each bin by generator index: the result is deterministic. */
+/* A counting sort, level by level. The order of the atomics only changes the ranks within a bin, and the last pass sorts
+   each bin by generator index: the result is deterministic. */
 
 /* Per generator i: keys[i] = its bin in grid 0, ranks[i] = its place in the bin. counts must be zero. */
 kernel void count_root(const int size, global const REAL *points, const FRAME frame, const int4 shape, global int *keys,
@@ -30,8 +30,7 @@ inline int child_side(int count)
     return side;
 }
 
-/* Per bin b of the newest level [begin, begin + n): is it divided, and into how many bins (and one entry that ends
-   them)? */
+/* Per bin b of the newest level [begin, begin + n): whether it is divided, and into how many bins, with the end entry. */
 kernel void plan_children(const int size, global const int *counts, const int begin, const int may_divide,
                           global int *grid_flags, global int *child_bins)
 {
@@ -56,7 +55,7 @@ kernel void place_bins(const int size, global const int *starts, const int begin
     bins[begin + b] = (int2)(start, first_grid + grid_ids[b]);
 }
 
-/* Per divided bin b: create grid g over its box, and note in each of the new bins which grid it belongs to. */
+/* Per divided bin b: create grid g over its box, and write g into each of its bins. */
 kernel void make_grids(const int size, global const int2 *bins, global const int *counts, const int begin,
                        const int next_begin, global const int *child_firsts, global int *bin_grid,
                        global FRAME *grid_frames, global int4 *grid_shapes, global int *grid_items)
@@ -101,7 +100,7 @@ kernel void count_in_child_bins(const int size, global const REAL *points, globa
     ranks[i] = atomic_inc(counts + key);
 }
 
-/* Per generator i: its place in the order of bins. */
+/* Per generator i: write it at its position in the order of bins. */
 kernel void place_items(const int size, global const int *keys, global const int *ranks, global const int2 *bins,
                         global int *items)
 {
@@ -109,9 +108,8 @@ kernel void place_items(const int size, global const int *keys, global const int
     items[bins[keys[i]].s0 + ranks[i]] = i;
 }
 
-/* The edge that a bin would have if it held OCCUPANCY generators where a block of bins about it in its grid, 3 each way
-   or as many more as hold SPACING_COUNT, holds as many as it does: a leaf's own few generators tell less of how far
-   neighbors are. */
+/* The edge of a bin with OCCUPANCY generators, estimated from a block of bins around bin b in its grid: 3 along each
+   axis, or more until they hold SPACING_COUNT generators. The few generators of one leaf are a poor estimate. */
 inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
 {
     const int place = b - shape.s0, rows = place / shape.s1, column = place - rows * shape.s1;
@@ -134,8 +132,7 @@ inline REAL local_spacing(int b, REAL edge, int4 shape, global const int2 *bins)
     return edge * (DIM == 2 ? sqrt(share) : cbrt(share));
 }
 
-/* Per bin: sort its items by generator index (a leaf holds a handful, but duplicates may pile up), and note for each
-   place the edge of its leaf and the spacing there. */
+/* Per bin: sort its items by generator index; write the edge of the leaf and the local spacing for each item. */
 kernel void sort_bins(const int size, global const int2 *bins, global const int *bin_grid,
                       global const FRAME *grid_frames, global const int4 *grid_shapes, global int *items,
                       global float *reach, global float *spacing)
@@ -144,7 +141,7 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
     const int g = bin_grid[b];
     const int4 shape = grid_shapes[g];
     if (b - shape.s0 == shape.s1 * shape.s2 * shape.s3)
-        return; /* the end of a grid's last bin */
+        return; /* the end entry of a grid */
     const int first = bins[b].s0, end = bins[b + 1].s0;
     if (first == end || bins[b].s1 != bins[b + 1].s1)
         return;
@@ -157,14 +154,14 @@ kernel void sort_bins(const int size, global const int2 *bins, global const int 
     }
 }
 
-/* Per place p: itself, which is what it holds once the generators have been brought into the order of the bins. */
+/* Per item p: generator p, once the generators have been sorted into the order of the bins. */
 kernel void number_items(const int size, global int *items)
 {
     WORK_ITEM(p);
     items[p] = p;
 }
 
-/* Per place p: the generator's position. */
+/* Per item p: the position of its generator. */
 kernel void gather_items(const int size, global const int *items, global const REAL *points, global REAL *binned)
 {
     WORK_ITEM(p);

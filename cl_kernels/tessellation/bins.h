@@ -1,18 +1,18 @@
-/* Hierarchical bins. Grid 0 covers the domain; a bin that holds many generators is divided by a grid of its own, and so
-   on, so that a leaf holds a few generators however the set is graded. Within a grid the bins lie row by row, and what
-   a divided bin holds stays in its place: the generators in neighboring bins of a row are one run of memory.
+/* Hierarchical bins. Grid 0 covers the domain. A bin with many generators is divided by a grid of its own, and so on:
+   a leaf holds a few generators, however graded the set is. The bins of a grid are stored row by row, and the
+   generators of a divided bin stay in its range. So the generators in neighboring bins of a row are contiguous.
 
    grid_frames[g]  origin (DIM), 1 / edge of a bin
-   grid_shapes[g]  (first bin, bins along x, y, z); behind its bins a grid has one more entry, which only ends the last
-   bins[b]         (first item, next grid): bin b holds the items up to those of bin b + 1, and is divided, by grid
-                   bins[b].s1, if that of bin b + 1 is another */
+   grid_shapes[g]  (first bin, bins along x, y, z); one more entry behind the last bin marks its end
+   bins[b]         (first item, next grid): bin b holds items [bins[b].s0, bins[b + 1].s0); it is divided, by grid
+                   bins[b].s1, if bins[b + 1].s1 differs */
 #include "opencl/real.h"
 
 #define FRAME REAL4
 #define FRAME_INVERSE(f) ((f).s3)
 
-/* Bin index along one axis: monotone in x also after rounding, so that a range of x covers its bins. A NaN is put into
-   bin 0: an index must not leave the grid. */
+/* Bin index along one axis. It is monotone in x, also after rounding: a range of x covers its bins. A NaN goes to bin 0,
+   so that no index leaves the grid. */
 inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
 {
     const REAL t = (x - origin) * inverse;
@@ -20,18 +20,18 @@ inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
     return t > 0 ? (t >= (REAL)side ? side - 1 : (int)t) : 0;
 }
 
-/* By how much what is in a bin may lie outside of it, along an axis, where x is near it and the first grid begins at
-   `start`: positions are put into bins with rounding, and a grid begins where the bin was that it divides, give or take
-   a rounding at each level. They add up to 10. */
+/* Bound of the distance of a generator from its bin, along one axis, for x near the bin and the first grid starting at
+   `start`. Positions are binned with round-off, and each level adds one rounding to the origin of its grid: at most 10
+   in all. */
 inline REAL bin_noise(REAL x, REAL start)
 {
     return 16 * REAL_EPS * (fabs(x) + fabs(start));
 }
 
-/* Share of a bin's edge by which it may be off, too, where it is not near x. */
+/* The same bound as a share of the edge of the bin, for x far from the bin. */
 #define BIN_SHARE (64 * REAL_EPS + R(1e-6))
 
-/* How far a row of bins is from y, give or take `slack`: no more than it is. */
+/* Lower bound of the distance of a row of bins from y, less `slack`. */
 inline REAL row_distance(REAL y, REAL origin, REAL edge, int row, REAL slack)
 {
     const REAL below = origin + row * edge - y;

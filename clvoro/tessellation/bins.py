@@ -15,25 +15,26 @@ from ..opencl.primitives import Scan
 from ..opencl.program import Engine
 
 OCCUPANCY = 2
-"""Generators per bin that the grids aim at: fewer bins to open against fewer generators to test."""
+"""Mean number of generators per bin: a compromise between bins to open and generators to test."""
 SPLIT_COUNT = {2: 10, 3: 18}
-"""A bin that holds more is divided by a grid of its own, in 2D and in 3D, where a division makes more bins. Uniform
-random sets (Poisson, mean 2) stay on one level."""
+"""A bin with more generators is divided by a grid of its own. Uniform random sets (Poisson, mean 2) stay on one
+level."""
 SPACING_COUNT = 8
-"""Generators at least, where a grid has them, from whose number the spacing about a leaf is told."""
+"""Least number of generators from which the spacing around a leaf is estimated."""
 _ZERO = np.zeros(1, np.int32)
 _WORK = ("_keys", "_counts", "_grid_of", "_grid_items", "_starts", "_flags", "_sizes")
-"""Buffers of what nobody asks for once generators are in their bins."""
+"""Buffers that only `build` uses."""
 MAX_CHILD_SIDE = 64
+"""Most bins per axis of a grid below the first."""
 MAX_LEVELS = 8
-"""Enough to tell 1e5 generators apart in a cluster of 1e-12 of the domain; deeper leaves only cost time."""
+"""Enough to separate 1e5 generators in a cluster of 1e-12 of the domain."""
 
 
 def root_edge(extent: np.ndarray, n: int) -> float:
-    """Return the edge of bins that cover a box and hold `OCCUPANCY` of `n` generators each, if these are anywhere.
+    """Return the edge of bins that cover a box and hold `OCCUPANCY` of `n` uniform generators each.
 
-    Across an axis that is thinner there is one bin, and the others say how long it is: a needle of squares as thin as
-    it is would take any number of them.
+    An axis shorter than the edge has one bin. The edge then follows from the other axes, so that a thin box does not
+    get more bins than generators.
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ class BinnedPoints:
     reach : (>= n,) float32
         Edge of the leaf that holds the generator, in the same order.
     spacing : (>= n,) float32
-        The edge that a bin there would have if it held `OCCUPANCY` generators, by the bins about the leaf.
+        Estimated edge of a bin with `OCCUPANCY` generators, from the bins around the leaf.
     bins : (b, 2) int32
     grid_frames : (g, 4) real
     grid_shapes : (g, 4) int32
@@ -80,7 +81,7 @@ class BinnedPoints:
 
 
 class Bins:
-    """Sort generators into bins. Buffers are kept from call to call and grow when needed."""
+    """Sort generators into bins. Buffers stay between calls and grow when needed."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -97,7 +98,7 @@ class Bins:
         self._capacity: tuple[int, int] = (0, 0)
 
     def _reserve(self, n: int, bins: int) -> None:
-        """Make room for `n` generators and `bins` bins, keeping what the bins hold."""
+        """Make room for `n` generators and `bins` bins; the contents of the bins stay."""
         engine, d = self.engine, self.engine.dim
         if n > self._capacity[0]:
             self._keys = engine.empty(n, np.int32)
@@ -126,21 +127,21 @@ class Bins:
         return grown
 
     def _clear(self, array: cla.Array, first: int, count: int) -> None:
-        """Write zeros: by the queue itself, as a kernel takes several times as long."""
+        """Write zeros by a fill command, which is several times as fast as a kernel."""
         size = array.dtype.itemsize
         cl.enqueue_fill(
             self.engine.queue, buffer_of(array), _ZERO, count * size, offset=first * size
         )
 
     def clear(self) -> None:
-        """Let go of all buffers."""
-        self._let_go([name for name in vars(self) if isinstance(getattr(self, name), cla.Array)])
+        """Free all buffers."""
+        self._free([name for name in vars(self) if isinstance(getattr(self, name), cla.Array)])
 
     def clear_work(self) -> None:
-        """Let go of what only `build` takes; the next one makes all anew."""
-        self._let_go([name for name in _WORK if hasattr(self, name)])
+        """Free the buffers that only `build` uses; the next `build` allocates them again."""
+        self._free([name for name in _WORK if hasattr(self, name)])
 
-    def _let_go(self, names: list[str]) -> None:
+    def _free(self, names: list[str]) -> None:
         for name in names:
             delattr(self, name)
         self._capacity = (0, 0)
@@ -199,7 +200,7 @@ class Bins:
             begin, size, grids = end, new_bins, grids + new_grids
         total = begin + size
         engine.run_each(k.place_items, n, self._keys, self._ranks, self._bins, self._items)
-        spacing = self._ranks.view(np.float32)  # ranks have done their work
+        spacing = self._ranks.view(np.float32)  # the ranks are no longer needed
         engine.run_each(
             k.sort_bins, total, self._bins, self._grid_of, self._frames, self._shapes, self._items,
             self._reach, spacing,
@@ -211,8 +212,8 @@ class Bins:
         )  # fmt: skip
 
     def renumber(self, binned: BinnedPoints, n: int) -> None:
-        """Make of `binned` what `build` would make of its `n` generators in the order that they have there.
+        """Update `binned` after its `n` generators have been sorted into its order: item p is now generator p.
 
-        Bit by bit so: they lie in the same bins, and in their order.
+        The result has the same bits as a new `build`.
         """
         self.engine.run_each(self._kernels.number_items, n, binned.items)
