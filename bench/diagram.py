@@ -51,7 +51,7 @@ from clvoro.opencl.profile import Profile, profiled_queue
 from clvoro.opencl.program import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
-from clvoro.tessellation.incremental import Repair
+from clvoro.tessellation.incremental import IncrementalUpdate
 from clvoro.tessellation.polyhedra import Polyhedra
 
 BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
@@ -169,7 +169,7 @@ class Tessellator:
         self.bins = Bins(engine)
         self.box = BOX if engine.dim == 2 else CUBE
         self.cells = Cells(engine) if engine.dim == 2 else Polyhedra(engine)
-        self.repair = Repair(engine) if engine.dim == 2 else None
+        self.incremental = IncrementalUpdate(engine) if engine.dim == 2 else None
         self.given = engine.upload(points)
         self.points = self.order()
         self.turn = 0
@@ -220,12 +220,12 @@ class Tessellator:
     def diagram_warm(self) -> None:
         """Tessellate where the generators moved to, from where they were, to and fro."""
         self.turn = 1 - self.turn
-        if isinstance(self.cells, Polyhedra) or self.repair is None:
+        if isinstance(self.cells, Polyhedra) or self.incremental is None:
             points = self.places[self.turn]
             binned = self.bins.build(self.box, points, self.n)
             self.t = self.cells.tessellate(self.box, points, self.n, binned, self.t)
             return
-        t = self.repair.follow(self.cells, self.box, self.places[self.turn], self.t)
+        t = self.incremental.update(self.cells, self.box, self.places[self.turn], self.t)
         if t is None:  # as a run does where too much has changed
             binned = self.bins.build(self.box, self.places[self.turn], self.n)
             t = self.cells.tessellate(self.box, self.places[self.turn], self.n, binned)

@@ -31,9 +31,9 @@ inline void leave_grid(descent_t *way, int child, int4 place, int4 start)
     way->places[way->depth] = start;
 }
 
-/* The next range of items in the bins from `*next` to `right` of a row; `*next` moves behind it. It spans all these bins
-   if none is divided or they hold at most `whole` items, for which opening divided bins does not pay. Otherwise it is
-   one bin; if that bin is divided and holds more, the range is empty and `*child` is its grid. */
+/* The next range of items in the bins from `*next` to `right` of a row; `*next` moves behind it. It spans all these
+   bins if none is divided or they hold at most `whole` items, for which opening divided bins does not pay. Otherwise it
+   is one bin; if that bin is divided and holds more, the range is empty and `*child` is its grid. */
 inline int2 next_run(global const int2 *row_bins, int *next, int right, int whole, int *child)
 {
     const int2 first = row_bins[*next];

@@ -1,8 +1,8 @@
 #include "tessellation/bins.h"
 #include "opencl/sort.h"
 
-/* A counting sort, level by level. The order of the atomics only changes the ranks within a bin, and the last pass sorts
-   each bin by generator index: the result is deterministic. */
+/* A counting sort, level by level. The order of the atomics only changes the ranks within a bin, and the last pass
+   sorts each bin by generator index: the result is deterministic. */
 
 /* Per generator i: keys[i] = its bin in grid 0, ranks[i] = its place in the bin. counts must be zero. */
 kernel void count_root(const int size, global const REAL *points, const FRAME frame, const int4 shape, global int *keys,
@@ -30,7 +30,8 @@ inline int child_side(int count)
     return side;
 }
 
-/* Per bin b of the newest level [begin, begin + n): whether it is divided, and into how many bins, with the end entry. */
+/* Per bin b of the newest level [begin, begin + n): whether it is divided, and into how many bins, with the end entry.
+ */
 kernel void plan_children(const int size, global const int *counts, const int begin, const int may_divide,
                           global int *grid_flags, global int *child_bins)
 {

@@ -11,8 +11,8 @@
 #define FRAME REAL4
 #define FRAME_INVERSE(f) ((f).s3)
 
-/* Bin index along one axis. It is monotone in x, also after rounding: a range of x covers its bins. A NaN goes to bin 0,
-   so that no index leaves the grid. */
+/* Bin index along one axis. It is monotone in x, also after rounding: a range of x covers its bins. A NaN goes to bin
+   0, so that no index leaves the grid. */
 inline int axis_bin(REAL x, REAL origin, REAL inverse, int side)
 {
     const REAL t = (x - origin) * inverse;

@@ -7,15 +7,15 @@
 #include "simd/eight_cells.h"
 #endif
 
-/* Per place p in bin order: the cell of generator i = items[p] as its list of neighbors, counter-clockwise.
+/* Per item p in bin order: the cell of generator i = items[p] as its list of neighbors, counter-clockwise.
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest corner cannot cut, so the search widens until the
-   square of bins that it has seen covers that circle. Its radius is left in reach[p], which begins as a guess of it.
+   searched square of bins covers that circle. reach[p] is the first guess of the radius, and then the radius.
    Only the first `rows_wanted` generators get cells.
 
-   With s = places[i], which is i for all but the longest:
-   rows[s * SLOT ...]  neighbors j, or -1 - wall; |row_counts[s]| of them, negative if rounding leaves a doubt
+   With s = places[i], which is i for all but the longest rows:
+   rows[s * SLOT ...]  neighbors j, or -1 - wall; |row_counts[s]| of them, negative if round-off leaves a doubt
 
    If `some`, rows that have faces are there already (`hulls.cl`, or where others had too many). */
 kernel void clip_polygons(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
@@ -34,11 +34,11 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
     cell_t cell;
     start_polygon(&cell, i, x, lower, upper);
     int flag = 0;
-    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
+    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
     while (flag == 0) {
         flag = clip_polygon_by_bins(&cell, x, p, w, inner, points, binned, items, bins, grid_frames, grid_shapes);
         const REAL need = sqrt(cutting_distance2(&cell));
-        if (!(need > w)) /* ends with a NaN, too */
+        if (!(need > w)) /* a NaN ends the loop, too */
             break;
         inner = w;
         w = fmin(need, 2 * w);
@@ -48,7 +48,7 @@ kernel void clip_polygons(const int size, const int rows_wanted, global const RE
     places[i] = store_cell(&cell, flag, x, points, i, rows, row_counts, flags);
 }
 
-/* Twice the area of the cell of generator j by the faces that it lists. */
+/* Twice the area of the cell of generator j, from its listed faces. */
 inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *points, const REAL *lower, const REAL *upper)
 {
     const REAL x[2] = {points[2 * j], points[2 * j + 1]};
@@ -67,13 +67,13 @@ inline REAL listed_area(const face_rows_t *rows, int j, global const REAL *point
     return area;
 }
 
-/* Per generator i: bit k of keep[its first slot ...] marks a neighbor that also lists i. Rounding may let one
-   of two cells, which is then doubtful, see a face of no length that the other does not see; such a face is dropped, so
-   that the graph is symmetric. If what it cuts off is more than rounding of the box, or than a share of one of the two
-   cells, generators are too close to tell apart (from far away, two an ulp apart have the same bisector), and that is
-   flagged. What borders on a generator without a row is not looked at.
+/* Per generator i: bit k of keep[its first slot ...] marks a neighbor that also lists i. With round-off one of two
+   cells may have a face of zero length that the other lacks; the cell is doubtful, and the face is dropped, so that the
+   graph is symmetric. If such a face cuts off more than the round-off of the box, or more than a share of one of the
+   cells, the generators are too close (from far away, two generators one ulp apart have the same bisector): a flag is
+   set. Faces with generators without a row are not checked.
 
-   If `repaired`, fits[i] tells of rows to whose neighbors i stands between the same two; of others it is not read. */
+   If `repaired`, fits[i] is 1 for rows that are consistent with all neighbors; otherwise it is not read. */
 kernel void match_polygon_faces(const int size, global const int *places, global const int *slots,
                                 global const int *slot_counts, global const int *old_starts,
                                 global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
@@ -89,9 +89,9 @@ kernel void match_polygon_faces(const int size, global const int *places, global
         counts[i] = n;
         return;
     }
-    const bool some = flags[1]; /* which the kernels before have written: no race with other work-items here */
+    const bool some = flags[1]; /* written by earlier kernels: no race */
     if (repaired ? fits[i] : !some) {
-        /* All its faces are seen from both sides, as it fits its neighbors', or every new row is certain. */
+        /* All its faces have two sides: the row is consistent, or every new row is certain. */
         for (int left = n, k = 0; left > 0; left -= 32, ++k)
             keep[place + k] = left < 32 ? (1u << left) - 1 : ~0u;
         counts[i] = n;
@@ -130,7 +130,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
                   cut <= share * listed_area(&rows, j, points, lower, upper)))
                 atomic_or(flags, FLAG_COLLAPSED);
             if (repaired) {
-                /* Now `before` and `after` follow each other. */
+                /* `before` and `after` are now adjacent. */
                 atomic_and(fits + i, 0);
                 if (a >= 0)
                     atomic_and(fits + a, 0);
@@ -204,13 +204,13 @@ kernel void measure_faces(const int size, global const int *starts, global const
     }
 }
 
-/* Cells around a vertex from which on faces that are nothing may have been left out one after the other, and how far
-   off each other the places may be that they take for it. */
+/* Number of cells around a vertex from which short faces may have been dropped one after the other, and the largest
+   distance of the positions that these cells compute for the vertex. */
 #define MANY_AROUND 8
 #define MOST_SPREAD (64 * REAL_EPS)
 
-/* Do cells around corner c of cell i, which is at v, take places for it that are too far off, if they are many? The one
-   with the least angle there asks, if not more do: no more than 45 degrees. */
+/* Whether many cells around corner c of cell i, at v, compute positions for it that are too far apart. Checked by the
+   cell with the smallest angle there, at most 45 degrees. */
 inline bool is_spread(const int size, global const int *starts, global const int *neighbors, int i, int c, REAL2 v,
                       const REAL *x, global const REAL *points, const REAL *lower, const REAL *upper)
 {
@@ -238,11 +238,10 @@ inline bool is_spread(const int size, global const int *starts, global const int
     return false;
 }
 
-/* Per new cell, where some are doubtful: is its area positive, and do neighbors have their common faces where it has
-   them, if one of the two is doubtful? Where two cells see different neighbors, having left out different faces, what
-   they disagree about must be as little as rounding makes of the box, and no more than a share of the cell; else too
-   many were left out, which is flagged, as are faces that cross others: those are short beside their corners' distance
-   from the generators, which is what rounds. */
+/* Per new cell, if some cells are doubtful: check that its area is positive, and that its faces lie where its neighbors
+   have them, if one of the two is doubtful. Two cells that dropped different faces may differ by no more than the
+   round-off of the box and a share of the cell; otherwise too many faces were dropped, and a flag is set. Crossing
+   faces are flagged, too: they are short compared with the distance of their corners from the generators. */
 kernel void check_doubtful(const int size, global const int *places, global const int *slot_counts,
                            global const int *starts, global const int *neighbors, global const REAL *volumes,
                            global const REAL *points, const REAL4 box_lower, const REAL4 box_upper, const REAL share,
@@ -266,20 +265,20 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     if (!any)
         return;
     REAL2 v = corner(i, x, row[n - 1], row[0], points, lower, upper);
-    /* PoCL 6 with LLVM 18 dies of `right = right && ...` in this loop: conditions are written out. */
+    /* PoCL 6 with LLVM 18 crashes on `right = right && ...` in this loop. */
     for (int k = 0; k < n; ++k) {
         const int j = row[k], before = row[k == 0 ? n - 1 : k - 1], after = row[k == n - 1 ? 0 : k + 1];
         const REAL2 u = v;
         v = corner(i, x, j, after, points, lower, upper);
         if (j < 0) {
-            /* Opposite walls never meet: what was between them is lost. */
+            /* Opposite walls never meet: the faces between them were lost. */
             if (after < 0 && (-1 - j) / 2 == (-1 - after) / 2)
                 right = false;
             continue;
         }
         if (j >= size)
             continue;
-        /* Corner k. With all faces there is nothing to be put right. */
+        /* Corner k. If no face was dropped, there is nothing to check. */
         if (doubtful && !flags[5] && is_spread(size, starts, neighbors, i, starts[i] + k, u, x, points, lower, upper))
             right = false;
         const REAL2 e = v - u;
@@ -293,8 +292,8 @@ kernel void check_doubtful(const int size, global const int *places, global cons
             continue;
         }
         const int p = other[q == 0 ? m - 1 : q - 1], s = other[q == m - 1 ? 0 : q + 1];
-        /* The area is no more than the gap times the distance of the farther corner. With all faces a gap that places
-           of corners have by rounding is none. */
+        /* The area is at most the gap times the distance of the farther corner. If no face was dropped, a gap
+           within round-off does not count. */
         const REAL reach2 = fmax(dot(u, u), dot(v, v));
         if (p != after) {
             const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
@@ -311,8 +310,8 @@ kernel void check_doubtful(const int size, global const int *places, global cons
         atomic_or(flags, FLAG_COLLAPSED);
 }
 
-/* Per generator i, all of whose rows are new: leave out of keep[its first slot ...] the faces that cross others. Where
-   two do, both go, and the four cells meet in a point. counts[i] is how many stay. */
+/* Per generator i, for a new graph: remove crossing faces from keep[its first slot ...]. Of two that cross both go, and
+   the four cells share a vertex. counts[i] is the number of remaining faces. */
 kernel void drop_loops(const int size, global const int *places, global const int *slot_counts,
                        global const int *starts, global const int *neighbors, global uint *keep, global int *counts,
                        global int *flags)

@@ -1,7 +1,7 @@
 #include "opencl/real.h"
 
-/* The difference along axis a from one generator to another. -DFOLD_0, -DFOLD_1: periods of a graph that is folded (see
-   seam.cl), in which a neighbor is the nearest image of its generator; 0 along an axis with walls. */
+/* The difference along axis a from one generator to another. -DFOLD_0, -DFOLD_1: periods of a folded graph (see
+   ghost_images.cl), in which a neighbor is the nearest image of its generator; 0 along an axis with walls. */
 #ifdef FOLD_0
 #define FOLD(a) ((a) == 0 ? R(FOLD_0) : R(FOLD_1))
 inline REAL fold_period(REAL d, REAL period)
@@ -10,8 +10,8 @@ inline REAL fold_period(REAL d, REAL period)
     return d > period / 2 ? d - period : (d < -period / 2 ? d + period : d);
 }
 #define BETWEEN(a, from, to) (FOLD(a) > 0 ? fold_period((to) - (from), FOLD(a)) : (to) - (from))
-/* From one neighbor to another, which may lie more than half a period from each other: by the directions to them,
-   whose differences are exact along a period (see geometry/domain.h). */
+/* From one neighbor to another, which may be more than half a period apart: the difference of the directions to them,
+   which is exact along a periodic axis (see geometry/domain.h). */
 #define APART(a, to_one, to_other, one, other) (FOLD(a) > 0 ? (to_other) - (to_one) : (other) - (one))
 #else
 #define FOLD(a) 0
@@ -19,13 +19,13 @@ inline REAL fold_period(REAL d, REAL period)
 #define APART(a, to_one, to_other, one, other) ((other) - (one))
 #endif
 
-/* From a place x to generator j. */
+/* From a position x to generator j. */
 inline REAL2 direction_of(const REAL *x, int j, global const REAL *points)
 {
     return (REAL2)(BETWEEN(0, x[0], points[2 * j]), BETWEEN(1, x[1], points[2 * j + 1]));
 }
 
-/* The point as far from u and from v as from 0; u2 and v2 are their squares. */
+/* The circumcenter of 0, u and v; u2 and v2 are the squares of u and v. */
 inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
 {
     const REAL inverse = R(0.5) / difference_of_products(u.s0, v.s1, u.s1, v.s0);
@@ -33,8 +33,8 @@ inline REAL2 circumcenter(REAL2 u, REAL2 v, REAL u2, REAL v2)
                    difference_of_products(v2, u.s0, u2, v.s0) * inverse);
 }
 
-/* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators themselves: the
-   cells that share the corner agree on it to a rounding. */
+/* Corner between the faces a and b (in this order) of generator i, relative to x_i, from the generators, so that
+   all cells that share the corner get the same point up to one rounding. */
 inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *points, const REAL *lower, const REAL *upper)
 {
     if (a >= 0 && b >= 0) {
@@ -42,8 +42,8 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
         const REAL2 w = (REAL2)(APART(0, u.s0, v.s0, points[2 * a], points[2 * b]),
                                 APART(1, u.s1, v.s1, points[2 * a + 1], points[2 * b + 1]));
         const REAL u2 = dot(u, u), v2 = dot(v, v), w2 = dot(w, w);
-        /* The circumcenter of the triangle, relative to x_i; where the other two are near each other its squares would
-           cancel, and it is taken relative to one of those. */
+        /* The circumcenter of the triangle, relative to x_i. If the other two generators are near each other, the
+           squares cancel, and it is computed relative to one of them. */
         if (w2 > R(1e-3) * u2)
             return circumcenter(u, v, u2, v2);
         return circumcenter(w, -u, w2, u2) + u;
@@ -68,7 +68,7 @@ inline REAL2 corner(int i, const REAL *x, int a, int b, global const REAL *point
     return axis == 0 ? (REAL2)(level - x[0], along) : (REAL2)(along, level - x[1]);
 }
 
-/* From what cell j takes for a corner, between its faces p and q, to that corner of cell i, relative to x_i. */
+/* From the corner of cell j between its faces p and q to the same corner of cell i, relative to x_i. */
 inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REAL *points, const REAL *lower,
                         const REAL *upper)
 {
@@ -77,7 +77,7 @@ inline REAL2 corner_gap(REAL2 mine, int i, int j, int p, int q, global const REA
     return mine + from - corner(j, x, p, q, points, lower, upper);
 }
 
-/* Where j stands in a row of n; n if it does not. */
+/* Index of j in a row of n; n if it is missing. */
 inline int place_in_row(global const int *row, int n, int j)
 {
     int q = 0;

@@ -1,6 +1,5 @@
-/* Rows of faces while a diagram is made: those that stay as they were lie in the previous graph, the others in slots of
-   SLOT. A row that is longer takes several which follow each other, from spare ones: few cells are, and all would need
-   as much room. */
+/* Rows of faces while a diagram is made. Unchanged rows stay in the previous graph, new ones lie in slots of SLOT
+   entries. A longer row takes several consecutive spare slots. */
 #include "tessellation/short_faces.h"
 
 #ifndef ROW_CAPACITY
@@ -10,18 +9,18 @@
 #error "build with -DSLOT=faces that have room in a slot, whose bits in a word"
 #endif
 
-/* Bits of flags[0], in which kernels report what went wrong; flags[1] is not 0 where there are doubtful cells. The next
-   spare slot is flags[3], flags[4] how many slots there are; flags[5]: faces that are nothing but rounding stay. */
-#define FLAG_FULL 1     /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than spare slots are left for */
-#define FLAG_COINCIDE 2 /* two generators at the same place */
+/* flags[0]: error bits, below. flags[1]: not 0 if there are doubtful cells. flags[3]: next spare slot. flags[4]: number
+   of slots. flags[5]: faces no longer than round-off stay. */
+#define FLAG_FULL 1      /* a cell has more faces than CELL_CAPACITY or ROW_CAPACITY, or than the spare slots hold */
+#define FLAG_COINCIDE 2  /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
 #define FLAG_LOOPED 32   /* faces cross */
 
 #define ELSEWHERE INT_MAX
 
-/* places[i]  first slot of row i, or -1 if it is the previous graph's
-   counts[s]  faces from slot s on, negative if rounding leaves a doubt; ELSEWHERE: they begin in the slot that this one
-              names */
+/* places[i]  first slot of row i, or -1 if it lies in the previous graph
+   counts[s]  faces from slot s on, negative if round-off leaves a doubt; ELSEWHERE: the row begins in the slot given
+              there */
 typedef struct {
     global const int *places, *slots, *counts, *old_starts, *old_neighbors;
 } face_rows_t;
@@ -46,16 +45,16 @@ inline global const int *face_row(const face_rows_t *rows, int i, int *n)
     return rows->slots + place * SLOT;
 }
 
-/* Is row i new, and has its cell left a doubt? */
+/* Whether row i is new and its cell doubtful. */
 inline bool is_doubtful_row(const face_rows_t *rows, int i)
 {
     const int place = rows->places[i];
     return place >= 0 && rows->counts[place] < 0;
 }
 
-/* Write the faces of a clipped cell to its slot, or to spare ones, the least label first: a row depends on the cell
-   alone, not on the order in which it was clipped. Its count is negative if rounding might let a neighbor see the
-   faces otherwise. Returns the first slot. */
+/* Write the faces of a clipped cell to its slot, or to spare slots, starting with the least label: the row does not
+   depend on the order of clipping. The count is negative if round-off might give a neighbor other faces. Returns the
+   first slot. */
 inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *points, int place, global int *slots,
                       global int *counts, global int *flags)
 {
@@ -69,7 +68,7 @@ inline int store_cell(cell_t *cell, int flag, const REAL *x, global const REAL *
             flag = FLAG_FULL;
     }
     if (flag == 0 && cell->n > SLOT) {
-        /* Which of them is chance; what they will hold is not. */
+        /* The slot depends on the order of work-items, its content does not. */
         const int taken = (cell->n + SLOT - 1) / SLOT;
         to = atomic_add(flags + 3, taken);
         if (to + taken > flags[4]) {

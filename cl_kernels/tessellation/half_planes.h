@@ -1,20 +1,20 @@
-/* On which side of a bisector two others meet, to twice the digits of REAL: cells that share a corner agree about it,
-   however close to each other generators are, however far away, and however many of them lie on a circle. */
+/* The side of a bisector on which two other bisectors intersect, with twice the digits of REAL. All cells that share a
+   corner get the same answer, also for close, distant or cocircular generators. */
 #include "tessellation/corner.h"
 #include "opencl/double_word.h"
 
-/* Largest square of the distance of generators that are near each other, as a share of that to them. */
+/* Generators are near each other if the square of their distance is at most this share of that to the cell. */
 #define NEAR_EACH_OTHER R(0.1)
-/* What double words may be off by in `beyond_corner`, as a share of the terms of its sum. */
+/* Relative error bound of double words in `beyond_corner`, as a share of the terms of its sum. */
 #define WIDE_NOISE (64 * REAL_EPS * REAL_EPS)
 
-/* What is hardly ever called is kept out of the way of what is. */
+/* Rare code is kept out of line. */
 #define OUT_OF_LINE __attribute__((noinline))
 
-/* BETWEEN without rounding; along a period it has none (see corner.h). */
+/* BETWEEN without round-off; along a periodic axis it is exact (see corner.h). */
 #define BETWEEN_WIDE(a, from, to) (FOLD(a) > 0 ? (wide_t)(BETWEEN(a, from, to), 0) : wide_sum(to, -(from)))
 
-/* The half-plane { y : n.y <= level } of the plane. */
+/* The half-plane { y : n.y <= level }. */
 typedef struct {
     wide_t x, y, level;
 } wide_half_plane_t;
@@ -24,7 +24,7 @@ inline wide_t wide_cross(wide_half_plane_t a, wide_half_plane_t b)
     return wide_add(wide_product(a.x, b.y), -wide_product(a.y, b.x));
 }
 
-/* What is nearer to a generator at x than to the one of `label`, or within a wall of the box; relative to x. */
+/* The points nearer to a generator at x than to that of `label`, or inside a wall of the box; relative to x. */
 inline wide_half_plane_t half_plane_of(const REAL *x, int label, global const REAL *points, const REAL *lower,
                                        const REAL *upper)
 {
@@ -45,7 +45,7 @@ inline wide_half_plane_t half_plane_of(const REAL *x, int label, global const RE
     return h;
 }
 
-/* The difference of two generators' half-planes: what is nearer to b than to a. Its line meets theirs where they meet.
+/* The difference of the half-planes of two generators: the points nearer to b than to a. The three lines share a point.
  */
 inline wide_half_plane_t between_half_planes(wide_half_plane_t a, wide_half_plane_t b)
 {
@@ -55,7 +55,7 @@ inline wide_half_plane_t between_half_planes(wide_half_plane_t a, wide_half_plan
     return h;
 }
 
-/* Square of the distance of two half-planes' generators, and of one from x. */
+/* Squared distance of the generators of two half-planes, and of one from x. */
 inline REAL squared_distance_between(wide_half_plane_t a, wide_half_plane_t b)
 {
     const REAL x = b.x.s0 - a.x.s0, y = b.y.s0 - a.y.s0;
@@ -67,11 +67,11 @@ inline REAL squared_distance_of(wide_half_plane_t h)
     return h.x.s0 * h.x.s0 + h.y.s0 * h.y.s0;
 }
 
-/* How far the corner of the cell of x between its faces a and b, in counter-clockwise order, lies beyond the bisector
-   with generator j, times the distance to that: the determinant of the three lines' equations (of generators:
-   Shewchuk's InCircle) by that of two. Of generators that are near each other, and far from x, one takes the place of
-   the other first, as products of long distances lose the digits in which they differ. 0 if double words cannot tell:
-   then all lines meet in a point. */
+/* Signed distance of the corner of the cell of x between its faces a and b (counter-clockwise) beyond the bisector with
+   generator j, times the distance to j: the determinant of the three line equations (for generators: Shewchuk's
+   InCircle) over that of two. For two generators near each other and far from x, their difference replaces one of them,
+   as products of long distances lose the digits in which they differ. 0 if double words cannot decide: all lines share
+   a point. */
 OUT_OF_LINE REAL beyond_corner(const REAL *x, int a, int b, int j, global const REAL *points, const REAL *lower,
                                const REAL *upper)
 {
@@ -91,8 +91,8 @@ OUT_OF_LINE REAL beyond_corner(const REAL *x, int a, int b, int j, global const 
     return sure && turn > 0 ? sum / turn : 0;
 }
 
-/* Which of two half-planes does the line a + t e leave first? Negative: u; 0 if double words cannot tell, or the line
-   does not lead out of both. All is relative to one place. */
+/* The half-plane that the line a + t e leaves first. Negative: u. 0: double words cannot decide, or the line does not
+   leave both. All coordinates are relative to one point. */
 inline REAL leaves_later(wide_half_plane_t u, wide_half_plane_t v, wide_t a_x, wide_t a_y, REAL2 e)
 {
     const wide_t e_x = (wide_t)(e.s0, 0), e_y = (wide_t)(e.s1, 0);

@@ -1,49 +1,50 @@
 #include "tessellation/corner.h"
 #include "tessellation/face_rows.h"
 
-/* The diagram of generators that have moved a little, from the one before, without a search.
+/* Incremental update: the diagram of generators that moved a little, from the previous diagram, without a search.
 
    The intersection C_i of the box and the half-planes of *any* generators holds the cell V_i of them all. If around
    every corner of C_i the cells that meet there name each other as neighbors, in the order of that corner, the C_i fit
-   together without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbors from
-   before, check that every cell is still convex and fits its neighbors (`check_rows`), clip those that do not by all
-   the neighbors of their neighbors (`clip_marked`), check these (`check_clipped`), and so on until all fit.
+   together without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbors of the
+   previous diagram, check that every cell is still convex and consistent with its neighbors (`check_rows`), clip the
+   others by all neighbors of their neighbors (`clip_marked`), check these (`check_clipped`), and repeat until all are
+   consistent.
 
    In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbors are nearest images. Cells without gap might
    cover that more than once; their volumes tell. */
 
-/* A cell with more is clipped anew each time: it is rare, and would hold up its work-group. */
+/* Cells with more faces are clipped again in each step: they are rare and would delay their work-group. */
 #define CHECKED_FACES 16
 
-/* Is a gap between corners, given by its square, no more than their rounding? d2 is the squared distance of the
-   generators across the face. In single precision a spacing may be a thousand roundings of a position, and a corner is
-   worse. */
+/* Whether a gap between corners, given by its square, is within their round-off. d2 is the squared distance of the
+   generators across the face. In single precision a spacing may be only a thousand roundings of a position, and a
+   corner is less accurate. */
 inline bool is_rounding(REAL gap2, REAL d2)
 {
     return gap2 <= 16 * POSITION_NOISE * POSITION_NOISE && gap2 <= (IS_DOUBLE ? R(1e-6) : R(1e-4)) * d2;
 }
 
-/* Does i stand between `before` and `after` in a row of n? */
+/* Whether i stands between `before` and `after` in a row of n. */
 inline bool stands_between(int i, int before, int after, global const int *row, int n)
 {
     const int q = place_in_row(row, n, i);
     return q < n && row[q == 0 ? n - 1 : q - 1] == before && row[q == n - 1 ? 0 : q + 1] == after;
 }
 
-/* Does cell j see its face with i between the same two corners as i does? In i's row j stands between `before` and
-   `after`, at corners u and v; so in j's row i must stand between `after` and `before`, or what it stands between must
-   meet it there but for rounding. */
+/* Whether cells i and j have their common face between the same two corners. In the row of i, j stands between `before`
+   and `after`, at corners u and v. So in the row of j, i must stand between `after` and `before`, or between faces that
+   meet it at the same corners up to round-off. */
 inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, REAL2 v, REAL d2, global const int *row, int n,
                           global const REAL *points, const REAL *lower, const REAL *upper)
 {
     const int q = place_in_row(row, n, i);
     if (q == n) {
-        /* A face of no length, which i is then doubtful of, will be dropped. */
+        /* A face of zero length, which makes i doubtful, will be dropped. */
         const REAL2 e = v - u;
         return is_rounding(dot(e, e), d2);
     }
     const int p = row[q == 0 ? n - 1 : q - 1], s = row[q == n - 1 ? 0 : q + 1];
-    /* Where four or more cells meet in a point, cells may leave out different faces of no length. */
+    /* Where four or more cells share a vertex, cells may drop different faces of zero length. */
     bool fits = true;
     if (p != after) {
         const REAL2 gap = corner_gap(v, i, j, p, i, points, lower, upper);
@@ -56,8 +57,8 @@ inline bool fits_neighbor(int i, int j, int before, int after, REAL2 u, REAL2 v,
     return fits;
 }
 
-/* A corner of cell i between the faces a and b (in this order) in the directions u and v, as `corner` computes it: from
-   the directions, which are at hand, where both are generators. */
+/* The corner of cell i between the faces a and b (in this order) with the directions u and v. The same as `corner`, but
+   uses the known directions where both faces belong to generators. */
 inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, global const REAL *points,
                         const REAL *lower, const REAL *upper)
 {
@@ -68,7 +69,7 @@ inline REAL2 row_corner(int i, const REAL *x, int a, int b, REAL2 u, REAL2 v, gl
     return w2 > R(1e-3) * u2 ? circumcenter(u, v, u2, dot(v, v)) : corner(i, x, a, b, points, lower, upper);
 }
 
-/* Check the row of generator i; see `check_rows`. Is it not as it should be? */
+/* Check the row of generator i; see `check_rows`. True if it is wrong. */
 inline bool check_row(int i, global const int *starts, global const int *neighbors, global const REAL *points,
                       const REAL *lower, const REAL *upper, global int *fits, global int *marks)
 {
@@ -135,12 +136,13 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
 #include "simd/eight_rows.h"
 #endif
 
-/* Per generator i: marks[i] = 1, and its neighbors' at the face in question, where the neighbors from before no
-   longer enclose a cell whose every face is longer than rounding, or do not fit together. Marks begin as 0; many may
-   write one at a time. fits[i] remembers that the rows themselves fit, so that only what has changed is looked up.
+/* Per generator i: set marks[i], and the mark of the neighbor at the face in question, where the previous neighbors no
+   longer enclose a cell with all faces longer than round-off, or where the rows are inconsistent. Marks start at 0;
+   several work-items may write the same 1. fits[i] records that the rows are consistent, so that only changed rows are
+   looked up.
 
-   In LANES a work-item takes so many generators, and there are so many fewer work-items. Of these only every one in
-   `stride` is done, and what is not as it should be counted in flags[2]; or, as the `rest`, the others. */
+   With LANES a work-item checks LANES generators. Only one work-item in `stride` runs and counts wrong rows in
+   flags[2]; with `rest`, the others run. */
 kernel void check_rows(const int size, const int stride, const int rest, global const int *starts,
                        global const int *neighbors, global const REAL *points, const REAL4 box_lower,
                        const REAL4 box_upper, global int *fits, global int *marks, global int *flags)
@@ -162,7 +164,7 @@ kernel void check_rows(const int size, const int stride, const int rest, global 
         atomic_add(flags + 2, found);
 }
 
-/* Per generator i: the marked ones, in order; slots are the exclusive sums of the marks. */
+/* Per generator i: list it if it is marked; slots are the exclusive prefix sums of the marks. */
 kernel void list_marked(const int size, global const int *marks, global const int *sums, global int *listed)
 {
     WORK_ITEM(i);
@@ -170,7 +172,7 @@ kernel void list_marked(const int size, global const int *marks, global const in
         listed[sums[i]] = i;
 }
 
-/* Clip by the generators of row i that are near enough. */
+/* Clip by those generators of row i that are near enough. */
 inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *row, int n, global const REAL *points)
 {
     for (int k = 0; k < n; ++k) {
@@ -190,8 +192,8 @@ inline int clip_polygon_by_row(cell_t *cell, const REAL *x, global const int *ro
 }
 
 #if IN_LANES
-/* Per LANES generators that are listed first of all: their cells among a few candidates, into slots from 0 on, or
-   slot_counts[w] = 0 where one is left to be clipped. */
+/* Per LANES listed generators of the first round: their cells from a few candidates, in slots from 0 on;
+   slot_counts[w] = 0 where a cell remains to be clipped. */
 kernel void wrap_marked(const int size, const int count, global const int *listed, global const int *places,
                         global int *slots, global int *slot_counts, global const int *old_starts,
                         global const int *old_neighbors, global const REAL *points, const REAL4 box_lower,
@@ -203,8 +205,8 @@ kernel void wrap_marked(const int size, const int count, global const int *liste
 }
 #endif
 
-/* Per listed generator: its cell, clipped by its neighbors and theirs, into slot base + w. If `wrapped`, rows that
-   have faces are there already. */
+/* Per listed generator w: its cell, clipped by its neighbors and their neighbors, in slot base + w. If `wrapped`, rows
+   with faces are complete. */
 kernel void clip_marked(const int size, global const int *listed, const int base, const int wrapped,
                         global const int *places, global int *slots, global int *slot_counts,
                         global const int *old_starts, global const int *old_neighbors, global const REAL *points,
@@ -229,7 +231,7 @@ kernel void clip_marked(const int size, global const int *listed, const int base
             flag = clip_polygon_by_row(&cell, x, other, m, points);
         }
 #ifdef FOLD_0
-    /* There is no wall across a period: whoever is left with one has lost his neighbors. */
+    /* A periodic axis has no wall: a cell with one has lost its neighbors. */
     for (int k = 0; k < cell.n; ++k)
         if (cell.faces[k] < 0 && FOLD((-1 - cell.faces[k]) / 2) > 0)
             flag = FLAG_FULL;
@@ -238,13 +240,13 @@ kernel void clip_marked(const int size, global const int *listed, const int base
               count = abs(slot_counts[to]);
     if (places[i] < 0)
         return;
-    /* Clipped once more, it may leave some that have been found to fit it. */
+    /* A cell that is clipped again may lose neighbors that were consistent with it. */
     for (int k = 0; k < n; ++k)
         if (row[k] >= 0 && place_in_row(slots + to * SLOT, count, row[k]) == count)
             atomic_and(fits + row[k], 0);
 }
 
-/* Per listed generator: put its new row in the place of the old one. It fits until a neighbor says otherwise. */
+/* Per listed generator: replace its old row by the new one, which is consistent until a neighbor finds otherwise. */
 kernel void place_clipped(const int size, global const int *listed, const int base, global const int *slots,
                           global const int *slot_counts, global int *places, global int *marks, global int *fits)
 {
@@ -261,7 +263,7 @@ inline void mark_both(int i, int j, global int *marks)
     atomic_or(marks + j, 1);
 }
 
-/* Per listed generator: mark it and its neighbors where they do not fit together. Those who were not clipped have been
+/* Per listed generator: mark it and its neighbors where they are inconsistent. Cells that were not clipped have been
    checked against each other before. */
 kernel void check_clipped(const int size, global const int *listed, global const int *places, global const int *slots,
                           global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
@@ -290,7 +292,7 @@ kernel void check_clipped(const int size, global const int *listed, global const
         if (!fits_neighbor(i, j, a, b, u, v, dot(d, d), other, m, points, lower, upper))
             mark_both(i, j, marks);
     }
-    /* Whom the row from before names is told as well: he may still name i. */
+    /* Neighbors of the previous row are marked, too: they may still list i. */
     const int end = old_starts[i + 1];
     for (int k = old_starts[i]; k < end; ++k) {
         const int j = old_neighbors[k];
@@ -302,7 +304,7 @@ kernel void check_clipped(const int size, global const int *listed, global const
         if (place_in_row(other, m, i) == m)
             continue;
         atomic_and(fits + j, 0);
-        if (!is_doubtful_row(&rows, j)) /* else its faces will be matched with its neighbors' */
+        if (!is_doubtful_row(&rows, j)) /* else its faces are matched with those of its neighbors */
             mark_both(i, j, marks);
     }
 }

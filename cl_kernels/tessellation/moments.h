@@ -1,8 +1,7 @@
 #include "opencl/real.h"
 
-/* Twice the area of a cell, and with it its first and second moments, unscaled: sums over triangles of the origin and a
-   piece of its outline. A triangle 0, v, w has the centroid (v + w) / 3 and the second moments area (v v + w w + (v +
-   w) (v + w)) / 12. */
+/* Twice the area of a cell, and its unscaled first and second moments: sums over triangles of the origin and one edge.
+   A triangle 0, v, w has the centroid (v + w) / 3 and the second moments area (v v + w w + (v + w) (v + w)) / 12. */
 typedef struct {
     REAL area, cx, cy, xx, xy, yy;
 } moments_t;

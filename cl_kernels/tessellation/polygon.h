@@ -1,4 +1,4 @@
-/* A convex polygon around its generator, and its clip by the half-plane nearer to the generator than to a neighbor.
+/* A convex polygon around its generator, and its clipping by the bisector with a neighbor.
    Coordinates are relative to the generator: differences of close positions are exact, so cells stay accurate
    whatever their size. */
 #include "tessellation/half_planes.h"
@@ -8,7 +8,7 @@
 #error "build with -DCELL_CAPACITY=faces that a cell may have while it is clipped"
 #endif
 
-/* Distances from a bisector that rounding may turn, as shares of d or of the corners' distance. */
+/* Uncertainty of distances from a bisector, as a share of d or of the distance of the corners. */
 #define IN_DOUBT (256 * REAL_EPS)
 
 /* Face k runs counter-clockwise from corner k to corner k + 1 and belongs to faces[k]: a generator, or -1 - wall. */
@@ -18,19 +18,19 @@ typedef struct {
     REAL y[CELL_CAPACITY];
     int faces[CELL_CAPACITY];
     REAL reach2; /* largest squared distance of a corner from the generator */
-    /* Whose cell it is, and where. */
+    /* The generator and its position. */
     int generator;
     REAL position[2], lower[2], upper[2];
 } cell_t;
 
-/* Square of the distance from which on no generator cuts the cell: twice the reach. Corners of faces that are nearly
-   parallel are off by far more than they round, and so is that: by eps over their angle. */
+/* Square of the distance beyond which no generator cuts the cell: twice the reach. Corners of nearly parallel faces
+   have an error of eps over the angle, and so has the reach. */
 inline REAL cutting_distance2(const cell_t *cell)
 {
     return 4 * cell->reach2 * R(1.01);
 }
 
-/* The whole box around generator x. */
+/* Start with the whole box around generator x. */
 inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL *lower, const REAL *upper)
 {
     cell->generator = i;
@@ -53,10 +53,10 @@ inline void start_polygon(cell_t *cell, int i, const REAL *x, const REAL *lower,
     cell->reach2 = rx * rx + ry * ry;
 }
 
-/* Where a face of the cell meets the bisector that cuts it between corners `in` and `out`, which lie at the signed
-   distances s_in <= 0 < s_out of it. Interpolation rounds by eps of the face's length, and by more where the two are
-   nearly parallel; where that is much, also beside the distance of the generators (near-duplicates; in single precision
-   where it is a ten-thousandth), the corner is computed from the generators instead. */
+/* Intersection of a face with the bisector that cuts it between the corners `in` and `out`, at signed distances
+   s_in <= 0 < s_out. Interpolation has an error of eps times the length of the face, more if the two are nearly
+   parallel. Where this is large, also compared with the distance of the generators (near-duplicates; in single
+   precision a ten-thousandth), the corner is computed from the generators instead. */
 inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out, int face, int neighbor, REAL d2,
                       global const REAL *points)
 {
@@ -65,7 +65,7 @@ inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out
     const REAL across = s_out - s_in, ab2 = dot(ab, ab);
     if (across * across < R(4e-3) * d2 * ab2 || d2 < R(1e-3) * ab2) {
         const REAL2 v = corner(cell->generator, cell->position, face, neighbor, points, cell->lower, cell->upper);
-        /* Parallel ones do not meet, whatever rounding says. */
+        /* Parallel lines do not intersect, whatever the round-off. */
         if (dot(v, v) <= 4 * cell->reach2)
             return v;
     }
@@ -73,8 +73,8 @@ inline REAL2 cut_face(const cell_t *cell, int in, int out, REAL s_in, REAL s_out
     return a + ab * (s / (s - s_out));
 }
 
-/* Signed distance, times |d|, of corner k from the bisector with the neighbor at x + d: from the places of generators
-   where rounding may have put the corner on the other side. */
+/* Signed distance, times |d|, of corner k from the bisector with the neighbor at x + d. Computed from the positions of
+   the generators if round-off may have moved the corner to the other side. */
 inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt, int neighbor,
                    global const REAL *points)
 {
@@ -86,7 +86,7 @@ inline REAL beyond(const cell_t *cell, int k, const REAL *d, REAL d2, REAL doubt
                          cell->upper);
 }
 
-/* The first corner that is beyond the bisector, where some are in doubt; n if there is none. */
+/* The first corner beyond the bisector, if some are in doubt; n if there is none. */
 OUT_OF_LINE int first_beyond(const cell_t *cell, const REAL *d, REAL d2, REAL doubt, int neighbor,
                              global const REAL *points)
 {
@@ -103,13 +103,14 @@ inline void copy_corner(cell_t *cell, int to, int from)
     cell->faces[to] = cell->faces[from];
 }
 
-/* Cut off what is nearer to the neighbor at x + d: the points y with y.d > d.d / 2. False if the cell is full. */
+/* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2. False if the cell
+   is full. */
 inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, bool seen_before,
                          global const REAL *points)
 {
     const int n = cell->n;
     const REAL doubt = IN_DOUBT * sqrt(d2 * fmax(d2, cell->reach2));
-    /* A corner that is cut off, if there is one: as a rule all are far from doubt. */
+    /* A corner to remove, if any. Usually no corner is in doubt. */
     int first = 0;
     REAL s_first = 0, far = -REAL_MAX;
     for (; first < n; ++first) {
@@ -129,7 +130,7 @@ inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, boo
             if (cell->faces[k] == neighbor)
                 return true;
 
-    /* The corners cut off are first..last, cyclically. */
+    /* The removed corners are first..last, cyclically. */
     int last = first, before = first == 0 ? n - 1 : first - 1;
     REAL s_last = s_first, s_before = beyond(cell, before, d, d2, doubt, neighbor, points);
     while (s_before > 0 && before != last) {
@@ -146,12 +147,12 @@ inline bool clip_polygon(cell_t *cell, const REAL *d, REAL d2, int neighbor, boo
         after = last == n - 1 ? 0 : last + 1;
         s_after = beyond(cell, after, d, d2, doubt, neighbor, points);
     }
-    /* Where the bisector meets the faces before -> first and last -> after. */
+    /* The bisector cuts the faces before -> first and last -> after. */
     const int last_face = cell->faces[last];
     const REAL2 va = cut_face(cell, before, first, s_before, s_first, cell->faces[before], neighbor, d2, points);
     const REAL2 vb = cut_face(cell, after, last, s_after, s_last, last_face, neighbor, d2, points);
 
-    int a; /* where the new corners go: a and a + 1 */
+    int a; /* indices of the new corners: a and a + 1 */
     if (first <= last && first > 0) {
         /* The gap lies inside the list: move the tail so that it is two wide. */
         const int shift = 2 - (last - first + 1);

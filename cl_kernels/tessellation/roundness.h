@@ -1,8 +1,8 @@
 #include "opencl/real.h"
 
 #if DIM == 2
-/* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Nearly all cells have so few sides that it need not be
-   evaluated. */
+/* 4 n tan(pi / n): perimeter^2 / area of a regular polygon. Tabulated for the numbers of sides that
+   nearly all cells have. */
 constant REAL ROUNDNESS[12] = {0,
                                0,
                                0,

@@ -1,6 +1,6 @@
 #include "opencl/real.h"
 
-/* Per generator i: its row of the new graph in the place of that of the previous one. */
+/* Per generator i: copy its row of the new graph over the previous graph. */
 kernel void put_graph(const int size, global const int *new_starts, global const int *new_neighbors, global int *starts,
                       global int *neighbors)
 {

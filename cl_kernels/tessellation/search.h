@@ -1,12 +1,12 @@
-/* The search for generators that may cut a cell, through the bins around it. */
+/* The search for generators that may cut a cell in 3D, through the bins around it. */
 #include "tessellation/bins.h"
 #include "tessellation/clip.h"
 
-/* Bits of the word in which kernels report what went wrong. */
+/* Bits of the error word of kernels. */
 #define FLAG_FULL 1      /* a cell has more faces than FACE_CAPACITY */
 #define FLAG_COINCIDE 2  /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
-#define FLAG_DOUBT 8     /* nothing wrong: there are doubtful cells, to be matched with their neighbors */
+#define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
 #define FLAG_NARROW 16   /* nor is it that some faces may be no wider than their vertices round; see loops.cl */
 
 #ifndef MAX_DEPTH
@@ -16,7 +16,7 @@
 #define BATCH 256 /* generators that are sorted by distance at a time */
 #define SHELLS 32
 
-/* The flag that tells of an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
+/* The flag for an outcome of clip_polyhedron or clip_polyhedron_by_row, or 0. */
 inline int flag_of(int what)
 {
     return what < CLIP_FULL
@@ -24,7 +24,7 @@ inline int flag_of(int what)
                : (what == CLIP_FULL ? FLAG_FULL : (what == CLIP_COINCIDE ? FLAG_COINCIDE : FLAG_COLLAPSED));
 }
 
-/* Where to look for neighbors. */
+/* The arrays to search for neighbors. */
 typedef struct {
     global const REAL *points, *binned;
     global const int *items;
@@ -33,15 +33,15 @@ typedef struct {
     global const int4 *grid_shapes;
 } search_t;
 
-/* Generators that may cut a cell: places in bin order. */
+/* Generators that may cut a cell, as items in bin order. */
 typedef struct {
     int n;
     int places[BATCH];
     REAL d2[BATCH];
 } batch_t;
 
-/* Clip the cell by the generators of a batch, about the nearest first: by shells of 1 / `per_shell` in squared
-   distance. Returns FLAG_* or 0. */
+/* Clip the cell by a batch of generators, roughly the nearest first: in shells of squared distance 1 / `per_shell`.
+   Returns FLAG_* or 0. */
 inline int clip_by_batch(cell_t *cell, REAL4 x, batch_t *batch, REAL per_shell, bool warm, const search_t *in)
 {
     ushort ends[SHELLS], order[BATCH];
@@ -83,7 +83,7 @@ inline int2 bin_range(REAL x, REAL w, REAL origin, REAL inverse, int side)
     return (int2)(axis_bin(x - w, origin, inverse, side), axis_bin(x + w, origin, inverse, side));
 }
 
-/* Add those of the items begin .. end - 1 to the batch that may cut the cell; when it is full, clip by it.
+/* Add those of the items begin .. end - 1 that may cut the cell to the batch; clip when it is full.
    Returns FLAG_* or 0. */
 inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_t *batch, REAL per_shell, bool warm,
                       const search_t *in)
@@ -113,16 +113,16 @@ inline int take_items(cell_t *cell, REAL4 x, int own, int begin, int end, batch_
     return 0;
 }
 
-/* A grid that is open: which, where it was left (layer, row, part of the row, bin), and whether its own bin was opened
-   for the inner cube. */
+/* An open grid: its number, its position (layer, row, part of the row, bin), and whether its bin lies in the inner
+ * cube. */
 typedef struct {
     int grid, iz, iy, part, bin;
     bool inside;
 } open_grid_t;
 
-/* Clip the cell of the generator at place `own` by every generator in the bins that the cube of half-width w covers
-   and the cube of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than twice
-   the farthest vertex. Returns FLAG_* or 0. */
+/* Clip the cell of item `own` by all generators in the bins within the cube of half-width w but outside the cube of
+   half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest vertex.
+   Returns FLAG_* or 0. */
 inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL inner, bool warm, const search_t *in)
 {
     open_grid_t open[MAX_DEPTH]; /* from the root down */
@@ -142,7 +142,7 @@ inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL 
         const REAL inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
         const int2 ys = bin_range(x.s1, w, frame.s1, inverse, shape.s2);
         const int2 zs = bin_range(x.s2, w, frame.s2, inverse, shape.s3);
-        /* What the inner cube has taken. */
+        /* The bins of the inner cube. */
         int2 done_x = (int2)(0, -1), done_y = done_x, done_z = done_x;
         if (here.inside) {
             done_x = bin_range(x.s0, inner, frame.s0, inverse, shape.s1);
@@ -150,7 +150,7 @@ inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL 
             done_z = bin_range(x.s2, inner, frame.s2, inverse, shape.s3);
         }
         int child = -1;
-        open_grid_t next = here; /* where to go on */
+        open_grid_t next = here; /* where to continue */
         int iy = here.iy, part = here.part, at = here.bin;
         for (int iz = max(here.iz, zs.s0); iz <= zs.s1 && child < 0; ++iz, iy = -1) {
             const REAL away_z = row_distance(x.s2, frame.s2, edge, iz, edge * BIN_SHARE + noise_z);
@@ -163,7 +163,7 @@ inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL 
                 const REAL span = left2 < w * w ? sqrt(left2) * (1 + 8 * REAL_EPS) + edge * R(1e-6) : w;
                 const int2 xs = bin_range(x.s0, span, frame.s0, inverse, shape.s1);
                 global const int2 *row_bins = in->bins + shape.s0 + (iz * shape.s2 + iy) * shape.s1;
-                /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
+                /* Parts of a row: left of the searched bins, these (only grids below may hold more), right of them. */
                 const bool row_done = layer_done && iy >= done_y.s0 && iy <= done_y.s1;
                 while (part < 3) {
                     int from = xs.s0, to = xs.s1;
@@ -177,12 +177,12 @@ inline int clip_polyhedron_by_bins(cell_t *cell, REAL4 x, int own, REAL w, REAL 
                         at = -1;
                         continue;
                     }
-                    /* A run of leaves beside each other is a run of items. */
+                    /* Adjacent leaves are a contiguous range of items. */
                     const int2 first = row_bins[from];
                     int2 end = row_bins[to + 1];
                     at = to + 1;
                     if (first.s1 != end.s1) {
-                        /* There are divided bins ahead: one bin at a time. */
+                        /* Divided bins follow: one bin at a time. */
                         end = row_bins[from + 1];
                         at = from + 1;
                         if (first.s1 != end.s1) {

@@ -1,9 +1,9 @@
-/* Walks around a vertex of a graph in the plane, from the corner of one cell to that of the next, by the graph alone.
+/* Walks around a vertex of a planar graph, from the corner of one cell to that of the next, by the graph alone.
    Corner k of a cell lies between its faces k - 1 and k. */
 
-/* Move from the corner before face *at of *cell to the same one of the next cell around the vertex: clockwise, beyond
-   that face, or `back`, beyond the face before it. False, and nowhere, where that is a wall or leads to a cell without
-   a row: one of `size` or more, or, in a graph that is not symmetric, one that does not list this one. */
+/* Move from the corner before face *at of *cell to the corner of the next cell around the vertex: clockwise, across
+   that face, or with `back` across the face before it. False, without a move, at a wall, at a cell without a row (an
+   index of `size` or more), or, in an asymmetric graph, at a cell that does not list this one. */
 inline bool walk(const int size, global const int *starts, global const int *neighbors, int *cell, int *at, bool back)
 {
     const int first = starts[*cell], last = starts[*cell + 1] - 1;
@@ -19,8 +19,8 @@ inline bool walk(const int size, global const int *starts, global const int *nei
     return true;
 }
 
-/* The next corner of a walk from corner c of cell i around their vertex: clockwise and, where a wall ends that, from c
-   on the other way. False at its end: at a wall or, in a symmetric graph, where it began. */
+/* The next corner of a walk from corner c of cell i around their vertex: clockwise and, after a wall, from c
+   counter-clockwise. False at the end: at a wall or, in a symmetric graph, at the start. */
 inline bool walk_on(const int size, global const int *starts, global const int *neighbors, int i, int c, int *cell,
                     int *at, bool *back)
 {
@@ -34,13 +34,12 @@ inline bool walk_on(const int size, global const int *starts, global const int *
     return walk(size, starts, neighbors, cell, at, true);
 }
 
-/* Does the walk around one end of face k of cell i come by its other end? No face of a diagram does that. Two that
-   cross do: each is seen from both sides, where rounding has let one pair of four nearly cocircular generators decide
-   otherwise than the other pair. */
+/* Whether the walk around one end of face k of cell i passes its other end. This never happens in a diagram, but for
+   two crossing faces: with round-off, both pairs of four nearly cocircular generators may become neighbors. */
 inline bool is_loop(const int size, global const int *starts, global const int *neighbors, int i, int k)
 {
     const int other = k + 1 < starts[i + 1] ? k + 1 : starts[i];
-    const int most = starts[size]; /* steps: rounding may leave a graph that is not symmetric */
+    const int most = starts[size]; /* bound of the steps: with round-off the graph may be asymmetric */
     int cell = i, at = k, steps = 0;
     bool back = false;
     while (steps++ < most && walk_on(size, starts, neighbors, i, k, &cell, &at, &back))

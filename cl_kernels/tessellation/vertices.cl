@@ -2,12 +2,11 @@
 
 #include "tessellation/vertex_walk.h"
 
-/* Corners of cells and the vertices that they share. Corner k of cell i, at place c = starts[i] + k, lies between its
-   faces k - 1 and k. Walking from cell to cell around the point visits all corners that are one vertex; the least of
-   them owns it. The walk uses the graph alone, so it needs no tolerance and holds for any number of cells at a
-   point. */
+/* Corners of cells and the vertices that they share. Corner k of cell i, with the index c = starts[i] + k, lies between
+   its faces k - 1 and k. A walk from cell to cell visits all corners of one vertex; the least of them owns it. The walk
+   uses the graph alone: it needs no tolerance and works for any number of cells at a vertex. */
 
-/* Per generator i: owners[c] of each of its corners. */
+/* Per generator i: owners[c] for each of its corners c. */
 kernel void find_vertex_owners(const int size, global const int *starts, global const int *neighbors,
                                global int *owners, global int *is_owner)
 {
@@ -23,8 +22,8 @@ kernel void find_vertex_owners(const int size, global const int *starts, global 
     }
 }
 
-/* Per generator i: cell_vertices[c] = number of the vertex at corner c; the owner writes its position, relative to the
-   box's frame. ids are the prefix sums of is_owner. */
+/* Per generator i: cell_vertices[c] = index of the vertex at corner c; the owner writes its position in the frame of
+   the box. ids are the prefix sums of is_owner. */
 kernel void place_polygon_vertices(const int size, global const REAL *points, const REAL4 box_lower,
                                    const REAL4 box_upper, global const int *starts, global const int *neighbors,
                                    global const int *owners, global const int *ids, global int *cell_vertices,

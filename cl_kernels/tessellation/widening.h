@@ -1,12 +1,12 @@
-/* The search for generators that may cut a cell of the plane, through the bins around it. */
+/* The search for generators that may cut a cell in 2D, through the bins around it. */
 #include "tessellation/bin_descent.h"
 #include "tessellation/face_rows.h"
 
-/* A search over more than WIDE bins to each side is worth a look at where it may end in each row. */
+/* Only searches over more than WIDE bins to each side bound the range of each row. */
 #define WIDE 4
 
-/* The x, relative to the generator, between which a row of bins may hold what cuts the cell: within the circle about a
-   corner through the generator. Wider by a little, as all rounds. */
+/* Range of x, relative to the generator, in which a row of bins may hold generators that cut the cell: the circles
+   around the corners through the generator, widened by the round-off. */
 inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
 {
     REAL2 extent = (REAL2)(REAL_MAX, -REAL_MAX);
@@ -22,10 +22,9 @@ inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
     return extent;
 }
 
-/* Clip the cell of the generator at place `own` by every generator in the bins that the square of half-width w covers
-   and the square of half-width `inner` does not (inner < 0: no bin was opened before), except what is farther than
-   twice the farthest corner meanwhile. Rows are taken from x outwards, as near generators cut most. Returns FLAG_* or
-   0. */
+/* Clip the cell of item `own` by all generators in the bins within the square of half-width w but outside the square of
+   half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest corner. Rows
+   are searched from x outwards, as near generators cut most. Returns FLAG_* or 0. */
 inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, global const REAL *points,
                                 global const REAL *binned, global const int *items, global const int2 *bins,
                                 global const FRAME *grid_frames, global const int4 *grid_shapes)
@@ -46,7 +45,7 @@ inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, RE
         const int bottom = axis_bin(x[1] - w, frame.s1, inverse, shape.s2);
         const int top = axis_bin(x[1] + w, frame.s1, inverse, shape.s2);
         const int middle = axis_bin(x[1], frame.s1, inverse, shape.s2);
-        /* The places and rows that the inner square has taken. */
+        /* The columns and rows of the inner square. */
         int4 done = (int4)(0, -1, 0, -1);
         if (place.s3)
             done = (int4)(axis_bin(x[0] - inner, frame.s0, inverse, shape.s1),
@@ -56,7 +55,7 @@ inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, RE
         const int last_turn = 2 * max(middle - bottom, top - middle);
         int turn = place.s0, part = place.s1, ix = place.s2;
         int child = -1;
-        bool inside = false; /* is that in a bin which was opened? */
+        bool inside = false; /* whether that lies in a searched bin */
         while (turn <= last_turn) {
             const int row = turn & 1 ? middle + (turn + 1) / 2 : middle - turn / 2;
             const REAL away = row_distance(x[1], frame.s1, edge, row, slack);
@@ -66,7 +65,7 @@ inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, RE
                 ix = -1;
                 continue;
             }
-            /* Parts of a row: left of what is done, done (only grids below may have more), right of it. */
+            /* Parts of a row: left of the searched bins, these (only grids below may hold more), right of them. */
             const bool row_done = row >= done.s2 && row <= done.s3;
             global const int2 *row_bins = bins + shape.s0 + row * shape.s1;
             int least = left, most = right;
@@ -85,11 +84,11 @@ inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, RE
                     ix = -1;
                     continue;
                 }
-                /* A run of leaves beside each other is a run of items. */
+                /* Adjacent leaves are a contiguous range of items. */
                 int2 first = row_bins[bin], end = row_bins[to + 1];
                 ix = to + 1;
                 if (first.s1 != end.s1) {
-                    /* There are divided bins ahead: one bin at a time. */
+                    /* Divided bins follow: one bin at a time. */
                     end = row_bins[bin + 1];
                     ix = bin + 1;
                     if (first.s1 != end.s1) {

@@ -1,4 +1,4 @@
-"""The tessellation: each cell cut by neighbors and walls, its faces and moments (`cells.cl`; `hulls.cl` on CPUs)."""
+"""Cells in 2D: each clipped by its neighbors and walls; faces and moments (`cells.cl`; `hulls.cl` on CPUs)."""
 
 from __future__ import annotations
 
@@ -31,28 +31,29 @@ from .device_diagram import (
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 
 CELL_CAPACITY = 24
-"""Faces that a cell may have while it is clipped."""
+"""Most faces of a cell while it is clipped."""
 ROW_CAPACITY = SLOT
-"""Faces that a cell may have in the end. Both are doubled where a mesh needs more."""
+"""Most faces of a finished cell. Both capacities are doubled when a mesh needs more."""
 LARGEST_ROW, LARGEST_ELSEWHERE = 4096, 512
-"""Faces that a cell may have, or a few more: on CPUs in boxes. On GPUs each of very many work-items has room of its own
-for so many; to trim such a cell by as many edges takes minutes."""
+"""Largest row capacity: on CPUs in boxes, and elsewhere. On a GPU every work-item has private memory of that size; in a
+polygon, clipping such a cell by as many edges takes minutes."""
 LANES, EIGHTS = 8, 16
-"""Cells that a CPU's work-item makes at a time, in lanes of vectors, and how many times `hulls.cl` does so."""
+"""Cells that one work-item of a CPU builds at once in vector lanes, and number of such batches in `hulls.cl`."""
 FIRST_REACH = 1.9
-"""How far it looks for neighbors at first, or less, in units of the spacing that the bins know."""
+"""Largest first search radius of `hulls.cl`, in units of the local spacing of the bins."""
 
 
 class Cells:
-    """Tessellate a box.
+    """Tessellate a box in 2D.
 
-    Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
+    Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
+    one is complete.
     """
 
     lanes = 1
-    """Cells that a work-item measures, or checks."""
+    """Cells that one work-item measures or checks."""
     searches = True
-    """Whether neighbors are searched for in bins."""
+    """Whether neighbors are searched in bins."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -76,7 +77,7 @@ class Cells:
 
     @property
     def defines(self) -> dict[str, object]:
-        """The capacities, as kernels that work on the rows must be built with."""
+        """The capacities, for building kernels that work on the rows."""
         return {
             "CELL_CAPACITY": self.cell_capacity,
             "ROW_CAPACITY": self.row_capacity,
@@ -84,10 +85,10 @@ class Cells:
         }
 
     def _reserve(self, n: int) -> None:
-        """Make room for the diagrams of `n` generators, but for their faces."""
+        """Allocate the arrays per cell for `n` generators."""
         engine, d = self.engine, self.engine.dim
         if n > self._capacity:
-            # The old ones are let go of first.
+            # Free the old arrays first.
             self._of_cells = self._views = {}
             self._of_cells = {
                 "starts": engine.empty(n + 1, np.int32),
@@ -104,10 +105,10 @@ class Cells:
             self._n = n
 
     def _reserve_faces(self, n: int, m: int) -> None:
-        """Make room for the `m` faces of `n` cells.
+        """Allocate the arrays for `m` half-faces of `n` cells.
 
-        Cells and walls are the nodes of a planar graph, which has at most 3 (n + 4) - 6 edges: two faces each, or one
-        at a wall. Rounding may add some, where many generators lie on a circle.
+        Cells and walls are the nodes of a planar graph with at most 3 (n + 4) - 6 edges. An edge has two half-faces, or
+        one at a wall. Round-off may add some where many generators lie on a circle.
         """
         most = max(m, 6 * n + 12)
         if most > self._room:
@@ -123,7 +124,7 @@ class Cells:
     def restore(
         self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
     ) -> Tessellation:
-        """Return the diagram of `points` (n, d) that was `saved`, as it was: with room for so many more faces."""
+        """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"])
         self._reserve(n)
         self._reserve_faces(n, m + spare)
@@ -145,10 +146,10 @@ class Cells:
         Parameters
         ----------
         exact : bool
-            Refuse generators so close together that rounding makes more than `EXACT_SHARE` of a cell uncertain. Without
-            it only more than `ROUGH_SHARE`.
+            Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
+            otherwise more than `ROUGH_SHARE`.
         wanted : int, optional
-            Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
+            Number of cells to build, those of the first generators. Their faces with other cells are not matched.
 
         Raises
         ------
@@ -161,7 +162,7 @@ class Cells:
         """
         engine, total, n = self.engine, n, n if wanted is None else wanted
         if self.row_capacity > ROW_CAPACITY and n > self._enlarged_for:
-            # One mesh had a cell of very many faces; a larger one need not pay for that.
+            # The capacities were enlarged for a smaller mesh: start again with the default ones.
             self._build(CELL_CAPACITY, ROW_CAPACITY)
         self._reserve(n)
         spare, whole = spare_slots(n), False
@@ -170,7 +171,7 @@ class Cells:
                 rows = self.take_rows(n, spare=spare, whole=whole)
                 flags, m = self._clip(rows, box, points, total, n, binned, exact)
                 if flags & CROWDED:
-                    # All anew: as many as have been asked for by now, and more by those that were not yet.
+                    # Repeat with twice the slots that were requested so far.
                     spare = 2 * (int(rows.flags.get()[3]) - n)
                     continue
                 t = None
@@ -181,7 +182,7 @@ class Cells:
                     return t
                 if whole or flags & COINCIDE:
                     raise CloseError(points, total)
-                # Faces that were left out one by one may have been too many together.
+                # Too many short faces may have been dropped: keep all.
                 whole = True
 
     def _clip(
@@ -194,7 +195,7 @@ class Cells:
         binned: BinnedPoints,
         exact: bool,
     ) -> tuple[int, int]:
-        """Make the rows of the first `n` of `total` generators and match them: see `_match` for what is returned."""
+        """Build and match the rows of the first `n` of `total` generators; return as `_match` does."""
         engine, corners = self.engine, box.device_corners(self.engine.real)
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
         wrap = self._wrap
@@ -210,12 +211,12 @@ class Cells:
                 self._kernels.clip_polygons, total, np.int32(n), binned.points, binned.items, *search,
                 points, *corners, np.int32(some), rows.slots, rows.counts, rows.places, rows.flags,
             )  # fmt: skip
-            # Every row is new: there are none from before.
+            # Every row is new.
             found = self._match(rows, box, points, n, rows.places, rows.places, exact)
             if not found[0] & FULL or found[0] & CROWDED:
                 return found
             self._enlarge(n)
-            # Only the cells that had too many faces, whose rows are empty; doubts about others stay.
+            # Clip only the cells that had too many faces: their rows are empty. Doubts about others stay.
             some = True
             self._reset_flags(n, len(rows.counts), byte_count=4)
 
@@ -227,10 +228,10 @@ class Cells:
         previous: Tessellation,
         fits: cla.Array,
     ) -> Tessellation | None:
-        """Return the diagram of `points` whose rows are those of `previous` or, where `rows` has a place, new ones.
+        """Return the diagram of `points` from the rows of `previous`, replaced by `rows` where these have a slot.
 
-        None if they do not make a diagram. `fits` (n,) has 1 for rows of which every neighbor names the generator
-        between the right two; 0 is put where a face that rounding has made is left out.
+        None if the rows are not consistent. `fits` (n,) is 1 for a row if every neighbor lists the generator between
+        the right two neighbors; it becomes 0 where a face made by round-off is dropped.
         """
         n, old = previous.n, (previous.starts, previous.neighbors)
         flags, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)
@@ -239,7 +240,7 @@ class Cells:
         return self._measure(rows, box, points, n, *old, m, flags, exact=False)
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
-        """Return `t`, a diagram of `box`, with what is known of faces in full precision, in arrays of its own."""
+        """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""
         if t.face_measures.dtype == self.engine.real:
             return t
         engine, m = self.engine, len(t.neighbors)
@@ -251,9 +252,9 @@ class Cells:
         return replace(t, face_measures=measures, face_centroids=centroids)
 
     def _read_flags(self) -> tuple[int, int]:
-        """Read what has gone wrong, and m.
+        """Return the flags and the number of half-faces.
 
-        With `DOUBT` where any cell is doubtful, and `CROWDED` where there were too few spare slots.
+        `DOUBT`: some cells are doubtful. `CROWDED`: there were too few spare slots.
         """
         wrong, doubtful, m, spare, slots, _ = (int(v) for v in self._flags.get())
         wrong |= (DOUBT if doubtful else 0) | (CROWDED if spare > slots else 0)
@@ -270,7 +271,7 @@ class Cells:
         exact: bool,
         fits: cla.Array | None = None,
     ) -> tuple[int, int]:
-        """Make the rows symmetric; return the flags and the number of faces."""
+        """Make the rows symmetric; return the flags and the number of half-faces."""
         engine, starts = self.engine, rows.starts
         engine.run_each(
             self._kernels.match_polygon_faces, n, rows.places, rows.slots, rows.counts, old_starts,
@@ -281,9 +282,9 @@ class Cells:
         return self._count(rows, starts, n)
 
     def _count(self, rows: FaceRows, counts: cla.Array, n: int) -> tuple[int, int]:
-        """Set `rows.starts` by the faces of each of `n` rows; return the flags and the number of faces."""
+        """Set `rows.starts` from the lengths of `n` rows; return the flags and the number of half-faces."""
         self._scan.exclusive(counts, rows.starts, n)
-        # The host reads all at once.
+        # One read fetches all.
         word = rows.starts.dtype.itemsize
         cl.enqueue_copy(
             self.engine.queue, buffer_of(rows.flags), buffer_of(rows.starts), byte_count=word, src_offset=n * word,
@@ -303,12 +304,11 @@ class Cells:
         flags: int,
         exact: bool,
     ) -> Tessellation | None:
-        """Write graph and measures of the rows; None if its doubtful cells do not fit."""
+        """Write graph and measures of the rows; return None if doubtful cells are inconsistent."""
         engine, corners, starts = self.engine, box.device_corners(self.engine.real), rows.starts
         self._reserve_faces(n, m)
         new, faces = self._views, self._of_faces
-        # The previous graph is read meanwhile, or stays if this call is broken off: unless no row is from there, and
-        # nothing can go wrong any more.
+        # The new graph may overwrite the previous one directly only if no row is read from there and no check follows.
         direct = old_starts is rows.places and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
         engine.run(
@@ -347,7 +347,7 @@ class Cells:
         neighbors: cla.Array,
         exact: bool,
     ) -> Tessellation | None:
-        """Measure anew without the faces that cross others, in the graph by `rows.starts` and `neighbors`."""
+        """Measure again without the crossing faces of the graph (`rows.starts`, `neighbors`)."""
         counts = self.engine.scratch(n + 1, np.int32)
         self._reset_flags(n, len(rows.counts), byte_count=4)
         self.engine.run_each(
@@ -365,10 +365,9 @@ class Cells:
     def take_rows(
         self, n: int, slots: int | None = None, spare: int = 0, whole: bool = False
     ) -> FaceRows:
-        """Return `n` rows of faces, of which as many as `slots` (by default all) may be new; no flags.
+        """Return `n` empty rows of faces, of which `slots` (by default all) may be new; the flags are reset.
 
-        `spare` are the slots, behind these, for rows that are longer than one. If they are to be `whole`, faces that
-        are no longer than rounding stay.
+        `spare` slots follow, for rows longer than one slot. With `whole`, faces no longer than round-off stay.
         """
         engine, slots = self.engine, n if slots is None else slots
         first, slots = slots, slots + spare
@@ -385,23 +384,23 @@ class Cells:
         )  # fmt: skip
 
     def _reset_flags(self, first: int, slots: int, whole: bool = False, **part: Any) -> None:
-        """Take the flags back, or a part of them, where `slots` from the `first` on are to spare."""
+        """Reset the flags, or a part of them; `first` and `slots` are the range of the spare slots."""
         if (first, slots, whole) not in self._no_flags:
             if len(self._no_flags) >= 4:
                 self._no_flags.clear()
-            # To be copied on the device: the host would have to wait for a transfer.
+            # A copy on the device avoids a blocking transfer.
             start = self.engine.upload([0, 0, 0, first, slots, whole], np.int32)
             self._no_flags[first, slots, whole] = start
         start = self._no_flags[first, slots, whole]
         cl.enqueue_copy(self.engine.queue, buffer_of(self._flags), buffer_of(start), **part)
 
     def _enlarge(self, n: int) -> None:
-        """Double the capacities, for `n` cells."""
+        """Double the capacities, for a mesh of `n` cells."""
         many = self.engine.group_size == 1 and not self.engine.trims
         if self.row_capacity >= (LARGEST_ROW if many else LARGEST_ELSEWHERE):
             raise ClvoroError(
-                f"a cell has more than {self.row_capacity} faces, and so many are not supported: remove or perturb "
-                "cocircular generators, or give thin layers a spacing nearer to the size of the cells beside them"
+                f"a cell has more than {self.row_capacity} faces, expected fewer; remove or perturb cocircular "
+                "generators, or give thin layers a spacing closer to the size of the cells beside them"
             )
         self._build(2 * self.cell_capacity, 2 * self.row_capacity)
         self._enlarged_for = n

@@ -1,4 +1,4 @@
-"""A diagram on the device: what the stages that make one hand on to all others."""
+"""A diagram on the device, as all other stages use it, and the error for generators that are too close."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ if TYPE_CHECKING:
     from .clipped.trim import Trimmed
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
-"""Share of a cell that rounding may make uncertain: in a diagram, and on a run's way, where all will move again."""
-# Bits of tessellation/face_rows.h; its other means cells that collapsed.
+"""Largest share of a cell that round-off may make uncertain: in a final diagram, and in the steps of a run."""
+# Bits of the flags in tessellation/face_rows.h and tessellation/search.h.
 FULL, COINCIDE, DOUBT, NARROW, LOOPED = 1, 2, 8, 16, 32
 
 
 class CloseError(InputError):
-    """Generators cannot be told apart; stages know them by their order alone, and by places of the device.
+    """Generators too close to be distinguished. Positions are those of the device until `within` converts them.
 
     Parameters
     ----------
     points : (n or more, d) real, on the device
-        In its coordinates.
+        Generators in normalized coordinates.
     n : int
-        How many there are.
+        Number of generators.
 
     Attributes
     ----------
     place : (d,) float
-        Of one of the two that are closest to each other: cells far away may be the first to show it.
+        Position of one generator of the closest pair.
     gap : float
-        From that to the other.
+        Distance of the pair.
     """
 
     def __init__(self, points: cla.Array, n: int) -> None:
@@ -53,23 +53,23 @@ class CloseError(InputError):
         other = "" if self.real == np.float64 else ", or use dtype='float64'"
         return (
             f"generators at {place}, {gap:.3g} apart, {what} in {self.real}, which leaves too much of a cell to "
-            f"rounding; remove one or move it{other}"
+            f"round-off; remove one or move it{other}"
         )
 
     def within(self, domain: Domain) -> InputError:
-        """Return what to tell the caller, in his units."""
+        """Return the error in the units of `domain`."""
         gap, thin = self.gap * domain.frame[1], float(domain.extent.min())
         if 0 < thin < gap:
             wider = "" if self.real == np.float64 else "use dtype='float64', or "
             return InputError(
                 f"{domain} is {thin:.3g} thin where generators are {gap:.3g} apart, which leaves too much of a cell to "
-                f"rounding in {self.real}; {wider}give it a thickness nearer to the size of cells"
+                f"round-off in {self.real}; {wider}give it a thickness closer to the size of cells"
             )
-        return InputError(self._text(whereabouts(domain, self.place), gap))
+        return InputError(self._text(domain_position(domain, self.place), gap))
 
 
-def whereabouts(domain: Domain, place: np.ndarray) -> np.ndarray:
-    """Return the position in `domain` of a place (d,) in the device's coordinates, which may be that of an image."""
+def domain_position(domain: Domain, place: np.ndarray) -> np.ndarray:
+    """Return the position in `domain` of a point (d,) in normalized coordinates, also if it is that of an image."""
     origin, scale = domain.frame
     x, lower = origin + scale * place, np.array(domain.lower)
     return np.where(domain.periodic, lower + (x - lower) % domain.extent, x)
@@ -97,7 +97,7 @@ class Tessellation:
     outlines : tuple of arrays
         The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
     trimmed : Trimmed, optional
-        How such a diagram came to be.
+        How the boundary cut such a diagram.
     narrow : bool
         Whether faces (in 3D) may be as narrow as their vertices round: of those, what has no loop in `Loops` is none.
     near : bool
@@ -123,9 +123,9 @@ class Tessellation:
 def restored(
     points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]
 ) -> Tessellation:
-    """Return the diagram of `points` of which `arrays` are to hold what was `saved`, by the names of its fields.
+    """Return the diagram of `points` with `saved` copied into `arrays`, by the names of the fields of `Tessellation`.
 
-    Arrays may have more rows, which are filled with zeros.
+    Arrays may have more rows; these become zero.
     """
     for name, array in arrays.items():
         known = len(saved[name])

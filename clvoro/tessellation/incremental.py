@@ -1,4 +1,4 @@
-"""The diagram of generators that have moved a little, from the one before, without a search (`repair.cl`)."""
+"""Incremental update: the diagram of generators that moved a little, from the previous one (`incremental.cl`)."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from .device_diagram import Tessellation
 from .face_rows import spare_slots
 
 MAX_ROUNDS = 6
-"""Rounds of clipping and checking, beyond which a diagram is made anew."""
+"""Most rounds of clipping and checking; after that the diagram is built from scratch."""
 MAX_SHARE = 0.4
-"""Share of the cells that may have to be clipped at first: a diagram made anew costs less than one mostly repaired."""
+"""Largest share of cells to clip in the first round. Beyond it a new diagram costs less."""
 AGAIN_SHARE = 0.1
-"""The same for cells that are clipped once more, and those found out later, together."""
+"""The same for all later rounds together."""
 SAMPLE, SAMPLED_FROM = 8, 200_000
-"""Of so many work-items one is done first, where cells are so many: to know soon whether too much has changed."""
+"""With at least `SAMPLED_FROM` cells, one work-item in `SAMPLE` runs first, to estimate how many cells changed."""
 WRONG_SHARE = 0.23
-"""Share of cells in this sample that may be wrong: with the neighbors concerned they come to `MAX_SHARE`."""
+"""Largest share of wrong cells in this sample. With their neighbors they amount to `MAX_SHARE`."""
 FEW = 256
-"""Cells that are clipped one by one; of more, those that change but once are found eight at a time, on CPUs."""
+"""From this many cells on, CPUs first build cells eight at a time in vector lanes."""
 
 
-class Repair:
-    """Carry a diagram over to moved generators: keep the neighbors, check that the cells fit, clip those that do not.
+class IncrementalUpdate:
+    """Update a diagram for moved generators: keep the neighbors, check all cells, clip those that do not fit.
 
-    The result is the Voronoi diagram itself, not an approximation: see the argument in `repair.cl`.
+    The result is the exact Voronoi diagram; `incremental.cl` has the proof.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -42,22 +42,22 @@ class Repair:
         self._scan = Scan(engine)
         self._kernels: dict[tuple[object, ...], SimpleNamespace] = {}
         self._n = -1
-        # Weakly: the diagram of another mesh need not be kept in memory for this.
+        # A weak reference, so that this stage does not keep the diagram of another mesh in memory.
         self._last: ReferenceType[Tessellation] | None = None
 
-    def follow(
+    def update(
         self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
     ) -> Tessellation | None:
-        """Tessellate `box` by `points` (n, d), the generators of `previous` where they are now.
+        """Tessellate `box` by `points` (n, d), the new positions of the generators of `previous`.
 
-        Returns None where too much has changed, or generators coincide: the diagram is then to be made anew.
+        Returns None if too much has changed, or if generators coincide. The diagram must then be built from scratch.
         """
         with self.engine.workspace.frame():
-            t = self._follow(cells, box, points, previous)
+            t = self._update(cells, box, points, previous)
         self._last = None if t is None else ref(t)
         return t
 
-    def _follow(
+    def _update(
         self, cells: Cells, box: ClipBox, points: cla.Array, previous: Tessellation
     ) -> Tessellation | None:
         engine, n = self.engine, previous.n
@@ -117,7 +117,7 @@ class Repair:
     def _check(
         self, kernel: cl.Kernel, items: int, n: int, args: tuple[object, ...], flags: cla.Array
     ) -> bool:
-        """Check all rows, by so many work-items; of many, stop where a sample tells that too much has changed."""
+        """Check all rows with `items` work-items. Return False early if a sample shows that too many have changed."""
         one, part = np.int32(1), -(-items // SAMPLE)
         if n < SAMPLED_FROM:
             self.engine.run(kernel, items, np.int32(n), one, np.int32(0), *args)

@@ -13,7 +13,7 @@ from .bins import BinnedPoints, Bins
 from .cells import Cells
 from .clipped.trim import Trim
 from .device_diagram import Tessellation
-from .incremental import Repair
+from .incremental import IncrementalUpdate
 from .periodic.folded import FoldedCells
 from .periodic.ghost_images import Seam
 from .polyhedra import Polyhedra
@@ -24,15 +24,15 @@ class TessellationStages:
 
     bins: Bins
     cells: Cells | Polyhedra
-    repair: Repair
+    incremental: IncrementalUpdate
     seam: Seam
     folded: FoldedCells
     trim: Trim
     gather: Gather
 
     CLASSES: ClassVar[dict[str, type]] = {
-        "bins": Bins, "cells": Cells, "repair": Repair, "seam": Seam, "folded": FoldedCells, "trim": Trim,
-        "gather": Gather,
+        "bins": Bins, "cells": Cells, "incremental": IncrementalUpdate, "seam": Seam, "folded": FoldedCells,
+        "trim": Trim, "gather": Gather,
     }  # fmt: skip
 
     def __init__(self, engine: Engine) -> None:
@@ -74,7 +74,7 @@ def tessellate_box(
         binned = stages.bins.build(domain, points, n) if binned is None else binned
         return stages.cells.tessellate(domain, points, n, binned, previous, exact)
     if previous is not None and not exact:
-        t = stages.repair.follow(stages.cells, domain, points, previous)
+        t = stages.incremental.update(stages.cells, domain, points, previous)
         if t is not None:
             return t
         # What steps have worked on is of no use here, where bins need room.

@@ -143,7 +143,7 @@ def repaired(adapter: clvoro.Adapter) -> None:
     for seed in range(2):
         where = np.clip(where + 0.008 * (points(n, seed=seed) - 0.5), 0, 1)
         x = stages.engine.upload(where)
-        again = stages.repair.follow(stages.cells, square, x, t)
+        again = stages.incremental.update(stages.cells, square, x, t)
         assert again is not None
         t = again
         assert abs(t.volumes.get().sum() - 1) < 1e-4

@@ -10,7 +10,7 @@ from clvoro.tessellation import cells as cells_module
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT, spare_slots
-from clvoro.tessellation.incremental import Repair
+from clvoro.tessellation.incremental import IncrementalUpdate
 from tests.reference import diagrams as reference
 from tests.reference import patch
 
@@ -86,7 +86,7 @@ def test_repair_has_room_for_long_rows(engine, monkeypatch):
     points = wheels()
     cells, _, t = make(engine, points)
     moved = engine.upload(points + np.random.default_rng(6).uniform(-1, 1, points.shape) * 1e-5)
-    repaired = Repair(engine).follow(cells, BOX, moved, t)
+    repaired = IncrementalUpdate(engine).update(cells, BOX, moved, t)
     assert repaired is not None
     repaired = patch.fetch(repaired)
     n = len(points)
@@ -97,4 +97,4 @@ def test_repair_has_room_for_long_rows(engine, monkeypatch):
     assert np.array_equal(repaired.volumes, anew.volumes)
     monkeypatch.setattr("clvoro.tessellation.incremental.spare_slots", lambda _: 1)
     cells, _, t = make(engine, points)
-    assert Repair(engine).follow(cells, BOX, moved, t) is None
+    assert IncrementalUpdate(engine).update(cells, BOX, moved, t) is None

@@ -10,7 +10,7 @@ from clvoro.tessellation import incremental as repair
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
-from clvoro.tessellation.incremental import Repair
+from clvoro.tessellation.incremental import IncrementalUpdate
 from tests.reference import patch
 
 N = 700
@@ -59,7 +59,11 @@ class Carried:
 
     def __init__(self, engine, points):
         self.engine, self.n = engine, len(points)
-        self.cells, self.bins, self.repair = Cells(engine), Bins(engine), Repair(engine)
+        self.cells, self.bins, self.incremental = (
+            Cells(engine),
+            Bins(engine),
+            IncrementalUpdate(engine),
+        )
         self.t = self.anew(self.cells, points)
 
     def anew(self, cells, points):
@@ -71,7 +75,7 @@ class Carried:
     def move(self, points):
         """Carry the diagram over to `points`; return it as NumPy arrays, and whether it was."""
         x = self.engine.upload(points)
-        t = self.repair.follow(self.cells, patch.BOX, x, self.t)
+        t = self.incremental.update(self.cells, patch.BOX, x, self.t)
         self.t = self.anew(self.cells, points) if t is None else t
         return patch.fetch(self.t), t is not None
 
@@ -171,7 +175,7 @@ def test_rows_that_are_known_to_fit_do(engine, name, share):
         if not was:
             continue
         changed += not np.array_equal(before, carried.t.neighbors.get())
-        fits = carried.repair._fits.get() == 1
+        fits = carried.incremental._fits.get() == 1
         assert not (fits & ~fitting(t)).any()
         if name in ("random", "graded", "hexagons") and engine.real == np.float64:
             # Not all: who was clipped once more has had to be doubted.
@@ -363,7 +367,7 @@ def test_rounds_of_clipping(ctx, monkeypatch):
         assert np.array_equal(t.neighbors, carried.reference(points).neighbors)
         most, times = max(most, len(rounds)), times + was
         if was and len(rounds) <= 1:
-            assert carried.repair._fits.get().all()
+            assert carried.incremental._fits.get().all()
     assert most >= 3
     assert times > 40
 
@@ -387,7 +391,7 @@ def test_sample_first(engine, share, monkeypatch):
     for least in (N + 1, N):
         monkeypatch.setattr(repair, "SAMPLED_FROM", least)
         carried = Carried(engine, points)
-        found.append((*carried.move(moved), carried.repair._fits.get()))
+        found.append((*carried.move(moved), carried.incremental._fits.get()))
     (a, was_a, fits_a), (b, was_b, fits_b) = found
     assert launched == [(1, 0), (repair.SAMPLE, 0), (repair.SAMPLE, 1)][: 3 if share < 1 else 2]
     assert was_a == was_b == (share < 1)
@@ -456,7 +460,7 @@ def test_onto_a_lattice(engine, name, monkeypatch):
             faces = zip(a.owners.tolist(), a.neighbors.tolist(), a.face_measures, strict=True)
             assert all(length < 256 * eps for i, j, length in faces if (i, j) not in known)
         if was:
-            assert not ((carried.repair._fits.get() == 1) & ~fitting(t)).any()
+            assert not ((carried.incremental._fits.get() == 1) & ~fitting(t)).any()
     assert times == 4
     if name == "lattice" and certain:
         assert max(certain) == 0
@@ -478,7 +482,7 @@ def test_coinciding_generators_are_left_to_the_cells(engine):
     points = points.copy()
     points[3] = points[4]
     x = engine.upload(points)
-    assert carried.repair.follow(carried.cells, patch.BOX, x, carried.t) is None
+    assert carried.incremental.update(carried.cells, patch.BOX, x, carried.t) is None
 
 
 @given(st.integers(0, 2**31), st.floats(1e-7, 1.0), st.integers(3, 60))

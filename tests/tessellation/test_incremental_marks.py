@@ -6,7 +6,7 @@ import pytest
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.face_rows import SLOT
-from clvoro.tessellation.incremental import Repair
+from clvoro.tessellation.incremental import IncrementalUpdate
 from tests.reference import patch
 
 
@@ -18,10 +18,10 @@ def test_who_is_left_by_a_cell_that_is_clipped_again_is_doubted(ctx, again):
     """
     engine, n, i = patch.make_engine(ctx), 40, 17
     points = patch.relaxed_points(n, 2501)
-    x, cells, repair = engine.upload(points), Cells(engine), Repair(engine)
+    x, cells, incremental = engine.upload(points), Cells(engine), IncrementalUpdate(engine)
     t = cells.tessellate(patch.BOX, x, n, Bins(engine).build(patch.BOX, x, n), exact=False)
-    repair.follow(cells, patch.BOX, x, t)  # has the kernels made
-    (kernels,) = repair._kernels.values()
+    incremental.update(cells, patch.BOX, x, t)  # has the kernels made
+    (kernels,) = incremental._kernels.values()
     host = patch.fetch(t)
     rows = np.split(host.neighbors, host.starts[1:-1])
     # All inside, so that nobody is a wall; the stranger is the farthest.

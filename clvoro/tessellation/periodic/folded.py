@@ -10,7 +10,7 @@ from ..cells import Cells
 
 
 class FoldedCells(Cells):
-    """The rows and measures of such cells: what `Repair` works on in a periodic box."""
+    """The rows and measures of such cells: what `IncrementalUpdate` works on in a periodic box."""
 
     searches = False
 

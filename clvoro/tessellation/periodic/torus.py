@@ -11,7 +11,7 @@ import pyopencl.array as cla
 from ...errors import InputError
 from ...geometry.box import Box
 from ...opencl.primitives import Summaries
-from ..device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, Tessellation, whereabouts
+from ..device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, Tessellation, domain_position
 from ..polyhedra import Polyhedra
 from .ghost_images import COLLAPSED, FAR, ExtendedBox, Folded, Images
 from .halo import Margins
@@ -130,7 +130,7 @@ class Torus:
         if flags & COLLAPSED:
             raise CloseError(points, n)
         if flags & FAR:
-            place = whereabouts(self.domain, points[generator].get())
+            place = domain_position(self.domain, points[generator].get())
             raise FewCellsError(
                 f"the generator at {place}, one of {n}, has a neighbor half a period away or farther, expected at "
                 f"least four or five cells across each period of {self.domain}; use a smaller size, more cells "
@@ -156,7 +156,7 @@ class Torus:
         """Return `previous` carried over to `points`, in 2D; None where too much has changed."""
         stages = self.stages
         stages.folded.reserve(n)
-        t = stages.repair.follow(stages.folded, self._wide, points, previous)
+        t = stages.incremental.update(stages.folded, self._wide, points, previous)
         if t is None:
             return None
         # Cells without gap could still lie twice around the torus.

@@ -91,7 +91,7 @@ def test_cells_that_cover_the_torus_twice(ctx, real):
     run = Carried(stages, UNIT, points + 0.001)
     twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
     stages.folded.reserve(run.n)
-    covered = stages.repair.follow(stages.folded, run.torus._wide, run.place(twice), run.t)
+    covered = stages.incremental.update(stages.folded, run.torus._wide, run.place(twice), run.t)
     assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
     run = Carried(stages, UNIT, points + 0.001)
     assert run.move(twice) is None
