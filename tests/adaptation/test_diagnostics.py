@@ -211,7 +211,10 @@ JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
 """Of a twentieth of a cell at the wall: the cells beside it ask for what no neighbor of theirs can be."""
 
 
-@pytest.mark.parametrize(("method", "effort"), [("adaptive", "fast"), ("exact", "default")])
+@pytest.mark.parametrize(
+    ("method", "effort"),
+    [("adaptive", "fast"), pytest.param("exact", "default", marks=pytest.mark.slow)],
+)
 def test_mesh_that_does_not_meet_its_sizes(ctx, method, effort):
     """It ends (the count that "exact" wants to have exactly would swing for ever there), and says where it is worst."""
     square, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)

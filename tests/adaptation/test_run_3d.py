@@ -369,12 +369,17 @@ FIELDS = {
 }
 INFEASIBLE = ("jump", "jump of 100", "steep", "peak")
 """No mesh can follow h that grows by a cell's length within the cell."""
+SIMILAR = ("smaller of two", "segment", "jump", "corner", "wall", "about the domain")
+"""Fields of which others stand for the kind."""
 
 
 @pytest.mark.filterwarnings(
     "ignore::clvoro.errors.CoarseSizeWarning"
 )  # one is larger than the domain
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(k, marks=pytest.mark.slow if k in SIMILAR else ()) for k in FIELDS],
+)
 def test_fields(adapter, name):
     field = FIELDS[name]()
     result = adapter.run(BOX, field, effort="fast", seed=20)

@@ -161,6 +161,7 @@ def test_landmarks_lie_on_the_surface_and_reach_all_of_it():
     assert gap.max() < 3 / 64
 
 
+@pytest.mark.slow
 def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
     """Number of cells: the thin shell of small ones is found, and is that of the exact sphere."""
     from clvoro.adaptation.sampling.quadrature import DensityTree

@@ -331,6 +331,7 @@ def test_report_holds_its_pictures(results, adapter, tmp_path):
         assert f"{result.quality.min():.3f}" in page
 
 
+@pytest.mark.slow
 def test_same_run_gives_the_same_page(result, tmp_path):
     for folder in ("a", "b"):
         write_report(result, tmp_path / folder, size=size)

@@ -56,7 +56,10 @@ def moved(points, box, by, rng):
     return np.where(held, np.clip(points + step, box.lower, box.upper), points + step)
 
 
-@pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
+@pytest.mark.parametrize(
+    "box",
+    [pytest.param(UNIT, id="unit", marks=pytest.mark.slow), pytest.param(CHANNEL, id="channel")],
+)
 def test_lanes_have_the_bits_of_one_by_one(ctx, box, monkeypatch):
     """Rows are checked, clipped and measured eight at a time on CPUs, images found by folding whole vectors."""
     monkeypatch.setattr(repair, "FEW", 1)
