@@ -47,7 +47,7 @@ def distance_to_polygon() -> Example:
     corners = [
         (0.35, 0.25), (1.1, 0.2), (1.2, 0.45), (0.8, 0.5), (1.05, 0.8), (0.5, 0.8), (0.6, 0.5),
     ]  # fmt: skip
-    size = sizing.Distance(sizing.Polygon(corners), h_min=0.013, growth=1.2, h_max=0.11)
+    size = sizing.Distance(sizing.ClosedPolyline(corners), h_min=0.013, growth=1.2, h_max=0.11)
     return Example("Distance(Polygon(...), growth=1.2)", size, [np.array([*corners, corners[0]])])
 
 
@@ -97,7 +97,7 @@ def from_solution(kind: str) -> Example:
 def composition() -> Example:
     """Return a wing section and its wake over a background that is coarser to the right."""
     wing = naca4("4415", chord=0.55, leading_edge=(0.3, 0.58), angle=8)
-    near = sizing.Distance(sizing.Polygon(wing), h_min=0.012, growth=1.2, h_max=0.1)
+    near = sizing.Distance(sizing.ClosedPolyline(wing), h_min=0.012, growth=1.2, h_max=0.1)
     wake = [tuple(wing[0]), (1.5, 0.42)]
     behind = sizing.Distance(sizing.Segment(*wake), h_min=0.022, growth=1.15, h_max=0.1)
     size = sizing.minimum(near, behind, sizing.Expression("0.05 + 0.03 * x"))

@@ -130,7 +130,7 @@ kernel void place_children(const int size, global const int *starts, global cons
                       (face_measures[m] > face_measures[k] || (face_measures[m] == face_measures[k] && m < k));
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {child[0], child[1]};
-            if (met || leaves_at(x, y, DOMAIN) <= 1) {
+            if (met || exit_parameter(x, y, DOMAIN) <= 1) {
                 const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
                 y[0] = x[0] + m.s0;
                 y[1] = x[1] + m.s1;

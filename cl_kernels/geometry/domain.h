@@ -1,6 +1,6 @@
-/* What a kernel that places generators has to know of the domain: DOMAIN_ARGS in its signature, DOMAIN to hand them
-   on. One that only wants differences of positions has PERIOD_ARGS at the end of its signature, and hands PERIODS on:
-   as arguments, so that kernels are built once for all periodic boxes. */
+/* The domain, for kernels that move generators: DOMAIN_ARGS in a signature, DOMAIN in a call. A kernel that needs only
+   differences of positions has PERIOD_ARGS at the end of its signature and passes PERIODS on. Periods are arguments, so
+   one program serves all periodic boxes. */
 #include "opencl/real.h"
 
 #ifdef PERIODIC
@@ -13,9 +13,13 @@
 
 #ifdef POLYGON
 #include "geometry/edges.h"
+#define keep_inside keep_inside_polygon
+#define reflect_inside reflect_inside_polygon
 #else
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper PERIOD_ARGS
 #define DOMAIN box_lower, box_upper PERIODS
+#define keep_inside keep_inside_box
+#define reflect_inside reflect_inside_box
 #endif
 
 /* Corners of the box as arrays. */
@@ -24,8 +28,8 @@
     const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3}
 
 #ifdef PERIODIC
-/* Length of the period along axis a, in which positions lie in [0, period); 0 where there are walls. Positions and
-   periods are multiples of eps in the unit box, so that differences are exact, whatever the image. */
+/* Length of the period along axis a, where positions lie in [0, period); 0 between walls. In the unit box positions and
+   periods are multiples of eps, so differences to any image are exact. */
 #define PERIOD(a) ((a) == 0 ? periods.s0 : (a) == 1 ? periods.s1 : periods.s2)
 
 inline REAL nearest_image(REAL d, REAL period)
@@ -34,7 +38,7 @@ inline REAL nearest_image(REAL d, REAL period)
     return period > 0 ? (d > half_period ? d - period : (d < -half_period ? d + period : d)) : d;
 }
 
-/* The image in [0, period), on the grid of eps. */
+/* The image of y in [0, period), rounded to a multiple of eps. */
 inline REAL wrapped(REAL y, REAL period)
 {
     y = (y - period * floor(y / period) + 1) - 1;
@@ -46,25 +50,24 @@ inline REAL wrapped(REAL y, REAL period)
 #define wrapped(y, period) (y)
 #endif
 
-/* Coordinate y along axis a, where an image that is beyond the seam is to stand for it in the domain. */
+/* Coordinate y along axis a, or that of its image in the domain if the axis is periodic. */
 #define PLACED(a, y) (PERIOD(a) > 0 ? wrapped(y, PERIOD(a)) : (y))
 
-/* The difference along axis a from one position to another: to its nearest image, where the axis is periodic. */
+/* The difference between two positions along axis a, to the nearest image if the axis is periodic. */
 #define DIFFERENCE(a, from, to) nearest_image((to) - (from), PERIOD(a))
 
 #ifndef POLYGON
-/* Where a generator that is to go from x to y ends, in the domain: on the way, at a wall of a box; on the other side of
-   a periodic one. */
-inline void keep_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
+/* Moves the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
+inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a)
     y[a] = PERIOD(a) > 0 ? wrapped(y[a], PERIOD(a)) : clamp(y[a], lower[a], upper[a]);
 }
 
-/* The same, but a generator that would leave comes back: so no two meet on a wall. Where h is larger than the domain,
-   it goes no further than from one wall to the other, which leaves it inside. */
-inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
+/* As keep_inside_box, but mirrors y at the wall, so that no two generators coincide on it. A step is at most as long as
+   the box first, so that the mirror image is inside. */
+inline void reflect_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);
     EACH_AXIS(a)
@@ -78,6 +81,6 @@ inline void reflect_inside(const REAL *x, REAL *y, DOMAIN_ARGS)
         if (y[a] > upper[a])
             y[a] = 2 * upper[a] - y[a];
     }
-    keep_inside(x, y, DOMAIN);
+    keep_inside_box(x, y, DOMAIN);
 }
 #endif

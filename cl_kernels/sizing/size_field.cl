@@ -50,10 +50,10 @@ kernel void evaluate_size_gradient(const int size, global const REAL *restrict p
 #ifdef POLYGON
         REAL y[DIM] = {x[0], x[1]};
         y[a] = ahead;
-        if (leaves_at(x, y, DOMAIN) <= 1)
+        if (exit_parameter(x, y, DOMAIN) <= 1)
             ahead = here;
         y[a] = behind;
-        if (leaves_at(x, y, DOMAIN) <= 1)
+        if (exit_parameter(x, y, DOMAIN) <= 1)
             behind = here;
 #endif
         x[a] = ahead;

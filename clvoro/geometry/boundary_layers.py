@@ -1,4 +1,4 @@
-"""Rows of generators along a boundary, which stay where they are: cells of a given height, in layers."""
+"""Boundary layers: rows of fixed generators along walls, for layers of cells with given heights."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from .box import Box, Domain
 from .layer_columns import count_columns, find_chains, place_columns
 from .polygon import Polygon
 
-_NEAR = 0.6  # of a cell: generators that are nearer to each other than this are one too many
-_SHORT = 1e-9  # of the domain: shorter edges of what layers leave are none
+_NEAR = 0.6  # of a cell: of two generators that are nearer to each other than this, one is dropped
+_SHORT = 1e-9  # of the domain: shorter edges of the region beyond the layers are dropped
 _APART = 0.3  # of a width, between the last row and the generators that move
-_NO_ROOM = "layers leave no room for other cells; make them thinner, or give them fewer edges"
-_OWN = 0.9  # of its distance from the wall: a generator that another wall is nearer to than this is not in its place
+_NO_ROOM = "layers leave no room for other cells; make them thinner, or choose fewer edges"
+_OWN = 0.9  # of its distance from its wall: a generator that is nearer to another wall than this is dropped
 
 
 @dataclass(frozen=True)
 class Layers:
-    """Layers of cells along walls, for `Adapter.run`, in 2D.
+    """Boundary layers: layers of cells along walls, for `Adapter.run`, in 2D.
 
-    Generators stand in columns across the wall, row over row, and do not move. Where the wall is straight their cells
-    are rectangles, layer k of height ``height * growth**k``; one row more, on the far side of the last layer, makes
-    that one's outer faces as regular. From there on sizes grow from `spacing` by `growth` a cell (see
-    `sizing.Distance`), up to the size field's.
+    Generators stand in columns normal to the wall and do not move. Where the wall is straight, their cells are
+    rectangles, and layer k has the height ``height * growth**k``. One more row beyond the last layer makes the outer
+    faces of that layer straight, too. Beyond it sizes grow from `spacing` by the factor `growth` per cell (see
+    `sizing.Distance`), up to the size field.
 
     Parameters
     ----------
     height : float
-        Of the first layer, in the domain's unit.
+        Height of the first layer, in the unit of the domain.
     count : int
         Number of layers.
     growth : float
@@ -48,12 +48,12 @@ class Layers:
     Raises
     ------
     InputError, InputTypeError
-        If a number is out of range.
+        If a number is out of range, or `edges` are neither numbers nor names.
 
     Notes
     -----
-    Where edges are 1.5 widths long or more, or all alike, cells have corners where the wall has: no wall's face is a
-    sliver. Along finer polygons cells are as wide as asked for, whatever the corners between them.
+    Where edges are at least 1.5 widths long, or all equal, each corner of the wall is a corner of cells, so no face on
+    the wall is a sliver. Along shorter edges cells have the width `spacing`, independent of the corners of the wall.
 
     Examples
     --------
@@ -98,7 +98,7 @@ class Layers:
 
     @property
     def thickness(self) -> float:
-        """Height of all layers together, infinite where numbers end."""
+        """Height of all layers together; infinite if float64 overflows."""
         count, g = self.count, self.growth
         with np.errstate(over="ignore"):
             return float(self.height * (count if g == 1 else np.expm1(count * np.log(g)) / (g - 1)))
@@ -113,9 +113,9 @@ class Layers:
 
     @property
     def rows(self) -> np.ndarray:
-        """Distances of the generators from the wall, (count + 1,), so that bisectors are where layers meet.
+        """Distances of the generators from the wall, (count + 1,), whose bisectors are the borders of layers.
 
-        At the share 1 / (1 + g) of each layer the bisectors of all layers fit; the last row mirrors the one before.
+        A generator is at the share 1 / (1 + g) of its layer. The last row mirrors the one before at the last border.
         """
         tops = np.cumsum(self.heights)
         rows = tops - self.heights * (1 - 1 / (1 + self.growth))
@@ -125,12 +125,12 @@ class Layers:
 def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     """Return the generators (n, 2) of `layers` in `domain`.
 
-    Where layers meet, in corners and narrow gaps, each wall has what is nearer to it.
+    In corners and narrow gaps, where layers of several walls overlap, a generator is kept for its nearest wall.
 
     Raises
     ------
     InputError
-        If a layer does not fit the domain at all, or an edge is not there.
+        If no generator of the layers is in the domain, or an edge does not exist.
     InputTypeError
         If the domain is neither a `Box` nor a `Polygon` in 2D.
     """
@@ -152,7 +152,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     )
     kept[kept] = nearest >= _OWN * wall[kept]
     points, limit = points[kept], limit[kept]
-    # Those nearest to the wall come first, in every chain; of two that are too near the later one goes.
+    # In every chain the nearest rows to the wall come first. Of two generators too near, drop the later one.
     close = (
         KDTree(points).query_pairs(limit.max(), output_type="ndarray")
         if len(points)
@@ -174,14 +174,14 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
 
 
 def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
-    """Return how many generators `place_layers` will choose from, before it makes any.
+    """Return the number of generators that `place_layers` begins with, without placing any.
 
     Raises
     ------
     InputError
-        If the layers of one wall alone fill the domain, or an edge is not there.
+        If the layers of one wall alone fill the domain, or an edge does not exist.
     InputTypeError
-        If something is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
+        If an item is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
     """
     polygon, _ = as_polygon(domain)
     total = 0
@@ -207,7 +207,7 @@ def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
 
 
 def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
-    """Return the edges along which `layer` lies, (k, 2, 2): both ends of each."""
+    """Return the edges that have `layer`, (k, 2, 2): both ends of each."""
     polygon, _ = as_polygon(domain)
     oriented = polygon.oriented
     ends = np.stack([oriented.vertices, oriented.vertices[oriented.next_vertex]], axis=1)
@@ -236,9 +236,9 @@ def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
 
 
 def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
-    """Return what is left of `domain` to generators that move, in its frame.
+    """Return the part of `domain` beyond the layers, for generators that move; it has the frame of `domain`.
 
-    They keep a third of a width away from the last row.
+    It begins a third of a width from the last row.
 
     Raises
     ------
@@ -264,7 +264,7 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
         for layer, distance in zip(layers, distances, strict=True)
     ]
     left = polygon.geometry.difference(shapely.union_all(strips))
-    # Where a strip ends beside a corner, an edge may be left that is no longer than a rounding.
+    # Where a strip ends beside a corner, an edge as short as round-off may remain.
     left = shapely.make_valid(
         shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max()))
     )
@@ -279,17 +279,17 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
 
 @dataclass(frozen=True)
 class _FreeBox(Box):
-    """A box in the frame of another."""
+    """A box with the frame of another box."""
 
     whole: Box = None  # type: ignore[assignment]
 
     @property
     def frame(self) -> tuple[np.ndarray, float]:
-        """Those of the whole."""
+        """Origin and scale of the device's coordinates: those of the whole box."""
         return self.whole.frame
 
 
 def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
-    """Return those of `points` (n, 2) that lie in the `free` domain, and not on one of `rows` (k, 2)."""
+    """Return the `points` (n, 2) that lie in the `free` domain and differ from all `rows` (k, 2)."""
     apart = free.contains(points) & (KDTree(rows).query(points)[0] > 0)
     return points[apart]

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from ..opencl.program import Engine
 
 LARGEST_EDGE = 1e50
-"""Longest edge, and one over the shortest: fifth powers of lengths must not leave the range of float64."""
+"""Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
 
 
 class ClipBox(Protocol):
-    """The box that cells are clipped by, all that stages know of a domain: a `Domain`, or a box of their own."""
+    """The box that clips cells. It is all that stages know of a domain: a `Domain`, or a box made by a stage."""
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""
@@ -33,14 +33,16 @@ class ClipBox(Protocol):
 
 
 class Domain(ABC):
-    """What is meshed.
+    """The region to mesh.
 
     Attributes
     ----------
     lower, upper : tuples of d floats
         Opposite corners of the bounding box.
     periodic : tuple of d bool
-        Directions in which the domain goes on with itself beyond the bounding box.
+        Directions in which the domain is periodic.
+    names : mapping or None
+        The caller's names of boundaries.
     """
 
     lower: tuple[float, ...]
@@ -49,7 +51,7 @@ class Domain(ABC):
 
     @property
     def periodic(self) -> tuple[bool, ...]:
-        """Directions in which the domain is periodic: none, unless a class says otherwise."""
+        """Directions in which the domain is periodic. By default none."""
         return (False,) * self.dim
 
     @property
@@ -64,7 +66,7 @@ class Domain(ABC):
 
     @property
     def n_pieces(self) -> int:
-        """Number of pieces, none of which is without generators."""
+        """Number of separate pieces. Each one needs a generator."""
         return 1
 
     @property
@@ -76,7 +78,7 @@ class Domain(ABC):
 
     @abstractmethod
     def _default_names(self) -> BoundaryNames:
-        """Return the parts of the boundary as they are called without names by the caller."""
+        """Return the parts of the boundary with their default names."""
 
     @cached_property
     def boundaries(self) -> BoundaryNames:
@@ -104,22 +106,22 @@ class Domain(ABC):
         """Return walls as a shape for `clvoro.sizing.Distance`: numbers, names, or by default all."""
 
     def _described_names(self) -> dict[str, Any]:
-        """Return the caller's names as `describe` does, as lists of numbers; nothing without names."""
+        """Return the caller's names for `describe`, with lists of numbers; empty without names."""
         parts = self.boundaries
         return {"names": {n: parts.select(n, n).tolist() for n in self.names}} if self.names else {}
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return what files hold of the domain, as plain values."""
+        """Return the domain as plain values for files."""
 
     @abstractmethod
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool.
+        """Return for each of `points` (n, d) whether it lies in the domain, boundary included; (n,) bool.
 
         Raises
         ------
         InputError, InputTypeError
-            If they are no numbers of that shape.
+            If `points` is not an array of numbers of that shape.
         """
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
@@ -132,7 +134,7 @@ class Domain(ABC):
     def frame(self) -> tuple[np.ndarray, float]:
         """Origin and scale of the device's coordinates, x' = (x - origin) / scale in [0, 1].
 
-        The scale is a power of two, so that scaling itself rounds nothing.
+        The scale is a power of two, so scaling is exact.
         """
         return np.array(self.lower), 2.0 ** math.ceil(math.log2(self.extent.max()))
 
@@ -143,12 +145,12 @@ class Domain(ABC):
 
     @property
     def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the box that cells are clipped by, whatever its walls mean."""
+        """Corners of the box that clips cells."""
         return np.array(self.lower), np.array(self.upper)
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners of `clip_box` in the device's coordinates, padded to four numbers as kernels take them."""
-        # Every stage asks for them in every step.
+        # Cached, because every stage needs them in every step.
         known: dict[np.dtype, tuple[np.ndarray, np.ndarray]] = vars(self).setdefault("_corners", {})
         if real not in known:
             origin, scale = self.frame
@@ -159,12 +161,12 @@ class Domain(ABC):
         return known[real]
 
     def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Names and values that kernels are built with for this kind of domain; see geometry/domain.h."""
+        """Return the macros, as names and values, of kernels for this kind of domain; see geometry/domain.h."""
         del real
         return ()
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
-        """Return what kernels take as DOMAIN_ARGS; see geometry/domain.h."""
+        """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""
         return *self.device_corners(engine.real), *engine.period_args
 
 
@@ -177,7 +179,7 @@ class Box(Domain):
     lower, upper : sequences of 2 or 3 floats
         Opposite corners. Side ``2 a`` is the lower one of axis a, side ``2 a + 1`` the upper one.
     periodic : bool, or a sequence of 2 or 3
-        Directions without walls: what leaves on one side comes in on the other. One bool stands for all directions.
+        Directions without walls: what leaves on one side enters on the other. One bool stands for all directions.
     names : mapping, optional
         Names of boundaries, each with its sides: numbers, default names, or a sequence of them. The default names are
         ``xMin``, ``xMax``, ``yMin``, ... Sides that are not mentioned keep them.
@@ -185,10 +187,11 @@ class Box(Domain):
     Raises
     ------
     InputError
-        If the corners are not 2 or 3 finite numbers each with lower < upper, or too near or far for float64; or if a
-        name is not a word, clashes with another one, or stands for a side that does not exist or is periodic.
+        If the corners are not 2 or 3 finite numbers each with lower < upper, or an edge is too short or long for
+        float64; or if a name is not a word, clashes with another one, or stands for a side that does not exist or is
+        periodic.
     InputTypeError
-        If `periodic` is something else than truth values, or `names` is not a mapping.
+        If `periodic` is not a bool or a sequence of them, or `names` is not a mapping.
 
     Examples
     --------
@@ -201,9 +204,9 @@ class Box(Domain):
 
     Notes
     -----
-    On the device the lengths of periods, and coordinates along them, are multiples of 2^-52 (2^-23 in float32) of the
-    frame's unit, at most twice the longest edge. Adding a period is then exact and so are differences of positions,
-    which are the same for every image: cells on both sides of a seam see each other with the same numbers.
+    On the device periods, and coordinates along them, are multiples of 2^-52 (2^-23 in float32) of the frame's unit,
+    which is at most twice the longest edge. Then the sum of a position and a period is exact, and so are differences of
+    positions. Both cells at a seam compute their common face from the same numbers.
     """
 
     lower: tuple[float, ...]
@@ -228,14 +231,14 @@ class Box(Domain):
         if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower < upper).all()):
             raise InputError(
                 f"Box got lower {self.lower} and upper {self.upper}, expected finite numbers with "
-                "lower < upper in every direction; exchange or correct the corners, as in Box((0, 0), (2.5, 1.5))"
+                "lower < upper in every direction; swap or correct the corners, as in Box((0, 0), (2.5, 1.5))"
             )
         with np.errstate(over="ignore"):
             extent = upper - lower
         if not (extent.min() >= 1 / LARGEST_EDGE and extent.max() <= LARGEST_EDGE):
             raise InputError(
-                f"Box got edges of {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to {LARGEST_EDGE:g}: "
-                "volumes and moments of cells must be numbers, too; choose another unit of length"
+                f"Box got edges of {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to {LARGEST_EDGE:g}, so that "
+                "volumes and moments of cells do not overflow; choose another unit of length"
             )
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))
@@ -287,14 +290,14 @@ class Box(Domain):
         return float(np.prod(self.extent))
 
     def describe(self) -> dict[str, Any]:
-        """Return the arguments that make this box."""
+        """Return the arguments of this box as plain values."""
         corners = {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
         return corners | self._described_names()
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.
+        """Return for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.
 
-        In a periodic direction every finite position does.
+        In a periodic direction every finite coordinate is inside.
         """
         points = check_rows("points", points, self.dim)
         inside = (points >= self.lower) & (points <= self.upper)
@@ -304,9 +307,11 @@ class Box(Domain):
         """Return `points` (n, d) with coordinates in [lower, upper) along the periodic directions."""
         points, lower, extent = np.asarray(points, float), np.array(self.lower), self.extent
         inside = (points >= lower) & (points < self.upper)
-        with np.errstate(invalid="ignore"):  # who is given infinite ones says so
+        with np.errstate(invalid="ignore"):  # callers refuse infinite coordinates
             moved = lower + np.mod(points - lower, extent)
-        last = np.nextafter(np.array(self.upper), lower)  # where rounding has put one on the seam
+        last = np.nextafter(
+            np.array(self.upper), lower
+        )  # for positions that are rounded up to the seam
         moved = np.clip(moved, lower, last)
         return np.where(inside | ~np.array(self.periodic), points, moved)
 
@@ -316,7 +321,7 @@ class Box(Domain):
         Raises
         ------
         InputError
-            If a period has no more than a thousand numbers of the precision.
+            If a period is shorter than 1000 units of round-off.
         """
         step = float(np.finfo(real).eps)
         lengths = np.rint(self.extent / self.frame[1] / step) * step
@@ -329,7 +334,7 @@ class Box(Domain):
         return np.where(self.periodic, lengths, 0.0)
 
     def place(self, points: np.ndarray, real: np.dtype) -> np.ndarray:
-        """Return positions (n, d) in the device's coordinates and precision, along periods in [0, period)."""
+        """Return positions (n, d) in the device's coordinates and precision, in [0, period) along periods."""
         if not any(self.periodic):
             return super().place(points, real)
         origin, scale = self.frame
@@ -347,7 +352,7 @@ class Box(Domain):
         return lower, upper
 
     def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Say how long the periods are, if there are any: kernels that do not name them take them as PERIOD_ARGS."""
+        """Return macros with the lengths of periods. A kernel that does not use them takes PERIOD_ARGS instead."""
         if not any(self.periodic):
             return ()
         lengths = np.zeros(3)
@@ -359,7 +364,7 @@ class Box(Domain):
 
 
 def _directions(periodic: object, dim: int) -> tuple[bool, ...]:
-    """Return a truth value for each of `dim` directions."""
+    """Return one bool for each of `dim` directions."""
     values = [periodic] * dim if isinstance(periodic, bool | np.bool_) else periodic
     if not isinstance(values, list | tuple | np.ndarray) or any(
         not isinstance(v, bool | np.bool_) for v in values

@@ -1,4 +1,4 @@
-"""A tree of bounding boxes over segments or triangles: what is nearest, and what overlaps."""
+"""A hierarchy of bounding boxes over segments or triangles, for nearest items and overlapping pairs."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from collections.abc import Callable
 import numpy as np
 
 _LEAF = 4  # items per leaf at most
-_BLOCK = 1 << 18  # points looked at together
+_BLOCK = 1 << 18  # points per batch
 
 
 class Tree:
-    """Complete binary tree of boxes over n items.
+    """Complete binary tree of bounding boxes over n items.
 
-    Node k has the children 2 k + 1 and 2 k + 2; node j of a level with m nodes holds the items
+    Node k has the children 2 k + 1 and 2 k + 2. Node j of a level with m nodes holds the items
     ``order[j n // m : (j + 1) n // m]``. Each node halves its items across the longest side of the
-    box of their middles, so the tree depends on the items alone.
+    box of their centers. The tree depends on the items only.
 
     Parameters
     ----------
     low, high : (n, d) float
-        Boxes of the items.
+        Lower and upper corners of the items' bounding boxes.
 
     Attributes
     ----------
     levels : int
-        Below the root; 2^levels leaves of at most 4 items.
+        Number of levels below the root; there are 2^levels leaves of at most 4 items.
     order : (n,) int
         The items in the order of the leaves.
     boxes : (2^(levels + 1) - 1, 2 d) float
@@ -46,7 +46,7 @@ class Tree:
         )
 
     def starts(self, level: int) -> np.ndarray:
-        """Return where the items of each node of a level begin, and the end: (2^level + 1,)."""
+        """Return the place in `order` where the items of each node of a level begin, and the end: (2^level + 1,)."""
         return (np.arange((1 << level) + 1, dtype=np.int64) * self.n) >> level
 
     def _sort(self, center: np.ndarray) -> np.ndarray:
@@ -59,7 +59,7 @@ class Tree:
             axis = extent.argmax(axis=1)
             node = np.repeat(np.arange(1 << level), np.diff(starts))
             longest = extent[np.arange(len(axis)), axis]
-            # One number says both node and place in it; equal places may go either way.
+            # One key for the node and the place in it. Items at equal places may go to either child.
             place = inside[np.arange(self.n), axis[node]] - low[node, axis[node]]
             place /= np.where(longest > 0, longest, 1)[node]
             order = order[np.argsort(node + 0.5 * place, kind="stable")]
@@ -71,15 +71,15 @@ class Tree:
         bound2: np.ndarray,
         distance2: Callable[[np.ndarray, np.ndarray], np.ndarray],
     ) -> np.ndarray:
-        """Return the least of `bound2` and the squared distances of `points` to the items, (n,).
+        """Return the smallest squared distance of each of `points` to the items, but at most `bound2`, (n,).
 
         Parameters
         ----------
         points : (n, d) float
         bound2 : (n,) float
-            What is farther is left out; the tighter, the faster.
+            Items beyond this squared distance are skipped; a tighter bound is faster.
         distance2 : callable
-            Squared distances of points (m, d) to items (m,), given by index.
+            Returns the squared distances of points (m, d) to items (m,), given by index.
         """
         best2 = bound2.copy()
         d = points.shape[1]
@@ -104,9 +104,9 @@ class Tree:
         return best2
 
     def overlaps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all pairs of items i < j in different leaves or in one whose leaves' boxes overlap.
+        """Return all pairs of items i < j whose leaves are the same or have overlapping boxes, two arrays (m,) int.
 
-        Both are (m,) int; touching boxes overlap.
+        Boxes that touch overlap.
         """
         d = self.boxes.shape[1] // 2
         i = j = np.zeros(1, np.int64)

@@ -1,4 +1,4 @@
-"""Edges of a polygon in uniform bins, for the device: which edge does a way cross? See geometry/edges.h."""
+"""Sort the edges of a polygon into uniform bins, for the device; see geometry/edges.h."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 BINS_PER_EDGE = 4
 LEAST_SIDE, LARGEST_SIDE = 32, 1024
-"""Bins along the longer side: small ones are quick to search, and empty ones cost nothing but memory."""
+"""Bins along the longer side. Small bins are fast to search; empty ones cost only memory."""
 
 
 def bin_edges(
@@ -17,31 +17,31 @@ def bin_edges(
     Returns
     -------
     frame : (4,) float
-        Origin (2), one over the edge of a bin, 0 for the caller to fill in.
+        Origin (2), 1 / width of a bin, and 0, which the caller replaces.
     shape : (4,) int32
-        Bins along x and y, 0, 0.
+        Number of bins along x and y, 0, 0.
     starts : (bins + 1,) int32
-        First edge listed of each bin, row by row.
+        Place in `listed` of the first edge of each bin, row by row.
     listed : int
-        Numbers of the edges that pass through each bin, or so near that rounding matters.
+        The edges that pass through each bin, or so near to it that round-off matters.
     """
     lower = np.minimum(begins, ends).min(axis=0)
     upper = np.maximum(begins, ends).max(axis=0)
     extent = upper - lower
     side = np.clip(np.sqrt(BINS_PER_EDGE * len(begins)), LEAST_SIDE, LARGEST_SIDE)
-    # A little more than the extent, so that nothing lies beyond the last bin.
+    # Slightly more than the extent, so that no point lies beyond the last bin.
     edge = extent.max() * (1 + 1e-6) / side
     counts = np.maximum(np.ceil(extent / edge).astype(int), 1)
-    slack = 1e-3  # of a bin: more than rounding, in single precision, too
+    slack = 1e-3  # of a bin, more than round-off in single precision
     a, b = (begins - lower) / edge, (ends - lower) / edge
-    # Row by row: each edge crosses some rows, and in each of them a range of bins.
+    # Each edge crosses a range of rows, and in each row a range of bins.
     first = np.clip(np.floor(np.minimum(a, b)[:, 1] - slack), 0, counts[1] - 1).astype(int)
     last = np.clip(np.floor(np.maximum(a, b)[:, 1] + slack), 0, counts[1] - 1).astype(int)
     number, row = _ranges(first, last)
     along = b[number] - a[number]
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (np.stack([row - slack, row + 1 + slack]) - a[number, 1]) / along[:, 1]
-    # A level edge has its whole length in its row.
+    # A horizontal edge has its whole length in one row.
     t = np.where(np.isfinite(t), np.clip(t, 0, 1), [[0.0], [1.0]])
     x = a[number, 0] + t * along[:, 0]
     left = np.clip(np.floor(x.min(axis=0) - slack), 0, counts[0] - 1).astype(int)

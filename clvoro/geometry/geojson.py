@@ -1,4 +1,4 @@
-"""Polygons of others, GeoJSON, well-known text and shapely's, as rings, piece by piece."""
+"""Read polygons from GeoJSON, well-known text and shapely: rings, piece by piece."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from ..errors import InputError, InputTypeError, MisfitWarning
 from ..files import LONGEST_GEOMETRY, read_text
 
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
-_ALIKE = 0.95  # a degree of longitude over one of latitude, from which on they count as the same
-_DEEPEST = 8  # parentheses in each other: a MULTIPOLYGON has three, and GEOS calls itself for each
+_ALIKE = (
+    0.95  # lengths of degrees of longitude and latitude with at least this ratio count as equal
+)
+_DEEPEST = 8  # nested parentheses: a MULTIPOLYGON has three, and GEOS uses a stack frame for each
 
 
 def pieces_of_shape(geometry: Any) -> list[list[np.ndarray]]:
@@ -49,15 +51,15 @@ def pieces_of_wkt(text: str) -> list[list[np.ndarray]]:
     brackets = letters[(letters == ord("(")) | (letters == ord(")"))]
     if np.where(brackets == ord("("), 1, -1).cumsum().max(initial=0) > _DEEPEST:
         raise InputError(
-            f"text {text!r:.60} has more than {_DEEPEST} parentheses in each other, expected a POLYGON or MULTIPOLYGON"
+            f"text {text!r:.60} has more than {_DEEPEST} nested parentheses, expected a POLYGON or MULTIPOLYGON"
         )
     try:
-        with np.errstate(all="ignore"):  # what is no number is refused below
+        with np.errstate(all="ignore"):  # coordinates that are not finite are refused below
             geometry = shapely.from_wkt(text)
     except shapely.errors.GEOSException as error:
         numbers = " and finite numbers" if re.search(r"\bnan\b", text, re.IGNORECASE) else ""
         raise InputError(
-            f"text {text!r:.60} is no well-known text ({error!s:.200}); expected closed rings{numbers}"
+            f"text {text!r:.60} is not well-known text ({error!s:.200}), expected closed rings{numbers}"
         ) from error
     return pieces_of_shape(geometry)
 
@@ -75,7 +77,7 @@ def pieces_of_geojson(
         Names of boundaries and the numbers of their edges, from the property "boundaries" of Features.
     """
     name = "GeoJSON"
-    # What shapely, geopandas and their kin make of themselves.
+    # Geometries of shapely, geopandas and other libraries.
     source = getattr(source, "__geo_interface__", source)
     if isinstance(source, Mapping):
         found: Any = source
@@ -94,23 +96,23 @@ def pieces_of_geojson(
         try:
             found = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{name} is no JSON ({error}), expected GeoJSON") from error
+            raise InputError(f"{name} is not JSON ({error}), expected GeoJSON") from error
     names: dict[str, list[int]] = {}
     pieces: list[list[object]] = []
     _collect(found, name, pieces, names)
     if not pieces:
-        raise InputError(f"{name} holds no Polygon, expected at least one")
+        raise InputError(f"{name} has no Polygon, expected at least one")
     _warn_of_degrees(found, pieces, name)
     return pieces, names or None
 
 
 def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:
-    """Tell whether a bounding box may be one of longitudes and latitudes."""
+    """Return whether a bounding box can be one of longitudes and latitudes."""
     return min(lower[0], -upper[0]) >= -180 and min(lower[1], -upper[1]) >= -90
 
 
 def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
-    """Warn if GeoJSON says that its coordinates are longitudes and latitudes, and a degree of both is not as long."""
+    """Warn if the crs of GeoJSON has longitudes and latitudes, and their degrees differ in length."""
     crs = node.get("crs")
     properties = crs.get("properties") if isinstance(crs, Mapping) else None
     system = properties.get("name") if isinstance(properties, Mapping) else None
@@ -118,16 +120,16 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
         return
     try:
         x = np.concatenate([np.asarray(ring, float).reshape(-1, 2) for p in pieces for ring in p])
-    except (ValueError, TypeError):  # for others to refuse
+    except (ValueError, TypeError):  # `make_rings` raises a better error
         return
     if not len(x) or not may_be_degrees(x.min(axis=0).tolist(), x.max(axis=0).tolist()):
         return
     latitude = float(np.abs(x[:, 1]).max())
     if math.cos(math.radians(latitude)) < _ALIKE:
         warn(
-            f"{name} is in longitudes and latitudes ({system}), which are taken as lengths in the plane: at latitude "
+            f"{name} has longitudes and latitudes ({system}), which are used as lengths in the plane: at latitude "
             f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
-            "coordinates first, and leave out its crs if they are projected",
+            "coordinates first, or remove the crs if they are projected",
             MisfitWarning,
         )
 
@@ -141,14 +143,14 @@ def _collect(
     """Walk through collections and features; append the rings of each polygon to `pieces`, and add to `names`."""
     kind = node.get("type") if isinstance(node, Mapping) else None
     if not isinstance(node, Mapping) or not isinstance(kind, str):
-        raise InputError(f"{name} holds {node!r:.40}, expected an object with a type")
+        raise InputError(f"{name} has {node!r:.40}, expected an object with a type")
     if kind in _MEMBERS:
         for member in _list(node, _MEMBERS[kind], name):
             _collect(member, name, pieces, names)
     elif kind == "Feature":
         if node.get("geometry") is None:
             raise InputError(
-                f"{name} holds a Feature without geometry, expected Polygons only; leave it out"
+                f"{name} has a Feature without geometry, expected Polygons only; leave it out"
             )
         before = len(pieces)
         _collect(node["geometry"], name, pieces, names)
@@ -162,7 +164,7 @@ def _collect(
             pieces.append([_flat(ring, name) for ring in piece])
     else:
         raise InputError(
-            f"{name} holds a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out"
+            f"{name} has a {kind!r:.40}, expected Polygon or MultiPolygon only; leave others out"
         )
 
 
@@ -197,11 +199,11 @@ def _count_edges(ring: object) -> int:
 
 
 def _flat(ring: object, name: str) -> object:
-    """Leave out heights."""
+    """Drop z coordinates."""
     if not isinstance(ring, (list, tuple)):
         raise InputError(f"{name} has the ring {ring!r:.40}, expected a list of positions")
     for k, p in enumerate(ring):
-        # NumPy would make numbers of these.
+        # NumPy would convert these to numbers.
         if isinstance(p, (list, tuple)) and any(type(c) in (bool, str) for c in p[:2]):
             raise InputError(
                 f"{name} has the position {p!r:.60} at {k} of a ring, expected numbers"

@@ -1,4 +1,4 @@
-"""Columns of layers along a boundary: where they stand, and in which direction they go."""
+"""Columns of boundary layers: their feet on the wall and their directions."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import numpy as np
 
 from .polygon import Polygon
 
-_SHARP = math.radians(50)  # a turn of the boundary at which rows end and begin anew
-_MOST = 2.0**62  # columns, more than any device holds: numbers of them stay finite
-_LONG = 1.5  # widths: an edge that has two columns or more of its own
-_EQUAL = 1e-6  # of their length: edges of regular polygons
+_SHARP = math.radians(50)  # turn of the boundary at which one row ends and another one begins
+_MOST = 2.0**62  # columns, more than fit on any device: keeps their number finite
+_LONG = 1.5  # widths: an edge of this length has columns that no other edge shares
+_EQUAL = 1e-6  # of their length: tolerance for edges of regular polygons
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Edges of the boundary one after the other, without a sharp turn.
+    """Consecutive edges of the boundary without a sharp turn.
 
     Attributes
     ----------
     corners : (k, 2) float
-        The domain on the left.
+        Vertices, with the domain on the left.
     closed : bool
-        Do the ends, which are then the same, meet smoothly?
+        Whether the last vertex is the first one, without a sharp turn there.
     fan : float
-        Angle at the end by which the boundary turns away from the domain, to the next chain; 0 if it does not.
+        Angle at the end by which the boundary turns away from the domain, towards the next chain; 0 for other turns.
     """
 
     corners: np.ndarray
@@ -42,7 +42,7 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
     turn = np.arctan2(
         along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
     )
-    # Does edge e go on smoothly in the next one?
+    # Whether edge e continues in the next one without a sharp turn.
     onward = chosen & chosen[following] & (np.abs(turn) < _SHARP)
     starts = chosen.copy()
     starts[following[onward]] = False
@@ -69,7 +69,7 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
 
 
 def count_columns(chain: Chain, width: float, thickness: float) -> tuple[int, int]:
-    """Return how many columns stand along the chain, and how many are spokes about its end."""
+    """Return the number of columns along the chain, and the number of those that fan out from its end."""
     corners, _ = _begun(chain, width)
     _, counts = _runs(np.hypot(*np.diff(corners, axis=0).T), width)
     fan = chain.fan * (thickness + width) / 2 / width
@@ -77,7 +77,7 @@ def count_columns(chain: Chain, width: float, thickness: float) -> tuple[int, in
 
 
 def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
-    """Return the corners of a chain, of a closed one from where a run begins, and whether there is such a place."""
+    """Return the corners of a chain, and whether it is closed and begins between two long edges."""
     long = np.hypot(*np.diff(chain.corners, axis=0).T) >= _LONG * width
     begins = np.flatnonzero(long & np.roll(long, 1)) if chain.closed else np.empty(0, int)
     if not len(begins):
@@ -87,12 +87,12 @@ def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
 
 
 def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a chain at the corners between long edges, which then are corners of cells, too: no sliver of a face is left.
+    """Cut a chain at the corners between long edges. These are corners of cells, too, so no face is a sliver.
 
     Returns
     -------
     runs, counts : (r,) float
-        Their lengths, and how many columns stand on each.
+        Lengths of the parts, and the number of columns on each.
     """
     long = lengths >= _LONG * width
     first = np.flatnonzero(np.concatenate([[True], long[1:] & long[:-1], [True]]))
@@ -102,7 +102,7 @@ def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
         counts = np.maximum(np.rint(np.minimum(runs / width, _MOST)), 1)
     edges = len(lengths)
     if len(runs) == 1 and np.ptp(lengths) <= _EQUAL * lengths[0]:
-        # As many on each edge of a regular polygon, or as many edges to each.
+        # On a regular polygon: equally many columns per edge, or equally many edges per column.
         share = counts[0] / edges
         whole = max(1, round(1 / share))
         if share >= 0.75:
@@ -113,9 +113,9 @@ def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _places(lengths: np.ndarray, width: float, joined: bool) -> np.ndarray:
-    """Return how far along the chain the columns stand: from a corner between runs as far on both sides of it.
+    """Return the places of columns along the chain. They are symmetric about each corner between runs.
 
-    `joined` tells whether the first run begins at such a corner, too.
+    `joined` says whether the first run begins at such a corner, too.
     """
     runs, counts = _runs(lengths, width)
     starts = np.cumsum(runs) - runs
@@ -132,7 +132,7 @@ def _places(lengths: np.ndarray, width: float, joined: bool) -> np.ndarray:
 
 
 def place_columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return feet (c, 2) on the wall and unit normals (c, 2) into the domain of columns about `width` apart."""
+    """Return feet (c, 2) on the wall, about `width` apart, and unit normals (c, 2) into the domain of the columns."""
     corners, joined = _begun(chain, width)
     along = np.diff(corners, axis=0)
     lengths = np.hypot(*along.T)
@@ -142,11 +142,11 @@ def place_columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndar
     edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
     share = ((at - reached[edge]) / lengths[edge])[:, None]
     normal = np.column_stack([-along[:, 1], along[:, 0]]) / lengths[:, None]
-    # Normals turn from corner to corner, so that columns neither cross nor gape where the wall is bent.
+    # Normals turn gradually from corner to corner, so that columns neither cross nor leave gaps at bends.
     first, last = (normal[-1], normal[0]) if chain.closed else (normal[0], normal[-1])
     at_corners = np.vstack([first, normal]) + np.vstack([normal, last])
     at_corners /= np.hypot(*at_corners.T)[:, None]
-    # Half an edge's normal, at most a width from its corner, is bent.
+    # A normal turns within half an edge of a corner, but at most within a width.
     bend = np.minimum(0.5, width / lengths[edge])[:, None]
     to_first, to_last = np.clip(1 - share / bend, 0, 1), np.clip(1 - (1 - share) / bend, 0, 1)
     mixed = (
@@ -157,5 +157,5 @@ def place_columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndar
     feet, normals = corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
     angles = -chain.fan * (np.arange(fan) + 0.5) / max(fan, 1)
     end = math.atan2(normal[-1, 1], normal[-1, 0])
-    spokes = np.column_stack([np.cos(end + angles), np.sin(end + angles)])
-    return np.vstack([feet, np.tile(corners[-1], (fan, 1))]), np.vstack([normals, spokes])
+    fanned = np.column_stack([np.cos(end + angles), np.sin(end + angles)])
+    return np.vstack([feet, np.tile(corners[-1], (fan, 1))]), np.vstack([normals, fanned])

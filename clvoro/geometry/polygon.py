@@ -1,4 +1,4 @@
-"""Domains bounded by straight edges, with holes, of one or several pieces."""
+"""Polygonal domains in 2D, with holes, of one or several pieces."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ if TYPE_CHECKING:
     from ..opencl.program import Engine
     from ..opencl.workspace import Workspace
 
-_MARGIN = 1 / 64  # of the clip box around the domain, of the bounding box's longest edge
+_MARGIN = (
+    1 / 64
+)  # of the bounding box's longest edge, between the domain and the box that clips cells
 _BEHIND = 16
-"""Roundings on the device by which generators that were put on an edge may be beyond it."""
+"""Tolerance for generators on an edge, in units of round-off on the device."""
 
 BOUNDARY_SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
-"""Shifts of the boundary, in units of round-off, each in another direction, that are tried where it cannot be traced
-through the diagram. They are within the tolerance of vertices, so that meshes stay as exact as without a shift."""
+"""Shifts of the boundary in units of round-off, each in another direction. They are tried one after the other if the
+boundary cannot be traced through the diagram. They are within the tolerance of vertices."""
 
 
 class Polygon(Region):
@@ -40,9 +42,9 @@ class Polygon(Region):
     Parameters
     ----------
     outer : array_like (k, 2)
-        Vertices of the outer ring in either order; the first may be repeated at the end.
+        Vertices of the outer ring in either orientation; the first may be repeated at the end.
     holes : sequence of array_like (k, 2)
-        Rings that are left out; they may touch each other and the outer ring in single points.
+        Rings of holes in either orientation; they may touch each other and the outer ring in single points.
     names : mapping, optional
         Names of boundaries, each with its edges: numbers, default names, or a sequence of them. By default a boundary
         is a ring: ``outer``, ``hole-1``, ``hole-2``, ..., or ``outer-1``, ``outer-2``, ... with several pieces. Edges
@@ -57,7 +59,7 @@ class Polygon(Region):
         Ring i is ``vertices[ring_starts[i] : ring_starts[i + 1]]``. Each piece's outer ring comes before
         its holes.
     piece_of_ring : (r,) int32
-        Which piece each ring bounds; pieces may touch in single points.
+        Number of the piece that each ring bounds; pieces may touch in single points.
     oriented : OrientedRings
         The same edges with the domain on their left, for algorithms.
     lower, upper : (2,) tuples of float
@@ -66,11 +68,11 @@ class Polygon(Region):
     Raises
     ------
     InputError, InputTypeError
-        Naming the ring and the place: if numbers are not finite, a ring has fewer than 3 distinct vertices,
-        no area, crosses or touches itself (slits of no width, too), holes lie outside or overlap or cut
-        the domain apart, pieces overlap, an edge is shorter than 1e-12 of the domain, or the whole is
-        too large, small or far from the origin for float64. Or if a name is not a word, clashes with
-        another one, or stands for an edge that does not exist or has a name already.
+        With the ring and the place: if a vertex is not finite; a ring has fewer than 3 distinct vertices or no area,
+        or crosses or touches itself; a hole is outside, overlaps another one or divides the domain; pieces overlap; an
+        edge is shorter than 1e-12 of the domain; or the domain is too large, too small or too far from the origin for
+        float64. Also if a name is not a word, clashes with another one, or stands for an edge that does not exist or
+        has a name already.
 
     Examples
     --------
@@ -82,7 +84,7 @@ class Polygon(Region):
     """
 
     framed_by: Polygon | None = None
-    """The polygon whose frame this one, a part of it, is to have on the device."""
+    """The polygon that this one is a part of; its frame is used on the device."""
 
     def __init__(
         self,
@@ -104,7 +106,7 @@ class Polygon(Region):
     ) -> Polygon:
         """Make a domain of several pieces, each a list of its outer ring and its holes.
 
-        Edges are numbered, and named, through all rings of the first piece, then of the second one, and so on.
+        Edges are numbered through the rings of the first piece, then of the second one, and so on.
 
         Examples
         --------
@@ -117,7 +119,7 @@ class Polygon(Region):
 
     @classmethod
     def from_shapely(cls, geometry: Any, names: Mapping[str, Walls] | None = None) -> Polygon:
-        """Make a domain of a shapely Polygon or MultiPolygon; heights are left out."""
+        """Make a domain of a shapely Polygon or MultiPolygon; z coordinates are dropped."""
         return cls.from_pieces(pieces_of_shape(geometry), names)
 
     @classmethod
@@ -142,9 +144,9 @@ class Polygon(Region):
         Parameters
         ----------
         source : path, str or dict
-            A file, a text that begins with ``{``, or what `json.loads` makes of it: a Polygon, MultiPolygon,
-            Feature or collection of these. Coordinates are taken as they are, in the plane: project
-            longitudes and latitudes before. A Feature may name its boundaries in its properties, by its own edges:
+            A file, a text that begins with ``{``, or the object that `json.loads` returns: a Polygon, MultiPolygon,
+            Feature or collection of these. Coordinates are used as plane coordinates: project longitudes and latitudes
+            before. A Feature may name its boundaries in its properties, by the numbers of its own edges:
             ``"boundaries": {"island": [4, 5, 6]}``.
         names : mapping, optional
             Names of boundaries, in place of those in `source`.
@@ -152,7 +154,8 @@ class Polygon(Region):
         Raises
         ------
         InputError
-            If there is no such file, it is no GeoJSON, holds something else than polygons, or these make no domain.
+            If the file cannot be read, is not GeoJSON or holds other geometries than polygons, or these are not a valid
+            domain.
 
         Examples
         --------
@@ -200,7 +203,7 @@ class Polygon(Region):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of vertices, rings and pieces: equal domains have the same."""
+        """SHA-256 of vertices, rings and pieces: the same for equal domains."""
         return hashlib.sha256(b"".join(array.tobytes() for array in self._arrays())).hexdigest()
 
     def __repr__(self) -> str:
@@ -217,7 +220,7 @@ class Polygon(Region):
         return _described, (self.describe(),)
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values (lists, numbers) of which `described` makes an equal domain."""
+        """Return lists and numbers from which `described` makes an equal domain."""
         return {
             "vertices": self.vertices.tolist(),
             "ring_starts": self.ring_starts.tolist(),
@@ -227,11 +230,17 @@ class Polygon(Region):
 
     @classmethod
     def described(cls, **values: Any) -> Polygon:
-        """Make the domain that `describe` described; damaged values are refused by an InputError."""
+        """Make the domain that `describe` describes.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If values are damaged.
+        """
         if "edge_numbers" in values:
             raise InputError(
                 "the Polygon was written by an earlier version of clvoro, which numbered its edges in another order; "
-                "make the mesh anew"
+                "make the mesh again"
             )
         try:
             starts = np.array(values["ring_starts"], np.int32)
@@ -249,14 +258,14 @@ class Polygon(Region):
             and vertices.shape == (starts[-1], 2)
         ):
             raise InputError("the description of a Polygon is damaged: its arrays do not fit")
-        # Closed, as a last vertex that is the first one would be taken for a closing one.
+        # Close the rings: a last vertex equal to the first one would be dropped as the closing one.
         rings = [np.concatenate([vertices[a:b], vertices[a : a + 1]]) for a, b in pairwise(starts)]
         firsts = [*np.flatnonzero(steps), len(rings)]
         return cls.from_pieces([rings[a:b] for a, b in pairwise(firsts)], values.get("names"))
 
     @property
     def measure(self) -> float:
-        """Area; rounded once per ring, and as a sum."""
+        """Area, with one rounding per ring and one for the sum."""
         return self._measure
 
     def _default_names(self) -> BoundaryNames:
@@ -317,7 +326,7 @@ class Polygon(Region):
         rows, vertices = self.find_edges("boundary", walls), self.oriented.vertices
         return Edges(vertices[rows], vertices[self.oriented.next_vertex[rows]])
 
-    # The device's view: the polygon never touches the box that cells are clipped by.
+    # The device's view: the polygon does not touch the box that clips cells.
 
     @property
     def clip_box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -334,19 +343,19 @@ class Polygon(Region):
         return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
 
     def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Kernels for polygons know of edges."""
+        """Return the macro of kernels for polygons."""
         del real
         return (("POLYGON", 1),)
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
-        """Return the corners of the clip box, and the edges in bins; see geometry/edges.h."""
+        """Return the corners of the clip box and the edges in bins; see geometry/edges.h."""
         there = self._on_device.setdefault(engine.workspace, {})
         if engine.real not in there:
             origin, scale = self.frame
             begins = (self.oriented.vertices - origin) / scale
             ends = begins[self.oriented.next_vertex]
             frame, shape, starts, listed = bin_edges(begins, ends)
-            # Where what is put on an edge may be: by the rounding of device and domain.
+            # The round-off of a generator on an edge: that of the device and that of the domain.
             frame[3] = _BEHIND * float(np.finfo(engine.real).eps) + self._rounding / scale
             there[engine.real] = (
                 frame.astype(engine.real), shape, engine.upload(starts, np.int32),
@@ -356,7 +365,7 @@ class Polygon(Region):
 
     @cached_property
     def _on_device(self) -> WeakKeyDictionary[Workspace, dict[np.dtype, tuple[object, ...]]]:
-        """What `device_args` has made, by the workspace of the engine, with which it goes, and precision."""
+        """Results of `device_args` by workspace and precision; they are freed with the workspace."""
         return WeakKeyDictionary()
 
 

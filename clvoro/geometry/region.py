@@ -1,4 +1,4 @@
-"""Where points lie in a region with straight edges: inside, in which piece, how far from which edge."""
+"""Locate points in a polygonal region: inside or outside, piece, nearest edge."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from ..arguments import check_rows
 from .box import Domain
 from .rings import OrientedRings, project
 
-_ROUNDINGS = 8  # of a coordinate, by which a point may lie off the boundary and still be on it
+_ROUNDINGS = (
+    8  # tolerance for points on the boundary, in units of round-off of the largest coordinate
+)
 
 
 class Region(Domain):
-    """What a `Polygon` tells of places; the attributes are described there."""
+    """Queries of a `Polygon` about points. `Polygon` describes the attributes."""
 
     vertices: np.ndarray
     ring_starts: np.ndarray
@@ -67,10 +69,10 @@ class Region(Domain):
         return _ROUNDINGS * float(np.finfo(float).eps) * far
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, 2) whether it lies in the domain; (n,) bool.
+        """Return for each of `points` (n, 2) whether it lies in the domain; (n,) bool.
 
-        The boundary is included, and with it what lies off it by less than eight roundings of the largest
-        coordinate: points on slanted edges can be met no better.
+        The boundary is included, with a tolerance of eight units of round-off of the largest coordinate: points on
+        slanted edges cannot be represented exactly.
         """
         points = check_rows("points", points, 2)
         inside = self.covers(points)
@@ -84,11 +86,11 @@ class Region(Domain):
         return inside
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Tell for each of `points` (n, 2) whether it lies in the domain exactly, boundary included; (n,) bool."""
+        """Return for each of `points` (n, 2) whether it lies in the domain, without tolerance; (n,) bool."""
         return np.array(shapely.intersects_xy(self.geometry, points[:, 0], points[:, 1]))
 
     def contains_well(self, points: np.ndarray, margin: float) -> np.ndarray:
-        """Tell for each of `points` (n, 2) whether it lies inside, more than `margin` from the boundary; (n,) bool."""
+        """Return for each of `points` (n, 2) whether it is inside and over `margin` from the boundary; (n,) bool."""
         inside = self.covers(points)
         rows = np.flatnonzero(inside)
         near, _ = self._edges.query(
@@ -110,7 +112,7 @@ class Region(Domain):
         """Return for each of `points` (n, 2) the piece that holds it or is nearest, (n,) int."""
         found = self.piece_of(points)
         rest = np.flatnonzero(found < 0)
-        if rest.size:  # off by a rounding
+        if rest.size:  # outside by round-off
             edge, _ = self.nearest_edge(
                 points[rest]
             )  # by the caller's number, as are the starts of rings
@@ -119,15 +121,15 @@ class Region(Domain):
         return found
 
     def inner_point(self, piece: int) -> np.ndarray:
-        """Return a place (2,) inside of a piece, off its boundary."""
+        """Return a point (2,) inside of a piece, not on its boundary."""
         return np.array(shapely.get_coordinates(shapely.point_on_surface(self.pieces[piece]))[0])
 
     def nearest_edge(
         self, points: np.ndarray, within: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the number of an edge that is nearest to each of `points` (n, 2), and the nearest point on it.
+        """Return the number of the nearest edge to each of `points` (n, 2), and the nearest point on it.
 
-        Looking no farther than `within` is faster; where there is no edge, its number is -1.
+        A search radius `within` makes it faster; the number is -1 for points without an edge in that radius.
 
         Returns
         -------
@@ -145,7 +147,7 @@ class Region(Domain):
         return np.where(edge >= 0, oriented.edge_numbers[edge], -1), project(points, begin, end)
 
     def is_slit(self, points: np.ndarray, within: float) -> np.ndarray:
-        """Tell for each of `points` (n, 2) whether the boundary runs by more than once, within `within`; (n,) bool."""
+        """Return for each of `points` (n, 2) whether separate parts of the boundary are within `within`; (n,) bool."""
         rows, edges = self._edges.query(
             shapely.points(points), predicate="dwithin", distance=within
         )
@@ -158,7 +160,7 @@ class Region(Domain):
         )
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Return the nearest point of the domain to each of `points` (n, 2): itself, or one on the boundary."""
+        """Return the nearest point of the domain to each of `points` (n, 2): the point itself if it is inside."""
         found = np.array(points, dtype=float)
         outside = np.flatnonzero(~self.contains(found))
         if outside.size:

@@ -1,4 +1,4 @@
-"""Rings of a polygonal domain: cleaned, oriented and found sound, or refused with the ring and the place."""
+"""Rings of a polygonal domain: clean, check and orient them. Errors name the ring and the place."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ from ..errors import InputError, InputTypeError
 from .box import LARGEST_EDGE
 
 SHORTEST_EDGE = 1e-12
-"""Least length of an edge, of the bounding box's longest edge."""
-_RESOLUTION = 2.0**-40  # least extent, of the largest coordinate: what is left of float64's digits
+"""Shortest edge, as a share of the bounding box's longest edge."""
+_RESOLUTION = (
+    2.0**-40
+)  # smallest extent, as a share of the largest coordinate: 12 bits are left of float64's 52
 _SPLIT = 2.0**27 + 1
-_NAMED = 4  # rings at one place
+_NAMED = 4  # rings at one place that an error lists
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class Ring:
     vertices : (k, 2) float64
         Those that differ from the next one, in the caller's order or in reverse.
     numbers : (k,) int64
-        The caller's number of each edge between `vertices`: his edge i goes from his vertex i to the next.
+        Number of each edge in `given`: edge i goes from vertex i to the next.
     name : str
-        As errors call it: "outer ring", "hole 2 of piece 0".
+        Name in errors: "outer ring", "hole 2 of piece 0".
     """
 
     given: np.ndarray
@@ -51,7 +53,7 @@ class Ring:
 
 @dataclass(frozen=True)
 class OrientedRings:
-    """The boundary of a polygon as algorithms walk along it: the domain on the left of every edge.
+    """The boundary of a polygon with the domain on the left of every edge, for algorithms.
 
     Outer rings run counter-clockwise, holes clockwise. Vertices on a straight line are kept, repeated ones are dropped.
     The place of an edge in these arrays is not its number: `edge_numbers` and `places` translate.
@@ -99,7 +101,7 @@ class OrientedRings:
 
     @cached_property
     def turns(self) -> np.ndarray:
-        """How far the boundary turns to the left in each vertex, -pi to pi, (k,)."""
+        """Angle by which the boundary turns to the left in each vertex, -pi to pi, (k,)."""
         ahead = self.vertices[self.next_vertex] - self.vertices
         ahead /= np.hypot(*ahead.T)[:, None]
         after = ahead[self.next_vertex]
@@ -111,7 +113,7 @@ class OrientedRings:
 
     @cached_property
     def sharpest(self) -> np.ndarray:
-        """The vertex of each ring in which it turns farthest, the first one up to round-off, (r,) int."""
+        """The vertex of each ring with the largest turn, the first of those equal up to round-off, (r,) int."""
         found = []
         for a, b in pairwise(self.ring_starts.tolist()):
             by = np.abs(self.turns[a:b])
@@ -120,15 +122,19 @@ class OrientedRings:
 
 
 def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
-    """Return the rings of each piece, its outer ring first, or raise an InputError.
+    """Return the rings of each piece, its outer ring first.
 
-    Repeated vertices are dropped and clockwise rings reversed (holes: the others); all else that is
-    no polygon is refused.
+    Repeated vertices are dropped. Clockwise outer rings and counter-clockwise holes are reversed.
 
     Parameters
     ----------
     pieces : sequence of sequences of array_like (k, 2)
         For each piece its outer ring and its holes, closed by a repeated first vertex or not.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the rings are not those of a valid polygon; names the ring and the place.
     """
     if not len(pieces):
         raise InputError("Polygon got no rings, expected an outer ring of at least 3 vertices")
@@ -143,12 +149,10 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
         rings.append([])
         for k, (ring, name) in enumerate(zip(piece, names, strict=True)):
             rings[-1].append(_cleaned(ring, name))
-            # Soon, as all pairs of such rings cross everywhere.
+            # Checked first: shapely would find an intersection at every edge.
             other = known.setdefault((k > 0, _shape_key(rings[-1][-1].vertices)), name)
             if other != name:
-                raise InputError(
-                    f"Polygon's {name} is the {other} once more; leave one of them out"
-                )
+                raise InputError(f"Polygon's {name} repeats the {other}; leave one of them out")
     flat = [ring for piece in rings for ring in piece]
     for ring in flat:
         _check_area(ring)
@@ -162,7 +166,7 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
 
 
 def signed_area(vertices: np.ndarray) -> float:
-    """Area that a ring (k, 2) encloses, positive if it runs counter-clockwise; correctly rounded."""
+    """Return the area inside a ring (k, 2), positive if it runs counter-clockwise; correctly rounded."""
     x, y = vertices.T
     x_next, y_next = np.roll(vertices, -1, axis=0).T
     terms = [*_product(x, y_next), *_product(-x_next, y)]
@@ -170,7 +174,7 @@ def signed_area(vertices: np.ndarray) -> float:
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a * b as an unevaluated sum of two numbers, without error (Dekker 1971)."""
+    """Return a * b exactly as a sum of two numbers (Dekker, Numer. Math. 18 (1971) 224)."""
     p = a * b
     (a_high, a_low), (b_high, b_low) = _halves(a), _halves(b)
     return p, a_low * b_low - (((p - a_high * b_high) - a_low * b_high) - a_high * b_low)
@@ -183,7 +187,7 @@ def _halves(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cleaned(given: object, name: str) -> Ring:
-    """Take a ring as it was given; drop vertices that are the same as the next."""
+    """Check one ring, and drop vertices that are equal to the next one."""
     hint = _other_maker(given)
     if hint:
         raise InputTypeError(
@@ -194,7 +198,7 @@ def _cleaned(given: object, name: str) -> Ring:
     except (InputError, InputTypeError) as error:
         hint = _other_nesting(given, name)
         raise type(error)(f"{error}{hint}") from error
-    array = array + 0.0  # which makes -0.0 0.0: equal polygons have equal bytes
+    array = array + 0.0  # turns -0.0 into 0.0, so that equal polygons have equal bytes
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise InputError(
@@ -212,7 +216,7 @@ def _cleaned(given: object, name: str) -> Ring:
 
 
 def _shape_key(vertices: np.ndarray) -> bytes:
-    """Return what is the same for a ring from whichever vertex and in whichever direction it begins."""
+    """Return a key that does not depend on the first vertex or the direction of a ring."""
     first = np.lexsort(vertices.T)[0]
     forth = np.roll(vertices, -first, axis=0)
     back = np.roll(forth[::-1], 1, axis=0)
@@ -220,7 +224,7 @@ def _shape_key(vertices: np.ndarray) -> bytes:
 
 
 def _other_maker(given: object) -> str:
-    """Tell how a Polygon is made of something that is no ring, but known."""
+    """Return a hint for objects from which another method makes a Polygon; empty for others."""
     if isinstance(given, str | PathLike):
         geojson = str(given).lstrip().startswith("{") or Path(given).suffix.endswith("json")
         return f"write clvoro.Polygon.{'from_geojson' if geojson else 'from_wkt'}(...)"
@@ -232,34 +236,34 @@ def _other_maker(given: object) -> str:
 
 
 def _other_nesting(given: object, name: str) -> str:
-    """Tell what is to be done with rings that are in too many lists, or in too few."""
+    """Return a hint for rings that are nested in too many or too few lists; empty for others."""
     if not isinstance(given, list | tuple | np.ndarray) or not len(given):
         return ""
     if isinstance(given[0], Real):
         return (
             ""
             if name.startswith("outer") or len(given) != 2
-            else " (holes is a list of rings: of one, [ring])"
+            else " (holes is a list of rings; write [ring] for a single hole)"
         )
     first = given[0]
     nested = isinstance(first, list | tuple | np.ndarray) and len(first) and np.ndim(first[0]) == 1
-    return " (of several rings, write clvoro.Polygon(rings[0], rings[1:]))" if nested else ""
+    return " (for several rings write clvoro.Polygon(rings[0], rings[1:]))" if nested else ""
 
 
 def _check_lengths(rings: Sequence[Ring]) -> None:
-    """Refuse what float64 cannot hold: domains too large, too small or too far off, edges too short."""
+    """Refuse domains that are too large, too small or too far from the origin for float64, and edges too short."""
     every = np.concatenate([ring.vertices for ring in rings])
     with np.errstate(over="ignore"):
         extent = every.max(axis=0) - every.min(axis=0)
     if not (extent.min() >= 1 / LARGEST_EDGE and extent.max() <= LARGEST_EDGE):
         raise InputError(
             f"Polygon has a bounding box of edges {extent.tolist()}, expected {1 / LARGEST_EDGE:g} to "
-            f"{LARGEST_EDGE:g}: areas and moments of cells must be numbers, too; choose another unit of length"
+            f"{LARGEST_EDGE:g}, so that areas and moments of cells do not overflow; choose another unit of length"
         )
     if extent.max() < _RESOLUTION * np.abs(every).max():
         raise InputError(
-            f"Polygon has vertices at {_at(every[0])} and extends over {extent.max():g} only: too few "
-            "digits of float64 are left; move it to the origin"
+            f"Polygon has a vertex at {_at(every[0])} and an extent of {extent.max():g}, expected a larger extent: too "
+            "few digits of float64 are left; move it to the origin"
         )
     for ring in rings:
         step = np.roll(ring.vertices, -1, axis=0) - ring.vertices
@@ -274,7 +278,7 @@ def _check_lengths(rings: Sequence[Ring]) -> None:
 
 
 def _check_area(ring: Ring) -> None:
-    # Relative to a vertex, as whatever lies on a line must be found to do so.
+    # Relative to a vertex, so that round-off does not depend on the distance from the origin.
     with np.errstate(over="ignore", invalid="ignore"):
         offset = ring.vertices - ring.vertices[0]
         far = offset[np.argmax(np.hypot(*offset.T))]
@@ -282,7 +286,7 @@ def _check_area(ring: Ring) -> None:
     if across.max() < SHORTEST_EDGE * np.hypot(*far):
         raise InputError(
             f"Polygon's {ring.name} has all its vertices on the line from {_at(ring.vertices[0])} to "
-            f"{_at(ring.vertices[0] + far)}: its area is zero"
+            f"{_at(ring.vertices[0] + far)}, expected a ring with an area"
         )
 
 
@@ -292,15 +296,15 @@ def _shape(piece: Sequence[Ring]) -> Any:
 
 _UNITE = "unite the pieces (shapely.union_all)"
 _REMEDIES = {
-    "Hole lies outside shell": "leave the hole out, or make it a piece of its own",
-    "Holes are nested": "unite the holes, or make what lies in a hole a piece of its own",
+    "Hole lies outside shell": "leave the hole out, or make it a separate piece",
+    "Holes are nested": "unite the holes, or make the inner one a separate piece",
     "Nested shells": _UNITE,
-    "Interior is disconnected": "give the parts as pieces of their own",
+    "Interior is disconnected": "pass the parts as separate pieces",
 }
 
 
 def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
-    """Refuse what is no polygon, with what shapely says about it and the rings at the place."""
+    """Refuse an invalid polygon, with the reason that shapely finds and the rings at the place."""
     reason = shapely.is_valid_reason(shape)
     if reason == "Valid Geometry":
         return
@@ -313,22 +317,22 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
         distance = distance_to_edges(place, ring.vertices)
         away.append((float(distance.min()), int(ring.numbers[np.argmin(distance)])))
     close = min(d for d, _ in away) + 1e-9 * float(np.ptp(rings[0].vertices, axis=0).max())
-    there = [  # by the numbers in their rings
+    there = [  # edges are numbered within their rings
         f"edge {e} of the {ring.name}"
         for ring, (d, e) in zip(rings, away, strict=True)
         if d <= close
     ]
     more = len(there) - _NAMED
-    where = " and ".join([*there[:_NAMED], *([f"those of {more} more rings"] if more > 0 else [])])
-    remedy = "correct it (shapely.make_valid shows what can be made of it)"
-    if shape.geom_type == "MultiPolygon":  # each piece of which is valid
+    where = " and ".join([*there[:_NAMED], *([f"edges of {more} more rings"] if more > 0 else [])])
+    remedy = "correct it (shapely.make_valid suggests how)"
+    if shape.geom_type == "MultiPolygon":  # each piece is valid
         remedy = _UNITE
     remedy = _REMEDIES.get(reason, remedy)
     raise InputError(f"Polygon is not valid: {reason} at {_at(place)}, {where}; {remedy}")
 
 
 def distance_to_edges(point: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Distances (k,) of one point (2,) to the edges of one ring (k, 2)."""
+    """Return the distances (k,) of one point (2,) to the edges of one ring (k, 2)."""
     nearest = project(point, vertices, np.roll(vertices, -1, axis=0))
     return np.hypot(*(nearest - point).T)
 
@@ -338,7 +342,7 @@ def project(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarra
     along = end - start
     t = ((points - start) * along).sum(axis=-1) / (along * along).sum(axis=-1)
     t = np.clip(t, 0.0, 1.0)[..., None]
-    # From the nearer end, so that both ends are met exactly.
+    # Computed from the nearer end, so that both ends are exact.
     return np.where(t <= 0.5, start + t * along, end - (1.0 - t) * along)
 
 

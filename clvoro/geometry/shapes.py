@@ -1,4 +1,4 @@
-"""Curves that distances are measured from: circles (spheres), segments, polylines and polygons."""
+"""Curves that distances are measured from: circles (spheres), segments, polylines and edges."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ def coordinates(what: str, values: object, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Circle, in 3D the sphere.
+    """A circle in 2D, a sphere in 3D.
 
     Parameters
     ----------
     center : (2,) or (3,) float
     radius : float
-        0 makes it a point.
+        0 for a point.
 
     Raises
     ------
     InputError, InputTypeError
-        If a number is none, not finite, or the radius negative.
+        If a coordinate or the radius is not a finite number, or the radius is negative.
     """
 
     center: np.ndarray
@@ -55,7 +55,7 @@ class Circle:
             raise InputError(f"Circle radius is {self.radius!r}, expected finite and not negative")
 
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.center[None], self.center[None], np.array([float(self.radius)])
 
 
@@ -65,17 +65,17 @@ Sphere = Circle
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """Open chain of straight segments.
+    """An open chain of straight segments.
 
     Parameters
     ----------
     points : (m, 2) or (m, 3) float
-        Two or more.
+        Two or more vertices.
 
     Raises
     ------
     InputError, InputTypeError
-        If they are too few, not finite, or of another shape.
+        If there are too few points, one is not finite, or the array has another shape.
     """
 
     points: np.ndarray
@@ -93,22 +93,22 @@ class Polyline:
         return 2
 
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.points[:-1], self.points[1:], np.zeros(len(self.points) - 1)
 
 
-class Polygon(Polyline):
-    """Closed chain of straight segments, a curve; the domain that has an inside is `clvoro.Polygon`.
+class ClosedPolyline(Polyline):
+    """A closed chain of straight segments. It is a curve; `clvoro.Polygon` is a domain.
 
     Parameters
     ----------
     points : (m, 2) or (m, 3) float
-        Three or more; the last joins the first.
+        Three or more vertices; a segment joins the last one to the first.
 
     Raises
     ------
     InputError, InputTypeError
-        If they are too few, not finite, or of another shape.
+        If there are too few points, one is not finite, or the array has another shape.
     """
 
     @staticmethod
@@ -116,13 +116,13 @@ class Polygon(Polyline):
         return 3
 
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.points, np.roll(self.points, -1, axis=0), np.zeros(len(self.points))
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Straight segments that need not hang together; `clvoro.Polygon.boundary` gives them for edges of a domain.
+    """Straight segments, connected or not. `clvoro.Polygon.boundary` returns edges of a domain.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class Edges:
     Raises
     ------
     InputError, InputTypeError
-        If there is none, a number is not finite, or shapes differ.
+        If there is no segment, a coordinate is not finite, or the shapes differ.
     """
 
     begin: np.ndarray
@@ -151,13 +151,13 @@ class Edges:
         object.__setattr__(self, "end", end)
 
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.begin, self.end, np.zeros(len(self.begin))
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Straight segment.
+    """A straight segment.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class Segment:
     Raises
     ------
     InputError, InputTypeError
-        If a number is none or not finite, or the ends differ in dimension.
+        If a coordinate is not a finite number, or the ends differ in dimension.
     """
 
     a: np.ndarray
@@ -183,5 +183,5 @@ class Segment:
         object.__setattr__(self, "b", b)
 
     def items(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return begins (m, d), ends (m, d) and radii (m,) of the pieces of the curve."""
+        """Return the ends (m, d), (m, d) and radii (m,) of the segments that the curve consists of."""
         return self.a[None], self.b[None], np.zeros(1)

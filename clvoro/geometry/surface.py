@@ -18,36 +18,33 @@ from .shapes import coordinates
 from .triangles import crossing, triangle_distance2
 
 _FORMATS = ("stl", "obj", "ply", "off")
-_BLOCK = 1 << 18  # pairs of triangles, or of a point and a triangle, looked at together
+_BLOCK = 1 << 18  # pairs of triangles, or of a point and a triangle, per batch
 
 
 class Surface:
-    """A triangulated surface in 3D; for a `Distance`, both its sides are alike.
+    """A triangulated surface in 3D.
 
     Parameters
     ----------
     vertices : (v, 3) float
     triangles : (t, 3) int
-        Rows of indices into `vertices`. Any order will do for distances; seen from outside
-        counter-clockwise for `contains`.
+        Indices into `vertices`. `contains` needs the same orientation in all triangles; distances do not depend on it.
     name : str
-        What errors call it.
+        Name of the surface in error messages.
     join : float
-        Vertices so near to each other count as one for `closed` and its like, in the unit of the
-        coordinates; 0 joins those at the same place.
+        Distance within which vertices count as one for `closed` and `open_edges`, in the unit of the coordinates. With
+        0 only vertices at the same place are one.
 
     Raises
     ------
     InputError, InputTypeError
-        If there is no triangle, or none with an area, if a vertex is not finite, or an index points
-        to no vertex; names the first.
+        If no triangle has an area, a vertex is not finite, or an index is out of range; names the first.
 
     Notes
     -----
-    Corners at the same place count as one vertex, so a file of separate triangles (STL) is as good
-    as one with shared vertices. Open, branching and self-intersecting surfaces are accepted: the
-    distance to them is well defined. `closed`, `open_edges`, `require_closed` and `check` are for
-    those who need more.
+    Corners at the same place count as one vertex, so a file of separate triangles (STL) serves as well as one with
+    shared vertices. Open, branching and self-intersecting surfaces are accepted, because distances to them are well
+    defined. `require_closed` and `check` refuse them.
 
     Examples
     --------
@@ -67,13 +64,12 @@ class Surface:
         if self.vertices.shape[1] != 3:
             raise InputError(
                 f"{name} vertices have shape {self.vertices.shape}, expected (v, 3); "
-                "in 2D use Polygon or Polyline"
+                "in 2D use ClosedPolyline or Polyline"
             )
         given = np.asarray(triangles)
         if given.size and given.dtype.kind not in "iu":
             raise InputTypeError(
-                f"{name} triangles are of type {given.dtype}, expected integers, the indices of "
-                "vertices"
+                f"{name} triangles have dtype {given.dtype}, expected integers, the indices of vertices"
             )
         if given.ndim != 2 or given.shape[1] != 3 or not len(given):
             raise InputError(
@@ -97,12 +93,18 @@ class Surface:
 
     @classmethod
     def read(cls, path: str | PathLike[str], join: float = 0.0) -> Surface:
-        """Read a surface from an STL, OBJ, PLY or OFF file (needs trimesh); `join` as above.
+        """Read a surface from an STL, OBJ, PLY or OFF file, with trimesh.
+
+        Parameters
+        ----------
+        path : str or path
+        join : float
+            See `Surface`.
 
         Raises
         ------
         InputError
-            If trimesh is not installed, the file cannot be read, or holds no good surface.
+            If trimesh is not installed, the file cannot be read, or it holds no valid surface.
         """
         path = Path(path)
         kind = path.suffix.lower().lstrip(".")
@@ -120,10 +122,10 @@ class Surface:
                 "reading a surface file needs trimesh; pip install 'clvoro[surfaces]' "
                 "(or pip install trimesh), or pass the arrays: Surface(vertices, triangles)"
             ) from error
-        # Pictures and materials beside the surface are none of our business.
+        # Files of textures and materials are not needed.
         extra: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
         try:
-            # What is no number among the coordinates is refused below.
+            # Coordinates that are not finite are refused below.
             with open_plain(path) as file, np.errstate(all="ignore"), unlogged("trimesh"):
                 mesh: Any = trimesh.load(file, file_type=kind, force="mesh", process=False, **extra)
             vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
@@ -135,14 +137,14 @@ class Surface:
             ) from error
         except (
             ModuleNotFoundError
-        ) as error:  # it would guess what the bytes that are no text could be
+        ) as error:  # trimesh would need a module that guesses the encoding
             raise InputError(
-                f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged, or no text in UTF-8; export it anew"
+                f"{str(path)!r} cannot be read as {kind.upper()}: it is damaged or not in UTF-8; export it again"
             ) from error
-        except Exception as error:  # a reader may fail in any way on a broken file
+        except Exception as error:  # trimesh raises many kinds of errors for damaged files
             raise InputError(
                 f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: "
-                f"{error}); export it anew"
+                f"{error}); export it again"
             ) from error
         if not triangles.size:
             raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
@@ -155,25 +157,25 @@ class Surface:
 
     @cached_property
     def _unit_corners(self) -> np.ndarray:
-        """The corners about the middle of the vertices, in units of their largest extent."""
+        """Corners relative to the center of the bounding box, in units of its longest edge."""
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         extent = (high - low).max()
         return (self.corners - (low + 0.5 * (high - low))) / (extent if extent > 0 else 1.0)
 
     @cached_property
     def areas(self) -> np.ndarray:
-        """Areas of the triangles, (t,) float, in units of the largest extent squared."""
+        """Areas of the triangles, (t,) float, in units of the bounding box's longest edge squared."""
         a, b, c = np.moveaxis(self._unit_corners, 1, 0)
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     @cached_property
     def tree(self) -> Tree:
-        """The boxes of the triangles."""
+        """Bounding boxes of the triangles."""
         return Tree(self.corners.min(axis=1), self.corners.max(axis=1))
 
     @cached_property
     def _merged(self) -> np.ndarray:
-        """Triangles (t, 3) as indices of places: vertices at the same place are one."""
+        """Triangles (t, 3) with one index for all vertices at the same place."""
         unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
         if self.join > 0:
             from scipy.sparse import coo_array
@@ -188,9 +190,9 @@ class Surface:
 
     @cached_property
     def _edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Edges (e, 2) of places, how many triangles each has, and a triangle and side of each.
+        """Edges (e, 2) between places, the number of triangles at each, and one of its triangles and sides, 3 t + s.
 
-        Triangles that have shrunk to an edge or a point have none.
+        Triangles without three distinct corners are left out.
         """
         merged = self._merged
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
@@ -202,7 +204,7 @@ class Surface:
 
     @cached_property
     def open_edges(self) -> np.ndarray:
-        """Edges that bound one triangle alone, (k, 2) int, indices of vertices."""
+        """Edges of a single triangle, (k, 2) int, as indices of vertices."""
         _, count, where = self._edges
         triangle, side = np.divmod(where[count == 1], 3)
         return np.column_stack(
@@ -211,7 +213,7 @@ class Surface:
 
     @property
     def closed(self) -> bool:
-        """Whether every edge belongs to an even number of triangles, so that there is an inside."""
+        """Whether every edge belongs to an even number of triangles. Then the surface has an inside."""
         return not (self._edges[1] % 2).any()
 
     def require_closed(self) -> None:
@@ -220,7 +222,7 @@ class Surface:
         Raises
         ------
         InputError
-            With the number of open edges and the first of them.
+            With the number of open edges, and the place of the first one.
         """
         if self.closed:
             return
@@ -228,7 +230,7 @@ class Surface:
         if len(edges):
             a, b = (self._place(self.vertices[i]) for i in edges[0])
             raise InputError(
-                f"{self.name} is open: {len(edges)} edges bound one triangle only, the first from "
+                f"{self.name} is open: {len(edges)} edges belong to a single triangle, the first from "
                 f"{a} to {b}; expected a closed surface: fill the holes, or pass join= if "
                 "vertices that should coincide are a little apart"
             )
@@ -237,15 +239,14 @@ class Surface:
         triangle, side = divmod(int(where[odd[0]]), 3)
         a, b = (self._place(self.corners[triangle, (side + k) % 3]) for k in (0, 1))
         raise InputError(
-            f"{self.name} is not closed: {len(odd)} edges bound an odd number of triangles, the "
-            f"first, from {a} to {b}, {count[odd[0]]}; remove the triangles too many"
+            f"{self.name} is not closed: {len(odd)} edges belong to an odd number of triangles, the "
+            f"first, from {a} to {b}, to {count[odd[0]]}; remove the surplus triangles"
         )
 
     def crossings(self) -> np.ndarray:
-        """Return the pairs of triangles that cross or cover each other, (k, 2) int, sorted.
+        """Return the pairs of triangles that intersect or cover each other, (k, 2) int, sorted.
 
-        Triangles that only touch, at shared corners and sides or elsewhere, do not; those thinner
-        than 1e-7 of their length are not looked at.
+        Contact without overlap is no intersection. Triangles thinner than 1e-7 of their length are skipped.
         """
         i, j = self.tree.overlaps()
         corners = self._unit_corners
@@ -261,30 +262,30 @@ class Surface:
         return pairs[np.lexsort(pairs.T[::-1])]
 
     def check(self) -> None:
-        """Raise if the surface crosses itself.
+        """Raise if the surface intersects itself.
 
         Raises
         ------
         InputError
-            Naming the first two triangles that cross, their place and how many pairs do.
+            With the first pair of triangles, their places and the number of pairs.
         """
         pairs = self.crossings()
         if len(pairs):
             p, q = pairs[0].tolist()
             raise InputError(
-                f"{self.name} crosses itself: triangles {p}, about "
-                f"{self._place(self.corners[p].mean(axis=0))}, and {q}, about "
+                f"{self.name} intersects itself: triangles {p}, at "
+                f"{self._place(self.corners[p].mean(axis=0))}, and {q}, at "
                 f"{self._place(self.corners[q].mean(axis=0))}, and {len(pairs) - 1} more pairs; "
-                "expected a surface without self-intersections. Mend it where it was made, for "
+                "expected a surface without self-intersections. Repair it in the program that made it, for "
                 "instance with a boolean union of its parts"
             )
 
     def contains(self, points: object) -> np.ndarray:
-        """Tell for each of `points` (n, 3) whether it lies inside the closed surface, (n,) bool.
+        """Return for each of `points` (n, 3) whether it lies inside the closed surface, (n,) bool.
 
-        By the winding number, the sum of the triangles' solid angles over 4 pi, rounded: exact off
-        the surface itself. Costs n t operations on the host. Either orientation will do, if it is
-        the same throughout.
+        By the winding number: the sum of the solid angles of all triangles over 4 pi, rounded to an integer (van
+        Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30 (1983) 125). Exact for points that are not on the surface.
+        Costs n t operations on the host. All triangles must have the same orientation, inwards or outwards.
 
         Raises
         ------
@@ -320,11 +321,11 @@ class Surface:
         )
 
     def landmarks(self, spacing: float, most: int) -> np.ndarray:
-        """Return at most `most` points on the surface, `spacing` apart or so."""
+        """Return at most `most` points on the surface, about `spacing` apart."""
         total = np.cumsum(self.areas)
         unit = np.ptp(self.vertices, axis=0).max()
         count = int(min(max(total[-1] * (unit / spacing) ** 2, 1), most))
-        # Evenly along the sum of areas, and in each triangle by the golden section.
+        # Equal shares of the area, and in each triangle a low-discrepancy sequence (plastic number, R2).
         item = np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1])
         item = np.minimum(item, len(total) - 1)
         k = np.arange(count)
@@ -333,12 +334,12 @@ class Surface:
         return np.einsum("nk,nkd->nd", weights, self.corners[item])
 
     def packed(self, origin: np.ndarray, scale: float, real: np.dtype) -> tuple[np.ndarray, Tree]:
-        """Return the triangles as the device takes them, (t, 21) in the tree's order, and the tree.
+        """Return the triangles as the device takes them, (t, 21) in the order of the tree, and the tree.
 
-        A corner a, the sides b - a and c - a, the two vectors that tell a point's coordinates s and
-        t in them, the unit normal, and 1 / length^2 of b - a, c - a, c - b; in coordinates
-        x' = (x - origin) / scale, rounded to `real` first, so that the rest fits what the device
-        sees. A triangle thinner than 1e-7 of its length has no normal: it is its sides.
+        A row has a corner a; the sides b - a and c - a; two vectors whose products with x - a are the coordinates s and
+        t of x along the sides; the unit normal; and 1 / length^2 of b - a, c - a and c - b. Coordinates are
+        x' = (x - origin) / scale. They are rounded to `real` first, so that the rest is consistent with them. The
+        normal of a triangle thinner than 1e-7 of its length is 0: it counts as its three sides.
         """
         corners = ((self.corners - origin) / scale).astype(real)
         tree = Tree(corners.min(axis=1), corners.max(axis=1))

@@ -1,11 +1,10 @@
-"""Triangles in space, many at once: distances, and whether two of them cross."""
+"""Triangles in space: distances to them, and which pairs intersect. All functions work row by row on arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Pairs overlap if nothing separates them to this part of their size.
-_TOUCH = 1e-9
+_TOUCH = 1e-9  # of the size of a pair: a smaller overlap counts as contact
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -24,8 +23,8 @@ def segment_distance2(x: np.ndarray, begin: np.ndarray, vector: np.ndarray) -> n
 def triangle_distance2(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return the squared distances of points (m, 3) to triangles (m, 3, 3), row by row.
 
-    The nearest of the three sides, or the plane where the foot of the perpendicular is inside: on
-    the inner side of all three sides, n . (side x (x - corner)) >= 0.
+    The distance is that to the plane if the foot of the perpendicular is in the triangle, that is, if
+    n . (side x (x - corner)) >= 0 for all three sides. Otherwise it is that to the nearest side.
     """
     sides = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(sides[:, 0], sides[:, 1])
@@ -40,12 +39,12 @@ def triangle_distance2(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Tell for pairs of triangles a, b (m, 3, 3) whether their interiors meet, (m,) bool.
+    """Return for pairs of triangles a, b (m, 3, 3) whether their interiors intersect, (m,) bool.
 
-    Two convex figures are apart, or only touch, if along one of a few directions their shadows
-    are: the two normals and the nine products of a side of each; for two triangles in one plane the
-    six normals of sides in it. "Only touch" means an overlap below 1e-9 of their size, so triangles
-    that share a corner or a side do not cross, unless one is folded onto the other.
+    By the separating axis theorem: two triangles do not intersect if their projections onto one of these directions do
+    not overlap: the two normals and the nine cross products of one side of each; for triangles in one plane, the six
+    normals of their sides in it. An overlap below 1e-9 of their size counts as contact. So triangles that share a
+    corner or a side do not intersect, unless one is folded onto the other.
     """
     origin = a[:, :1]
     a, b = a - origin, b - origin
@@ -56,20 +55,20 @@ def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     def unit(axis: np.ndarray, scale: np.ndarray) -> np.ndarray:
         length = np.sqrt(_dot(axis, axis))
-        # A product of parallel sides is no direction: 0 separates nothing, and is left out.
+        # The product of parallel sides is about 0 and has no direction. It separates nothing.
         sound = length > 1e-7 * scale
         return np.where(sound[:, None], axis / np.where(sound, length, 1)[:, None], 0)
 
     def separated(axis: np.ndarray) -> np.ndarray:
-        shadow_a, shadow_b = _dot(a, axis[:, None]), _dot(b, axis[:, None])
-        # How far one shadow would have to move to leave the other on either side.
-        up = shadow_a.max(axis=1) - shadow_b.min(axis=1)
-        down = shadow_b.max(axis=1) - shadow_a.min(axis=1)
+        projection_a, projection_b = _dot(a, axis[:, None]), _dot(b, axis[:, None])
+        # Distances by which one projection must move to leave the other at its upper and lower end.
+        up = projection_a.max(axis=1) - projection_b.min(axis=1)
+        down = projection_b.max(axis=1) - projection_a.min(axis=1)
         return (np.minimum(up, down) <= touch) & axis.any(axis=1)
 
     longest_a, longest_b = (np.sqrt(_dot(s, s).max(axis=1)) for s in (sides_a, sides_b))
     n_a, n_b = unit(normal_a, longest_a**2), unit(normal_b, longest_b**2)
-    # A triangle without area crosses nothing.
+    # A triangle without area intersects nothing.
     apart = ~(n_a.any(axis=1) & n_b.any(axis=1))
     flat = np.abs(_dot(b, n_a[:, None])).max(axis=1) <= touch
     solid = separated(n_a) | separated(n_b)

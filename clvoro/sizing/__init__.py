@@ -9,7 +9,7 @@ How to add a size field:
 3. Export the class below and test both forms against each other, as in tests/sizing/test_sizing.py.
 """
 
-from ..geometry.shapes import Circle, Edges, Polygon, Polyline, Segment, Sphere
+from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment, Sphere
 from ..geometry.surface import Surface
 from .codegen import generate_code
 from .distance import Distance
@@ -23,6 +23,7 @@ from .solution import gradient_size, hessian_size
 
 __all__ = [
     "Circle",
+    "ClosedPolyline",
     "Constant",
     "Distance",
     "Edges",
@@ -31,7 +32,6 @@ __all__ = [
     "Field",
     "Function",
     "Graded",
-    "Polygon",
     "Polyline",
     "Raster",
     "Scattered",

@@ -12,8 +12,8 @@ import numpy as np
 from ..errors import InputError, InputTypeError
 from ..geometry.box import Box, Domain
 from ..geometry.bvh import Tree
-from ..geometry.polygon import Polygon as PolygonalDomain
-from ..geometry.shapes import Circle, Edges, Polygon, Polyline, Segment
+from ..geometry.polygon import Polygon
+from ..geometry.shapes import Circle, ClosedPolyline, Edges, Polyline, Segment
 from ..geometry.surface import Surface, box_surface
 from ..geometry.triangles import segment_distance2
 from .arguments import check_positive, check_slope
@@ -29,7 +29,7 @@ _FAR = 100  # diagonals of the domain beyond which a shape is probably in anothe
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
 Curve = Circle | Segment | Polyline | Edges
-Shape = Curve | Surface | Box | PolygonalDomain
+Shape = Curve | Surface | Box | Polygon
 
 
 class Distance(Field):
@@ -38,10 +38,10 @@ class Distance(Field):
     Parameters
     ----------
     shapes : shape or iterable of shapes
-        `Circle`, `Segment`, `Polyline`, `Polygon`; in 3D `Sphere`, `Segment`, `Polyline`,
-        `Polygon` (the closed chain, not its area), `Surface`; in both a `clvoro.Box`, which means
-        its sides, and a `clvoro.Polygon`, which means its edges (``domain.boundary(edges)`` some of
-        them). The distance is to the curve or surface itself, from both sides.
+        `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Sphere`, `Segment`, `Polyline`, `ClosedPolyline`,
+        `Surface`; in both a `clvoro.Box`, which stands for its sides, and a `clvoro.Polygon`, which stands for its
+        edges (``domain.boundary("island")`` for some of them). The distance is to the curve or surface, from both
+        sides.
     h_min : float
         Size on the shapes.
     growth : float, optional
@@ -244,14 +244,14 @@ class Distance(Field):
 
 def _plain(shape: Shape) -> Curve | Surface:
     """Return the sides of a domain, and any other shape as it is."""
-    if isinstance(shape, PolygonalDomain):
+    if isinstance(shape, Polygon):
         return shape.boundary()
     if not isinstance(shape, Box):
         return shape
     if shape.dim == 3:
         return box_surface(np.array(shape.lower), np.array(shape.upper))
     (x0, y0), (x1, y1) = shape.lower, shape.upper
-    return Polygon(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
+    return ClosedPolyline(np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]))
 
 
 def _item_boxes(

@@ -161,7 +161,7 @@ def test_longitudes_and_latitudes(tmp_path, crs):
     path = tmp_path / "lake.geojson"
     path.write_text(json.dumps(lake(46.2, crs)))
     with pytest.warns(
-        MisfitWarning, match=r"lake\.geojson is in longitudes and latitudes.* 0\.69 times"
+        MisfitWarning, match=r"lake\.geojson has longitudes and latitudes.* 0\.69 times"
     ):
         clvoro.Polygon.from_geojson(path)
 

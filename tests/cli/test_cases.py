@@ -137,14 +137,14 @@ shapes = [
   { kind = "segment", a = [0, 0], b = [1, 0] },
   { kind = "circle", center = [1.5, 0.5], radius = 0.1 },
   { kind = "polyline", points = [[0, 1], [1, 1], [1, 0.8]] },
-  { kind = "polygon", points = [[0.2, 0.2], [0.4, 0.2], [0.3, 0.4]] },
+  { kind = "closed_polyline", points = [[0.2, 0.2], [0.4, 0.2], [0.3, 0.4]] },
 ]
 """
     shapes = [
         sizing.Segment((0, 0), (1, 0)),
         sizing.Circle((1.5, 0.5), 0.1),
         sizing.Polyline([(0, 1), (1, 1), (1, 0.8)]),
-        sizing.Polygon([(0.2, 0.2), (0.4, 0.2), (0.3, 0.4)]),
+        sizing.ClosedPolyline([(0.2, 0.2), (0.4, 0.2), (0.3, 0.4)]),
     ]
     wanted = np.minimum(0.4, sizing.Distance(shapes, 0.01, slope=0.5)(x))
     assert field(tree)(x) == pytest.approx(wanted)

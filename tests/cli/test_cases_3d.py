@@ -118,8 +118,8 @@ def test_printed_case_runs_elsewhere(here, capsys):
 @pytest.mark.parametrize(
     ("part", "named"),
     [
-        (off(CORNERS, TRIANGLES[:-1]), "is open: 3 edges bound one triangle only"),
-        (twice(), "crosses itself"),
+        (off(CORNERS, TRIANGLES[:-1]), "is open: 3 edges belong to a single triangle"),
+        (twice(), "intersects itself"),
         (off(CORNERS, []), "no triangles"),
         ("", "cannot be read as OFF"),
         ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "part.off"),

@@ -334,7 +334,7 @@ def test_self_intersection_names_two_triangles():
     assert pairs.tolist() == expected
     p, q = expected[0]
     with pytest.raises(
-        InputError, match=rf"parts crosses itself: triangles {p}, .* and {q}, .*more"
+        InputError, match=rf"parts intersects itself: triangles {p}, .* and {q}, .*more"
     ):
         surface.check()
 
@@ -418,7 +418,7 @@ def test_missing_reader_is_named(tmp_path, monkeypatch):
         (CUBE[0], [[0, 1, 8]], InputError, r"triangles\[0, 2\] is 8.*0 to 7"),
         (CUBE[0], [[0, 1, 2], [0, -1, 2]], InputError, r"triangles\[1, 1\] is -1"),
         (CUBE[0], [[0.0, 1.0, 2.0]], InputTypeError, "integers"),
-        (CUBE[0][:, :2], CUBE[1], InputError, r"\(v, 3\).*Polygon"),
+        (CUBE[0][:, :2], CUBE[1], InputError, r"\(v, 3\).*ClosedPolyline"),
         (np.where(CUBE[0] > 0, np.nan, 0), CUBE[1], InputError, r"vertices\[1, 0\] is nan"),
         (CUBE[0] * (1, 0, 0), CUBE[1], InputError, "none of which has an area"),
         ("ab", CUBE[1], InputTypeError, "numbers"),

@@ -32,7 +32,7 @@ def some_shape(rng: np.random.Generator, d: int) -> dict[str, Any]:
         {"kind": "boundary"},
         {"kind": "segment", "a": at[0], "b": at[1]},
         {"kind": "polyline", "points": at},
-        {"kind": "polygon", "points": at},
+        {"kind": "closed_polyline", "points": at},
         {"kind": "box"},
         {"kind": "naca4", "digits": "0012", "angle": -5, "n_points": 30},
         {"kind": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.2},

@@ -94,7 +94,7 @@ def some_shape(rng: np.random.Generator, domain: Domain):
     if kind == 2:
         return sizing.Polyline(corners)
     if kind == 3:
-        return sizing.Polygon(corners)
+        return sizing.ClosedPolyline(corners)
     if kind == 4 and d == 3:
         return (
             sizing.Surface(corners[:3], [[0, 1, 2]]) if len(corners) < 5 else tetrahedron(corners)

@@ -392,14 +392,14 @@ def test_names_of_cases_are_folders_in_out(tmp_path, name):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("GEOMETRYCOLLECTION(" * 100_000, "more than 8 parentheses"),
-        ("POLYGON (" + "(" * 9 + ")" * 9 + ")", "more than 8 parentheses"),
+        ("GEOMETRYCOLLECTION(" * 100_000, "more than 8 nested parentheses"),
+        ("POLYGON (" + "(" * 9 + ")" * 9 + ")", "more than 8 nested parentheses"),
         ("POLYGON ((nan 0, 1 0, 1 1, nan 0))", "finite numbers"),
         ("POLYGON ((0 0, 1 0, 1 nan, 0 0))", "vertex 2 at .* expected finite numbers"),
         ("POLYGON ((0 0, 1e400 0, 1 1, 0 0))", "vertex 1 at .* expected finite numbers"),
-        ("x" * 100_000, "no well-known text"),
-        ("POLYGON ((0 0\0, 1 0, 1 1, 0 0))", "no well-known text"),
-        ("POLYGON ((0 0, 1 0, 1 1, \udc80 0))", "no well-known text"),
+        ("x" * 100_000, "not well-known text"),
+        ("POLYGON ((0 0\0, 1 0, 1 1, 0 0))", "not well-known text"),
+        ("POLYGON ((0 0, 1 0, 1 1, \udc80 0))", "not well-known text"),
     ],
     ids=["deep", "deeper", "nan", "nan within", "huge", "long", "zero byte", "no text"],
 )
@@ -429,10 +429,10 @@ def test_equal_rings_are_refused_before_all_are_looked_at(monkeypatch, other):
     monkeypatch.setattr(
         rings, "_cleaned", lambda *a, clean=rings._cleaned: looked.append(a) or clean(*a)
     )
-    with pytest.raises(InputError, match="Polygon's hole 1 is the hole 0 once more; leave"):
+    with pytest.raises(InputError, match="Polygon's hole 1 repeats the hole 0; leave"):
         clvoro.Polygon(square, [hole, *[other] * 10_000])
     assert len(looked) == 3
-    with pytest.raises(InputError, match="outer ring of piece 1 is the outer ring of piece 0 once"):
+    with pytest.raises(InputError, match="outer ring of piece 1 repeats the outer ring of piece 0"):
         clvoro.Polygon.from_pieces([[hole], [other]])
 
 
@@ -488,7 +488,7 @@ def read_damaged(folder, name, data, seeds):
 
 def test_surfaces_with_bytes_that_are_no_text(valid, tmp_path):
     (tmp_path / "s.off").write_bytes(valid["s.off"].replace(b"0.0", b"\xff\xfe\x80", 1))
-    with pytest.raises(InputError, match=r"s\.off' cannot be read as OFF.*export it anew"):
+    with pytest.raises(InputError, match=r"s\.off' cannot be read as OFF.*export it again"):
         files.read(tmp_path / "s.off")
 
 

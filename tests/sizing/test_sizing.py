@@ -50,12 +50,16 @@ PLANE_FIELDS = {
     "point": sizing.Distance(sizing.Circle((0.2, 100.9), 0), 0.02, slope=0.2),
     "capped": sizing.Distance(sizing.Segment((0, 100.5), (1, 101)), 0.01, slope=0.5, h_max=0.1),
     "flat": sizing.Distance(sizing.Segment((0, 100.5), (1, 101)), 0.01, growth=1),
-    "polygon": sizing.Distance(sizing.Polygon(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1),
+    "polygon": sizing.Distance(
+        sizing.ClosedPolyline(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1
+    ),
     "polygon capped": sizing.Distance(
-        sizing.Polygon(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1, h_max=0.004
+        sizing.ClosedPolyline(_wavy(700, (0.5, 101), 0.4)), 0.001, growth=1.1, h_max=0.004
     ),
     "polyline": sizing.Distance(sizing.Polyline(_wavy(9, (0.5, 101), 0.4)), 0.01, growth=1.1),
-    "polygon 9": sizing.Distance(sizing.Polygon(_wavy(9, (0.5, 101), 0.4)), 0.01, growth=1.1),
+    "polygon 9": sizing.Distance(
+        sizing.ClosedPolyline(_wavy(9, (0.5, 101), 0.4)), 0.01, growth=1.1
+    ),
     "mixed": sizing.Distance([*_SEGMENTS, *_CIRCLES], 0.01, growth=1.5),
     "zero segments": sizing.Distance(
         [sizing.Polyline([(0, 101), (0, 101), (1, 101)]), sizing.Segment((1, 101), (1, 101))],
@@ -313,7 +317,7 @@ def test_distance_to_simple_shapes():
     points = [(0, 0), (3, 4), (5, 0), (-1, 2)]
     ring = sizing.Distance(sizing.Circle((0, 0), 2), 1, slope=1)
     assert ring(points).tolist() == pytest.approx([3, 4, 4, math.sqrt(5) - 1])
-    square = sizing.Distance(sizing.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)]), 1, slope=1)
+    square = sizing.Distance(sizing.ClosedPolyline([(0, 0), (4, 0), (4, 4), (0, 4)]), 1, slope=1)
     assert square([(2, 1), (1, 2), (-3, -4), (5, 2)]).tolist() == [2, 2, 6, 2]
     line = sizing.Distance(sizing.Polyline([(0, 0), (4, 0), (4, 4)]), 1, slope=1, h_max=2.5)
     assert line([(0, 2), (2, 1), (4, 6), (3, 3)]).tolist() == [2.5, 2, 2.5, 2]
@@ -590,8 +594,8 @@ def test_sizes_beyond_the_domain_and_the_precision(make_engine):
         (lambda: sizing.Segment((0, 0), (1, 1, 1)), InputError, "same number"),
         (lambda: sizing.Segment((0, float("inf")), (1, 1)), InputError, "finite"),
         (lambda: sizing.Polyline([(0, 0)]), InputError, "at least 2"),
-        (lambda: sizing.Polygon([(0, 0), (1, 1)]), InputError, "at least 3"),
-        (lambda: sizing.Polygon(np.zeros((5, 4))), InputError, "shape"),
+        (lambda: sizing.ClosedPolyline([(0, 0), (1, 1)]), InputError, "at least 3"),
+        (lambda: sizing.ClosedPolyline(np.zeros((5, 4))), InputError, "shape"),
         (lambda: sizing.Distance([], 1, growth=1.2), InputError, "no shapes"),
         (lambda: sizing.Distance([(0, 0)], 1, growth=1.2), InputTypeError, "tuple"),
         (lambda: sizing.Distance(_CIRCLES, 1), InputError, "exactly one"),

@@ -104,9 +104,11 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         return sizing.Segment(node["a"], node["b"])
     if kind == "polyline":
         return sizing.Polyline(node["points"])
-    if kind == "polygon":
-        return sizing.Polygon(node["points"])
-    return sizing.Polygon(naca4(**{key: value for key, value in node.items() if key != "kind"}))
+    if kind == "closed_polyline":
+        return sizing.ClosedPolyline(node["points"])
+    return sizing.ClosedPolyline(
+        naca4(**{key: value for key, value in node.items() if key != "kind"})
+    )
 
 
 def load_array(path: Path, place: str) -> np.ndarray:

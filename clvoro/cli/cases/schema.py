@@ -54,7 +54,7 @@ SHAPE = Kinds(
         "surface": Table({"file": text}, {"closed": true_or_false, "join": positive}),
         "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
         "polyline": Table({"points": vectors(2)}, {}),
-        "polygon": Table({"points": vectors(3)}, {}),
+        "closed_polyline": Table({"points": vectors(3)}, {}),
         "naca4": Table(
             {"digits": text},
             {"chord": positive, "leading_edge": vector(2), "angle": number, "n_points": whole(3)},
