@@ -1,4 +1,4 @@
-"""From generators to the diagram of a domain: which stages, in which order."""
+"""From generators to the diagram of a domain: the stages and their order."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from .stages import TessellationStages, tessellate_box
 
 
 class Tessellator:
-    """Tessellate one domain again and again.
+    """Tessellate one domain repeatedly.
 
-    Buffers are the stages': the next call overwrites a `Tessellation`, its graph once the new one is made.
+    Each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new one is complete.
 
     Parameters
     ----------
     spacing : callable, optional
-        Of a polygonal domain: distance of generators near points (k, 2) of its boundary, (k,); see `place_sentinels`.
+        For a polygon: distance of generators near points (k, 2) of its boundary, (k,); places the ghost generators.
     coarser : Tessellator, optional
-        Of the same domain, for fewer generators: what it knows of their distances is a good guess to begin with.
+        The tessellator of a coarser level of the same domain. Its halo is the first guess in a periodic box.
     """
 
     def __init__(
@@ -50,24 +50,24 @@ class Tessellator:
 
     @property
     def unfolded(self) -> Unfolded | None:
-        """What the latest diagram was folded from, in a periodic box."""
+        """The extended diagram that the latest one was folded from, in a periodic box."""
         return None if self.torus is None else self.torus.latest
 
     def is_whole(self, t: Tessellation) -> bool:
-        """Tell whether all is known that `t`, the latest diagram, was folded from, if it was."""
+        """Return whether the complete extended diagram of `t`, the latest diagram, is known."""
         latest = self.unfolded
         return self.torus is None or (latest is not None and latest.folded.tessellation is t)
 
     def make_whole(self, points: cla.Array, n: int) -> Tessellation:
-        """Tessellate a periodic box anew, so that it is."""
+        """Tessellate a periodic box from scratch, with a complete extended diagram."""
         assert self.torus is not None
         with self._in_units():
             return self.torus.tessellate(points, n, whole=True)
 
     def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
-        """Return `t`, the latest diagram, which `is_whole`, with what is known of faces in full precision.
+        """Return `t`, the latest diagram, with faces in full precision, and its extended diagram in a periodic box.
 
-        Return also, in a periodic box, what it was folded from.
+        `t` must be whole (`is_whole`).
         """
         if self.torus is not None:
             return self.torus.measure_faces(), self.unfolded
@@ -78,13 +78,13 @@ class Tessellator:
     def restore(
         self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
     ) -> Tessellation:
-        """Return the diagram of `points` (n, d) that was `saved`, with room for so many more faces.
+        """Return the `saved` diagram of `points` (n, d), with room for `spare` more half-faces.
 
-        It lies in the arrays of the stage that makes the next one: those of a run take much of the device's memory.
+        It uses the arrays of the stage that makes the next diagram, to save memory.
         """
         stages = self.stages
         if self._polygon is not None:
-            # Trimmed from another diagram, which is not kept: made anew, it has the same bits.
+            # The convex diagram is not saved. A new diagram has the same bits.
             t = self.tessellate(points, len(points))
             stages.bins.clear()
             return t
@@ -92,7 +92,7 @@ class Tessellator:
             return stages.folded.restore(points, saved, spare)
         t = stages.cells.restore(points, saved, spare)
         if self.torus is not None:
-            # The next one may take several attempts, each of which begins with this graph, and has its own there.
+            # The next diagram may take several attempts that all start from this graph.
             t = replace(t, starts=t.starts.copy(), neighbors=t.neighbors.copy())
         return t
 
@@ -104,21 +104,21 @@ class Tessellator:
         exact: bool = False,
         binned: BinnedPoints | None = None,
     ) -> Tessellation:
-        """Tessellate by the first `n` of `points` (n, d), in the coordinates of the domain's frame.
+        """Tessellate by the first `n` of `points` (n, d), in normalized coordinates.
 
         Parameters
         ----------
         previous : Tessellation, optional
-            The latest diagram, of the same generators at earlier positions: what has stayed of it is kept.
+            The latest diagram, of the same generators at earlier positions, for an incremental update.
         exact : bool
-            Refuse generators so close together that rounding makes a share of a cell uncertain; see `Cells.tessellate`.
+            Reject generators so close that round-off makes a share of a cell uncertain; see `Cells.tessellate`.
         binned : BinnedPoints, optional
-            The generators in bins of the domain, where the caller has them.
+            The generators in bins, if they are known.
 
         Raises
         ------
         InputError
-            If generators are too close to each other to be told apart.
+            If generators are too close to each other to be distinguished.
         """
         with self._in_units():
             if self.torus is not None:
@@ -129,7 +129,7 @@ class Tessellator:
 
     @contextmanager
     def _in_units(self) -> Iterator[None]:
-        """Tell of generators that are too close where they are in the domain."""
+        """Give errors about close generators the positions in the domain."""
         try:
             yield
         except CloseError as error:

@@ -1,4 +1,4 @@
-"""The boundary of a polygonal domain, cut by the cells of the convex diagram into chords (`chords.cl`)."""
+"""Chords: the edges of the boundary, cut by the cells of the convex diagram (`boundary_crossings.cl`)."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from ...opencl.primitives import Room, Scan
 from ...opencl.program import Engine
 from ..device_diagram import Tessellation
 
-LOST, OUTSIDE = 1, 2  # of the bits in chords.cl
+LOST, OUTSIDE = 1, 2  # bits of the flags in boundary_crossings.cl
 UNTOUCHED = 0x7FFFFFFF
-_ROUNDINGS = 4  # by which vertices lie off a face for sure; ON_FACE in chords.cl
+_ROUNDINGS = 4  # distance, in units of round-off, at which a vertex is surely off a face; ON_FACE in the kernels
 
 
 class BoundaryError(InputError):
-    """Rounding lets the boundary not be followed through the cells, or leaves cells along it open."""
+    """With round-off the boundary cannot be traced through the cells, or leaves cells along it open."""
 
     def __init__(self) -> None:
         super().__init__(
-            "the boundary of the polygon cannot be followed through the cells: edges of it are too close to each "
-            "other, or generators are, for the precision; use dtype='float64', or a polygon without such slits"
+            "the boundary of the polygon cannot be traced through the cells: some of its edges, or some generators, "
+            "are too close to each other for the precision; use dtype='float64', or a polygon without such slits"
         )
 
 
 @dataclass(frozen=True)
 class Chords:
-    """Chords, edge by edge, and the cells that they lie in, on the device; see tessellation/clipped/boundary.h.
+    """Chords, edge by edge, and their cells, on the device; see tessellation/clipped/boundary.h.
 
     Attributes
     ----------
     count : int
     arrays : tuple of arrays
-        What kernels take as CHORD_ARGS.
+        The CHORD_ARGS of kernels.
     slots : (n,) int32
-        Number of each cell among those that the boundary passes through, `UNTOUCHED` for the others.
+        Number of each cell among those that the boundary crosses, `UNTOUCHED` for the others.
     touched : (t,) int32
-        Those cells.
+        The cells that the boundary crosses.
     list_starts : (t + 1,) int32
     listed : (count,) int32
-        The chords of each, in order.
+        The chords of each of these cells, in order.
     tangents : (edges, 2) real
         Unit vectors along the edges.
     turns : tuple of arrays
-        The edge before each and how far the boundary turns there; see tessellation/clipped/wall_sides.h.
+        The edge before each edge, and the turning angle between them; see tessellation/clipped/wall_sides.h.
     shift : (2,) float
-        By how much the boundary was put aside.
+        Shift of the boundary in normalized coordinates.
     """
 
     count: int
@@ -64,15 +64,15 @@ class Chords:
     shift: np.ndarray
 
 
-def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
-    """Return vectors (k, 2), a few roundings long, from the vertices of `domain` inwards: between the edges."""
+def inward_vectors(domain: Polygon, real: np.dtype) -> np.ndarray:
+    """Return vectors (k, 2) from the vertices of `domain` inwards, between the edges, a few units of round-off long."""
     vertices, following = domain.oriented.vertices, domain.oriented.next_vertex
     ahead = vertices[following] - vertices
     ahead /= np.hypot(*ahead.T)[:, None]
     before = np.empty_like(ahead)
     before[following] = ahead
     across = before + ahead
-    # Between the normals to the left; in a needle's tip, whose normals cancel, along it.
+    # The mean of the left normals. In the tip of a needle these cancel: then the direction along it.
     along = ahead - before
     turn = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
     sharp = np.hypot(*across.T) < np.hypot(*along.T)
@@ -84,7 +84,7 @@ def inward(domain: Polygon, real: np.dtype) -> np.ndarray:
     return _ROUNDINGS * float(np.finfo(real).eps) * way / np.hypot(*way.T)[:, None]
 
 
-def shells(domain: Polygon) -> np.ndarray:
+def outer_ring_edges(domain: Polygon) -> np.ndarray:
     """Return for each edge of `domain` an edge of the outer ring of its piece, (k,); -1 on that ring itself."""
     first = np.searchsorted(domain.piece_of_ring, domain.piece_of_ring)  # outer rings come first
     found = np.where(first == np.arange(len(first)), -1, domain.oriented.ring_starts[first])
@@ -96,20 +96,20 @@ class Boundary:
 
     def __init__(self, engine: Engine, domain: Polygon) -> None:
         self.engine = engine
-        # Counts change a little from step to step.
+        # Counts change little between steps.
         self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/boundary_crossings")
         origin, scale = domain.frame
         oriented = domain.oriented
         self.edges = len(oriented.vertices)
         vertices = (oriented.vertices - origin) / scale
-        inner = vertices + inward(domain, engine.real)
-        # Rings that touch in a vertex have it in the same cell.
+        inner = vertices + inward_vectors(domain, engine.real)
+        # Rings that share a vertex start in the same cell.
         same = np.unique(oriented.vertices, axis=0, return_index=True, return_inverse=True)
         self._places = vertices, inner[same[1]][same[2].ravel()]
         self.vertices, self.inner = (engine.upload(places) for places in self._places)
         self.next_vertex = engine.upload(oriented.next_vertex, np.int32)
-        self.shells = engine.upload(shells(domain), np.int32)
+        self.shells = engine.upload(outer_ring_edges(domain), np.int32)
         along = oriented.vertices[oriented.next_vertex] - oriented.vertices
         self.tangents = engine.upload(along / np.hypot(*along.T)[:, None])
         before = np.empty_like(oriented.next_vertex)
@@ -117,21 +117,21 @@ class Boundary:
         before[oriented.sharpest] = -1 - before[oriented.sharpest]
         self.turns = engine.upload(before, np.int32), engine.upload(oriented.turns)
         self.owners = engine.zeros(self.edges, np.int32)
-        self._known = 0  # cells that owners are among
+        self._known = 0  # number of cells when `owners` was computed
         self._flags = engine.empty(1, np.int32)
 
     def cut(
         self, t: Tessellation, generators: int, shift: tuple[float, float] = (0, 0)
     ) -> Chords | np.ndarray:
-        """Walk along all edges, put aside by `shift` in the device's coordinates, through the cells of `t`.
+        """Trace all edges, shifted by `shift` (normalized coordinates), through the cells of `t`.
 
-        Only the first `generators` of its generators lie in the domain. If the boundary passes through cells of others,
-        those are returned, (i,) int, counted from `generators` on.
+        The first `generators` generators of `t` lie in the domain, the others are ghost generators. If the boundary
+        crosses cells of ghost generators, the indices of these are returned, (i,) int, counted from `generators` on.
 
         Raises
         ------
         BoundaryError
-            If rounding lets a walk find no way.
+            If round-off stops the tracing of an edge.
         """
         engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
         vertices, inner = self.vertices, self.inner
@@ -177,7 +177,7 @@ class Boundary:
     def _sort(
         self, count: int, arrays: tuple[cla.Array, ...], cells: cla.Array, n: int, shift: np.ndarray
     ) -> Chords:
-        """List the cells, and the chords of each."""
+        """List the crossed cells, and the chords of each."""
         engine, k, room = self.engine, self._kernels, self._room
         slots = room("slots", size=n, dtype=np.int32).fill(UNTOUCHED)
         ranks = room("ranks", size=count + 1, dtype=np.int32)

@@ -1,9 +1,8 @@
-"""Auxiliary generators outside a polygonal domain.
+"""Ghost generators: auxiliary generators outside a polygonal domain.
 
-The convex cells of generators at the boundary reach far out, as far as to the middle of a hole, and what they would
-have to be clipped by is sought as far away. Generators out there cost little and end those cells. They change nothing
-within the domain as long as none of their own cells reaches into it, which is checked whenever the boundary is cut
-(`chords.py`).
+The convex cells of generators at the boundary reach far outside, up to the middle of a hole, and so does the search
+for their neighbors. Ghost generators bound these cells at little cost. They do not change the diagram inside the
+domain as long as none of their cells reaches into it; `boundary_crossings.py` checks this in each step.
 """
 
 from __future__ import annotations
@@ -17,13 +16,15 @@ from ...geometry.polygon import Polygon
 CLEARANCE = 3.0
 """Least distance to the boundary, in spacings of the generators there."""
 GRADING = 1.5
-"""Distance to the boundary over the spacing of sentinels."""
+"""Distance to the boundary over the spacing of ghost generators."""
 MOST_BOXES = 1 << 20
 _JITTER = 0.2  # of a spacing, so that no four lie on a circle
 
 
-def place_sentinels(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return points (s, 2) outside `domain`, in the box that its cells are clipped by.
+def place_ghost_generators(
+    domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Return ghost generators (s, 2) outside `domain`, inside the box that clips its cells.
 
     Parameters
     ----------
@@ -50,7 +51,7 @@ def place_sentinels(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]
         taken = good & (distance >= clearance)
         shift = rng.uniform(-_JITTER, _JITTER, (np.count_nonzero(taken), 2)) * edge
         found.append(centers[taken] + shift)
-        # Others are divided while there is room in them for one that keeps its distance.
+        # Divide the others while a point at the least distance fits into them.
         reach = distance + edge * np.sqrt(0.5)
         divided = (
             ~good & ~(~outside & whole) & (np.where(outside, reach, reach - distance) > clearance)

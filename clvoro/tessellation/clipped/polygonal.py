@@ -1,4 +1,4 @@
-"""The diagram of a polygonal domain: convex cells of generators and sentinels, trimmed by the boundary."""
+"""The diagram of a polygonal domain: convex cells of generators and ghost generators, clipped by the boundary."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ..bins import BinnedPoints
 from ..device_diagram import CloseError, Tessellation
 from ..stages import TessellationStages, tessellate_box
 from .boundary_crossings import Boundary, BoundaryError, Chords
-from .ghost_generators import place_sentinels
+from .ghost_generators import place_ghost_generators
 
 PATIENCE = 3
-"""Times that sentinels are taken away one by one, before all are."""
+"""Attempts that remove single ghost generators, before all are removed."""
 
 
 class PolygonTessellator:
-    """Tessellate one polygon again and again; see `Tessellator`, whose part for polygons it is.
+    """Tessellate one polygon repeatedly: the part of `Tessellator` for polygons.
 
     Parameters
     ----------
     spacing : callable or None
-        Distance of generators near points (k, 2) of the boundary, (k,); see `place_sentinels`. Without it there are no
-        sentinels: what is right in any case, and slow where many generators stand around a wide hole.
+        Distance of generators near points (k, 2) of the boundary, (k,); see `place_ghost_generators`. None: no ghost
+        generators. The diagram is the same, but slow to make where many generators surround a wide hole.
     """
 
     def __init__(
@@ -41,9 +41,9 @@ class PolygonTessellator:
         self.engine = stages.engine
         self._boundary = Boundary(self.engine, domain)
         origin, scale = domain.frame
-        found = np.empty((0, 2)) if spacing is None else place_sentinels(domain, spacing)
-        self._sentinels = ((found - origin) / scale).astype(self.engine.real)
-        self._taken_away = 0
+        found = np.empty((0, 2)) if spacing is None else place_ghost_generators(domain, spacing)
+        self._ghosts = ((found - origin) / scale).astype(self.engine.real)
+        self._removals = 0
         self._all: cla.Array | None = None
 
     def tessellate(
@@ -58,11 +58,11 @@ class PolygonTessellator:
         stages, domain = self.stages, self.domain
         convex = previous.trimmed.convex if previous is not None and previous.trimmed else None
         while True:
-            total = n + len(self._sentinels)
+            total = n + len(self._ghosts)
             if self._all is None or len(self._all) != total:
                 self._all = self.engine.empty((total, 2))
                 if total > n:
-                    self._all[n:].set(self._sentinels)
+                    self._all[n:].set(self._ghosts)
                 convex = None
             cl.enqueue_copy(
                 self.engine.queue,
@@ -71,31 +71,29 @@ class PolygonTessellator:
                 byte_count=2 * n * self.engine.real.itemsize,
             )
             if total > n:
-                binned = None  # sentinels are not among these
+                binned = None  # without the ghost generators
             try:
                 convex = tessellate_box(stages, domain, self._all, total, convex, exact, binned)
             except CloseError:
                 if total == n:
                     raise
-                # From far away generators may look too close to each other, which without sentinels nobody sees.
-                self._sentinels = self._sentinels[:0]
+                # Ghost generators far away may see generators as too close that are not: try without them.
+                self._ghosts = self._ghosts[:0]
                 continue
-            found = self._cut_out(points, convex, n)
+            found = self._clip(points, convex, n)
             if isinstance(found, Tessellation):
                 return found
-            self._taken_away += 1
-            keep = np.ones(len(self._sentinels), bool)
+            self._removals += 1
+            keep = np.ones(len(self._ghosts), bool)
             keep[found] = False
-            self._sentinels = self._sentinels[keep & (self._taken_away < PATIENCE)]
+            self._ghosts = self._ghosts[keep & (self._removals < PATIENCE)]
             convex = None
 
-    def _cut_out(
-        self, points: cla.Array, convex: Tessellation, n: int
-    ) -> Tessellation | np.ndarray:
-        """Return the diagram of `points` (n, 2) that the boundary leaves of `convex`, or sentinels that are in its way.
+    def _clip(self, points: cla.Array, convex: Tessellation, n: int) -> Tessellation | np.ndarray:
+        """Return the diagram of `points` (n, 2): `convex` clipped by the boundary; or the ghost generators to remove.
 
-        Where very many cells meet at one vertex of the boundary, their faces there are as rounding has it, and no edge
-        may find its way through them. A little aside there are one or two of them.
+        Where many cells share a vertex that lies on a vertex of the boundary, their faces there are round-off, and the
+        tracing may fail. A boundary shifted by a few units of round-off meets one or two of these cells only.
         """
         eps = float(np.finfo(self.engine.real).eps)
         lost = BoundaryError()
@@ -103,7 +101,7 @@ class PolygonTessellator:
             angle, length = 2 * attempt, far * eps
             shift = (length * math.cos(angle), length * math.sin(angle))
             try:
-                # The vertices of the boundary are found from the cells that held them before, or from the least.
+                # The search for the vertices starts from the cells of the previous call.
                 chords = self._boundary.cut(convex, n, shift)
                 if not isinstance(chords, Chords):
                     return chords

@@ -300,7 +300,7 @@ def stages(ctx, request):
 
 
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "koch", "comb"])
-def test_sentinels_change_nothing(stages, name):
+def test_ghost_generators_change_nothing(stages, name):
     domain = POLYGONS[name]()
     points = domain.place(scattered(domain, 400, 2), stages.engine.real)
     spacing = np.sqrt(domain.measure / 400)

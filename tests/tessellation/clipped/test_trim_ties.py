@@ -131,7 +131,7 @@ def test_crowds_around_a_corner(adapters, real, n):
 def test_edges_may_find_no_way(adapters, monkeypatch):
     """The boundary is put aside where it must be, and an error says so where that does not help."""
     monkeypatch.setattr(polygonal, "BOUNDARY_SHIFTS", ())
-    with pytest.raises(BoundaryError, match="cannot be followed"):
+    with pytest.raises(BoundaryError, match="cannot be traced"):
         adapters[0].diagram(PAIR, crowd(0, 200))
     # Nothing of it is left.
     diagram = adapters[0].diagram(PAIR, crowd(0, 8))
