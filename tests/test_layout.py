@@ -28,6 +28,8 @@ ORDER = (
 UPWARD = {
     ("mesh.results", "io"),
     ("mesh.results", "plotting"),
+    ("mesh.diagram", "io"),
+    ("mesh.diagram", "plotting"),
     ("mesh.diagram", "remapping"),
 }
 """Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, transfer."""

@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
 from ..geometry.boundary_names import Walls
+from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
+from .contents import Contents
 from .foam import write_foam
 from .formats import check_plane, write_foreign
 from .history import write_history
@@ -26,14 +28,27 @@ from .ugrid import write_ugrid
 from .vtu import write_vtu
 from .vtu_read import load_vtu
 
-__all__ = ["check_writable", "load", "make_folder", "save", "write_history"]
+if TYPE_CHECKING:
+    import meshio
+    import pyvista
+    from numpy.typing import ArrayLike
+
+__all__ = [
+    "check_writable",
+    "load",
+    "make_folder",
+    "save",
+    "to_meshio",
+    "to_pyvista",
+    "write_history",
+]
 
 _WRITERS = {".npz": write_npz, ".vtu": write_vtu}
 _CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas}
 
 
-def load(path: str | PathLike[str]) -> Result:
-    """Read a result that `Result.save` wrote to a ``.npz`` or ``.vtu`` file.
+def load(path: str | PathLike[str]) -> Result | Diagram:
+    """Read a result or a diagram that its `save` wrote to a ``.npz`` or ``.vtu`` file.
 
     A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is made anew,
     the history is empty, and a plain box is taken as the bounding box of the cells. The file is not trusted: nothing in
@@ -46,7 +61,8 @@ def load(path: str | PathLike[str]) -> Result:
 
     Returns
     -------
-    Result
+    Result or Diagram
+        What was saved.
 
     Raises
     ------
@@ -64,22 +80,23 @@ def load(path: str | PathLike[str]) -> Result:
 
 
 def save(
-    result: Result,
+    mesh: Result | Diagram,
     path: str | PathLike[str],
     *,
+    cell_data: Mapping[str, ArrayLike] | None = None,
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
     convention: Literal["ugrid", "mpas"] | None = None,
     units: str | None = None,
 ) -> None:
-    """Write `result` to `path`; the suffix chooses the format.
+    """Write a mesh to `path`; the suffix chooses the format.
 
     ``.npz``
         Everything; `load` reads it.
     ``.vtu``
         For ParaView and other VTK programs, and for `load`: polygons or polyhedra with size, error, quality, boundary
-        and more as cell data; row i is cell i of `result`. VTK's `vtkCellSizeFilter` (PyVista's `compute_cell_sizes`)
+        and more as cell data; row i is cell i of the mesh. VTK's `vtkCellSizeFilter` (PyVista's `compute_cell_sizes`)
         is wrong for cells that are not convex, as there are along the boundary of a polygon: use the cell data
         `volume`. meshio 5.3 reads a mesh in 2D as one block of cells for each run of cells with equally many corners;
         a ``.vtk`` file has one block for each number of corners. In 3D it refuses most files, as its reader assigns
@@ -91,12 +108,16 @@ def save(
         Meshes in 2D as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
     ``.vtk``, ``.ply``, ``.obj``
         Meshes in 2D, written by meshio (``pip install "clvoro[formats]"``); the latter two without cell data. Cells are
-        sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in `result`.
+        sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in the mesh.
 
     Parameters
     ----------
-    result : Result
+    mesh : Result or Diagram
+        A diagram has no sizes, errors and history, and neither has its file.
     path : str or path
+    cell_data : mapping, optional
+        Data of your own by name, (n,) or (n, k) arrays of real numbers: cell data in ``.vtu`` and ``.vtk``, variables
+        in ``.nc``, members ``cell_data.<name>`` in ``.npz``, which `load` leaves out. Other formats hold none.
     patches : mapping, optional
         For OpenFOAM: names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls
         that are not mentioned keep the name that the domain gives them.
@@ -119,11 +140,7 @@ def save(
         If the format is unknown or cannot hold the cells, an argument is for another format or wrong, or the file
         cannot be written. An existing file is then as before.
     """
-    if not isinstance(result, Result):
-        raise InputTypeError(
-            f"result is a {type(result).__name__}, expected a clvoro.Result; pass what "
-            "Adapter.run returned"
-        )
+    contents = Contents.of(mesh, cell_data)
     path = Path(check_path("path", path))
     suffix = path.suffix.lower()
     is_foam = path.name == "polyMesh" or suffix == ".foam"
@@ -139,20 +156,42 @@ def save(
                 f"cannot write {path} with {given[0]}, which is for {format_}; save as {name} or leave it out"
             )
     if is_foam:
-        write_foam(result, path, **for_foam)
+        if contents.extra:
+            raise InputError(
+                f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
+            )
+        write_foam(contents, path, **for_foam)
     elif suffix == ".nc":
-        check_plane(result, path)
+        check_plane(contents, path)
         unit = "m" if units is None else units
         if not isinstance(unit, str) or not unit.isascii() or not unit.strip():
             raise InputTypeError(
                 f"units is {unit!r:.60}, expected a unit of length, as 'm' or 'km'"
             )
-        _chosen(convention)(result, path, unit)
+        _chosen(convention)(contents, path, unit)
     else:
-        _WRITERS.get(suffix, write_foreign)(result, path)
+        _WRITERS.get(suffix, write_foreign)(contents, path)
 
 
-def _chosen(convention: object) -> Callable[[Result, Path, str], None]:
+def to_meshio(
+    mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None
+) -> meshio.Mesh:
+    """Return a mesh of meshio; see `Diagram.to_meshio`."""
+    from .convert import to_meshio
+
+    return to_meshio(Contents.of(mesh, cell_data))
+
+
+def to_pyvista(
+    mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None
+) -> pyvista.UnstructuredGrid:
+    """Return an unstructured grid of PyVista; see `Diagram.to_pyvista`."""
+    from .convert import to_pyvista
+
+    return to_pyvista(Contents.of(mesh, cell_data))
+
+
+def _chosen(convention: object) -> Callable[[Contents, Path, str], None]:
     name = "ugrid" if convention is None else convention
     if not isinstance(name, str) or name not in _CONVENTIONS:
         raise InputError(f"convention is {name!r:.60}, expected 'ugrid' or 'mpas'")

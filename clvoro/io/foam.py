@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry.boundary_names import Walls
-from ..mesh.results import Result
 from .atomic import atomic_file, atomic_folder, make_folder
+from .contents import Contents
 from .polymesh import PatchType, PolyMesh, poly_mesh
 
 _FILES = {
@@ -25,7 +25,7 @@ _CHUNK = 1 << 16
 
 
 def write_foam(
-    result: Result,
+    contents: Contents,
     path: Path,
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
@@ -42,7 +42,7 @@ def write_foam(
     patches, types, thickness : optional
         See `poly_mesh`.
     """
-    mesh = poly_mesh(result.diagram, patches, types, thickness)
+    mesh = poly_mesh(contents.diagram, patches, types, thickness)
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:
@@ -51,7 +51,7 @@ def write_foam(
             pass
     make_folder(folder)
     note = (
-        f"nPoints:{len(mesh.points)} nCells:{len(result.diagram)} nFaces:{len(mesh.owner)} "
+        f"nPoints:{len(mesh.points)} nCells:{len(contents.diagram)} nFaces:{len(mesh.owner)} "
         f"nInternalFaces:{len(mesh.neighbor)}"
     )
     bodies = {

@@ -17,13 +17,13 @@ from scipy.sparse.csgraph import connected_components
 from ..errors import InputError
 from ..mesh.connectivity import neighbor_points
 from ..mesh.diagram import Diagram
-from ..mesh.results import Result
+from .contents import Contents
 from .half_edges import HalfEdges, half_edges
 from .netcdf import NetCDF, squared
 from .trisk import find_weights
 
 
-def write_mpas(result: Result, path: Path, unit: str = "m") -> None:
+def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:
     """Write the mesh, with coordinates in `unit`; in a periodic box each edge and vertex at a seam is once in the box.
 
     Raises
@@ -31,11 +31,11 @@ def write_mpas(result: Result, path: Path, unit: str = "m") -> None:
     InputError
         If a cell has several loops of edges, or something of it is half a period away: MPAS takes the nearest image.
     """
-    _describe(result, path, unit).write()
+    _describe(contents, path, unit).write()
 
 
-def _describe(result: Result, path: Path, unit: str) -> NetCDF:
-    diagram, domain = result.diagram, result.diagram.domain
+def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
+    diagram, domain = contents.diagram, contents.diagram.domain
     halves = half_edges(diagram, glued=True)
     _check_loops(halves, path)
     shape = _measure(diagram, halves)
@@ -46,7 +46,7 @@ def _describe(result: Result, path: Path, unit: str) -> NetCDF:
     periods = np.where(domain.periodic, domain.extent, 0.0)
     file = NetCDF(
         path,
-        result,
+        contents,
         {
             "nCells": n, "nEdges": e, "nVertices": v, "maxEdges": width, "maxEdges2": 2 * width, "TWO": 2,
             "vertexDegree": degree,
@@ -78,7 +78,10 @@ def _describe(result: Result, path: Path, unit: str) -> NetCDF:
     file.add("nEdgesOnEdge", ("nEdges",), weights.counts)
     for name, items in (("edges", weights.edges + 1), ("weights", weights.values)):
         file.add_rows(f"{name}OnEdge", wide, weights.counts, items, 0)
-    file.add("meshDensity", ("nCells",), (result.target_size.min() / result.target_size) ** 4)
+    run = contents.result
+    size = np.sqrt(diagram.volumes) if run is None else run.target_size
+    file.add("meshDensity", ("nCells",), (size.min() / size) ** 4)
+    file.add_extra("nCells")
     return file
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.io import netcdf_file
 
 from ..errors import InputError
-from ..mesh.results import Result
 from .atomic import atomic_file
+from .contents import Contents
 
 _MOST = (
     2**31 - 4
@@ -41,8 +41,8 @@ class NetCDF:
     Parameters
     ----------
     path : Path
-    result : Result
-        Whose settings go along.
+    contents : Contents
+        Its settings become an attribute, its extra data variables by `add_extra`.
     dimensions : mapping
         Lengths by name.
     attributes : mapping
@@ -52,12 +52,12 @@ class NetCDF:
     def __init__(
         self,
         path: Path,
-        result: Result,
+        contents: Contents,
         dimensions: Mapping[str, int],
         attributes: Mapping[str, str | np.generic],
     ) -> None:
-        self.path, self.dimensions = path, dict(dimensions)
-        settings = json.dumps(result.settings, default=repr)
+        self.path, self.dimensions, self.extra = path, dict(dimensions), contents.extra
+        settings = json.dumps(contents.settings, default=repr)
         self.attributes = {**attributes, "source": "clvoro", "clvoro_settings": settings}
         self._variables: dict[str, _Variable] = {}
 
@@ -95,6 +95,27 @@ class NetCDF:
             If the format has no room for it.
         """
         self._add(name, _Variable(dimensions, items, attributes, counts, missing))
+
+    def add_extra(self, cells: str, **attributes: str) -> None:
+        """Add the caller's data along the dimension `cells`.
+
+        Raises
+        ------
+        InputError
+            If the file has a variable of that name, or the format has no room for it.
+        """
+        for name, values in self.extra.items():
+            if name in self._variables:
+                raise InputError(
+                    f"cell_data has the name {name!r}, which {self.path} has for a variable of its own; choose another"
+                )
+            if values.dtype.kind != "f" and abs(values).max() >= 2**31:  # netCDF-3 has no 64 bits
+                values = values.astype(float)
+            columns = ()
+            if values.ndim == 2:
+                columns = (f"{name}_columns",)
+                self.dimensions[columns[0]] = values.shape[1]
+            self.add(name, (cells, *columns), values, **attributes)
 
     def _add(self, name: str, variable: _Variable) -> None:
         lengths = [self.dimensions[d] for d in variable.dimensions]

@@ -2,8 +2,8 @@
 
 Members, each one array (`.npy`): `format`, `version`, `about` (JSON: domain, settings, and what of
 a `Result` is a single value), the arrays of a `Result` under their names, `diagram.<name>` for
-those of its `Diagram`, and `initial.<name>`, `final.<name>` for `Displacements`. `numpy.load` reads
-it, too.
+those of its `Diagram`, `initial.<name>`, `final.<name>` for `Displacements`, and `cell_data.<name>` for data of the
+caller, which `load` leaves out. The file of a diagram has no arrays of a `Result`. `numpy.load` reads it, too.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from .arrays import FileError, explained, list_members, read_member, write_arrays
+from .contents import Contents
 
 FORMAT, VERSION = "clvoro-result", 2
 
@@ -55,18 +56,18 @@ _INTEGERS = {
 }  # fmt: skip
 
 
-def write_npz(result: Result, path: Path) -> None:
-    """Write all of `result` to `path`; the same result gives the same bytes."""
-    diagram = result.diagram
+def write_npz(contents: Contents, path: Path) -> None:
+    """Write all of `contents` to `path`; the same contents give the same bytes."""
+    diagram, result = contents.diagram, contents.result
     domain = diagram.domain
     about: dict[str, Any] = {
         "domain": {"kind": type(domain).__name__, **domain.describe()},
-        "settings": result.settings,
+        "settings": contents.settings,
         "values": {},
     }
     arrays: dict[str, object] = {}
-    for name in _FIELDS:
-        value = getattr(result, name)
+    for name in _FIELDS if result is not None else ("diagram",):
+        value = getattr(contents if result is None else result, name)
         if name in _PARTS:
             # A diagram knows which of its arrays it has; they are fetched here.
             names = getattr(value, "_arrays", _PARTS[name]) if value is not None else ()
@@ -75,12 +76,13 @@ def write_npz(result: Result, path: Path) -> None:
             arrays[name] = value
         elif name != "settings":
             about["values"][name] = value
+    arrays |= {f"cell_data.{name}": values for name, values in contents.extra.items()}
     arrays["about"] = json.dumps(about, default=_plain)
     write_arrays(path, FORMAT, VERSION, arrays)
 
 
-def load(path: str | PathLike[str]) -> Result:
-    """Read a result that `Result.save` wrote to a ``.npz`` file.
+def load(path: str | PathLike[str]) -> Result | Diagram:
+    """Read what `Result.save` or `Diagram.save` wrote to a ``.npz`` file.
 
     The file is not trusted: nothing in it is executed, sizes are compared with the bytes that are
     there before memory is asked for, and the arrays must fit each other.
@@ -96,7 +98,9 @@ def load(path: str | PathLike[str]) -> Result:
             members = list_members(archive, FORMAT, VERSION)
             if "target_size" not in members:
                 members = {_FORMER.get(name, name): info for name, info in members.items()}
-            missing = [name for name in _NEEDED if name not in members]
+            alone = not any(name in members for name in _NEEDED[1:-1])
+            needed = ("about", "diagram.points") if alone else _NEEDED
+            missing = [name for name in needed if name not in members]
             if missing:
                 raise FileError(f"it lacks {', '.join(missing)}")
             parts = (f"{part}.{name}" for part, names in _PARTS.items() for name in names)
@@ -143,8 +147,8 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
             raise FileError(f"{items} points to what does not exist")
 
 
-def _assemble(arrays: dict[str, np.ndarray]) -> Result:
-    about = arrays["about"]
+def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
+    about, alone = arrays["about"], "points" not in arrays
     try:
         if about.dtype.kind != "U" or about.shape != ():
             raise TypeError("about is no text")
@@ -156,16 +160,20 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result:
         domain = _DOMAINS[kind](**description)
         settings = dict(facts["settings"])
         values = {name: value for name, value in facts["values"].items() if name in _FIELDS}
-        if {"converged", "stop_reason"} - set(values) or set(values) & (set(arrays) | set(_PARTS)):
+        needed = set() if alone else {"converged", "stop_reason"}
+        if needed - set(values) or set(values) & (set(arrays) | set(_PARTS)):
             raise KeyError("values")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FileError(f"its description is damaged ({error})") from error
-    if arrays["points"].shape[1] != domain.dim:
-        raise FileError(f"its points have {arrays['points'].shape[1]} coordinates in {domain}")
+    coordinates = arrays["diagram.points"].shape[1]
+    if coordinates != domain.dim:
+        raise FileError(f"its points have {coordinates} coordinates in {domain}")
     for name in Diagram._NAMES:
         if not name.startswith(_not_in(domain)) and f"diagram.{name}" not in arrays:
             raise FileError(f"it has no diagram.{name}")
     _check_domain(arrays, domain)
+    if alone:
+        return Diagram(domain, _part(arrays, "diagram"))
     stored = arrays["history"]
     history = np.zeros(len(stored), HISTORY_DTYPE)
     for column in set(stored.dtype.names or ()) & set(HISTORY_DTYPE.names or ()):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..mesh.connectivity import cell_corners
-from ..mesh.results import Result
+from .contents import Contents
 from .half_edges import half_edges
 from .netcdf import NetCDF, squared
 
@@ -32,18 +32,18 @@ _FACE_DATA = {
 """With what programs call them."""
 
 
-def write_ugrid(result: Result, path: Path, unit: str = "m") -> None:
+def write_ugrid(contents: Contents, path: Path, unit: str = "m") -> None:
     """Write the cells with size, error, quality and area, and the number and name of the wall at each edge.
 
     The coordinates of faces are the generators, those of edges their middles, all in `unit`. With "degrees" they are
     longitudes and latitudes, otherwise coordinates of a projection. Names of boundaries are the flags of the
     variable `boundary`.
     """
-    _describe(result, path, unit).write()
+    _describe(contents, path, unit).write()
 
 
-def _describe(result: Result, path: Path, unit: str) -> NetCDF:
-    diagram = result.diagram
+def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
+    diagram = contents.diagram
     halves = half_edges(diagram, glued=False)
     starts, corners = cell_corners(diagram)
     sides = np.diff(starts)
@@ -51,7 +51,7 @@ def _describe(result: Result, path: Path, unit: str) -> NetCDF:
     width = int(sides.max())
     file = NetCDF(
         path,
-        result,
+        contents,
         {
             "mesh_nodes": len(diagram.vertices),
             "mesh_edges": e,
@@ -95,18 +95,12 @@ def _describe(result: Result, path: Path, unit: str) -> NetCDF:
     file.add("mesh_edge_nodes", pairs, ends, **_role("edge_node"))
     beside = np.stack([halves.cell, across], axis=1)[first]
     file.add("mesh_edge_faces", pairs, beside, **_role("edge_face"), _FillValue=minus)
-    values = {
-        "size": result.target_size,
-        "error": result.size_error,
-        "quality": result.quality,
-        "area": diagram.volumes,
-    }
+    of_faces = {"mesh": "mesh", "location": "face", "coordinates": "mesh_face_x mesh_face_y"}
     units = {"size": unit, "area": squared(unit)}
-    for name, what in _FACE_DATA.items():
+    for name, values in {**contents.of_run, "area": diagram.volumes}.items():
         file.add(
-            name, ("mesh_faces",), values[name],
-            long_name=what, units=units.get(name, "1"), mesh="mesh", location="face",
-            coordinates="mesh_face_x mesh_face_y",
+            name, ("mesh_faces",), values,
+            long_name=_FACE_DATA[name], units=units.get(name, "1"), **of_faces,
         )  # fmt: skip
     walls = np.maximum(-1 - diagram.neighbors[halves.rows[first]], -1)
     file.add(
@@ -123,6 +117,7 @@ def _describe(result: Result, path: Path, unit: str) -> NetCDF:
             coordinates="mesh_edge_x mesh_edge_y", flag_values=np.arange(len(names), dtype=np.int32),
             flag_meanings=" ".join(names), _FillValue=minus,
         )  # fmt: skip
+    file.add_extra("mesh_faces", **of_faces)
     return file
 
 

@@ -19,9 +19,9 @@ from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 from ..mesh.connectivity import face_corners, face_owners, next_faces
 from ..mesh.diagram import Diagram
-from ..mesh.results import Result
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
+from .contents import Contents
 
 NAMES = "clvoro names: "
 """Beginning of the comment with names of boundaries."""
@@ -30,25 +30,25 @@ _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
 
-def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
+def write_vtu(contents: Contents, path: Path, compress: bool = True) -> None:
     """Write the cells as polygons or polyhedra with their data; the settings go along in a comment.
 
-    Cell data: `size` (h), `error` (signed), `quality`, `volume` (area in 2D), `sides` (in 3D `faces_of_cell`),
-    `label` (the cell's row in the result), `boundary` (see `largest_boundary`), and the vector `generator`, from the
-    origin to the cell's generator. Names of boundaries that the caller gave go along in a comment, a polygonal or
-    periodic domain as field data. In a periodic box cells are not cut at the seams.
+    Cell data: `size` (h), `error` (signed) and `quality` of a result, `volume` (area in 2D), `sides` (in 3D
+    `faces_of_cell`), `label` (row of the cell), `boundary` (see `largest_boundary`), the vector `generator`, from the
+    origin to the cell's generator, and data of the caller. Names of boundaries that the caller gave go along in a
+    comment, a polygonal or periodic domain as field data. In a periodic box cells are not cut at the seams.
     """
-    diagram = result.diagram
+    diagram = contents.diagram
     n = len(diagram)
     appended = _Appended(compress)
     points = appended.add(None, in_space(diagram.vertices))
     if diagram.domain.dim == 2:
         kind, topology = _POLYGON, _polygons(diagram)
     else:
-        kind, topology = _POLYHEDRON, _polyhedra(diagram)
+        kind, topology = _POLYHEDRON, polyhedra(diagram)
     topology["types"] = np.full(n, kind, np.uint8)
     cells = [appended.add(name, array) for name, array in topology.items()]
-    data = [appended.add(name, values) for name, values in cell_data(result).items()]
+    data = [appended.add(name, values) for name, values in cell_data(contents).items()]
     field = [
         appended.add(name, array, tuples=True) for name, array in _domain_data(diagram).items()
     ]
@@ -56,7 +56,7 @@ def write_vtu(result: Result, path: Path, compress: bool = True) -> None:
     head = f"""<?xml version="1.0"?>
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
 header_type="UInt64"{compressor}>
-{_comment("clvoro settings: " + json.dumps(result.settings, default=repr))}
+{_comment("clvoro settings: " + json.dumps(contents.settings, default=repr))}
 {_names_comment(diagram.domain)}\
 <UnstructuredGrid>
 {_field_data(field)}<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
@@ -66,7 +66,7 @@ header_type="UInt64"{compressor}>
 <Cells>
 {_lines(cells)}
 </Cells>
-<CellData Scalars="error" Vectors="generator">
+<CellData Scalars="{"volume" if contents.result is None else "error"}" Vectors="generator">
 {_lines(data)}
 </CellData>
 </Piece>
@@ -136,7 +136,7 @@ def _polygons(diagram: Diagram) -> dict[str, np.ndarray]:
     }
 
 
-def _polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
+def polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return the cells' corners and the streams that describe their faces.
 
     `faces` has for each cell the number of its faces, then for each face the number of its corners and the
@@ -170,22 +170,21 @@ def _polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
     }
 
 
-def cell_data(result: Result) -> dict[str, np.ndarray]:
+def cell_data(contents: Contents) -> dict[str, np.ndarray]:
     """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
-    diagram = result.diagram
+    diagram = contents.diagram
     flat, n = diagram.domain.dim == 2, len(diagram)
     # In 3D of the faces that are written: those with a loop.
     seen = np.diff(face_corners(diagram)[0]) > 0
     counts = count_sides(diagram) if flat else np.bincount(face_owners(diagram)[seen], minlength=n)
     return {
-        "size": result.target_size,
-        "error": result.size_error,
-        "quality": result.quality,
+        **contents.of_run,
         "volume": diagram.volumes,
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),
         "label": np.arange(n, dtype=np.int32),
         "boundary": largest_boundary(diagram),
-        "generator": in_space(result.points),
+        "generator": in_space(diagram.points),
+        **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.extra.items()},
     }
 
 

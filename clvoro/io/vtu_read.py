@@ -51,8 +51,8 @@ class _FileError(Exception):
     """What is wrong with a file; `load_vtu` adds which one."""
 
 
-def load_vtu(path: str | PathLike[str]) -> Result:
-    """Read the cells and what is known of them from a `.vtu` file that `Result.save` wrote.
+def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
+    """Read the cells and what is known of them from a `.vtu` file that `Result.save` or `Diagram.save` wrote.
 
     The domain is the polygon or periodic box that the file describes, or else the vertices' bounding box. The graph is
     made anew from the corners that cells share; volumes, sizes, errors and quality are those of the file, the history
@@ -144,9 +144,9 @@ class _Reader:
             if given.get("format") != "appended" or given["type"] not in _TYPES:
                 raise _FileError(f"its array {name!r:.60} is not appended, or of an unknown type")
             width = int(given.get("NumberOfComponents", "1"))
-            if width not in (1, 3):
-                raise _FileError(f"its array {name!r:.60} has {width} components")
             key = f"{group}.{name}"
+            if width not in (1, 3) and key in _USED:
+                raise _FileError(f"its array {name!r:.60} has {width} components")
             if key in self.entries:
                 raise _FileError(f"it has two arrays called {key!r:.60}")
             self.entries[key] = (_TYPES[given["type"]], width, int(given["offset"]))
@@ -205,7 +205,9 @@ class _Reader:
             yield data
 
 
-def _assemble(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) -> Result:
+def _assemble(
+    arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None
+) -> Result | Diagram:
     vertices = arrays["Points."].astype(float)
     kinds = arrays["Cells.types"]
     if not len(kinds) or not len(vertices) or not np.isfinite(vertices).all():
@@ -261,6 +263,8 @@ def _assemble(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None)
     # What the file does not hold is what its corners give.
     diagram = Diagram(domain, {**known, **rebuild(Diagram(domain, known))})
     check_repeated(arrays, diagram)
+    if not {f"CellData.{name}" for name in ("size", "error", "quality")} & set(arrays):
+        return diagram
     size, error, quality = (
         arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
     )

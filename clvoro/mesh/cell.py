@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .diagram import Diagram
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cell(Sealed):
     """One cell; see `Diagram.cell`. Lengths are in the domain's unit.
 

@@ -23,7 +23,7 @@ In a polygonal domain a part of a cell that the boundary cuts off belongs to ano
 bisector of the generators of the two cells."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Faces(Sealed):
     """Every face of a diagram once, seams and walls included; see `Diagram.faces`.
 

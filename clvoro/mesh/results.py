@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -12,9 +13,15 @@ from .diagram import Diagram
 from .read_only import Sealed
 
 if TYPE_CHECKING:
+    import meshio
+    import pyvista
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
+    from ..geometry.boundary_names import Walls
+    from ..io.polymesh import PatchType
+    from ..plotting.colors import Color
+    from ..plotting.solids import View
     from .check.findings import Report
     from .quality import Measures
 
@@ -43,7 +50,7 @@ HISTORY_DTYPE = np.dtype(
 """One row per step of a run, and one more if cells or the sizes asked for have changed after the last."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Displacements(Sealed):
     """The two halves of one step, before they are combined: the paper's Figure 6.
 
@@ -60,7 +67,7 @@ class Displacements(Sealed):
     poisson: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result(Sealed):
     """A finished (or interrupted) run. Its arrays are read-only; take a `copy()` to change one.
 
@@ -129,23 +136,165 @@ class Result(Sealed):
         """Carry cell data (n,) or (n, k) over to another mesh of the same domain; see `Diagram.transfer`."""
         return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
 
-    def save(self, path: str | PathLike[str], **options: Any) -> None:
-        """Write the mesh to `path`: `.npz` (for `clvoro.load`), `.vtu`, netCDF (`.nc`), OpenFOAM's `polyMesh`, ...
+    def save(
+        self,
+        path: str | PathLike[str],
+        *,
+        cell_data: Mapping[str, ArrayLike] | None = None,
+        patches: Mapping[str, Walls] | None = None,
+        types: Mapping[str, PatchType] | None = None,
+        thickness: float | None = None,
+        convention: Literal["ugrid", "mpas"] | None = None,
+        units: str | None = None,
+    ) -> None:
+        """Write the mesh to `path`; the suffix chooses the format.
 
-        See `clvoro.io.save` for all formats and their options.
+        Parameters
+        ----------
+        path : str or path
+            ``.npz`` (for `clvoro.load`), ``.vtu``, netCDF (``.nc``), OpenFOAM's ``polyMesh``, ...
+        cell_data : mapping, optional
+            Data of your own by name, one number or row of numbers per cell.
+        patches, types, thickness, convention, units : optional
+            Of single formats; see `clvoro.io.save`.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            As `clvoro.io.save`.
         """
         from ..io import save
 
-        save(self, path, **options)
+        save(
+            self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness, convention=convention,
+            units=units,
+        )  # fmt: skip
 
-    def plot(self, color: str = "error", **options: Any) -> Any:
-        """Draw the cells colored by "error", "quality", "size", "sides" or "skewness"; returns the Matplotlib figure.
+    def plot(
+        self,
+        color: Color | ArrayLike = "error",
+        *,
+        label: str | None = None,
+        view: View | None = None,
+        ax: Any = None,
+        limits: tuple[float, float] | None = None,
+        window: tuple[ArrayLike, ArrayLike] | None = None,
+        normal: str | ArrayLike = "z",
+        through: ArrayLike | None = None,
+        cut: str | ArrayLike | None = "octant",
+        angles: tuple[float, float] | None = None,
+        edges: bool = True,
+        key: bool = True,
+        title: str | None = None,
+    ) -> Any:
+        """Draw the cells with Matplotlib.
 
-        In 3D `view` is "slices" (default), "slice" or "cutaway"; see `clvoro.plotting` for further options.
+        Parameters
+        ----------
+        color : str or (n,) array of real numbers
+            "error", "quality", "size", "sides", "skewness", "volume", or data of your own.
+        label : str, optional
+            Text at the color bar.
+        view : "slices", "slice" or "cutaway", optional
+            For 3D; "slices" by default.
+        ax, limits, window, normal, through, cut, angles, edges, key, title : optional
+            See `clvoro.plotting.plot_mesh`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If a color does not exist, or an option is for other pictures.
+        ClvoroError
+            If Matplotlib is not installed.
         """
         from ..plotting import plot_mesh
 
-        return plot_mesh(self, color, **options)
+        return plot_mesh(
+            self, color, label=label, view=view, ax=ax, limits=limits, window=window, normal=normal, through=through,
+            cut=cut, angles=angles, edges=edges, key=key, title=title,
+        )  # fmt: skip
+
+    def to_pyvista(
+        self, cell_data: Mapping[str, ArrayLike] | None = None
+    ) -> pyvista.UnstructuredGrid:
+        """Return the cells as an unstructured grid of PyVista.
+
+        Parameters
+        ----------
+        cell_data : mapping, optional
+            Data of your own by name, one number or row of numbers per cell.
+
+        Returns
+        -------
+        pyvista.UnstructuredGrid
+            Polygons or polyhedra in the order of the generators, with the cell data of a ``.vtu`` file, sizes included.
+
+        Raises
+        ------
+        ClvoroError
+            If PyVista is not installed (``pip install "clvoro[pyvista]"``).
+        InputError, InputTypeError
+            If `cell_data` does not fit the cells.
+        """
+        from ..io import to_pyvista
+
+        return to_pyvista(self, cell_data)
+
+    def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
+        """Return the cells as a mesh of meshio.
+
+        Parameters
+        ----------
+        cell_data : mapping, optional
+            Data of your own by name, one number or row of numbers per cell.
+
+        Returns
+        -------
+        meshio.Mesh
+            One block of cells for each number of corners; the cell data `label` is the row of a cell in this mesh. The
+            other cell data are those of a ``.vtu`` file, sizes included.
+
+        Raises
+        ------
+        ClvoroError
+            If meshio is not installed (``pip install "clvoro[formats]"``).
+        InputError, InputTypeError
+            If `cell_data` does not fit the cells.
+        """
+        from ..io import to_meshio
+
+        return to_meshio(self, cell_data)
+
+    def to_shapely(self) -> np.ndarray:
+        """Return the cells of a mesh in 2D as polygons of shapely, (n,); see `Diagram.to_shapely`."""
+        return self.diagram.to_shapely()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures that describe the mesh and the run.
+
+        Returns
+        -------
+        dict
+            ``cells``, ``steps``, ``mean_error`` and ``max_error`` (of |e|), ``mean_quality``, ``min_quality``,
+            ``size_factor``, ``ever_changed`` (share of cells whose set of neighbors changed on the finest level),
+            ``converged``, ``stop_reason`` and ``seconds``. In a polygonal domain also ``boundary_cells``,
+            ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and the others (None
+            where there is no such cell).
+
+        Examples
+        --------
+        >>> mesh = clvoro.adapt(clvoro.Box((0, 0), (1, 1)), 0.1, "fast")
+        >>> figures = mesh.summary()
+        >>> figures["cells"] == len(mesh.points), figures["stop_reason"]
+        (True, 'plan completed')
+        """
+        from .summary import summary
+
+        return summary(self)
 
     @property
     def measures(self) -> Measures:

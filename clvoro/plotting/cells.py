@@ -17,7 +17,7 @@ from ..mesh.connectivity import face_ends, face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .boundary import clip_to_domain, frame_part
-from .colors import COLORINGS, Coloring, cell_norm, coloring, without_ends
+from .colors import COLORINGS, Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
 from .legends import add_color_bar, add_key, round_numbers
 from .style import WIDTH, interactive_figure, single_height, styled
 
@@ -32,10 +32,11 @@ def require_plane(diagram: Diagram) -> None:
 
 
 def plot_cells(
-    result: Result,
-    color: str = "error",
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
     ax: Any = None,
     *,
+    label: str | None = None,
     limits: tuple[float, float] | None = None,
     window: tuple[ArrayLike, ArrayLike] | None = None,
     edges: bool = True,
@@ -46,11 +47,14 @@ def plot_cells(
 
     Parameters
     ----------
-    result : Result
-    color : {"error", "quality", "size", "sides", "skewness"}
-        The paper's (3.1), its (4.1), the target size h, the number of faces, or the worst face's skewness.
+    mesh : Result or Diagram
+    color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
+        The paper's (3.1), its (4.1), the target size h, the number of faces, the skewness of the worst face, the area,
+        or data of your own. A diagram has neither "error" nor "size".
     ax : matplotlib axes, optional
         Drawn into; a new figure by default.
+    label : str, optional
+        Text at the color bar; by default what `color` names.
     limits : (low, high), optional
         Ends of the color scale; by default those that 99 % of the cells keep.
     window : (lower, upper), optional
@@ -67,11 +71,13 @@ def plot_cells(
 
     Raises
     ------
-    InputError
-        For an unknown color, or a 3D mesh.
+    InputError, InputTypeError
+        For an unknown color, an array of another shape, or a 3D mesh.
     """
-    scheme, diagram = coloring(color), result.diagram
+    result = picture_of(mesh)
+    diagram = result.diagram
     require_plane(diagram)
+    scheme = coloring_of(result, color, label)
     corners = (diagram.domain.lower, diagram.domain.upper) if window is None else window
     lower, upper = (np.asarray(corner, float) for corner in corners)
     with styled():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from matplotlib import colormaps
@@ -16,10 +16,16 @@ from matplotlib.colors import (
     Normalize,
 )
 
-from ..errors import InputError
+from ..errors import InputError, InputTypeError
+from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.straightening import count_sides
 from .style import nice
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ..mesh.quality import Measures
 
 # Up to four, five, six, seven, eight and more sides: neutral for six, warm below, cool above.
 _SIDES = ("#7F2704", "#E6762B", "#EDEDED", "#5AA6D1", "#08306B")
@@ -90,6 +96,16 @@ def _span(values: np.ndarray) -> tuple[float, float]:
     return (low, high) if high > low * (1 + 1e-6) else (low * 0.99, low * 1.01)
 
 
+def _most(values: np.ndarray) -> tuple[float, float]:
+    """Limits that 98 % of the finite values keep, at least a little apart."""
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return 0.0, 1.0
+    low, high = np.quantile(values, (0.01, 0.99)).tolist()
+    least = 1e-6 * max(abs(low), abs(high)) or 1.0
+    return (low, high) if high - low >= least else (low - least, high + least)
+
+
 COLORINGS = {
     "error": Coloring(
         "metric error $e$ [–]   (< 0 too small, > 0 too large)",
@@ -118,6 +134,13 @@ COLORINGS = {
         "viridis_r",
         _from_zero,
     ),
+    "volume": Coloring(
+        "area of the cell [squared unit of length]",
+        lambda r: r.diagram.volumes,
+        "viridis",
+        _span,
+        logarithmic=True,
+    ),
 }
 """What `plot_cells` can color by."""
 
@@ -135,7 +158,77 @@ _SOLID_COLORINGS = {
         lambda v: (11.5, 16.5),
         classes=tuple(f"{label} faces" for label in _FACES_LABELS),
     ),
+    "volume": replace(COLORINGS["volume"], label="volume of the cell [cubed unit of length]"),
 }
+
+
+Color = Literal["error", "quality", "size", "sides", "skewness", "volume"]
+"""Names of what cells are colored by."""
+_OF_RUNS = ("error", "size")
+
+
+class DiagramPicture:
+    """A diagram as pictures take a result: with quality, and the widths of cells in the place of sizes."""
+
+    def __init__(self, diagram: Diagram) -> None:
+        self.diagram, self.points = diagram, diagram.points
+        self.target_size = diagram.volumes ** (1 / diagram.domain.dim)
+
+    @property
+    def measures(self) -> Measures:
+        """See `Diagram.measures`."""
+        return self.diagram.measures
+
+    @property
+    def quality(self) -> np.ndarray:
+        """Quality of the cells, (n,)."""
+        return self.diagram.measures.quality
+
+
+def picture_of(mesh: Result | Diagram) -> Result:
+    """Return what pictures are made of: a result, or a diagram in its place.
+
+    Raises
+    ------
+    InputTypeError
+    """
+    if isinstance(mesh, Diagram):
+        return cast("Result", DiagramPicture(mesh))
+    if not isinstance(mesh, Result | DiagramPicture):
+        raise InputTypeError(
+            f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram"
+        )
+    return mesh
+
+
+def coloring_of(mesh: Result, color: Color | ArrayLike, label: str | None = None) -> Coloring:
+    """Return the coloring for the cells of `mesh`: by its name, or for an array with one number per cell.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If there is no such color, or the array has another shape or no real numbers.
+    """
+    dim = mesh.diagram.domain.dim
+    if isinstance(color, str):
+        if isinstance(mesh, DiagramPicture) and color in _OF_RUNS:
+            others = [name for name in COLORINGS if name not in _OF_RUNS]
+            raise InputError(
+                f"color is {color!r}, which a diagram without sizes does not have, expected one of {', '.join(others)} "
+                "or an array"
+            )
+        scheme = coloring(color, dim)
+        return scheme if label is None else replace(scheme, label=label)
+    values = np.asarray(color)
+    n = len(mesh.points)
+    if values.dtype.kind not in "fiub":
+        raise InputTypeError(
+            f"color is {color!r:.60}, expected one of {', '.join(COLORINGS)}, or an array of real numbers"
+        )
+    if values.shape != (n,):
+        raise InputError(f"color has shape {values.shape}, expected ({n},): one number per cell")
+    values = values.astype(float)
+    return Coloring(label or "", lambda _: values, "viridis", _most)
 
 
 def coloring(name: str, dim: int = 2) -> Coloring:

@@ -13,7 +13,7 @@ from ..mesh.connectivity import face_owners
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import edge_style
-from .colors import Coloring, cell_norm, coloring, without_ends
+from .colors import Color, Coloring, cell_norm, coloring_of, picture_of, without_ends
 from .cutaway import draw_cutaway
 from .legends import add_key
 from .section import Section, cut_cells, plane_axes
@@ -57,12 +57,13 @@ def as_normal(normal: str | ArrayLike) -> np.ndarray:
 
 
 def plot_slice(
-    result: Result,
-    color: str = "error",
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
     ax: Any = None,
     *,
     normal: str | ArrayLike = "z",
     through: ArrayLike | None = None,
+    label: str | None = None,
     limits: tuple[float, float] | None = None,
     window: tuple[ArrayLike, ArrayLike] | None = None,
     edges: bool = True,
@@ -73,8 +74,8 @@ def plot_slice(
 
     Parameters
     ----------
-    result : Result
-    color : {"error", "quality", "size", "sides", "skewness"}
+    mesh : Result or Diagram
+    color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
         As for `plot_cells`.
     ax : matplotlib axes, optional
         Drawn into; a new figure by default.
@@ -82,7 +83,7 @@ def plot_slice(
         Direction at right angles to the plane.
     through : 3 floats, optional
         A point of the plane; by default amid the smallest cells.
-    limits, edges, key, title
+    label, limits, edges, key, title
         As for `plot_cells`.
     window : (lower, upper), optional
         Corners (2 floats each) of the part to show, in the picture's coordinates.
@@ -96,9 +97,10 @@ def plot_slice(
     InputError
         For a 2D mesh, an unknown color, or a plane beside the domain.
     """
+    result = picture_of(mesh)
     diagram = result.diagram
     require_space(diagram)
-    scheme, direction = coloring(color, 3), as_normal(normal)
+    scheme, direction = coloring_of(result, color, label), as_normal(normal)
     point = focus(result) if through is None else np.asarray(through, float)
     if point.shape != (3,):
         raise InputError(f"through has shape {point.shape}, expected 3 coordinates")
@@ -154,11 +156,12 @@ def _shown_part(
 
 
 def plot_slices(
-    result: Result,
-    color: str = "error",
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
     figure: Any = None,
     *,
     through: ArrayLike | None = None,
+    label: str | None = None,
     limits: tuple[float, float] | None = None,
     title: str | None = None,
 ) -> Any:
@@ -168,7 +171,7 @@ def plot_slices(
 
     Parameters
     ----------
-    result, color, through, limits, title
+    mesh, color, label, through, limits, title
         As for `plot_slice`.
     figure : matplotlib figure, optional
         An empty one to draw into, of `slices_height`.
@@ -177,9 +180,10 @@ def plot_slices(
     -------
     matplotlib.figure.Figure
     """
+    result = picture_of(mesh)
     diagram = result.diagram
     require_space(diagram)
-    scheme = coloring(color, 3)
+    scheme = coloring_of(result, color, label)
     point = focus(result) if through is None else np.asarray(through, float)
     values = scheme.values(result)
     ends = scheme.limits(values) if limits is None else limits

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from matplotlib import colormaps
@@ -11,9 +11,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import plot_cells
-from .colors import cell_norm, coloring
+from .colors import Color, cell_norm, coloring, coloring_of, picture_of
 from .cutaway import VIEW, draw_cutaway, view_axes
 from .legends import add_key
 from .slices import as_normal, focus, plot_slice, plot_slices, require_space
@@ -21,43 +22,98 @@ from .style import WIDTH, interactive_figure, styled
 
 __all__ = ["plot_cutaway", "plot_distributions", "plot_mesh", "plot_slice", "plot_slices"]
 
-_VIEWS = ("slices", "slice", "cutaway")
+View = Literal["slices", "slice", "cutaway"]
+_USED = {
+    "2D": ("ax", "window", "edges", "key"),
+    "slices": ("through",),
+    "slice": ("ax", "window", "normal", "through", "edges", "key"),
+    "cutaway": ("ax", "through", "cut", "angles", "edges", "key"),
+}
+"""Options of `plot_mesh` that a kind of picture uses."""
 
 
-def plot_mesh(result: Result, color: str = "error", view: str | None = None, **options: Any) -> Any:
+def plot_mesh(
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
+    *,
+    label: str | None = None,
+    view: View | None = None,
+    ax: Any = None,
+    limits: tuple[float, float] | None = None,
+    window: tuple[ArrayLike, ArrayLike] | None = None,
+    normal: str | ArrayLike = "z",
+    through: ArrayLike | None = None,
+    cut: str | ArrayLike | None = "octant",
+    angles: tuple[float, float] | None = None,
+    edges: bool = True,
+    key: bool = True,
+    title: str | None = None,
+) -> Any:
     """Draw a mesh: 2D by `plot_cells`, 3D by `plot_slices`, `plot_slice` or `plot_cutaway`.
 
     Parameters
     ----------
-    result : Result
-    color : {"error", "quality", "size", "sides", "skewness"}
+    mesh : Result or Diagram
+    color, label, limits, title
+        As for `plot_cells`.
     view : {"slices", "slice", "cutaway"}, optional
-        For 3D meshes; "slices" by default.
-    **options
-        Of the function that draws.
+        For meshes in 3D: planes along the axes and a cut-away view (the default), one plane, or a cut-away view.
+    ax : matplotlib axes, optional
+        Axes to draw into; not for "slices", which has several.
+    window, edges, key
+        As for `plot_cells`; window for 2D and "slice", edges and key not for "slices".
+    normal : {"x", "y", "z"} or 3 floats
+        For "slice": direction at right angles to the plane.
+    through : 3 floats, optional
+        For 3D: a point of the planes or of the cut.
+    cut, angles
+        For "cutaway": what is taken out, and azimuth and elevation of the viewer in degrees; `cut` and `view` of
+        `plot_cutaway`.
 
     Returns
     -------
     matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If a color does not exist, an array has another shape, or an option is for other pictures.
     """
-    if result.diagram.domain.dim == 2:
-        if view is not None:
-            raise InputError(f"view is {view!r}, which is for meshes in 3D; leave it out")
-        return plot_cells(result, color, **options)
-    drawing = dict(zip(_VIEWS, (plot_slices, plot_slice, plot_cutaway), strict=True))
-    if view is not None and view not in drawing:
-        raise InputError(f"view is {view!r}, expected one of {', '.join(_VIEWS)}")
-    return drawing[view or "slices"](result, color, **options)
+    flat = picture_of(mesh).diagram.domain.dim == 2
+    if flat and view is not None:
+        raise InputError(f"view is {view!r}, which is for meshes in 3D; leave it out")
+    if view is not None and view not in get_args(View):
+        raise InputError(f"view is {view!r}, expected one of {', '.join(get_args(View))}")
+    kind = "2D" if flat else view or "slices"
+    draw = {"2D": plot_cells, "slices": plot_slices, "slice": plot_slice, "cutaway": plot_cutaway}[
+        kind
+    ]
+    given = {
+        "ax": (ax, None), "window": (window, None), "normal": (normal, "z"), "through": (through, None),
+        "cut": (cut, "octant"), "angles": (angles, None), "edges": (edges, True), "key": (key, True),
+    }  # fmt: skip
+    options: dict[str, Any] = {}
+    for name, (value, default) in given.items():
+        if value is default or (isinstance(value, str) and value == default):
+            continue
+        if name not in _USED[kind]:
+            known = [k for k, names in _USED.items() if name in names]
+            raise InputError(
+                f"{name} is for {', '.join(known)}, and this picture is {kind}; leave it out"
+            )
+        options["view" if name == "angles" else name] = value
+    return draw(mesh, color, label=label, limits=limits, title=title, **options)
 
 
 def plot_cutaway(
-    result: Result,
-    color: str = "error",
+    mesh: Result | Diagram,
+    color: Color | ArrayLike = "error",
     ax: Any = None,
     *,
     cut: str | ArrayLike | None = "octant",
     through: ArrayLike | None = None,
     view: tuple[float, float] = VIEW,
+    label: str | None = None,
     limits: tuple[float, float] | None = None,
     edges: bool = True,
     key: bool = True,
@@ -67,8 +123,8 @@ def plot_cutaway(
 
     Parameters
     ----------
-    result : Result
-    color : {"error", "quality", "size", "sides", "skewness"}
+    mesh : Result or Diagram
+    color : {"error", "quality", "size", "sides", "skewness", "volume"} or (n,) array of real numbers
     ax : matplotlib axes, optional
         Two-dimensional ones to draw into; a new figure by default.
     cut : "octant", "x", "y", "z", 3 floats, (n,) bool or None
@@ -79,7 +135,7 @@ def plot_cutaway(
         The point; by default amid the smallest cells.
     view : (azimuth, elevation), degrees
         Where the viewer is.
-    limits, edges, key, title
+    label, limits, edges, key, title
         As for `plot_cells`.
 
     Returns
@@ -91,8 +147,9 @@ def plot_cutaway(
     InputError
         For a 2D mesh, an unknown color or cut.
     """
+    result = picture_of(mesh)
     require_space(result.diagram)
-    scheme = coloring(color, 3)
+    scheme = coloring_of(result, color, label)
     point = focus(result) if through is None else np.asarray(through, float)
     what = _cut(cut, len(result.points), view)
     values = scheme.values(result)

@@ -347,7 +347,8 @@ def test_arrays_are_read_only(result, tmp_path):
 
 
 def test_colors(result):
-    refused(lambda: result.plot(result.size_error), "expected one of error", kind=InputError)
+    refused(lambda: result.plot(None), "expected one of error", kind=InputTypeError)
+    refused(lambda: result.plot(result.size_error[1:]), "one number per cell", kind=InputError)
 
 
 def test_pictures_without_matplotlib(result, monkeypatch):

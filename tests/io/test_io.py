@@ -21,6 +21,7 @@ from clvoro import io
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.box import Box
 from clvoro.io import formats, npz
+from clvoro.io.contents import Contents
 from clvoro.io.vtu import write_vtu
 from clvoro.mesh.diagram import Diagram
 from clvoro.mesh.results import HISTORY_DTYPE, Displacements, Result
@@ -267,7 +268,7 @@ def test_every_truncation_and_flipped_byte_is_noticed(result, tmp_path):
 @pytest.mark.parametrize("compress", [True, False])
 def test_vtu_as_meshio_reads_it(result, tmp_path, compress, meshio_for_vtu):
     path = tmp_path / "mesh.vtu"
-    write_vtu(result, path, compress)
+    write_vtu(Contents.of(result), path, compress)
     mesh = meshio_for_vtu.read(path)
     d = result.diagram
     np.testing.assert_array_equal(mesh.points[:, :2], d.vertices)

@@ -11,7 +11,8 @@ import pytest
 
 from clvoro import io
 from clvoro.errors import InputError
-from clvoro.io.vtu import _polyhedra, largest_boundary, write_vtu
+from clvoro.io.contents import Contents
+from clvoro.io.vtu import largest_boundary, polyhedra, write_vtu
 from clvoro.mesh.connectivity import face_corners, face_owners, face_topology, take_rows
 from clvoro.mesh.diagram import Diagram
 from tests.io.test_io import assert_equal_results, assert_same_array, rewrite
@@ -70,7 +71,7 @@ def enclosed_volume(vertices, faces):
 
 def test_polyhedra_are_the_cells(diagram, lattice):
     for d in (diagram, lattice):
-        arrays = _polyhedra(d)
+        arrays = polyhedra(d)
         cells = decode(arrays["faces"], arrays["faceoffsets"])
         loops, starts = loops_of(d), d.neighbor_starts
         assert cells == [loops[a:b] for a, b in itertools.pairwise(starts)]
@@ -93,8 +94,8 @@ def test_faces_without_measure_are_left_out(lattice):
         face_vertex_starts=np.cumsum([0] + [len(loop) for loop in loops]).astype(np.int32),
         face_vertices=np.concatenate(loops).astype(np.int32),
     )
-    for name, array in _polyhedra(lattice).items():
-        assert_same_array(_polyhedra(d)[name], array)
+    for name, array in polyhedra(lattice).items():
+        assert_same_array(polyhedra(d)[name], array)
     assert [len(loop) for loop in loops_of(d)[5:9]] == [4, 0, 0, 4]
     assert len(face_topology(d).owner) == len(face_topology(lattice).owner)
 
@@ -176,11 +177,11 @@ def appended_arrays(path):
 
 @pytest.mark.parametrize("compress", [True, False])
 def test_vtu_holds_cells_and_data(result, tmp_path, compress):
-    write_vtu(result, tmp_path / "mesh.vtu", compress)
+    write_vtu(Contents.of(result), tmp_path / "mesh.vtu", compress)
     arrays = appended_arrays(tmp_path / "mesh.vtu")
     d = result.diagram
     expected = {
-        **_polyhedra(d),
+        **polyhedra(d),
         "points": d.vertices,
         "types": np.full(len(d), 42, np.uint8),
         "size": result.target_size,

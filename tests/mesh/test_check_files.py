@@ -5,6 +5,7 @@ import pytest
 
 import clvoro
 from clvoro.io import vtu
+from clvoro.io.contents import Contents
 from clvoro.io.vtu import write_vtu
 from tests.reference.solids import solid_diagram, solid_result
 
@@ -49,7 +50,7 @@ def test_arrays_for_other_programs_have_to_agree(
     meshes, kind, part, name, change, tmp_path, monkeypatch
 ):
     path = tmp_path / "m.vtu"
-    write_vtu(meshes[kind], path)
+    write_vtu(Contents.of(meshes[kind]), path)
     clvoro.load(path)
     make = getattr(vtu, part)
 
@@ -63,6 +64,6 @@ def test_arrays_for_other_programs_have_to_agree(
         return arrays
 
     monkeypatch.setattr(vtu, part, spoilt)
-    write_vtu(meshes[kind], path)
+    write_vtu(Contents.of(meshes[kind]), path)
     with pytest.raises(clvoro.ClvoroError, match=rf"(\b{name}\b|not finite)"):
         clvoro.load(path)

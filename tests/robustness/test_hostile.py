@@ -23,6 +23,7 @@ from clvoro.cli.cases.fields import load_array
 from clvoro.errors import InputError
 from clvoro.files import read_text
 from clvoro.geometry import rings
+from clvoro.io.contents import Contents
 from clvoro.io.vtu import write_vtu
 from clvoro.io.vtu_read import load_vtu
 from clvoro.sizing import Expression
@@ -227,7 +228,7 @@ def test_many_arrays_in_the_same_bytes_are_refused(tmp_path, compress):
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_arrays_that_lie_in_each_other_are_refused(result, tmp_path, compress):
-    write_vtu(result, tmp_path / "m.vtu", compress)
+    write_vtu(Contents.of(result), tmp_path / "m.vtu", compress)
     data = (tmp_path / "m.vtu").read_bytes()
     load_vtu(tmp_path / "m.vtu")
     for name in ("size", "error", "quality", "volume"):

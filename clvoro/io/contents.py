@@ -1,0 +1,111 @@
+"""What a file of a mesh holds: a diagram, what a run knows of its cells, and data of the caller."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
+OWN = frozenset(
+    ("size", "error", "quality", "volume", "area", "sides", "faces_of_cell", "label", "boundary", "generator", "wall")
+)  # fmt: skip
+"""Names that clvoro's own cell data have in some format."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file holds.
+
+    Attributes
+    ----------
+    diagram : Diagram
+    result : Result or None
+        None for a diagram without sizes.
+    extra : dict
+        The caller's data by name, (n,) or (n, k) arrays of float32, float64, int32, int64 or uint8.
+    """
+
+    diagram: Diagram
+    result: Result | None
+    extra: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, mesh: object, cell_data: Mapping[str, ArrayLike] | None = None) -> Contents:
+        """Return the contents for a result or a diagram.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If `mesh` is neither, or `cell_data` does not have one number, or row of numbers, per cell.
+        """
+        if isinstance(mesh, Result):
+            return cls(mesh.diagram, mesh, _checked(cell_data, len(mesh.diagram)))
+        if isinstance(mesh, Diagram):
+            return cls(mesh, None, _checked(cell_data, len(mesh)))
+        raise InputTypeError(
+            f"mesh is a {type(mesh).__name__}, expected a clvoro.Result or a clvoro.Diagram, as clvoro.adapt and "
+            "clvoro.voronoi return them"
+        )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the run; none of a diagram."""
+        return {} if self.result is None else self.result.settings
+
+    @property
+    def of_run(self) -> dict[str, np.ndarray]:
+        """What the run knows of the cells: size, error and quality; nothing of a diagram."""
+        r = self.result
+        if r is None:
+            return {}
+        return {"size": r.target_size, "error": r.size_error, "quality": r.quality}
+
+
+def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
+    """Return the caller's data as arrays of types that files have."""
+    if cell_data is None:
+        return {}
+    if not isinstance(cell_data, Mapping):
+        raise InputTypeError(
+            f"cell_data is a {type(cell_data).__name__}, expected a mapping from names to arrays, as "
+            "{'pressure': values}"
+        )
+    found = {}
+    for name, values in cell_data.items():
+        if not isinstance(name, str) or not _WORD.fullmatch(name) or name in OWN:
+            why = "which is clvoro's own" if name in OWN else "no word of ASCII letters and digits"
+            raise InputError(f"cell_data has the name {name!r:.60}, {why}; choose another name")
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiub":
+            raise InputTypeError(
+                f"cell_data[{name!r}] has dtype {array.dtype}, expected real numbers"
+            )
+        if array.ndim not in (1, 2) or len(array) != n or 0 in array.shape:
+            raise InputError(
+                f"cell_data[{name!r}] has shape {array.shape}, expected ({n},) or ({n}, k): a row per cell"
+            )
+        found[name] = _in_known_type(array)
+    return found
+
+
+def _in_known_type(array: np.ndarray) -> np.ndarray:
+    """Return `array` in the smallest of the types that holds all its values."""
+    if array.dtype.kind == "b":
+        return array.astype(np.uint8)
+    if array.dtype.kind == "f":
+        return array.astype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
+    for kind in (np.uint8, np.int32, np.int64):
+        if np.can_cast(array.dtype, kind):
+            return array.astype(kind)
+    return array.astype(np.float64)  # uint64

@@ -1,0 +1,83 @@
+"""Pictures of data of the caller, and of diagrams without sizes."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError
+
+POINTS = np.random.default_rng(6).random((30, 3))
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def diagram(request, ctx):
+    d = request.param
+    return clvoro.Adapter(ctx).diagram(clvoro.Box((0,) * d, (1,) * d), POINTS[:, :d])
+
+
+def colored(figure):
+    """The values of the cells that are drawn first."""
+    (cells,) = [c for c in figure.axes[0].collections if c.get_array() is not None]
+    return cells
+
+
+def labels(figure):
+    axes = [a for ax in figure.axes for a in (ax, *ax.child_axes)]
+    return {ax.get_xlabel() for ax in axes} | {ax.get_ylabel() for ax in axes}
+
+
+def test_own_data(diagram):
+    values = np.arange(30) - 10
+    figure = diagram.plot(values, label="pressure [Pa]")
+    assert set(colored(figure).get_array()) <= set(values)
+    assert "pressure [Pa]" in labels(figure)
+    low, high = colored(figure).get_clim()
+    assert -10 <= low < -9
+    assert 18 < high <= 19
+    constant = colored(diagram.plot(np.full(30, 7.0)))
+    assert constant.get_clim()[0] < 7 < constant.get_clim()[1]
+    gaps = np.where(values < 0, np.nan, values)
+    assert np.isfinite(colored(diagram.plot(gaps)).get_clim()).all()
+
+
+def test_diagrams(diagram):
+    if diagram.domain.dim == 2:
+        drawn = colored(diagram.plot()).get_array()
+        np.testing.assert_array_equal(drawn, diagram.measures.quality)
+    for color in ("sides", "skewness", "volume"):
+        diagram.plot(color)
+    for color in ("error", "size"):
+        with pytest.raises(InputError, match=f"'{color}', which a diagram without sizes does not"):
+            diagram.plot(color)
+    assert "mine" in labels(diagram.plot("volume", label="mine"))
+
+
+def test_views(diagram):
+    if diagram.domain.dim == 2:
+        ax = diagram.plot(window=((0, 0), (0.5, 0.5)), edges=False, title="part").axes[0]
+        assert ax.get_xlim() == (0, 0.5)
+        with pytest.raises(InputError, match="view is 'slice', which is for meshes in 3D"):
+            diagram.plot(view="slice")
+        with pytest.raises(InputError, match="cut is for cutaway, and this picture is 2D"):
+            diagram.plot(cut=None)
+    else:
+        assert diagram.plot(view="slice", normal="x").axes[0].get_xlabel() == "y"
+        diagram.plot(view="cutaway", cut=POINTS[:, 0] < 0.5, angles=(30, 30))
+        with pytest.raises(InputError, match="ax is for 2D, slice, cutaway, and this picture is"):
+            diagram.plot(ax="any")
+        with pytest.raises(InputError, match="view is 'all', expected one of slices, slice"):
+            diagram.plot(view="all")
+
+
+@pytest.mark.parametrize(
+    ("color", "error", "message"),
+    [
+        (np.zeros(29), InputError, r"shape \(29,\), expected \(30,\)"),
+        (np.zeros((30, 1)), InputError, "one number per cell"),
+        (["a"] * 30, InputTypeError, "an array of real numbers"),
+        ("shade", InputError, "expected one of error"),
+    ],
+)
+def test_bad_colors(diagram, color, error, message):
+    with pytest.raises(error, match=message):
+        diagram.plot(color)
