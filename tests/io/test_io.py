@@ -458,5 +458,5 @@ def test_check_writable_leaves_nothing(tmp_path):
 
 
 def test_save_refuses_what_is_no_result(result, tmp_path):
-    with pytest.raises(InputTypeError, match="Diagram"):
-        io.save(result.diagram, tmp_path / "mesh.npz")
+    with pytest.raises(InputTypeError, match=r"mesh is a ndarray, expected a clvoro.Result"):
+        io.save(result.points, tmp_path / "mesh.npz")

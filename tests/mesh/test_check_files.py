@@ -31,11 +31,11 @@ def put(index, value):
 
 
 CASES = [
-    ("solid", "_polyhedra", "connectivity", swap),
-    ("solid", "_polyhedra", "connectivity", put(7, -1)),
-    ("solid", "_polyhedra", "connectivity", put(7, 10**8)),
-    ("solid", "_polyhedra", "offsets", put(3, 1)),
-    ("solid", "_polyhedra", "offsets", put(-1, 10**8)),
+    ("solid", "polyhedra", "connectivity", swap),
+    ("solid", "polyhedra", "connectivity", put(7, -1)),
+    ("solid", "polyhedra", "connectivity", put(7, 10**8)),
+    ("solid", "polyhedra", "offsets", put(3, 1)),
+    ("solid", "polyhedra", "offsets", put(-1, 10**8)),
     ("solid", "cell_data", "faces_of_cell", put(3, 5)),
     ("solid", "cell_data", "label", swap),
     ("flat", "cell_data", "label", swap),
