@@ -11,8 +11,7 @@ periodic box. `alone`: 50 to 300 points within 15 to 60 units of round-off, with
 box. Points are rounded to the precision first, and duplicates are removed.
 
 In the unit cube: `clusters` and `lines` likewise; `spheres`: 100 at random on one; `rings`: 60 on a
-circle; `few roundings`: two groups of 2 to 16, each within 40 units of round-off, beside 60;
-`lattices`: 3 to 60 points of a 5 x 5 x 5 lattice with the spacing of one unit of round-off, beside 200.
+circle. There sets nearer than a least separation may be refused.
 """
 
 from __future__ import annotations
@@ -120,23 +119,6 @@ def lines_in_space(rng: np.random.Generator, _real: np.dtype) -> np.ndarray:
     return np.vstack([line, rng.random((40, 3))])
 
 
-def few_roundings(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
-    """Return two groups of generators within a few roundings of each other, and 60 anywhere."""
-    step = 2 * float(np.spacing(np.asarray(PLACE, real)))
-    groups = [
-        at + step * rng.integers(0, 40, (int(rng.integers(2, 17)), 3)) for at in (PLACE, 0.25)
-    ]
-    return np.vstack([*groups, rng.random((60, 3))])
-
-
-def lattices(rng: np.random.Generator, real: np.dtype) -> np.ndarray:
-    """Return places of a lattice a rounding apart, and 200 anywhere."""
-    step = 2 * float(np.spacing(np.asarray(PLACE, real)))
-    lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
-    chosen = lattice[rng.permutation(125)[: int(rng.integers(3, 61))]]
-    return np.vstack([PLACE + step * chosen, rng.random((200, 3))])
-
-
 KINDS = {
     2: {
         "clusters": clusters,
@@ -152,8 +134,6 @@ KINDS = {
         "spheres": spheres,
         "rings": rings,
         "lines": lines_in_space,
-        "few-roundings": few_roundings,
-        "lattices": lattices,
     },
 }
 

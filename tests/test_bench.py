@@ -61,7 +61,7 @@ def test_restart():
 @pytest.mark.slow
 def test_clusters():
     rows = records("clusters.py", "--sets", "3")
-    rows += records("clusters.py", "--sets", "3", "--dim", "3", "--kinds", "spheres,few-roundings")
+    rows += records("clusters.py", "--sets", "3", "--dim", "3", "--kinds", "spheres,rings")
     assert len(rows) == 18
     assert all(r["meshes"] == r["sets"] == 3 for r in rows)
 

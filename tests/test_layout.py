@@ -40,8 +40,6 @@ OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[
 PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
     "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
-    "tessellation.topology3d.loops": {"tessellation.topology3d.face_matching"},
-    "tessellation.topology3d.face_matching": {"tessellation.topology3d.corners"},
     "tessellation.incremental": {"tessellation.cells"},
 }
 """Modules with kernels that use the kernels of others."""

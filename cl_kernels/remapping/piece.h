@@ -186,7 +186,7 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
                        global const REAL *points, REAL4 box_lower, REAL4 box_upper)
 {
     const REAL4 x = load_vector(points, i);
-    start_polyhedron(piece, x, box_lower, box_upper, true);
+    start_polyhedron(piece, x, box_lower, box_upper);
     const int what = clip_polyhedron_by_row(piece, i, x, starts, neighbors, points);
     if (what >= CLIP_FULL)
         return what == CLIP_FULL ? PIECE_FULL : PIECE_BROKEN;

@@ -12,8 +12,6 @@
 
 /* Largest square of the distance of generators that are near each other, as a share of that to the cell's own. */
 #define NEAR_EACH_OTHER R(1e-3)
-/* Less than what any vertex is beyond, times the distance of two generators. */
-#define NOTHING (IS_DOUBLE ? R(1e-300) : R(1e-37))
 
 inline REAL4 cross_product(REAL4 a, REAL4 b)
 {
@@ -52,7 +50,8 @@ inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const
 
 /* Make what lies beyond one disc: grown from the farthest vertex by a triangle at a time, the farthest first, and where
    that does not reach all that lies farther beyond than `doubt`, through the nearest that do not. The distances of
-   vertices that do not belong where rounding has put them are changed. False if something stays out of reach. */
+   vertices that do not belong where round-off has put them are changed. False if something stays out of reach, such as
+   the wrong end of a slit, which is not cut off. */
 inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 {
     REAL *s = (REAL *)cell->beyond;
@@ -229,55 +228,6 @@ inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, 
     }
 }
 
-/* How far vertex v is beyond the bisector between the generator at p, on whose bisector it lies, and that at p + w. */
-inline REAL beyond_from(const cell_t *cell, int v, REAL4 p, REAL4 w)
-{
-    return w.s0 * (X(cell)[v] - (p.s0 + w.s0 / 2)) + w.s1 * (Y(cell)[v] - (p.s1 + w.s1 / 2)) +
-           w.s2 * (Z(cell)[v] - (p.s2 + w.s2 / 2));
-}
-
-/* Where the generator at x + d is near that of a face of the cell, beside the way to both, the planes of the two differ
-   by less than the vertices of that face round: what decides there is the bisector between them, to their distance's
-   digits. Vertices beyond by no more than `depth`, or than they round, are then put on the bisector; false if there is
-   no such face. */
-inline bool look_from_near(cell_t *cell, REAL4 d, int label, REAL depth, global const REAL *points)
-{
-    REAL *s = (REAL *)cell->beyond;
-    bool found = false;
-    for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1)) {
-        const REAL4 p = cell->planes[f], between = d - p;
-        if (between.s0 * between.s0 + between.s1 * between.s1 + between.s2 * between.s2 >
-            2 * NEAR_EACH_OTHER * p.s3) /* level is half a square */
-            continue;
-        const int other = cell->labels[f];
-        if (other < 0 || other == label)
-            continue;
-        const REAL4 w = (REAL4)(points[3 * label] - points[3 * other], points[3 * label + 1] - points[3 * other + 1],
-                                points[3 * label + 2] - points[3 * other + 2], 0);
-        const REAL w2 = w.s0 * w.s0 + w.s1 * w.s1 + w.s2 * w.s2;
-        for (int v = 0; v < cell->n && !found; ++v)
-            s[v] = s[v] > depth ? s[v] : fmin(s[v], R(0));
-        found = true;
-        const REAL rounding = 4 * REAL_EPS * sqrt(cell->reach2 * w2);
-        for (int v = 0; v < cell->n; ++v) {
-            const INDEX4 g = cell->faces[v];
-            if (g.s0 != f && g.s1 != f && g.s2 != f)
-                continue;
-            const REAL beyond = beyond_from(cell, v, p, w);
-            s[v] = beyond > rounding ? beyond : fmin(beyond, R(0));
-        }
-    }
-    return found;
-}
-
-inline bool any_beyond(const cell_t *cell, REAL depth)
-{
-    bool any = false;
-    for (int v = 0; v < cell->n; ++v)
-        any |= ((const REAL *)cell->beyond)[v] > depth;
-    return any;
-}
-
 /* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbors that are seen are known to have a face. */
 #ifndef CLIP_SHARPLY
 #define CLIP_SHARPLY 0
@@ -298,13 +248,11 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
     const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
     const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
     const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
-    /* As far as it rounds, where that matters. */
-    if (!(farthest > (cell->from_near ? -8 * REAL_EPS * (d2 + cell->reach2) : CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
+    /* Most bisectors miss the cell: no square root for these. */
+    if (!(farthest > (CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
         return CLIP_MISSED;
-    const REAL distance = sqrt(d2), least = CLIP_SHARPLY ? 0 : distance * noise_length(distance);
-    const bool from_near = cell->from_near && look_from_near(cell, d, label, least, points);
-    const REAL depth = from_near ? NOTHING : least;
-    if (from_near ? !any_beyond(cell, depth) : !(farthest > depth))
+    const REAL distance = sqrt(d2), depth = CLIP_SHARPLY ? 0 : distance * noise_length(distance);
+    if (!(farthest > depth))
         return CLIP_MISSED;
     if (seen_before)
         for (int f = next_face(cell->alive, 0); f < FACE_CAPACITY; f = next_face(cell->alive, f + 1))
@@ -316,7 +264,8 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
         if (rim.gone == cell->n)
             return CLIP_COLLAPSED;
         const REAL doubt = 64 * distance * (noise_length(distance) + REAL_EPS * sqrt(cell->reach2));
-        if (!keep_disc(cell, depth, doubt) || !find_rim(cell, depth, &rim))
+        cell->torn |= !keep_disc(cell, depth, doubt);
+        if (!find_rim(cell, depth, &rim))
             return CLIP_COLLAPSED;
     }
     const int face = replace_faces(cell, &rim, label);

@@ -3,6 +3,17 @@
 #include "tessellation/periodic/halo.h"
 #include "tessellation/search.h"
 
+/* Share of a cell's volume that may differ about its faces without notice. */
+#define EVEN_SHARE R(1e-3)
+
+inline REAL distance_between(global const REAL *points, int i, int j)
+{
+    const REAL dx = points[3 * j] - points[3 * i];
+    const REAL dy = points[3 * j + 1] - points[3 * i + 1];
+    const REAL dz = points[3 * j + 2] - points[3 * i + 2];
+    return sqrt(dx * dx + dy * dy + dz * dz);
+}
+
 inline REAL4 vertex_at(const cell_t *cell, int v)
 {
     return (REAL4)(X(cell)[v], Y(cell)[v], Z(cell)[v], 0);
@@ -53,10 +64,10 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                            global float *reach, global const int2 *bins, global const FRAME *grid_frames,
                            global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
                            const REAL4 box_upper, const int warm, global const int *old_starts,
-                           global const int *old_neighbors, const int again, const int from_near, const int room,
-                           const REAL share, global int *row_places, global int *row_counts, global int *labels,
-                           global REAL *measures, global REAL *centroids, global REAL *volumes, global REAL *offsets,
-                           global REAL *covariances, global int *report SEAM_ARGS)
+                           global const int *old_neighbors, const int again, const int room, const REAL share,
+                           global int *row_places, global int *row_counts, global int *labels, global REAL *measures,
+                           global REAL *centroids, global REAL *volumes, global REAL *offsets, global REAL *covariances,
+                           global int *report SEAM_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -65,7 +76,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     const REAL4 x = (REAL4)(binned[3 * p], binned[3 * p + 1], binned[3 * p + 2], 0);
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
     cell_t cell;
-    start_polyhedron(&cell, x, box_lower, box_upper, from_near);
+    start_polyhedron(&cell, x, box_lower, box_upper);
     int flag = 0;
     REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
     if (warm) {
@@ -106,7 +117,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     const REAL reach_length = sqrt(cell.reach2), near2 = sqrt(REAL_EPS) * cell.reach2;
     const REAL slim = 512 * noise_length(reach_length);
     int count = 0;
-    bool doubtful = false, narrow = false;
+    bool doubtful = cell.torn, narrow = false;
     REAL volume = 0, lost = 0;
     REAL4 first = 0, square = 0, mixed = 0; /* moments: x, y, z; xx, yy, zz; yz, zx, xy */
     for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1)) {
@@ -172,6 +183,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     /* In a box as thin as rounding all faces are below it. */
     if (count < 4 || !(volume > 0 && lost <= share * volume))
         atomic_or(report, FLAG_COLLAPSED);
+    else if (lost > EVEN_SHARE * volume)
+        atomic_or(report, FLAG_UNEVEN);
     const REAL inverse = 1 / volume;
     first *= inverse / 4;
     square = square * (inverse / 20) - first * first;
@@ -188,15 +201,27 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     covariances[6 * i + 5] = square.s2;
 }
 
-/* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, rounding may let one
-   of two see a face of no size that the other does not see; such a face is dropped, so that the graph is symmetric.
-   If it is wider than rounding explains, generators are too close to tell apart so (from far away, two an ulp apart
-   have the same bisector), and that is flagged: cells are clipped once more, with `from_near` (tessellation/clip.h). So
-   it is where both see a face, but of areas that differ by more than a share of the cell. What borders on a generator
-   without a row is not looked at, nor are two cells that are certain.
+/* The area that a face of cell i may have by round-off alone. The bisector of generators d apart is off by eps R / d at
+   the distance R. Two bisectors with generators at the least distance d meet at an angle of about d / R, as in a ring.
+   Their edge is off by eps R^2 / d^2 of R, and the area of a face along it by as much of R^2, for which the area of all
+   faces stands. */
+inline REAL rounded_area(int i, int begin, int count, global const int *labels, global const REAL *measures,
+                         global const REAL *points)
+{
+    REAL surface = 0, least = INFINITY;
+    for (int k = begin; k < begin + count; ++k) {
+        surface += measures[k];
+        if (labels[k] >= 0)
+            least = fmin(least, distance_between(points, i, labels[k]));
+    }
+    return surface * fmin(64 * REAL_EPS * surface / (least * least), sqrt(REAL_EPS));
+}
 
-   A bisector of generators d apart rounds by eps R / d of the distance R from them, along all of its face: by
-   eps R³ / d, where that is little beside the cell. The area of all faces stands for R². */
+/* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, round-off may let one
+   of two cells have a face of no size that the other does not have. Such a face is dropped, so that the graph is
+   symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
+   faces and those of its neighbors differ by more than a share of the cell. Faces of a neighbor without a row are not
+   compared, nor are those of two certain cells. */
 kernel void match_polyhedron_faces(const int size, global const int *row_places, global const int *row_counts,
                                    global const int *labels, global const REAL *measures, global const REAL *volumes,
                                    global const REAL *points, const REAL share, const int some_doubtful,
@@ -209,10 +234,7 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
     if (!some_doubtful)
         return;
     int count = 0;
-    REAL surface = 0;
-    for (int k = row_places[i]; k < row_places[i] + n; ++k)
-        surface += measures[k];
-    REAL apart = 0; /* the volume of the cones to what faces differ by */
+    REAL apart = 0; /* volume of the cones to the differences of areas */
     for (int k = row_places[i]; k < row_places[i] + n; ++k) {
         const int j = labels[k];
         bool mutual = j < 0 || j >= size || (certain && (row_counts[j] & CERTAIN) != 0);
@@ -223,14 +245,11 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
             while (q < m && row[q] != i)
                 ++q;
             mutual = q < m;
-            const REAL dx = points[3 * j] - points[3 * i];
-            const REAL dy = points[3 * j + 1] - points[3 * i + 1];
-            const REAL dz = points[3 * j + 2] - points[3 * i + 2];
-            const REAL distance = sqrt(dx * dx + dy * dy + dz * dz);
+            const REAL distance = distance_between(points, i, j);
             const REAL other = mutual ? measures[row_places[j] + q] : 0;
             apart += fabs(measures[k] - other) * distance / 6;
-            const REAL rounded = fmin(64 * REAL_EPS * surface * sqrt(surface) / distance, sqrt(REAL_EPS) * surface);
-            if (!mutual && !(measures[k] < fmax(2048 * REAL_EPS * distance, rounded)))
+            if (!mutual && !(measures[k] < fmax(2048 * REAL_EPS * distance,
+                                                rounded_area(i, row_places[i], n, labels, measures, points))))
                 atomic_or(report, FLAG_COLLAPSED);
         }
         kept[k] = mutual;
@@ -239,6 +258,8 @@ kernel void match_polyhedron_faces(const int size, global const int *row_places,
     counts[i] = count;
     if (count < 4 || !(apart <= share * volumes[i]))
         atomic_or(report, FLAG_COLLAPSED);
+    else if (apart > EVEN_SHARE * volumes[i])
+        atomic_or(report, FLAG_UNEVEN);
 }
 
 /* Per generator i: its faces, those kept, as row i of the graph; all if there is no doubt.

@@ -60,7 +60,7 @@ inline int next_face(const ulong *set, int f)
 /* Arrays of vertices are filled up to whole vectors by zeros: the generator itself, which no bisector cuts off. */
 typedef struct {
     int n;                   /* vertices */
-    bool from_near;          /* are generators near each other looked at from there? See clip.h */
+    bool torn;               /* has a clip left something that it should have cut off? See clip.h */
     REAL reach2;             /* largest squared distance of a vertex from the generator */
     ulong alive[FACE_WORDS]; /* set of the faces that there are */
     REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
@@ -98,10 +98,10 @@ inline void find_reach(cell_t *cell)
 }
 
 /* The whole box around generator x. Face w is wall w. */
-inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper, bool from_near)
+inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
     cell->n = 8;
-    cell->from_near = from_near;
+    cell->torn = false;
     for (int k = 0; k < FACE_WORDS; ++k)
         cell->alive[k] = k == 0 ? 63 : 0;
     const REAL4 low = lower - x, high = upper - x;

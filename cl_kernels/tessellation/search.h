@@ -7,7 +7,8 @@
 #define FLAG_COINCIDE 2  /* two generators at the same place */
 #define FLAG_COLLAPSED 4 /* generators too close for the precision */
 #define FLAG_DOUBT 8     /* no error: there are doubtful cells, whose faces must be matched */
-#define FLAG_NARROW 16   /* nor is it that some faces may be no wider than their vertices round; see loops.cl */
+#define FLAG_NARROW 16   /* no error: some faces may be no wider than round-off; see consistency.cl */
+#define FLAG_UNEVEN 64   /* no error: two cells differ about their common face by more than a small share of one */
 
 #ifndef MAX_DEPTH
 #error "build with -DMAX_DEPTH=levels that the bins may have"

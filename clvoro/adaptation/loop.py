@@ -13,7 +13,6 @@ from ..errors import InputTypeError
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
 from ..solvers.conjugate_gradient import Solution
-from ..tessellation.device_diagram import CloseError
 from .checkpoint import Checkpointer
 from .schedule import MOST_SURPLUS, Action, Mend, Refine, Reorganize, Rest, Settle, Step, work_of
 from .state import Mesh
@@ -344,9 +343,8 @@ class Loop:
         labels = np.sort(mesh.labels.get())
         size = mesh.values(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)
-        close = CloseError(mesh.t.points, mesh.t.n).within(mesh.domain) if mesh.t.near else None
         diagram = mesh.finish()
-        result = Result(
+        return Result(
             points=diagram.points,
             diagram=diagram,
             target_size=size,
@@ -362,6 +360,3 @@ class Loop:
             settings=settings,
             origin=np.where(labels < self.n_start, labels, -1).astype(np.int32),
         )
-        if close is not None and not result.check():
-            raise close
-        return result

@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 
 EXACT_SHARE, ROUGH_SHARE = 0.01, 0.5
 """Largest share of a cell that round-off may make uncertain: in a final diagram, and in the steps of a run."""
+LEAST_SEPARATION = {"float64": 1e-6, "float32": 3e-3}
+"""Of generators in 3D, as a share of the longest edge of the domain. Nearer ones may be rejected."""
 # Bits of the flags in tessellation/face_rows.h and tessellation/search.h.
-FULL, COINCIDE, DOUBT, NARROW, LOOPED = 1, 2, 8, 16, 32
+FULL, COINCIDE, DOUBT, NARROW, LOOPED, UNEVEN = 1, 2, 8, 16, 32, 64
 
 
 class CloseError(InputError):
@@ -49,8 +51,13 @@ class CloseError(InputError):
         super().__init__(self._text(self.place, self.gap))
 
     def _text(self, place: np.ndarray, gap: float) -> str:
-        what = "coincide" if gap == 0 else "are too close to each other"
         other = "" if self.real == np.float64 else ", or use dtype='float64'"
+        if len(place) == 3 and self.gap >= LEAST_SEPARATION[self.real.name]:
+            return (
+                f"round-off leaves too much of a cell uncertain in {self.real}, though the nearest generators, at "
+                f"{place}, are {gap:.3g} apart; perturb generators that lie on a common sphere or circle{other}"
+            )
+        what = "coincide" if gap == 0 else "are too close to each other"
         return (
             f"generators at {place}, {gap:.3g} apart, {what} in {self.real}, which leaves too much of a cell to "
             f"round-off; remove one or move it{other}"
@@ -98,11 +105,9 @@ class Tessellation:
         The OUTLINE_ARGS of a diagram trimmed by a boundary (tessellation/clipped/outline.h); else empty.
     trimmed : Trimmed, optional
         How the boundary cut such a diagram.
-    narrow : bool
-        Whether faces (in 3D) may be as narrow as their vertices round: of those, what has no loop in `Loops` is none.
-    near : bool
-        Whether generators (in 3D) are so near each other that rounding may have made cells wrong: what the caller gets
-        of such a diagram is checked.
+    round_off : int
+        In 3D, what round-off may have spoiled, for `topology3d.consistency`: bits `NARROW`, faces may be no wider than
+        round-off, and `UNEVEN`, cells may differ about their common faces by more than a thousandth of a cell.
     """
 
     n: int
@@ -116,8 +121,7 @@ class Tessellation:
     covariances: cla.Array
     outlines: tuple[cla.Array, ...] = ()
     trimmed: Trimmed | None = None
-    narrow: bool = False
-    near: bool = False
+    round_off: int = 0
 
 
 def restored(

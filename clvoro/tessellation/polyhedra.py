@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,14 +24,15 @@ from .device_diagram import (
     FULL,
     NARROW,
     ROUGH_SHARE,
+    UNEVEN,
     CloseError,
     Tessellation,
     restored,
 )
 from .periodic.halo import seam_defines
 
-FINE_SHARE = 1e-3
-"""Share of a cell's volume that it may differ by from others about their common faces, before more is done about it."""
+HARMLESS = DOUBT | NARROW | UNEVEN
+"""Flags of a diagram that is not rejected."""
 FACE_CAPACITY = 64
 """Faces that a cell may have while it is clipped; doubled for those cells that have more."""
 MOST_FACES = 512
@@ -186,22 +187,15 @@ class Polyhedra:
         """
         engine, rows = self.engine, n if rows is None else rows
         self._reserve_cells(rows)
-        share = EXACT_SHARE if exact else ROUGH_SHARE
+        share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
-        # Where cells differ about a face, what generators near each other cut off is seen from there: it takes longer.
-        for from_near in (False, True):
-            # What is made once more is checked in the end.
-            most = engine.real.type(FINE_SHARE if exact and not from_near else share)
-            with engine.workspace.frame():
-                cut = self._cut(
-                    box, points, n, binned, first, previous, rows, most, seams, from_near
-                )
-                t = None if cut is None else self._match(cut, points, most)
-            if t is not None:
-                return replace(t, near=True) if from_near else t
-            self._begin_anew(binned, first, n)
-        raise CloseError(points, n)
+        with engine.workspace.frame():
+            cut = self._cut(box, points, n, binned, first, previous, rows, share, seams)
+            t = None if cut is None else self._match(cut, points, share)
+        if t is None:
+            raise CloseError(points, n)
+        return t
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
         """Have the radii from before: the last bits depend on them, and should not on what has been tried."""
@@ -220,11 +214,10 @@ class Polyhedra:
         rows: int,
         share: np.floating,
         seams: tuple[object, ...],
-        from_near: bool,
     ) -> _CutCells | None:
         """Cut the first `rows` cells, again with more room for as long as any needs it; None if one collapses.
 
-        `first` (n,) float32 is what `binned.reach` has been to begin with; `from_near`: see tessellation/clip.h.
+        `first` (n,) float32 is what `binned.reach` has been to begin with.
         """
         engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
@@ -240,7 +233,7 @@ class Polyhedra:
             if previous is not None and warm
             else (counts, counts)
         )
-        capacity, again, walk = FACE_CAPACITY, False, None if from_near else self._wrap
+        capacity, again, walk = FACE_CAPACITY, False, self._wrap
         first_reach = engine.real.type(FIRST_REACH)
         self._report.set(np.zeros(2, np.int32))
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
@@ -254,15 +247,15 @@ class Polyhedra:
                         binned.items, binned.spacing, *search, lower, upper, first_reach, room,
                         *written, *seams, group=1,
                     )  # fmt: skip
-            how = np.int32(again or walk is not None), np.int32(from_near)
+            some = np.int32(again or walk is not None)
             engine.run_each(
                 self._kernels(capacity).clip_polyhedra, n, np.int32(rows), binned.points, binned.items,
-                *search, points, lower, upper, np.int32(warm), *old, *how, room, share, *written, *seams,
+                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *seams,
                 # Private arrays of a whole group lie on the stack of a CPU's thread.
                 group=1 if again else None,
             )  # fmt: skip
             flags, m = (int(v) for v in self._report.get())
-            if flags & ~(FULL | DOUBT | NARROW):
+            if flags & ~(FULL | HARMLESS):
                 return None
             if m > self._room:
                 # All anew: what did not fit was not kept.
@@ -278,7 +271,7 @@ class Polyhedra:
                         f"a cell has more than {MOST_FACES} faces; so many generators on a common sphere "
                         "are not supported: remove or perturb some"
                     )
-                self._report.set(np.array([flags & (DOUBT | NARROW), m], np.int32))
+                self._report.set(np.array([flags & HARMLESS, m], np.int32))
             else:
                 return _CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
 
@@ -294,7 +287,7 @@ class Polyhedra:
             points, share, doubt, kept, starts, self._report,
         )  # fmt: skip
         flags = int(self._report.get()[0])
-        if flags & ~(DOUBT | NARROW):
+        if flags & ~HARMLESS:
             return None
         self._scan.exclusive(starts, starts, rows)
         faces, of_rows = self._faces(m), self._of_cells["starts"][: rows + 1]
@@ -306,7 +299,7 @@ class Polyhedra:
         return Tessellation(
             n=rows, points=points, starts=of_rows, neighbors=faces["neighbors"],
             face_measures=faces["face_measures"], face_centroids=faces["face_centroids"], volumes=cells["volumes"],
-            offsets=cells["offsets"], covariances=cells["covariances"], narrow=bool(flags & NARROW),
+            offsets=cells["offsets"], covariances=cells["covariances"], round_off=flags & (NARROW | UNEVEN),
         )  # fmt: skip
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:

@@ -11,11 +11,12 @@ from scipy.spatial import KDTree
 
 import clvoro
 from clvoro.errors import InputError
+from clvoro.tessellation.device_diagram import LEAST_SEPARATION
 from tests.reference.polygon_diagrams import faults
 
 CLOSE = 64
-"""Roundings: generators that are given nearer to each other than that, in domains of size 1, may come too near to be
-told apart in space, or for the boundary of a polygon to find its way between them."""
+"""Roundings: generators that are given nearer to each other than that, in domains of size 1, may come too near for the
+boundary of a polygon to find its way between them."""
 NARROW = 8
 """Roundings of positions: where parts of a polygon are no further from each other than that, it may be refused."""
 LARGEST = 150e6
@@ -83,7 +84,10 @@ def demand_truth(error: InputError, domain: Any, real: str, points: Any, levels:
     if points is not None:
         placed = domain.place(np.asarray(points, float), np.dtype(float))
         apart = KDTree(placed).query(placed, k=2)[0][:, 1] if len(placed) > 1 else np.array([1.0])
-        if apart.min() <= CLOSE * np.finfo(real).eps * (3**levels if domain.dim == 3 else 1):
+        least = (
+            CLOSE * np.finfo(real).eps if domain.dim == 2 else 3**levels * LEAST_SEPARATION[real]
+        )
+        if apart.min() <= least:
             return
     raise Wrong(f"this is not so: {error}") from error
 

@@ -97,13 +97,13 @@ def lattice(side: int, dim: int) -> np.ndarray:
 
 
 def almost_cubes(adapter: clvoro.Adapter) -> np.ndarray:
-    """Return a lattice in space that is off by so little that loops must be mended."""
+    """Return a lattice in space that is off by so little that its cells differ about their faces."""
     noise = np.random.default_rng(0).standard_normal((8, 3))
     return lattice(2, 3) + (1e-14 if adapter.dtype == np.float64 else 3e-6) * noise
 
 
 def ring() -> np.ndarray:
-    """Return places on a circle in space, of which vertices slide along the line where all cells meet."""
+    """Return places on a circle in space: all cells meet along a line."""
     rng = np.random.default_rng(7)
     turn = rng.uniform(0, 2 * np.pi, 30)
     plane = np.linalg.qr(rng.standard_normal((3, 3)))[0][:2]

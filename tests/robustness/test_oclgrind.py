@@ -60,7 +60,7 @@ IN_PLANE = {
     "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_flaws",
     "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.tally_pairs",
 }  # fmt: skip
-IN_SPACE = {"face_matching", "corners", "loops", "polyhedra", "walks"}
+IN_SPACE = {"consistency", "half_faces", "polyhedra", "walks"}
 AT_POLYGONS = {"boundary_crossings", "trim"}
 AT_LAYERS = {"metric.hold_sizes", "motion.hold_generators", "insertion_deletion.exempt_fixed"}
 NOT_FOR = {

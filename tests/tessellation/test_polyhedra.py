@@ -94,7 +94,6 @@ def point_sets():
     }  # fmt: skip
 
 
-CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 POINTS = point_sets()
 FINE = [name for name in POINTS if name not in ("walls, edges and corners", "lattice on walls")]
 
@@ -211,64 +210,6 @@ def test_lattices_off_by_roundings(adapter, kind, roundings):
         check_loops(diagram, eps, 2)
 
 
-@pytest.mark.parametrize("n", [40, 90, 160])
-def test_cells_of_points_on_spheres(adapter, n):
-    """All cells of a sphere meet in its center, or nearly so: what each sees there differs by rounding."""
-    rng = np.random.default_rng(n)
-    center, eps = np.array([1.0, 0.75, 0.5]), float(np.finfo(adapter.dtype).eps)
-    for radii in ([0.4], [0.4, 0.2]):
-        points = np.concatenate([center + r * directions(n // len(radii), rng) for r in radii])
-        diagram = adapter.diagram(BOX, points)
-        check_invariants(diagram, eps, 8)
-        check_loops(diagram, eps, 8)
-
-
-@pytest.mark.parametrize("n", [80, 100, 300])
-@pytest.mark.parametrize("layers", [1, 3])
-def test_cells_of_points_around_an_axis(adapter, n, layers):
-    """As in a mesh of a pipe: all of them meet along a line, where faces are slits as long as the cells."""
-    turn = 2 * np.pi * np.arange(n) / n + 0.1
-    ring = 0.5 + 0.4 * np.column_stack([np.cos(turn), np.sin(turn)])
-    heights = np.repeat((np.arange(layers) + 0.5) / layers, n)
-    diagram = adapter.diagram(CUBE, np.column_stack([np.tile(ring, (layers, 1)), heights]))
-    assert diagram.check()
-    assert diagram.volumes.sum() == pytest.approx(1, rel=1e-6)
-
-
-@pytest.mark.sparse
-@pytest.mark.parametrize("n", [300, 1000, 2000])
-def test_very_many_points_on_a_sphere(adapter, n):
-    """In single precision a mesh or an error: vertices are not brought together over a share of the cells."""
-    u = np.random.default_rng(61301).standard_normal((n, 3))
-    points = 0.5 + 0.4 * u / np.linalg.norm(u, axis=1)[:, None]
-    said = ""
-    try:
-        assert adapter.diagram(CUBE, points).check()
-    except clvoro.ClvoroError as error:
-        said = str(error)
-    if said:
-        assert adapter.dtype == np.float32, said
-        assert n > 300
-        assert "do not come together" in said
-        assert "float64" in said
-
-
-@pytest.mark.sparse
-@pytest.mark.parametrize("n", [60, 300])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_cells_of_points_anywhere_on_a_ring(adapter, n, seed):
-    """All meet along a line that is parallel to no wall, from one to another; slits beside it end anywhere on it."""
-    rng = np.random.default_rng(seed)
-    radius, turn = 10 ** rng.uniform(-3, -0.5), rng.uniform(0, 2 * np.pi, n)
-    plane = np.linalg.qr(rng.standard_normal((3, 3)))[0][:2]
-    ring = 0.5 + radius * np.column_stack([np.cos(turn), np.sin(turn)]) @ plane
-    diagram = adapter.diagram(CUBE, ring)
-    assert diagram.check()
-    assert diagram.volumes.sum() == pytest.approx(1, rel=1e-6)
-    # No cell has dozens of vertices on the line.
-    assert len(diagram.vertices) < 6 * n
-
-
 @pytest.mark.parametrize("name", FINE)
 def test_against_qhull(adapter64, name):
     points = POINTS[name]
@@ -364,24 +305,6 @@ def test_too_many_neighbors_are_refused(adapter64):
     points = np.concatenate([center + 0.4 * directions(900, np.random.default_rng(31)), [center]])
     with pytest.raises(clvoro.ClvoroError, match="more than 512 faces"):
         adapter64.diagram(BOX, points)
-
-
-@pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 2e-16])
-def test_near_duplicates(adapter64, gap):
-    """Right down to gaps at which the bisectors with generators far away still differ; refused below."""
-    cluster = np.array([0.7, 0.6, 0.3]) + gap * np.array(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    )
-    refused = None
-    try:
-        diagram = adapter64.diagram(BOX, np.concatenate([cluster, POINTS["random"]]))
-    except clvoro.ClvoroError as error:
-        refused = str(error)
-    if refused is not None:
-        assert gap < 1e-11
-        assert "too close" in refused
-    else:
-        check_invariants(diagram, np.finfo(float).eps, 1 / gap)
 
 
 def test_duplicates_are_named(adapter):

@@ -261,8 +261,7 @@ class Seam:
             )
             graph, measures = list(closed[:2]), closed[2:]
         folded = Tessellation(
-            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n],
-            near=t.near,
+            n, points, starts, graph[0], *measures, t.volumes[:n], t.offsets[:n], t.covariances[:n]
         )  # fmt: skip
         enough = not words[0]
         if not enough:

@@ -8,17 +8,18 @@ from functools import cached_property
 import numpy as np
 import pyopencl.array as cla
 
-from ...geometry.box import Box, Domain
+from ...geometry.box import Box, ClipBox, Domain
 from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...opencl.program import Engine
-from ..device_diagram import CloseError, Tessellation
+from ..device_diagram import UNEVEN, CloseError, Tessellation
 from ..periodic.torus import Unfolded
-from ..topology3d.loops import FaceLoops, Loops, apart
+from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
 
 LEFT_OUT = 1e-5
-"""Share of a cell: if faces that are left out, as they are no polygons, make up more, the diagram is checked."""
+"""Share of a cell: if faces that are left out, as they are no wider than round-off, make up more, the diagram is
+checked."""
 
 
 def fetch_diagram(
@@ -37,9 +38,7 @@ def fetch_diagram(
     Raises
     ------
     InputError
-        If rounding has made cells of generators near each other wrong.
-    ClvoroError
-        If the faces of such cells do not come together.
+        If round-off has made cells wrong.
     """
     from .fetch_polygon import _FetchedPolygon
     from .fetch_torus import _FetchedTorus
@@ -55,10 +54,9 @@ def fetch_diagram(
     else:
         fetched = _Fetched(engine, domain, t, labels, copy)
     fetched.names = [name for name in Diagram._NAMES if not name.startswith(tuple(others))]
-    diagram = fetched.diagram()
-    if t.near:
-        fetched.refuse_if_wrong(diagram)
-    return diagram
+    if fetched.whole.round_off & UNEVEN:
+        assert fetched.faces
+    return fetched.diagram()
 
 
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
@@ -77,8 +75,7 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
         volumes=kept(t.volumes),
         offsets=kept(t.offsets),
         covariances=t.covariances,
-        narrow=t.narrow,
-        near=t.near,
+        round_off=t.round_off,
     )
 
 
@@ -89,6 +86,7 @@ class _Fetched:
         self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool
     ) -> None:
         self.engine, self.domain, self.n = engine, domain, t.n
+        self.box: ClipBox = domain
         self.origin, self.scale = domain.frame
         self.labels = labels.get()[: t.n]
         self.names: list[str] = []
@@ -111,35 +109,39 @@ class _Fetched:
             self.domain, {name: (lambda name=name: getattr(self, name)()) for name in self.names}
         )
 
-    def refuse_if_wrong(self, diagram: Diagram) -> None:
-        """Check the result, and raise InputError if something is wrong."""
-        if not diagram.check():
-            raise CloseError(self.t.points, self.n).within(self.domain)
+    @cached_property
+    def faces(self) -> SharedFaces:
+        """Vertices, each once, in 3D, and the loops of faces in the order of `whole`.
+
+        Raises
+        ------
+        InputError
+            If round-off has made cells wrong.
+        """
+        try:
+            faces = share_faces(self.engine, self.box, self.whole)
+            trial = shallow_copy(self)
+            vars(trial)["faces"] = faces
+            if trial.needs_check() and not trial.diagram().check():
+                raise CloseError(self.t.points, self.n)
+        except CloseError as error:
+            raise error.within(self.domain) from None
+        return faces
+
+    def needs_check(self) -> bool:
+        """Tell whether round-off may have spoiled the result."""
+        if self.faces.needs_check or self.whole.round_off & UNEVEN:
+            return True
+        lost = 0 if self.kept is None else self._gaps(self.kept)
+        return bool((lost > LEFT_OUT * self.whole.volumes.get()).any())
 
     @cached_property
     def kept(self) -> np.ndarray | None:
         """Which of the device's faces are in the result, (m,) bool; None if all are.
 
-        A face in 3D that is no polygon, as narrow as its vertices round, is none.
-
-        Raises
-        ------
-        InputError
-            If what that leaves out makes a cell wrong.
+        In 3D faces no wider than round-off are left out.
         """
-        if not self.whole.narrow:
-            return None
-        kept = self.polygons()
-        if (self._gaps(kept) > LEFT_OUT * self.whole.volumes.get()).any():
-            trial = self._with(kept=kept)
-            trial.refuse_if_wrong(trial.diagram())
-        return kept
-
-    def _with(self, **made: object) -> _Fetched:
-        """Return a copy for which this is `made`, which is not ours before it has proved right."""
-        trial = shallow_copy(self)
-        vars(trial).update(made)
-        return trial
+        return self.polygons() if self.whole.round_off else None
 
     def polygons(self) -> np.ndarray:
         """Which of the device's faces are polygons, (m,) bool."""
@@ -191,26 +193,9 @@ class _Fetched:
         return VertexNumbering(self.engine).number(self.domain, self.t)
 
     @cached_property
-    def loops(self) -> Loops:
-        """Vertices, each once, in 3D, and the loops of faces in the device's order.
-
-        Raises
-        ------
-        ClvoroError
-            If cells do not come to see the same, or only what is wrong.
-        """
-        loops = self._walked()
-        if loops.doubtful and not self._with(loops=loops).diagram().check():
-            raise apart(self.engine.real)
-        return loops
-
-    def _walked(self) -> Loops:
-        return FaceLoops(self.engine).walk(self.domain, self.t)
-
-    @cached_property
     def loop_starts(self) -> np.ndarray:
         """Device `starts` of the loops, (m + 1,)."""
-        return self.loops.starts.get()
+        return self.faces.starts.get()
 
     def _read(self, array: cla.Array, rows: np.ndarray, power: int) -> np.ndarray:
         return array.get().astype(np.float64)[rows] * self.scale**power
@@ -243,7 +228,7 @@ class _Fetched:
         return self._read(self.t.face_centroids, self.slots, 1) + own
 
     def vertices(self) -> np.ndarray:
-        shared = self.shared if self.engine.dim == 2 else self.loops
+        shared = self.shared if self.engine.dim == 2 else self.faces
         positions = shared.positions.get().astype(np.float64) * self.scale + self.origin
         # A rounding may not carry a corner out of the domain.
         return np.clip(positions, self.domain.lower, self.domain.upper)
@@ -262,4 +247,4 @@ class _Fetched:
         starts = self.face_vertex_starts()
         shift = self.loop_starts[self.slots] - starts[:-1]
         places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))
-        return self.loops.vertices.get()[places]
+        return self.faces.vertices.get()[places]

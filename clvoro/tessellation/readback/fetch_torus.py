@@ -11,7 +11,6 @@ from ...geometry.box import Box
 from ...opencl.program import Engine
 from ..device_diagram import Tessellation
 from ..periodic.torus import Unfolded
-from ..topology3d.loops import FaceLoops, Loops
 from ..vertices import VertexNumbering, Vertices
 from .fetch import _Fetched, kept_faces
 
@@ -45,10 +44,6 @@ class _FetchedTorus(_Fetched):
     def shared(self) -> Vertices:
         """Vertices of the extended diagram, in 2D."""
         return VertexNumbering(self.engine).number(self.box, self.whole)
-
-    def _walked(self) -> Loops:
-        """Vertices and loops of the extended diagram, in 3D."""
-        return FaceLoops(self.engine).walk(self.box, self.whole)
 
     def polygons(self) -> np.ndarray:
         """Which of the folded faces are polygons, (m,) bool."""
@@ -101,7 +96,7 @@ class _FetchedTorus(_Fetched):
         starts = self.face_vertex_starts()
         shift = self.loop_starts[self.extended_places] - starts[:-1]
         places = np.arange(starts[-1]) + np.repeat(shift, np.diff(starts))
-        return self.loops.vertices.get()[places]
+        return self.faces.vertices.get()[places]
 
     def points(self) -> np.ndarray:
         positions = self._read(self.t.points, self.order, 1) + self.origin
@@ -115,7 +110,7 @@ class _FetchedTorus(_Fetched):
         return np.stack(steps, axis=1).astype(np.int8)
 
     def vertices(self) -> np.ndarray:
-        shared = self.shared if self.engine.dim == 2 else self.loops
+        shared = self.shared if self.engine.dim == 2 else self.faces
         used = shared.positions.get()[self.corners[0]].astype(np.float64)
         positions = used * self.scale + self.origin
         inside = np.clip(positions, self.domain.lower, self.domain.upper)

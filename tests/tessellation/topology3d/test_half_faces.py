@@ -1,4 +1,4 @@
-"""Corners of cells in 3D, and which of them are one vertex, one by one in NumPy."""
+"""Half-faces and corners of cells in 3D, one by one in NumPy."""
 
 import numpy as np
 import pytest
@@ -9,22 +9,23 @@ import clvoro
 from clvoro.opencl.program import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
-from clvoro.tessellation.topology3d.corners import Corners
+from clvoro.tessellation.topology3d.consistency import FaceSharing
 from tests.tessellation.test_polyhedra import BOX, POINTS, tessellation
 
 
 class Seen:
-    """What the cells of some points see, on the host."""
+    """The half-faces of the cells of some points, on the host."""
 
     def __init__(self, ctx, points):
         adapter = clvoro.Adapter(ctx)
         engine = Engine(adapter.ctx, adapter.queue, 3, adapter.dtype)
         t = tessellation(engine, Bins(engine), Polyhedra(engine), points)
-        views = Corners(engine).list(BOX, t)
+        sharing = FaceSharing(engine, BOX, t)
         self.x, self.edges = t.points.get(), BOX.extent / BOX.frame[1]
         self.row_starts, self.neighbors = t.starts.get(), t.neighbors.get()
-        for name, array in vars(views).items():
+        for name, array in vars(sharing.half_faces).items():
             setattr(self, name, array.get())
+        self.vertices = sharing.labels.get()
         self.at = self.corners + self.x[self.owners]
         self.faces = [frozenset(faces) for faces in self.corner_faces.tolist()]
         self.u = np.arange(len(self.owners))
@@ -71,7 +72,7 @@ def test_corners_lie_on_their_faces(seen):
         assert seen.sharpness[u] == pytest.approx(span * share, rel=1e-5)
 
 
-def test_corners_that_are_one_vertex(seen):
+def test_corners_of_one_vertex(seen):
     by_faces = {
         (i, faces): u for u, (i, faces) in enumerate(zip(seen.owners, seen.faces, strict=True))
     }
@@ -82,50 +83,50 @@ def test_corners_that_are_one_vertex(seen):
             if 0 <= j < i and other is not None:
                 found = other
                 break
-        assert seen.twins[u] == found
+        assert seen.twin_corners[u] == found
         # Corners of a lattice's cell are apart by its edges, or the same to rounding.
         own = np.flatnonzero(seen.owners == i)
         near = own[np.linalg.norm(seen.at[own] - seen.at[u], axis=1) < 1e-12]
         assert seen.same[u] == near[0]
-    ends = np.concatenate([seen.same, seen.twins])
+    ends = np.concatenate([seen.same, seen.twin_corners])
     pairs = coo_matrix((np.ones(len(ends)), (np.tile(seen.u, 2), ends)), shape=(len(seen.u),) * 2)
     _, of = connected_components(pairs, directed=False)
     least = np.full(of.max() + 1, len(of))
     np.minimum.at(least, of, seen.u)
-    assert np.array_equal(seen.labels, least[of])
+    assert np.array_equal(seen.vertices, least[of])
 
 
-def test_views_are_rows_and_then_walls(seen):
-    check_views(seen)
+def test_half_faces_are_rows_and_then_walls(seen):
+    check_half_faces(seen)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 4])
 def test_walls_that_cells_just_touch(ctx, seed):
-    """Views of what is no face of the graph follow its faces."""
+    """Half-faces that the graph lacks follow its faces."""
     seen = Seen(ctx, off_walls(seed))
-    assert len(seen.view_labels) > seen.row_starts[-1]
-    check_views(seen)
+    assert len(seen.labels) > seen.row_starts[-1]
+    check_half_faces(seen)
 
 
-def check_views(seen):
+def check_half_faces(seen):
     n = len(seen.x)
     for i in range(n):
         row = seen.neighbors[seen.row_starts[i] : seen.row_starts[i + 1]].tolist()
         own = np.flatnonzero(seen.owners == i)
         touched = set().union(*(seen.faces[u] for u in own))
-        labels = seen.view_labels[seen.starts[i] : seen.starts[i + 1]].tolist()
+        labels = seen.labels[seen.starts[i] : seen.starts[i + 1]].tolist()
         assert labels[: len(row)] == row
         assert len(set(labels)) == len(labels)
         assert set(labels[len(row) :]) == touched - set(row)
-        for view in range(seen.starts[i], seen.starts[i + 1]):
-            loop = seen.turns[seen.turn_starts[view] : seen.turn_starts[view + 1]]
-            label = seen.view_labels[view]
+        for half_face in range(seen.starts[i], seen.starts[i + 1]):
+            loop = seen.loops[seen.loop_starts[half_face] : seen.loop_starts[half_face + 1]]
+            label = seen.labels[half_face]
             assert sorted(loop) == [u for u in own if label in seen.faces[u]]
             for u, v in zip(loop, np.roll(loop, -1), strict=True):
                 faces = seen.corner_faces[u].tolist()
                 # The edge that leaves a corner counter-clockwise is shared with the face before.
                 assert faces[faces.index(label) - 1] in seen.faces[v]
-    assert seen.turn_starts[-1] == 3 * len(seen.owners)
+    assert seen.loop_starts[-1] == 3 * len(seen.owners)
     assert np.array_equal(
-        np.unique(seen.turns, return_counts=True)[1], np.full(len(seen.owners), 3)
+        np.unique(seen.loops, return_counts=True)[1], np.full(len(seen.owners), 3)
     )

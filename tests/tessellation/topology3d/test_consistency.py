@@ -1,4 +1,4 @@
-"""How cells come to see the same faces in 3D, step by step, against plain ones in Python."""
+"""How both cells of every face in 3D come to share its vertices, step by step and as a whole."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,7 @@ import clvoro
 from clvoro.opencl.program import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
-from clvoro.tessellation.topology3d.face_matching import MOST_DOUBLINGS, Agreement
-from clvoro.tessellation.topology3d.meetings import Meetings
+from clvoro.tessellation.topology3d.consistency import FaceSharing, share_faces
 from tests.tessellation.test_polyhedra import BOX, tessellation
 
 
@@ -20,9 +19,7 @@ def engine(ctx):
 
 @pytest.fixture(scope="module")
 def kernels(engine):
-    return engine.kernels(
-        "tessellation/topology3d/face_matching", {"MOST_DOUBLINGS": MOST_DOUBLINGS}
-    )
+    return engine.kernels("tessellation/topology3d/consistency")
 
 
 def rows(engine, loops, behind=None):
@@ -72,7 +69,7 @@ def test_loops_without_repetitions_and_spurs(engine, kernels, labels):
     turns = engine.upload(names[flat], np.int32)
     reduced, counts = engine.empty(len(flat), np.int32), engine.empty(len(given), np.int32)
     engine.run_each(
-        kernels.reduce_views, len(given), engine.upload(starts, np.int32), turns,
+        kernels.reduce_loops, len(given), engine.upload(starts, np.int32), turns,
         engine.upload(of, np.int32), reduced, counts,
     )  # fmt: skip
     reduced, counts = reduced.get(), counts.get()
@@ -82,7 +79,7 @@ def test_loops_without_repetitions_and_spurs(engine, kernels, labels):
     assert 0 < np.count_nonzero(counts) < len(given)
 
 
-def test_views_that_differ(engine, kernels):
+def test_half_faces_that_differ(engine, kernels):
     """The twin of a loop passes the same vertices the other way round, each once."""
     rng = np.random.default_rng(61202)
     loops, twins, expected = [], [], []
@@ -111,7 +108,7 @@ def test_views_that_differ(engine, kernels):
             add(loop, other, n == 3 or turned(other) != turned(loop[::-1]))
             add(loop + loop[:1] + [25], (loop + loop[:1] + [25])[::-1], True)
     add([], [], False)
-    # Walls, and views that the graph knows nothing of.
+    # Walls, and half-faces that the graph lacks.
     for loop, twin, differs in (
         ([1, 2, 3, 4], "own", False), ([1, 2, 1, 4], "own", True), ([1, 2, 3, 4, 2], "own", True),
         ([], "own", False), ([], -1, False), ([1, 2, 3], -1, True),
@@ -129,17 +126,16 @@ def test_views_that_differ(engine, kernels):
     v, any_ = len(loops), engine.zeros(1, np.int32)
     differs = engine.zeros(v, np.uint8)
     engine.run_each(
-        kernels.compare_views, v, engine.upload(twins, np.int32), starts, turns, counts, differs, any_
+        kernels.compare_half_faces, v, engine.upload(twins, np.int32), starts, turns, counts, differs, any_
     )  # fmt: skip
-    # It stays known that they have.
-    assert differs.get().tolist() == [3 if d else 0 for d in expected]
+    assert differs.get().tolist() == expected
     assert int(any_[0].get()) == 1
     same = [k for k in range(v) if not expected[k]]
     place = {k: s for s, k in enumerate(same)}
     starts, turns = rows(engine, [loops[k] for k in same])
     any_.fill(0)
     engine.run_each(
-        kernels.compare_views, len(same), engine.upload([place.get(twins[k], -1) for k in same], np.int32),
+        kernels.compare_half_faces, len(same), engine.upload([place.get(twins[k], -1) for k in same], np.int32),
         starts, turns, engine.upload([len(loops[k]) for k in same], np.int32), differs, any_,
     )  # fmt: skip
     assert int(any_[0].get()) == 0
@@ -160,50 +156,8 @@ def test_the_first_of_the_sharpest_corners(engine, kernels):
         assert chosen[label] == expected
 
 
-def test_vertices_put_into_edges(engine):
-    """In both faces of an edge, once, whoever proposes it; halves know their other sides."""
-    rng, cells = np.random.default_rng(61203), Polyhedra(engine)
-    t = tessellation(engine, Bins(engine), cells, rng.random((12, 3)) * BOX.extent)
-    stage = Agreement(engine, BOX, t)
-    views, v = stage.views, len(stage.views.view_labels)
-    owners, faces = views.owners.get(), views.corner_faces.get()
-    labels = np.repeat(views.view_labels.get(), np.diff(views.turn_starts.get()))
-    assert not stage._begin_snapping().get().any()
-    for _ in range(3):
-        starts, turns = views.turn_starts.get(), views.turns.get()
-        before, of_chain = (a.get()[: len(turns)] for a in (stage._opposites, stage._chains))
-        following = np.arange(len(turns)) + 1
-        following[starts[1:] - 1] = starts[:-1]
-        # The other side begins where an edge ends, in the same cell's face across, and goes back.
-        assert np.array_equal(before[before], np.arange(len(turns)))
-        assert np.array_equal(turns[before], turns[following])
-        assert np.array_equal(turns[following[before]], turns)
-        if len(labels) == len(turns):
-            assert np.array_equal(owners[turns[before]], owners[turns])
-            assert (labels[before] != labels).all()
-            assert (faces[turns] == labels[before][:, None]).any(axis=1).all()
-            assert np.array_equal(of_chain, np.minimum(np.arange(len(turns)), before))
-        proposals = np.where(
-            rng.random(len(turns)) < 0.3, rng.integers(0, len(owners), len(turns)), -1
-        )
-        proposals[0] = 0  # a number, too
-        put = [max(proposals[min(s, o)], -1) for s, o in enumerate(before)]
-        put = [p if p >= 0 else proposals[max(s, before[s])] for s, p in enumerate(put)]
-        expected, expected_chains, new_starts = [], [], [0]
-        for k in range(v):
-            for s in range(starts[k], starts[k + 1]):
-                more = [put[s]] if put[s] >= 0 else []
-                expected += [turns[s], *more]
-                expected_chains += [of_chain[s]] * (1 + len(more))
-            new_starts.append(len(expected))
-        stage._put(engine.upload(proposals, np.int32))
-        assert views.turn_starts.get().tolist() == new_starts
-        assert views.turns.get().tolist() == expected
-        assert stage._chains.get().tolist() == expected_chains
-
-
-def test_what_is_no_wider_than_vertices_round(engine, kernels):
-    """Of walls: all vertices of a loop lie within the tolerance of a line, and a neighbor of it differed."""
+def test_slits(engine, kernels):
+    """All vertices of a loop lie within the tolerance of a line."""
     rng, level = np.random.default_rng(61205), 3
     points = engine.upload(rng.random((1, 3)))
     eps = float(np.finfo(float).eps)
@@ -222,37 +176,69 @@ def test_what_is_no_wider_than_vertices_round(engine, kernels):
     v, c = len(loops), sum(map(len, loops))
     starts = np.cumsum([0] + [len(loop) for loop in loops])
     own, each = engine.upload(np.arange(c), np.int32), engine.upload(np.arange(v), np.int32)
-    state = rng.choice([2, 4, 6], v)
-    differs, any_ = engine.upload(state, np.uint8), engine.zeros(1, np.int32)
+    differs, any_ = engine.zeros(v, np.uint8), engine.zeros(1, np.int32)
+    corners, unused = engine.upload(np.concatenate(loops)), np.zeros(4, engine.real)
     engine.run_each(
-        kernels.find_slits, v, points, engine.upload(np.concatenate(loops)), engine.zeros(c, np.int32), own, own,
-        each, engine.upload(starts, np.int32), own, own, engine.upload(np.diff(starts), np.int32),
-        engine.upload(np.full(v, level), np.uint8), differs, any_,
+        kernels.mark_slits, v, points, corners, engine.zeros(c, np.int32), own, own, own, unused, unused,
+        engine.upload(starts, np.int32), own, each, own, engine.upload(np.diff(starts), np.int32), np.int32(level),
+        differs, any_,
     )  # fmt: skip
-    expected = [s | (slit and s & 4 > 0) for slit, s in zip(narrow, state.tolist(), strict=True)]
-    assert differs.get().tolist() == expected
+    assert differs.get().tolist() == narrow
     assert int(any_[0].get()) == 1
-    assert 20 < np.count_nonzero(differs.get() & 1) < v - 20
+    assert 20 < sum(narrow) < v - 20
 
 
-def test_vertices_as_far_from_all_their_generators():
-    """On circles and on spheres, on a wall, and where hardly anything tells: it stays there."""
-    rng = np.random.default_rng(61206)
-    t, u = rng.uniform(0, 2 * np.pi, 40), rng.standard_normal((30, 3))
-    circle = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t), 0 * t])
-    sphere = np.array([0.2, 0.4, 0.6]) + 0.1 * u / np.linalg.norm(u, axis=1)[:, None]
-    points = np.vstack([circle, sphere])
-    vertices = np.repeat([0, 1, 2], [40, 40, 30])
-    cells = np.concatenate([np.arange(40), np.arange(40), np.arange(40, 70)])
-    fixed = np.zeros((3, 3), bool)
-    fixed[0, 2] = True
-    order = rng.permutation(110)
-    meetings = Meetings(points, fixed, vertices[order], cells[order])
-    begun = np.array([[0.51, 0.48, 0.0], [0.5 + 1e-9, 0.5, 0.7], [0.2 + 1e-3, 0.4, 0.6]])
-    placed, eps = meetings.place(begun), float(np.finfo(float).eps)
-    assert np.abs(placed - [[0.5, 0.5, 0], [0.5, 0.5, 0.7], [0.2, 0.4, 0.6]]).max() < 8 * eps
-    far = [np.linalg.norm(begun[k] - points[cells[vertices == k]], axis=1) for k in (0, 2)]
-    found = meetings.excess(np.array([0, 2]), begun[[0, 2]])
-    assert found == pytest.approx([np.ptp(f) for f in far], rel=1e-12)
-    assert meetings.excess(np.arange(3), placed).max() < 8 * eps
-    assert meetings.excess(np.zeros(0, int), np.zeros((0, 3))).shape == (0,)
+def ring(n):
+    """Generators on a circle whose axis is parallel to no wall: all cells meet along it."""
+    turn = 2 * np.pi * np.arange(n) / n
+    plane = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0][:2]
+    return BOX.extent / 2 + 0.4 * np.column_stack([np.cos(turn), np.sin(turn)]) @ plane
+
+
+def off_planes(sharing, u, y):
+    """How far a position lies off the planes of corner u."""
+    f, points = sharing.half_faces, sharing.t.points.get()
+    own, offs = points[f.owners.get()[u]], []
+    for label in f.corner_faces.get()[u].tolist():
+        if label < 0:
+            wall = (0, (BOX.extent / BOX.frame[1])[(-1 - label) // 2])[(-1 - label) % 2]
+            offs.append(abs(y[(-1 - label) // 2] - wall))
+        else:
+            offs.append(abs(np.linalg.norm(y - own) - np.linalg.norm(y - points[label])))
+    return max(offs)
+
+
+def test_vertices_are_merged_into_better_ones_on_their_planes(engine):
+    t = tessellation(engine, Bins(engine), Polyhedra(engine), ring(40))
+    sharing = FaceSharing(engine, BOX, t)
+    f = sharing.half_faces
+    sharp = f.sharpness.get()
+    assert sharing.compare()
+    before, best = sharing.labels.get(), sharing.best_corners.get()
+    assert sharing.merge(0)
+    after, chosen = sharing.labels.get(), sharing.best_corners.get()
+    merged = np.flatnonzero((after != before) & (best[before] != chosen[after]))
+    assert len(merged) > 20
+    at = t.points.get()[f.owners.get()] + f.corners.get()
+    for u in merged.tolist():
+        assert sharp[chosen[after[u]]] >= sharp[best[before[u]]]
+        assert off_planes(sharing, u, at[chosen[after[u]]]) < 64 * np.finfo(float).eps
+    # The ends of the axis stay apart.
+    while sharing.compare() or sharing.mark_slits(0):
+        if not sharing.merge(0):
+            break
+    ends = {i for i, label in enumerate(f.corner_faces.get().tolist()) if min(label) < 0}
+    on_axis = [
+        u for u in ends if abs(np.ptp(np.linalg.norm(at[u] - t.points.get(), axis=1))) < 1e-14
+    ]
+    labels = sharing.labels.get()
+    assert len({labels[u] for u in on_axis}) == 2
+
+
+def test_a_face_that_cannot_be_shared_is_an_error(engine, monkeypatch):
+    monkeypatch.setattr(FaceSharing, "merge", lambda self, doublings: False)
+    t = tessellation(engine, Bins(engine), Polyhedra(engine), ring(40))
+    with pytest.raises(
+        clvoro.errors.InputError, match="perturb generators that lie on a common sphere"
+    ):
+        share_faces(engine, BOX, t)

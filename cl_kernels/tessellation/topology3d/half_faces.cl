@@ -1,24 +1,25 @@
 #define CLIP_SHARPLY 1
-#include "tessellation/topology3d/join_vertices.h"
 #include "tessellation/clip.h"
 
-/* The corners of a diagram's cells in 3D, and which of them are surely one vertex. Each cell is clipped once more, by
-   its neighbors alone. Its vertices, the corners, are numbered cell by cell: corner u. Two corners are one vertex
-   where the same four generators or walls meet, whatever their positions have rounded to, and where an edge between
-   them has no length; the least corner of a vertex is its label. What is left to agree about is that of loops.cl.
+/* The faces of a diagram in 3D as each cell has them by itself. Each cell is clipped once more, by its neighbors alone.
+   Its vertices are the corners, numbered cell by cell. A face that two cells share has a half-face in each. Two corners
+   surely belong to one vertex where the same four generators or walls meet, and where an edge of no length joins them.
+   consistency.cl does the rest.
 
-   starts, neighbors          the graph: faces k, in rows i
-   view_starts (n + 1,)        rows of views, a cell's faces as it sees them itself: those of the graph in its order,
-   then walls that the cell touches although the graph has no face there view_labels (v,)            a generator, or -1
-   - wall corner_starts (n + 1,)      first corner of each cell; its first turn is the triple of that turn_starts (v +
-   1,)        first turn of each view: its loop, counter-clockwise from outside turns (t,)                  corners */
+   starts, neighbors           the graph
+   half_face_starts (n + 1,)   rows of half-faces: the faces of the graph in its order, then walls that the cell touches
+                               although the graph has no face there
+   half_face_labels (h,)       a generator, or -1 - wall
+   corner_starts (n + 1,)      first corner of each cell
+   loop_starts (h + 1,)        of the loops of half-faces; those of cell i begin at 3 corner_starts[i]
+   loops (3 c,)                corners, counter-clockwise from outside */
 
 /* The cell of generator i; false if there is not enough room. */
 inline bool make_cell(cell_t *cell, int i, global const REAL *points, REAL4 lower, REAL4 upper,
                       global const int *starts, global const int *neighbors)
 {
     const REAL4 x = (REAL4)(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0);
-    start_polyhedron(cell, x, lower, upper, true);
+    start_polyhedron(cell, x, lower, upper);
     return clip_polyhedron_by_row(cell, i, x, starts, neighbors, points) != CLIP_FULL;
 }
 
@@ -30,11 +31,11 @@ inline bool is_in_row(int label, int begin, int end, global const int *labels)
     return false;
 }
 
-/* Per generator i: how many corners its cell has, and how many views. full[0] is set if a cell has more than
+/* Per generator i: how many corners and half-faces its cell has. full[0] is set if a cell has more than
    FACE_CAPACITY faces. */
 kernel void count_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                           global const int *starts, global const int *neighbors, global int *corner_counts,
-                          global int *view_counts, global int *full)
+                          global int *half_face_counts, global int *full)
 {
     WORK_ITEM(i);
     cell_t cell;
@@ -47,7 +48,7 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
     for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
         count += !is_in_row(cell.labels[f], begin, end, neighbors);
     corner_counts[i] = cell.n;
-    view_counts[i] = count;
+    half_face_counts[i] = count;
 }
 
 /* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each,
@@ -71,9 +72,9 @@ inline REAL sharpness_of(const cell_t *cell, int v)
     return fabs(span) * shares;
 }
 
-/* Write the loops of the views of cell i. */
-inline void list_turns(const cell_t *cell, int base, int view, int end, global const int *view_labels,
-                       global int *turn_starts, global int *turns)
+/* Write the loops of a cell's half-faces, from `half_face` up to `end`. */
+inline void list_loops(const cell_t *cell, int base, int half_face, int end, global const int *half_face_labels,
+                       global int *loop_starts, global int *loops)
 {
     INDEX start[FACE_CAPACITY];
     for (int v = 0; v < cell->n; ++v) {
@@ -81,30 +82,30 @@ inline void list_turns(const cell_t *cell, int base, int view, int end, global c
         start[f.s0] = start[f.s1] = start[f.s2] = v;
     }
     int t = 3 * base;
-    for (; view < end; ++view) {
-        turn_starts[view] = t;
+    for (; half_face < end; ++half_face) {
+        loop_starts[half_face] = t;
         int f = next_face(cell->alive, 0);
-        while (f < FACE_CAPACITY && cell->labels[f] != view_labels[view])
+        while (f < FACE_CAPACITY && cell->labels[f] != half_face_labels[half_face])
             f = next_face(cell->alive, f + 1);
         if (f == FACE_CAPACITY) /* the graph has it, but clipping sharply leaves nothing */
             continue;
         const int first = start[f];
         int v = first;
         do {
-            turns[t++] = base + v;
+            loops[t++] = base + v;
             v = vertex_after(cell, v, f);
         } while (v != first);
     }
 }
 
 /* Per generator i: its corners (c, 3), relative to x_i, how sharp each is, the labels of their faces (c, 3),
-   counter-clockwise, their owner, and its views. same[u] is the least corner of the cell that lies where corner u does,
-   joined to it by edges of no length. */
+   counter-clockwise, their owner, and its half-faces. same[u] is the least corner of the cell that lies where corner u
+   does, joined to it by edges of no length. */
 kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                          global const int *starts, global const int *neighbors, global const int *corner_starts,
-                         global const int *view_starts, global REAL *corners, global float *sharpness,
-                         global int *corner_faces, global int *owners, global int *same, global int *view_labels,
-                         global int *turn_starts, global int *turns)
+                         global const int *half_face_starts, global REAL *corners, global float *sharpness,
+                         global int *corner_faces, global int *owners, global int *same, global int *half_face_labels,
+                         global int *loop_starts, global int *loops)
 {
     WORK_ITEM(i);
     cell_t cell;
@@ -149,16 +150,16 @@ kernel void list_corners(const int size, global const REAL *points, const REAL4 
     }
     for (int v = 0; v < cell.n; ++v)
         same[base + v] = base + joined[v];
-    const int begin = starts[i], end = starts[i + 1], view = view_starts[i];
-    int to = view;
+    const int begin = starts[i], end = starts[i + 1], half_face = half_face_starts[i];
+    int to = half_face;
     for (int k = begin; k < end; ++k)
-        view_labels[to++] = neighbors[k];
+        half_face_labels[to++] = neighbors[k];
     for (int f = next_face(cell.alive, 0); f < FACE_CAPACITY; f = next_face(cell.alive, f + 1))
         if (!is_in_row(cell.labels[f], begin, end, neighbors))
-            view_labels[to++] = cell.labels[f];
-    list_turns(&cell, base, view, to, view_labels, turn_starts, turns);
+            half_face_labels[to++] = cell.labels[f];
+    list_loops(&cell, base, half_face, to, half_face_labels, loop_starts, loops);
     if (i == size - 1)
-        turn_starts[to] = 3 * (base + cell.n);
+        loop_starts[to] = 3 * (base + cell.n);
 }
 
 /* Is label one of the three faces of corner u? */
@@ -188,21 +189,4 @@ kernel void match_corners(const int size, global const int *owners, global const
             }
     }
     twin_corners[u] = found;
-}
-
-/* Per corner u: pass on the least label to the corners that are one vertex with it. The least of all is where this
-   ends, in whatever order. */
-kernel void spread_labels(const int size, global const int *same, global const int *twin_corners, global const int *old,
-                          global int *new, global int *changed)
-{
-    WORK_ITEM(u);
-    bool any = join(old, new, u, same[u]);
-    any |= join(old, new, u, twin_corners[u]);
-    const int label = old[old[u]];
-    if (label < old[u]) {
-        atomic_min(new + u, label);
-        any = true;
-    }
-    if (any)
-        atomic_or(changed, 1);
 }

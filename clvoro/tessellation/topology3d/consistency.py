@@ -1,0 +1,194 @@
+"""A diagram in 3D in, vertices and faces that are the same from both cells of every face out (`consistency.cl`).
+
+This is the one place for round-off in 3D. Cells are clipped one by one. Where more than four cells meet in a point, or
+where generators lie on a circle or a sphere, round-off decides which faces each of them has. `share_faces` makes both
+cells of every face agree, or raises.
+
+Generators may be as near each other as `LEAST_SEPARATION`, a share of the longest edge of the domain. Nearer ones may
+work, but may as well raise an error. What is returned is right either way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ...geometry.box import ClipBox
+from ...opencl.device_array import buffer_of
+from ...opencl.primitives import Scan
+from ...opencl.program import Engine
+from ..device_diagram import CloseError, Tessellation
+from .half_faces import HalfFaces, list_half_faces
+
+MOST_DOUBLINGS, SAFE_DOUBLINGS = 14, 3
+"""How often the tolerance may double, and how often without a check of the result. Lattices take none."""
+_LARGEST = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class SharedFaces:
+    """Vertices and the loops of faces, on the device.
+
+    Attributes
+    ----------
+    positions : (v, 3) real
+        In the order of the first cell that has the vertex.
+    starts : (m + 1,) int32
+        The loop of face k is ``vertices[starts[k]:starts[k + 1]]``, counter-clockwise as seen from outside of its cell,
+        reversed in the row of the neighbor. Both are empty where the face is no wider than round-off: the other faces
+        close both cells without it.
+    vertices : (l,) int32
+    needs_check : bool
+        Whether the tolerance was so large that the diagram has to be checked.
+    """
+
+    positions: cla.Array
+    starts: cla.Array
+    vertices: cla.Array
+    needs_check: bool = False
+
+
+def share_faces(engine: Engine, box: ClipBox, t: Tessellation) -> SharedFaces:
+    """Return the vertices and faces of `t`, the same from both cells of every face.
+
+    Raises
+    ------
+    MemoryLimitError
+        If the loops are too long for 32-bit indices.
+    CloseError
+        If round-off leaves too much of a cell uncertain.
+    """
+    return FaceSharing(engine, box, t).run()
+
+
+class FaceSharing:
+    """Vertices are merged until the two half-faces of every face are identical.
+
+    Attributes
+    ----------
+    half_faces : HalfFaces
+    labels : (c,) int32
+        Of each corner: its vertex, named by its first corner.
+    best_corners : (c,) int32
+        Of each vertex: the corner that its faces determine best.
+    reduced, counts : (3 c,), (h,) int32
+        The loops of half-faces as vertices, without repetitions and spurs, and their lengths.
+    differs : (h,) uint8
+    """
+
+    def __init__(self, engine: Engine, box: ClipBox, t: Tessellation) -> None:
+        self.engine, self.t = engine, t
+        self._kernels = engine.kernels("tessellation/topology3d/consistency")
+        self._corners = box.device_corners(engine.real)
+        self.half_faces: HalfFaces = list_half_faces(engine, box, t)
+        f = self.half_faces
+        self.c, self.h = len(f.owners), len(f.labels)
+        self.twins, self.counts = (engine.empty(self.h, np.int32) for _ in range(2))
+        engine.run_each(self._kernels.find_twins, t.n, t.starts, f.starts, f.labels, self.twins)
+        self.differs = engine.empty(self.h, np.uint8)
+        self.reduced = engine.empty(len(f.loops), np.int32)
+        self.labels = f.same.copy()
+        self.name_vertices(f.same.copy())
+
+    def run(self) -> SharedFaces:
+        """Return the faces once their half-faces are identical."""
+        doublings, merged = 0, False
+        while True:
+            differ = self.compare()
+            if not differ and not (merged and self.mark_slits(doublings)):
+                break
+            if self.merge(doublings):
+                merged = True
+            elif doublings < MOST_DOUBLINGS:
+                doublings += 1
+            elif differ:
+                raise CloseError(self.t.points, self.t.n)
+            else:
+                break  # the slits that are left agree
+        return self._write(needs_check=doublings > SAFE_DOUBLINGS)
+
+    def name_vertices(self, labels: cla.Array) -> None:
+        """Find the labels and best corners of vertices, where `labels` (c,) holds lesser ones of some corners."""
+        engine, f, k = self.engine, self.half_faces, self._kernels
+        changed = engine.empty(1, np.int32)
+        while True:
+            changed.fill(0)
+            cl.enqueue_copy(engine.queue, buffer_of(self.labels), buffer_of(labels))
+            engine.run_each(
+                k.spread_labels, self.c, f.same, f.twin_corners, self.labels, labels, changed
+            )
+            if not int(changed[0].get()):
+                break
+        best = engine.zeros(self.c, np.uint32)
+        self.best_corners = engine.empty(self.c, np.int32).fill(_LARGEST)
+        engine.run_each(k.rate_corners, self.c, self.labels, f.sharpness, best)
+        engine.run_each(k.choose_corners, self.c, self.labels, f.sharpness, best, self.best_corners)
+
+    def compare(self) -> bool:
+        """Reduce all loops; tell whether any half-face differs from its twin."""
+        f, k, any_ = self.half_faces, self._kernels, self.engine.zeros(1, np.int32)
+        self.engine.run_each(
+            k.reduce_loops, self.h, f.loop_starts, f.loops, self.labels, self.reduced, self.counts
+        )
+        self.engine.run_each(
+            k.compare_half_faces, self.h, self.twins, f.loop_starts, self.reduced, self.counts, self.differs, any_
+        )  # fmt: skip
+        return bool(any_[0].get())
+
+    @property
+    def _vertices(self) -> tuple[object, ...]:
+        """What kernels take as VERTEX_ARGS."""
+        f = self.half_faces
+        return (
+            self.t.points, f.corners, f.owners, f.corner_faces, self.labels, self.best_corners, *self._corners
+        )  # fmt: skip
+
+    def mark_slits(self, doublings: int) -> bool:
+        """Let faces count as differing that are no wider than the tolerance; tell whether there are any."""
+        f, any_ = self.half_faces, self.engine.zeros(1, np.int32)
+        self.engine.run_each(
+            self._kernels.mark_slits, self.h, *self._vertices, f.loop_starts, f.loops, self.twins, self.reduced,
+            self.counts, np.int32(doublings), self.differs, any_,
+        )  # fmt: skip
+        return bool(any_[0].get())
+
+    def merge(self, doublings: int) -> bool:
+        """Merge vertices of half-faces that differ, within a tolerance; tell whether there were any to merge."""
+        engine, f, k, c = self.engine, self.half_faces, self._kernels, self.c
+        distances = engine.empty(c, np.uint32).fill(2**32 - 1)
+        targets = engine.empty(c, np.int32).fill(_LARGEST)
+        for second_pass in (0, 1):
+            engine.run_each(
+                k.find_targets, self.h, *self._vertices, f.sharpness, f.loop_starts, f.loops, self.twins,
+                self.differs, np.int32(doublings), np.int32(second_pass), distances, targets,
+            )  # fmt: skip
+        rejected, any_ = engine.zeros(c, np.uint8), engine.zeros(1, np.int32)
+        engine.run_each(
+            k.reject_targets, c, *self._vertices, targets, np.int32(doublings), rejected
+        )
+        labels = self.labels.copy()
+        engine.run_each(k.merge_vertices, c, self.labels, targets, rejected, labels, any_)
+        if not int(any_[0].get()):
+            return False
+        self.name_vertices(labels)
+        return True
+
+    def _write(self, needs_check: bool) -> SharedFaces:
+        engine, t, f, k, c = self.engine, self.t, self.half_faces, self._kernels, self.c
+        n, m, scan = t.n, int(t.starts[t.n].get()), Scan(engine)
+        starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
+        engine.run_each(
+            k.measure_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, self.counts, starts, ids
+        )  # fmt: skip
+        scan.exclusive(starts, starts, m)
+        scan.exclusive(ids, ids, c)
+        vertices = engine.empty(int(starts[m].get()), np.int32)
+        positions = engine.empty((int(ids[c].get()), 3))
+        engine.run_each(
+            k.write_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, ids, starts, vertices
+        )  # fmt: skip
+        engine.run_each(k.write_positions, c, *self._vertices, ids, positions)
+        return SharedFaces(positions, starts, vertices, needs_check)

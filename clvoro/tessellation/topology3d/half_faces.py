@@ -1,0 +1,94 @@
+"""The faces of a diagram in 3D as each cell has them by itself (`half_faces.cl`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ...errors import MemoryLimitError
+from ...geometry.box import ClipBox
+from ...opencl.primitives import Scan
+from ...opencl.program import Engine
+from ..device_diagram import Tessellation
+
+FACE_CAPACITY = 64
+MOST_LOOP_ENTRIES = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class HalfFaces:
+    """Corners of all cells, and loops of corners around their faces, on the device.
+
+    Attributes
+    ----------
+    corners : (c, 3) real
+        Relative to the generator `owners` (c,) int32.
+    sharpness : (c,) float32
+        How well its faces determine a corner.
+    corner_faces : (c, 3) int32
+        Labels of the faces that meet there: a generator, or ``-1 - wall``.
+    same, twin_corners : (c,) int32
+        A corner of the same cell, and one of another cell, at the same vertex.
+    starts : (n + 1,) int32
+        Rows of half-faces: those of the graph in its order, then walls that the graph leaves out.
+    labels : (h,) int32
+        Of half-faces.
+    loop_starts : (h + 1,) int32
+    loops : (3 c,) int32
+        Corners, counter-clockwise from outside.
+    """
+
+    corners: cla.Array
+    owners: cla.Array
+    sharpness: cla.Array
+    corner_faces: cla.Array
+    same: cla.Array
+    twin_corners: cla.Array
+    starts: cla.Array
+    labels: cla.Array
+    loop_starts: cla.Array
+    loops: cla.Array
+
+
+def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
+    """Clip each cell of `t` by its neighbors, and return its faces.
+
+    Raises
+    ------
+    MemoryLimitError
+        If the corners are too many for 32-bit indices.
+    """
+    n, scan = t.n, Scan(engine)
+    corner_starts, starts = engine.empty(n + 1, np.int32), engine.empty(n + 1, np.int32)
+    cell = (t.points, *box.device_corners(engine.real), t.starts, t.neighbors)
+    capacity, full = FACE_CAPACITY, engine.zeros(1, np.int32)
+    while True:
+        k = engine.kernels("tessellation/topology3d/half_faces", {"FACE_CAPACITY": capacity})
+        # Private arrays of a whole group lie on the stack of a CPU's thread.
+        group = None if capacity == FACE_CAPACITY else 1
+        engine.run_each(k.count_corners, n, *cell, corner_starts, starts, full, group=group)
+        if not int(full[0].get()):
+            break
+        capacity *= 2
+        full.fill(0)
+    scan.exclusive(corner_starts, corner_starts, n)
+    scan.exclusive(starts, starts, n)
+    c, h = int(corner_starts[n].get()), int(starts[n].get())
+    if not 0 < c <= MOST_LOOP_ENTRIES // 3:
+        raise MemoryLimitError(
+            f"{n} cells have more vertices than 32-bit indices can tell apart; use fewer cells"
+        )
+    owners, same, twin_corners = (engine.empty(c, np.int32) for _ in range(3))
+    corners, sharpness = engine.empty((c, 3)), engine.empty(c, np.float32)
+    corner_faces, loops = engine.empty((c, 3), np.int32), engine.empty(3 * c, np.int32)
+    labels, loop_starts = engine.empty(h, np.int32), engine.empty(h + 1, np.int32)
+    engine.run_each(
+        k.list_corners, n, *cell, corner_starts, starts, corners, sharpness, corner_faces, owners,
+        same, labels, loop_starts, loops, group=group,
+    )  # fmt: skip
+    engine.run_each(k.match_corners, c, owners, corner_starts, corner_faces, twin_corners)
+    return HalfFaces(
+        corners, owners, sharpness, corner_faces, same, twin_corners, starts, labels, loop_starts, loops
+    )  # fmt: skip
