@@ -2,13 +2,13 @@
 #include "tessellation/half_planes.h"
 #include "opencl/sort.h"
 
-/* The boundary of a polygonal domain is cut into chords by walking along every edge from cell to cell of the convex
-   diagram. Each crossing of an edge with a face is computed once, for both cells beside it, so that trimmed cells tile
-   the domain. */
+/* Chords: the parts of the edges of a polygonal domain in the cells of the convex diagram. Each edge is traced from
+   cell to cell. A crossing of an edge with a face is computed once, for both cells, so that the clipped cells tile the
+   domain. */
 
-#define FLAG_OUTSIDE 2 /* the cell of a generator outside the domain, an auxiliary one, reaches into it */
+#define FLAG_OUTSIDE 2 /* the cell of a ghost generator reaches into the domain */
 
-#define MOST_STEPS 64 /* among generators that are as near as each other, but for rounding */
+#define MOST_STEPS 64 /* among generators at the same distance up to round-off */
 
 inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
 {
@@ -16,8 +16,8 @@ inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
     return dot(d, d);
 }
 
-/* By how much y is on j's side of the bisector of i and j, times their distance; for i and j the same but for the sign.
-   Where they are so near each other that their distances from y differ by less than these round, it is right. */
+/* Signed distance of y beyond the bisector of i and j, on the side of j, times the distance of i and j; antisymmetric
+   in i and j. Exact also where the distances from y differ by less than their round-off. */
 inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j);
@@ -27,9 +27,9 @@ inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
     return i == o ? s : -s;
 }
 
-/* Per vertex: the generator in whose cell it lies, the nearest one, from neighbor to neighbor: as long as one is
-   nearer; then, among those as near but for rounding, by the bisectors. `inner` are the vertices a few roundings
-   further inside, so that what lies on faces counts to the cells within. */
+/* Per vertex of the polygon: the generator of its cell. A walk goes to the neighbor nearest to the vertex while one is
+   nearer; among equally near ones, up to round-off, the bisectors decide. `inner` are the vertices moved inwards by a
+   few units of round-off, so that vertices on faces belong to cells inside. */
 kernel void find_boundary_owners(const int size, global const REAL2 *inner, global const int *starts,
                                  global const int *neighbors, global const REAL *points, global int *owners)
 {
@@ -48,7 +48,7 @@ kernel void find_boundary_owners(const int size, global const REAL2 *inner, glob
             }
         }
     } while (next != cell);
-    /* Rounding may lead around in a circle. */
+    /* With round-off the walk may go in a circle. */
     for (int steps = 0; steps < MOST_STEPS; ++steps) {
         REAL most = 0;
         for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
@@ -66,7 +66,7 @@ kernel void find_boundary_owners(const int size, global const REAL2 *inner, glob
     owners[v] = cell;
 }
 
-/* Where the line a + t e meets the bisector of two generators; the same for both. */
+/* Parameter t at which the line a + t e meets the bisector of two generators; symmetric in the two. */
 inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
 {
     const int o = min(i, j), q = max(i, j);
@@ -75,9 +75,8 @@ inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
     return dot(x - a + d / 2, d) / dot(e, d);
 }
 
-/* On which side of the faces between generators at x and x + d does a corner v of the polygon count that lies on their
-   line? On that of its own generator at `own`, if v is a point of the cell of x. Elsewhere on the left of edge e.
-   Positive: of x + d. */
+/* The side of the face between generators at x and x + d to which a polygon corner v on that face belongs. If v is a
+   point of the cell of x: the side of its own generator, at `own`. Otherwise: the left of edge e. Positive: x + d. */
 inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
 {
     const REAL2 between = x - own;
@@ -86,15 +85,15 @@ inline REAL side_of(REAL2 v, REAL2 own, REAL2 x, REAL2 d, REAL2 e)
     return side != 0 ? side : e.s0 * d.s1 - e.s1 * d.s0;
 }
 
-/* How an edge can leave a cell: to which one behind, where on the edge, in which order of those there, and by how much
-   rounding may have put the place off; edges on faces are not in doubt. */
+/* A possible exit of an edge from a cell: the cell behind, the parameter on the edge, the rank among exits at that
+   parameter, and the error bound of the parameter. Edges along faces have no doubt. */
 typedef struct {
     int behind;
     REAL at, rank, doubt;
 } exit_t;
 
-/* Does an edge leave the cell of x by `a` before `b`? Where rounding may have it either way, double words tell; if
-   these cannot, the nearer of the two generators behind is the first. */
+/* Whether an edge leaves the cell of x by exit `a` before exit `b`. In doubt double words decide; if they cannot, the
+   nearer of the two generators behind comes first. */
 inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2 e, global const REAL *points)
 {
     if (fabs(a.at - b.at) <= a.doubt + b.doubt) {
@@ -116,15 +115,13 @@ inline bool leaves_before(exit_t a, exit_t b, REAL2 x, REAL2 start, REAL2 e, glo
     return a.at < b.at || (a.at == b.at && a.rank < b.rank);
 }
 
-/* The cell behind `cell` on the way along edge a + t e, t = 0 to 1, from cell `origin` to cell `target`; -1 if there is
-   none. Of the faces that the edge can leave by, the first; so generators come in the order of e.x, and a walk ends.
-   Where rounding has led past the end of the edge, the neighbor that is nearest to the target's generator: that way
-   leads to it.
+/* The cell after `cell` on edge a + t e, 0 <= t <= 1, from cell `origin` to cell `target`; -1 if there is none. It is
+   the first exit of the edge. Generators then come in the order of e.x, so the tracing ends. If round-off has led past
+   the end of the edge, it is the neighbor nearest to the generator of the target.
 
-   Rounding must not choose an order of crossings that no edges could have. An end of the edge on a face counts as a
-   little inside the cell that it is in, a share of the way to its generator, and faces there are crossed in that order
-   (rank), at the end itself. An edge on a face counts to the side of its ends: to the cell on its left, as ends are
-   moved inwards. */
+   Round-off must not produce an order of crossings that is geometrically impossible. An end of the edge on a face is
+   treated as slightly inside its cell, towards the generator; faces there are crossed in that order (rank). An edge
+   along a face belongs to the side of its ends: to the cell on its left, as ends are moved inwards. */
 inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global const int *starts,
                       global const int *neighbors, global const REAL *points, REAL *t)
 {
@@ -175,8 +172,8 @@ inline int step_along(int cell, int origin, int target, REAL2 a, REAL2 e, global
     return first.behind < 0 ? towards : first.behind;
 }
 
-/* Per edge: walk along it. Without chord_cells only the number of chords is counted. `generators` are those in the
-   domain; the cells of others must not be met: those are marked. */
+/* Per edge: trace it. The first pass only counts the chords. `generators` is the number of generators in the domain;
+   ghost generators whose cells are crossed are marked. */
 kernel void walk_edges(const int size, const int generators, global const REAL2 *vertices,
                        global const int *next_vertex, global const int *owners, global const int *starts,
                        global const int *neighbors, global const REAL *points, const int write, global int *firsts,
@@ -188,7 +185,7 @@ kernel void walk_edges(const int size, const int generators, global const REAL2 
     const REAL2 a = vertices[v], e = vertices[w] - a;
     int cell = owners[v], chord = write ? firsts[v] : 0;
     REAL t = 0;
-    /* A walk meets a cell once, whatever rounding does. */
+    /* The tracing enters a cell once at most, whatever the round-off. */
     for (int steps = 0; cell >= 0; ++steps) {
         const bool last = cell == target || steps > size + generators;
         const int next = last ? -1 : step_along(cell, owners[v], target, a, e, starts, neighbors, points, &t);
@@ -210,7 +207,7 @@ kernel void walk_edges(const int size, const int generators, global const REAL2 
         firsts[v] = chord;
 }
 
-/* Per chord: slots[cell] = the first chord of the cell (INT_MAX before: the boundary does not pass through). */
+/* Per chord: slots[cell] = the first chord of the cell (INT_MAX: the boundary does not cross the cell). */
 kernel void find_firsts(const int size, global const int *chord_cells, global int *slots)
 {
     WORK_ITEM(c);
@@ -224,7 +221,7 @@ kernel void flag_firsts(const int size, global const int *chord_cells, global co
     ranks[c] = slots[chord_cells[c]] == c;
 }
 
-/* Per first chord of a cell: list the cell as number ranks[c] of those that the boundary passes through. */
+/* Per first chord of a cell: list the cell as crossed cell number ranks[c]. */
 kernel void list_touched(const int size, global const int *chord_cells, global const int *ranks, global int *touched)
 {
     WORK_ITEM(c);
@@ -232,7 +229,7 @@ kernel void list_touched(const int size, global const int *chord_cells, global c
         touched[ranks[c]] = chord_cells[c];
 }
 
-/* Per touched cell: its number in place of its first chord. */
+/* Per crossed cell: replace its first chord by its number. */
 kernel void number_touched(const int size, global const int *touched, global int *slots, global int *counts)
 {
     WORK_ITEM(u);
@@ -240,7 +237,7 @@ kernel void number_touched(const int size, global const int *touched, global int
     counts[u] = 0;
 }
 
-/* Per chord: count it to its cell. */
+/* Per chord: count it in its cell. */
 kernel void count_chords(const int size, global const int *chord_cells, global const int *slots, global int *ranks,
                          global int *counts)
 {
@@ -248,7 +245,7 @@ kernel void count_chords(const int size, global const int *chord_cells, global c
     ranks[c] = atomic_inc(counts + slots[chord_cells[c]]);
 }
 
-/* Per chord: into the list of its cell. The order is put right by sort_chords. */
+/* Per chord: append it to the list of its cell; sort_chords sorts the lists. */
 kernel void place_chords(const int size, global const int *chord_cells, global const int *slots,
                          global const int *ranks, global const int *starts, global int *listed)
 {
@@ -256,7 +253,7 @@ kernel void place_chords(const int size, global const int *chord_cells, global c
     listed[starts[slots[chord_cells[c]]] + ranks[c]] = c;
 }
 
-/* Per touched cell: its chords in order. */
+/* Per crossed cell: sort its chords. */
 kernel void sort_chords(const int size, global const int *starts, global int *listed)
 {
     WORK_ITEM(u);

@@ -1,10 +1,9 @@
-/* The boundary as a cell of a trimmed diagram has it. OUTLINE_ARGS come last in a kernel's signature and are empty in
+/* The boundary of cells in a clipped diagram. OUTLINE_ARGS come last in the signature of a kernel and are empty in
    boxes.
 
-   outlines[i]  (quality of the cell by the paper's 4.1, as the polygon whose sides are its faces, those on the boundary
-                taken together and straightened as long as they turn by no more than 30 degrees: see sides.h;
-                neighbors that a hexagonal lattice would have there)
-   tangents[e]  unit vector along edge e of the boundary, the domain on its left: the face of label -1 - e */
+   outlines[i]  (quality of the cell by the paper's (4.1), with stretches of the boundary that turn by at most 30
+   degrees as one straight side, see wall_sides.h; number of neighbors of a hexagonal lattice there) tangents[e]  unit
+   vector along edge e of the boundary, the domain on its left: the face with label -1 - e */
 #include "opencl/real.h"
 
 #ifdef POLYGON

@@ -1,9 +1,9 @@
 #include "opencl/real.h"
 
-#define UNTOUCHED 0x7fffffff /* in the place of the number of a cell that the boundary does not pass through */
-#define ISLAND -2            /* the end of a chord that belongs to a hole within its cell */
+#define UNTOUCHED 0x7fffffff /* number of a cell that the boundary does not cross */
+#define ISLAND -2            /* end of a chord that belongs to a hole inside its cell */
 
-/* Segments of all touched cells, cell by cell, piece by piece, loop by loop; see segment_t (trimmed.h). */
+/* Segments of all crossed cells, cell by cell, piece by piece, loop by loop; see segment_t (trimmed.h). */
 typedef struct {
     global const int *starts, *labels, *from, *to, *places;
     global const REAL2 *p, *q;
@@ -23,8 +23,7 @@ inline bool is_empty(const segments_t *s, int k)
     return s->labels[k] < 0 ? s->from[k] < 0 : s->from[k] == s->to[k];
 }
 
-/* The segment of cell j, number u of those that the boundary passes through, that is segment k of cell i from the other
-   side; -1 if there is none. */
+/* The segment of cell j, crossed cell number u, that is the other side of segment k of cell i; -1 if there is none. */
 inline int other_side(const segments_t *s, int k, int i, int u)
 {
     for (int m = s->starts[u]; m < s->starts[u + 1]; ++m) {
@@ -38,14 +37,15 @@ inline int other_side(const segments_t *s, int k, int i, int u)
     return -1;
 }
 
-/* The generator that the piece on the other side of segment k of cell i goes to, -1 if it is not known yet. */
+/* The generator that gets the piece on the other side of segment k of cell i, -1 if unknown. */
 inline int other_root(const segments_t *s, int k, int i, global const int *slots, global const int *roots)
 {
     const int j = s->labels[k], u = slots[j];
     return u == UNTOUCHED ? j : roots[s->places[other_side(s, k, i, u)]];
 }
 
-/* Is segment k of cell i, in a piece that goes to `root`, a face of the cell of `root`? *other is what it names. */
+/* Whether segment k of cell i, in a piece of generator `root`, is a face of the cell of `root`; *other: its neighbor.
+ */
 inline bool is_face(const segments_t *s, int k, int i, int root, global const int *slots, global const int *roots,
                     int *other)
 {

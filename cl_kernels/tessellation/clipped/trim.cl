@@ -4,18 +4,18 @@
 #include "tessellation/clipped/wall_sides.h"
 #include "tessellation/clipped/trimmed.h"
 
-/* The diagram of a polygonal domain from the convex diagram of its generators. Where the boundary passes through a
-   cell, what lies in the domain is cut out: its pieces, each an outer loop and the islands in it. The piece with the
-   generator is the cell; the others, which a spit or a slit cuts off from it, go to the cell beside them with which
-   they share the longest face, and stay where they are only if there is none. */
+/* The diagram of a polygonal domain from the convex diagram of its generators. A cell that the boundary crosses is
+   clipped to the domain. The result consists of pieces, each an outer loop and the islands in it. The piece with the
+   generator is the cell. Another piece, cut off by a spit or a slit, goes to the neighboring cell with which it shares
+   the longest face, and stays only if there is none. */
 
-#define FLAG_ORPHANS 4 /* a cell is in several pieces */
+#define FLAG_ORPHANS 4 /* a cell consists of several pieces */
 
-/* By which a corner may lie outside of the domain, as `check` allows. */
+/* Distance by which a corner may lie outside of the domain; `check` allows the same. */
 #define MOST_OUTSIDE (256 * REAL_EPS)
 
-/* Does a segment on a face, from a corner of the cell to a chord's end or from there to a corner, leave the domain by
-   that chord's edge? Edges miss the tips of needles that are narrower than rounding. */
+/* Whether a segment on a face, between a corner of the cell and the end of a chord, leaves the domain across the edge
+   of that chord. Edges miss the tips of needles narrower than round-off. */
 inline bool leads_out(const segment_t *s, const chords_t *c)
 {
     if ((s->from < 0) == (s->to < 0))
@@ -26,12 +26,12 @@ inline bool leads_out(const segment_t *s, const chords_t *c)
     return difference_of_products(e.s0, inwards.s1, e.s1, inwards.s0) < -MOST_OUTSIDE * sqrt(dot(e, e));
 }
 
-/* Per touched cell u: its loops, in places first = list_starts[u] + u and on.
+/* Per crossed cell u: its loops, at the indices first = list_starts[u] + u and following.
 
-   loop_chords   a chord with which each loop begins; -1: around the whole cell
-   loop_pieces   place of the outer loop that the loop belongs to, itself if it is one; -1: no loop
-   loop_roots    of outer loops: the generator that the piece goes to, -1 if that is not known yet
-   counts        segments of all loops of the cell */
+   loop_chords   first chord of each loop; -1: the loop around the whole cell
+   loop_pieces   index of the outer loop of the loop's piece, which may be the loop itself; -1: no loop
+   loop_roots    for outer loops: the generator that gets the piece, -1 if unknown
+   counts        number of segments of all loops of the cell */
 kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chord_loops, global int *loop_chords,
                        global int *loop_pieces, global int *loop_roots, global int *counts, global int *flags)
 {
@@ -44,7 +44,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     REAL nearest = REAL_MAX;
     for (int k = 0; k < cell.chord_count; ++k)
         chord_loops[cell.chords[k]] = -1;
-    /* First the loops with chords that come in over a face: they begin with one. */
+    /* First the loops with chords that enter across a face: they begin with such a chord. */
     for (int turn = 0; turn < 2 * cell.chord_count; ++turn) {
         const int begin = cell.chords[turn % cell.chord_count];
         if (chord_loops[begin] >= 0 || (turn < cell.chord_count && begins_inside(&c, begin)))
@@ -53,7 +53,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         REAL near = REAL_MAX;
         int around = 0, count = 0;
         bool open = false, lost = false;
-        /* A loop that takes more segments than there are has lost its way. */
+        /* A loop with more segments than the cell has is an error. */
         const int most = 2 * (cell.chord_count + 1) * (cell.n + 2);
         do {
             const bool on_chord = cursor.chord >= 0;
@@ -64,10 +64,10 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
             near = fmin(near, squared_distance_to(s, 0));
             open |= !on_chord;
             astray |= !on_chord && leads_out(&s, &c);
-            lost |= !on_chord && s.label < 0; /* at a wall of the box, which is far outside */
+            lost |= !on_chord && s.label < 0; /* a wall of the clip box, far outside */
         } while (!is_complete(&cursor, begin) && ++count < most);
         if (lost || count == most) {
-            /* What follows would not find to an end either. */
+            /* The next loops would fail, too. */
             atomic_or(flags, FLAG_LOST);
             for (int place = first; place < list_starts[u + 1] + u + 1; ++place)
                 loop_pieces[place] = -1;
@@ -76,8 +76,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         }
         const int shell = c.shells[c.edges[begin]];
         const bool is_outer = open || shell < 0;
-        /* A hole within the cell whose piece goes on beyond it: the cell's faces lie in the domain, if no chord leaves
-           it. */
+        /* A hole inside the cell whose piece extends beyond it: the faces of the cell lie in the domain if no chord
+           leaves it. */
         rim |= !is_outer && c.cells[c.firsts[shell]] != cell.i;
         const int place = first + loops;
         loop_chords[place] = begin;
@@ -85,7 +85,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         loop_roots[place] = -1;
         crossed |= open;
         total += count + 1;
-        /* The generator's own piece winds around it, closest of all that do; or the generator lies on its boundary. */
+        /* The piece of the generator winds around it, the closest if several do, or has it on its boundary. */
         const bool winds = around > 0 || near <= ON_BOUNDARY * ON_BOUNDARY;
         if (is_outer && (main < 0 || winds > main_winds || (winds == main_winds && near < nearest))) {
             main = place;
@@ -104,7 +104,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         loop_roots[place] = -1;
         ++outer;
         total += cell.n;
-        /* Unless the generator is on an island in a hole. */
+        /* But not if the generator is on an island in a hole. */
         if (!main_winds)
             main = place;
     }
@@ -114,8 +114,8 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
     }
     for (int place = first; place < first + loops; ++place)
         if (loop_pieces[place] < 0) {
-            /* A hole lies in the outer ring of its piece. Where that leaves the cell, one of the pieces that it leaves
-               by has it. */
+            /* A hole lies in the outer ring of its piece. If that ring leaves the cell, one of the pieces along it
+               contains the hole. */
             const int shell = c.firsts[c.shells[c.edges[loop_chords[place]]]];
             const int ring = c.cells[shell] == cell.i ? first + chord_loops[shell] : -1;
             loop_pieces[place] = main;
@@ -136,7 +136,7 @@ kernel void find_loops(const int size, CONVEX_ARGS, CHORD_ARGS, global int *chor
         atomic_or(flags, FLAG_ORPHANS);
 }
 
-/* Per touched cell u: its segments, behind segment_starts[u]; `places` tells the loop's piece. */
+/* Per crossed cell u: its segments, from segment_starts[u] on; `places` holds the piece of each. */
 kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const int *loop_chords,
                            global const int *loop_pieces, global const int *segment_starts, global int *labels,
                            global int *from, global int *to, global int *places, global REAL2 *p, global REAL2 *q)
@@ -159,7 +159,7 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
                 do {
                     const segment_t s = next_segment(&cursor, &cell, &c);
                     labels[at] = s.label;
-                    /* Empty ones end where they begin; on the boundary -1. */
+                    /* An empty segment ends where it begins; -1 on the boundary. */
                     from[at] = !s.empty ? s.from : (s.label < 0 ? -1 : s.to);
                     to[at] = turn ? ISLAND : s.to;
                     places[at] = piece;
@@ -171,10 +171,9 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
     }
 }
 
-/* Per touched cell: do its pieces fit to what is beside them? All faces are there from both sides, none is one of a
-   generator outside the domain, and so the cells tile the domain. Where edges cross a face closer to each other than
-   rounding, they do not. And is anything left for the generator, beside those that are as near to the boundary as it
-   is? `n` generators are in the domain. */
+/* Per crossed cell: check that its pieces fit to the neighboring ones. All faces must have two sides and none may
+   belong to a ghost generator; then the cells tile the domain. This fails where edges cross a face closer to each other
+   than round-off. Check also that the generator keeps a piece. `n` generators are in the domain. */
 kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global const int *touched,
                            global const int *slots, global const int *roots, global const int *starts,
                            global const int *neighbors, global int *flags)
@@ -210,8 +209,8 @@ kernel void check_segments(const int size, const int n, SEGMENT_ARGS, global con
         atomic_or(flags, FLAG_LOST);
 }
 
-/* Per touched cell: its pieces that have no generator yet take that of the piece beyond their longest face, if that is
-   known. Only cells that the boundary passes through take pieces. */
+/* Per crossed cell: pieces without a generator take that of the piece across their longest face, if it is known. Only
+   crossed cells take pieces. */
 kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
                          global const int *list_starts, global const int *loop_pieces, global const int *roots,
                          global int *new_roots)
@@ -239,8 +238,8 @@ kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched
     }
 }
 
-/* Per touched cell: a piece that nobody takes stays its own. orphans[place] = 1 for pieces that go to another cell,
-   whose untouched neighbors are to name that one: marked. */
+/* Per crossed cell: a piece without a taker stays. orphans[place] = 1 for pieces that go to another cell; their
+   uncrossed neighbors, which must list that cell, are marked. */
 kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
                           global const int *list_starts, global const int *loop_pieces, global int *roots,
                           global int *orphans, global int *marks)
@@ -263,7 +262,7 @@ kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touche
     }
 }
 
-/* Per place of a loop: list the orphans, and the touched cell that each lies in. */
+/* Per loop: list the orphans, and the crossed cell that each lies in. */
 kernel void list_orphans(const int size, global const int *ranks, global int *orphans)
 {
     WORK_ITEM(place);
@@ -271,14 +270,14 @@ kernel void list_orphans(const int size, global const int *ranks, global int *or
         orphans[ranks[place]] = place;
 }
 
-/* Per generator of the domain: faces of its cell, if the boundary does not pass through it. */
+/* Per generator of the domain: number of faces of its cell, if the boundary does not cross it. */
 kernel void count_whole(const int size, global const int *starts, global const int *slots, global int *counts)
 {
     WORK_ITEM(i);
     counts[i] = slots[i] == UNTOUCHED ? starts[i + 1] - starts[i] : 0;
 }
 
-/* Per touched cell: count the faces of each piece to the generator that the piece goes to. */
+/* Per crossed cell: add the faces of each piece to the count of the generator that gets it. */
 kernel void count_trimmed(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
                           global const int *roots, global int *counts)
 {
@@ -292,8 +291,8 @@ kernel void count_trimmed(const int size, SEGMENT_ARGS, global const int *touche
     }
 }
 
-/* Per generator of the domain whose cell the boundary does not pass through: its row as it was. Where a neighbor's
-   piece goes to another cell (marks), that one is named. */
+/* Per generator of the domain with an uncrossed cell: copy its row. Where the piece of a neighbor goes to another cell
+   (marks), list that cell. */
 kernel void copy_whole(const int size, global const int *starts, global const int *neighbors,
                        global const REAL *face_measures, global const REAL2 *face_centroids, SEGMENT_ARGS,
                        global const int *slots, global const int *roots, global const int *marks,
@@ -323,10 +322,10 @@ kernel void copy_whole(const int size, global const int *starts, global const in
     outlines[i] = (REAL2)(polygon_quality(starts[i + 1] - starts[i], volumes[i], perimeter), 6);
 }
 
-/* Per touched cell u: what its generator owns, as row and measures of the new diagram. orphans lists the pieces that
-   have changed cells, in order; place_cells[place] is the touched cell that they lie in.
+/* Per crossed cell u: row and measures of all pieces of its generator. orphans lists the pieces that changed cells, in
+   order; place_cells[place] is the crossed cell that they lie in.
 
-   outlines[i] = (quality, neighbors that a hexagonal lattice would have here) */
+   outlines[i] = (quality, number of neighbors of a hexagonal lattice here) */
 kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const REAL2 *points,
                           global const int *touched, global const int *slots, global const int *roots,
                           global const int *orphans, const int orphan_count, global const int *place_cells,
@@ -343,7 +342,7 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const
     REAL perimeter = 0;
     int at = new_starts[i];
     for (int turn = -1; turn < orphan_count; ++turn) {
-        /* First the pieces in this cell, then those that have come to it. */
+        /* First the pieces in this cell, then those from other cells. */
         const int place = turn < 0 ? -1 : orphans[turn];
         if (turn >= 0 && roots[place] != i)
             continue;
@@ -371,13 +370,13 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const
         }
     }
     write_moments(&m, i, volumes, offsets, covariances);
-    /* Two sides, of which one is bent, are no polygon. */
+    /* Two sides are no polygon, even if one is bent. */
     const REAL quality =
         o.sides < 3 ? polygon_quality(3, m.area / 2, perimeter) : polygon_quality(o.sides, o.area / 2, o.perimeter);
     outlines[i] = (REAL2)(fmax(quality, R(0)), 6 - o.missing);
 }
 
-/* Per touched cell: the places of its loops are its own, its chords those of the pieces that they bound. */
+/* Per crossed cell: write its number for its loops, and the owner of the bounded piece for its chords. */
 kernel void name_owners(const int size, SEGMENT_ARGS, global const int *list_starts, global const int *listed,
                         global const int *roots, global int *place_cells, global int *chord_owners)
 {

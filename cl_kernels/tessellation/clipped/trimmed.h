@@ -1,12 +1,12 @@
-/* A cell trimmed by the boundary of the domain: what is left of a convex cell, as loops of segments, each with the
-   domain on its left. A loop follows the chords of the boundary through the cell and, where one leaves the cell, the
-   cell's own faces, counter-clockwise, to the place where the next chord enters. */
+/* A convex cell clipped by the boundary of the domain, as loops of segments with the domain on their left. A loop
+   follows the chords of the boundary through the cell and, where a chord leaves the cell, the faces of the cell,
+   counter-clockwise, up to the point where the next chord enters. */
 #include "tessellation/clipped/boundary.h"
 
-#define ON_BOUNDARY (4 * REAL_EPS) /* so near to it rounding may put what is on it */
-#define MUCH (64 * ON_FACE)        /* by which no crossing rounds, but of edges that go along faces */
+#define ON_BOUNDARY (4 * REAL_EPS) /* largest distance of points on it, by round-off */
+#define MUCH (64 * ON_FACE)        /* larger than the error of crossings, but for edges along faces */
 
-/* A convex cell: its generator, faces, and the chords in it in the order of their numbers. */
+/* A convex cell: its generator, its faces, and its chords in ascending order. */
 typedef struct {
     int i, n, chord_count;
     REAL x[2], lower[2], upper[2];
@@ -14,7 +14,7 @@ typedef struct {
     global const REAL *points;
 } convex_t;
 
-/* Of number u of those that the boundary passes through. */
+/* Crossed cell number u. */
 #define CONVEX_ARGS                                                                                                    \
     global const int *starts, global const int *neighbors, global const REAL *points, const REAL4 box_lower,           \
         const REAL4 box_upper, global const int *touched, global const int *list_starts, global const int *listed
@@ -38,9 +38,9 @@ inline convex_t convex_cell(int u, CONVEX_ARGS)
 }
 #define CONVEX starts, neighbors, points, box_lower, box_upper, touched, list_starts, listed
 
-/* A piece of a loop from p to q, relative to the generator. It lies on the boundary's edge -1 - label, or on the face
-   with generator `label`. from, to: a chord that ends there, where a segment ends on a face; else -1 - corner of the
-   cell; on the boundary the chord. A segment is empty if both ends are in the same place: for all cells that see it. */
+/* A segment of a loop from p to q, relative to the generator. It lies on edge -1 - label of the boundary, or on the
+   face with generator `label`. from, to: the chord that ends there, if a segment ends on a face; otherwise -1 - corner
+   of the cell; on the boundary the chord. A segment is empty if both ends coincide; this holds for both cells. */
 typedef struct {
     REAL2 p, q;
     int label, from, to;
@@ -52,16 +52,16 @@ inline bool same_place(REAL2 p, REAL2 q)
     return p.s0 == q.s0 && p.s1 == q.s1;
 }
 
-/* Where chords cross a cell's boundary, in counter-clockwise order: by face, along the face, and, what rounding puts in
-   one place there, by turn: how much further along the face than the nearest corner of the polygon or, where that lies
-   on the face, as if it lay a little inside the cell that it is counted to, as in chords.cl. */
+/* The order of crossings on the boundary of a cell, counter-clockwise: by face, by the position on the face, and for
+   positions equal up to round-off by turn: the distance along the face from the nearest corner of the polygon. A corner
+   on the face is treated as slightly inside its cell, as in boundary_crossings.cl. */
 typedef struct {
     int face;
     REAL along, turn;
 } place_t;
 
-/* Of the crossing at which `chord` ends, between this cell and the one of generator j: the same numbers for both cells,
-   but for the sign. */
+/* The position of the crossing at the end of `chord`, between this cell and that of generator j; the same numbers for
+   both cells, but for the sign. */
 inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
 {
     const int edge = c->edges[chord], o = min(cell->i, j), q = max(cell->i, j);
@@ -73,8 +73,8 @@ inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord
     const REAL2 corner = c->vertices[v];
     place_t place;
     place.face = place_in_row(cell->row, cell->n, j);
-    /* From the corner on, where the polygon's edges are told apart also by less than the crossing's place rounds. Not
-       where the corner is on the face, nor where the walk has put the crossing elsewhere. */
+    /* Relative to the corner, to separate edges that are closer than the error of the crossing. Not if the corner is on
+       the face, nor if the tracing moved the crossing. */
     const REAL behind = dot(corner - x - d / 2, d), dd = dot(d, d), e2 = dot(e, e);
     const REAL walked = t < R(0.5) ? t : t - 1, s = -behind / dot(e, d);
     const bool at_corner = walked == 0 || (is_on_face(behind, dd) && is_at_corner(walked, e2));
@@ -87,7 +87,7 @@ inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord
     const int owner = c->owners[v];
     const REAL2 inside = (REAL2)(cell->points[2 * owner], cell->points[2 * owner + 1]) - corner;
     const REAL ahead = c->cells[chord] == o ? 1 : -1;
-    /* The edge goes ahead over the face, though rounding may have it otherwise. */
+    /* The edge crosses the face forwards, whatever the round-off. */
     const REAL across = fmax(ahead * dot(e, d), R(0)), shift = -ahead * dot(inside, d) * dot(e, along);
     const REAL turn = across > 0 ? shift / across : (shift > 0 ? REAL_MAX : (shift < 0 ? -REAL_MAX : 0));
     place.along = sign * dot(chord_end(c, chord) - x, along);
@@ -102,13 +102,13 @@ inline bool is_after(place_t a, place_t b)
     return a.along > b.along || (a.along == b.along && a.turn >= b.turn);
 }
 
-/* Around a loop, segment by segment. */
+/* An iterator over the segments of a loop. */
 typedef struct {
-    int chord; /* on this chord; -1: on a face */
-    int face;  /* the face */
-    int from;  /* the segment on the face begins where this chord ends; -1: at the face's first corner */
-    int entry; /* the chord by which the loop comes back from the faces; -1: never, it goes around the whole cell */
-    place_t left, entered; /* where the faces are reached and left */
+    int chord; /* the current chord; -1: on a face */
+    int face;  /* the current face */
+    int from;  /* the segment on the face begins at the end of this chord; -1: at the first corner of the face */
+    int entry; /* the chord that returns from the faces; -1: the loop goes around the whole cell */
+    place_t left, entered; /* positions where the faces are entered and left */
 } cursor_t;
 
 inline cursor_t along_chord(int chord)
@@ -122,7 +122,7 @@ inline cursor_t around_cell()
     return along_chord(-1);
 }
 
-/* Leave chord `chord` for the faces: which chord enters next? */
+/* Leave chord `chord` for the faces; find the chord that enters next. */
 inline void leave_chord(cursor_t *cursor, const convex_t *cell, const chords_t *c, int chord)
 {
     cursor->left = crossing_place(cell, c, chord, c->cells[chord + 1]);
@@ -188,13 +188,13 @@ inline segment_t next_segment(cursor_t *cursor, const convex_t *cell, const chor
     return s;
 }
 
-/* Is the loop that began with `chord` (-1: around the cell) complete? */
+/* Whether the loop that began with `chord` (-1: around the cell) is complete. */
 inline bool is_complete(const cursor_t *cursor, int chord)
 {
     return chord >= 0 ? cursor->chord == chord : cursor->face == 0;
 }
 
-/* How often a segment winds around y: +1 or -1 where it crosses the ray from y to the right. */
+/* Contribution of a segment to the winding number around y: +1 or -1 if it crosses the ray from y to the right. */
 inline int winding(segment_t s, REAL2 y)
 {
     const REAL2 p = s.p - y, q = s.q - y;
@@ -215,14 +215,14 @@ inline REAL squared_distance_to(segment_t s, REAL2 y)
     return dot(nearest, nearest);
 }
 
-/* The beginning of the loop that begins with `chord`; -1: around the cell. */
+/* Start the loop that begins with `chord`; -1: around the cell. */
 inline cursor_t loop_begin(int chord)
 {
     return chord >= 0 ? along_chord(chord) : around_cell();
 }
 
-/* Does the hole whose loop begins with `hole` lie within the loop that begins with `chord`? By a corner or a middle of
-   its edges that is not on that: the hole may touch it. */
+/* Whether the hole with the loop from `hole` lies inside the loop from `chord`. Tested with a corner or an edge
+   midpoint of the hole that is not on the loop: the hole may touch it. */
 inline bool lies_within(const convex_t *cell, const chords_t *c, int chord, int hole)
 {
     const REAL2 x = (REAL2)(cell->x[0], cell->x[1]);
@@ -246,7 +246,7 @@ inline bool lies_within(const convex_t *cell, const chords_t *c, int chord, int 
     return false;
 }
 
-/* Does a loop leave the boundary for faces of the cell? */
+/* Whether a loop leaves the boundary for faces of the cell. */
 inline bool is_open(const convex_t *cell, const chords_t *c, int chord)
 {
     cursor_t cursor = loop_begin(chord);

@@ -1,28 +1,26 @@
 #include "tessellation/clipped/boundary.h"
 #include "tessellation/clipped/outline.h"
 
-/* The outline of a cell, side by side: a face between cells is one, and so is each stretch of the boundary along which
-   it turns by no more than 30 degrees. A stretch counts as if it were straight, from its first end to its last, with
-   the area that the cell then has: as a polygon of so many sides.
+/* The sides of a cell: its faces with other cells, and each stretch of the boundary that turns by at most 30 degrees. A
+   stretch counts as one straight side, from its first to its last point; area and quality follow.
 
-   A run is what one cell has of a ring without a break, in however many pieces it came to the cell: chord by chord, as
-   the ring goes on. Its first stretch begins where it begins; of a ring that is all one cell's, in its sharpest corner.
-   A hole that is all within a cell is no side of it. How many neighbors a hexagonal lattice would have at the
-   boundary: 6 - sum of 2 + turning / 60 degrees over the runs. */
+   A run is a contiguous part of a ring that bounds one cell, chord by chord. Its first stretch begins at its start or,
+   for a ring around a whole cell, at the sharpest corner. A hole inside a cell is no side. The number of neighbors of a
+   hexagonal lattice at the boundary is 6 - the sum of 2 + turning / 60 degrees over the runs. */
 typedef struct {
     REAL sides, missing;
     REAL perimeter, area; /* twice the area */
 } outline_t;
 
-/* 30 degrees and a little more, which no part of a regular ring turns by: an arc of 2 x 15 degrees is one side, however
-   its sum rounds. The host adds up the same numbers in the same order (outlines.py). */
+/* Slightly more than 30 degrees, so that an arc of 2 x 15 degrees is one side despite round-off. The host adds the same
+   numbers in the same order (outlines.py). */
 #define SIDE_TURN R(0.524110102527594)
 
-/* The boundary as the cells of a trimmed diagram have it.
+/* The boundary of the cells of a clipped diagram.
 
-   owners[chord]  the generator whose cell it bounds, -1 for those without length, which are passed over
-   before[e]      the edge before edge e in its ring; -1 - that where e begins in the ring's sharpest corner
-   turns[e]       how far the boundary turns to the left where edge e begins */
+   owners[chord]  the generator whose cell it bounds, -1 for chords of zero length, which are skipped
+   before[e]      the edge before edge e in its ring; -1 - that if e begins at the sharpest corner of the ring
+   turns[e]       turning angle to the left at the start of edge e */
 typedef struct {
     chords_t c;
     global const int *owners, *before;
@@ -55,7 +53,7 @@ inline void add_wall_face(outline_t *o, REAL2 p, REAL2 q)
     add_straight(o, p, q);
 }
 
-/* The next chord that has a length; the boundary turns on the way there. */
+/* The next chord of nonzero length, and the turning angle up to it. */
 inline int chord_past(const shore_t *s, int chord, REAL *turned)
 {
     do {
@@ -66,7 +64,7 @@ inline int chord_past(const shore_t *s, int chord, REAL *turned)
     return chord;
 }
 
-/* Are all chords of the ring generator i's? */
+/* Whether all chords of the ring bound generator i. */
 inline bool is_ring(const shore_t *s, int chord, int i)
 {
     REAL turned = 0;
@@ -77,7 +75,7 @@ inline bool is_ring(const shore_t *s, int chord, int i)
     return other == chord;
 }
 
-/* Does a run of generator i begin with the chord? */
+/* Whether a run of generator i begins with the chord. */
 inline bool begins_run(const shore_t *s, int chord, int i)
 {
     bool sharpest = false;
@@ -93,7 +91,7 @@ inline bool begins_run(const shore_t *s, int chord, int i)
     return s->owners[other] != i || (sharpest && is_ring(s, chord, i));
 }
 
-/* The run of generator i, at x, that begins with `first`. */
+/* Add the run of generator i, at x, that begins with chord `first`. */
 inline void add_wall_sides(outline_t *o, const shore_t *s, int first, int i, REAL2 x)
 {
     const bool is_hole = s->c.shells[s->c.edges[first]] >= 0 && is_ring(s, first, i);
