@@ -1,4 +1,4 @@
-"""Open files that others wrote: plain files only, which neither wait for somebody nor go on for ever."""
+"""Open files of others: regular files only, which neither block nor are endless."""
 
 from __future__ import annotations
 
@@ -12,26 +12,28 @@ from io import BufferedReader
 from os import PathLike
 
 LONGEST_GEOMETRY = 1 << 28
-"""Bytes of a polygon's file: the coasts of the whole Earth, at some hundred meters, take fewer."""
+"""Largest size of a polygon's file in bytes: enough for the coasts of the Earth at a resolution of 100 meters."""
 _PIECE = 1 << 20
-# A pipe is opened without waiting for whoever writes into it; plain files take no notice.
+# Opens a pipe without waiting for its writer; without effect on regular files.
 _NOWAIT = getattr(os, "O_NONBLOCK", 0)
 
 
 def open_plain(path: str | PathLike[str]) -> BufferedReader:
-    """Open a plain file for reading, through symbolic links; every reader of the package does so.
+    """Open a regular file for reading, through symbolic links. All readers of the package use it.
 
     Raises
     ------
     OSError
-        If it cannot be opened, or is a folder, pipe, socket or device: these block, or have no end.
+        If the file cannot be opened, or is a folder, pipe, socket or device: these block or are endless.
     """
     if "\0" in os.fsdecode(path):
         raise OSError(errno.EINVAL, "its name has zero bytes", os.fsdecode(path))
-    _check_plain(path, os.stat(path))  # before it is opened, which does something to some devices
+    _check_plain(path, os.stat(path))  # first, because some devices react to being opened
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NOWAIT))
     try:
-        _check_plain(path, os.fstat(file.fileno()))  # it may be another one by now
+        _check_plain(
+            path, os.fstat(file.fileno())
+        )  # again, because the file may have been replaced
     except OSError:
         file.close()
         raise
@@ -40,10 +42,7 @@ def open_plain(path: str | PathLike[str]) -> BufferedReader:
 
 @contextmanager
 def unlogged(library: str) -> Iterator[None]:
-    """Keep what a library logs from being printed: how its reader got into trouble, beside what we say of it.
-
-    Who has a handler of his own on its log goes on to see it.
-    """
+    """Keep the log messages of a library off the terminal. Handlers of the user still receive them."""
     log, nowhere = logging.getLogger(library), logging.NullHandler()
     was, log.propagate = log.propagate, False
     log.addHandler(nowhere)
@@ -55,21 +54,21 @@ def unlogged(library: str) -> Iterator[None]:
 
 
 def read_text(path: str | PathLike[str], longest: int) -> str:
-    """Return the text of a plain file in UTF-8, with or without a byte order mark.
+    """Return the text of a regular file in UTF-8, with or without a byte order mark.
 
     Raises
     ------
     OSError
-        As `open_plain`, or if the file holds more than `longest` bytes.
+        As `open_plain`, or if the file has more than `longest` bytes.
     UnicodeDecodeError
-        If it is no text.
+        If the file is not in UTF-8.
     """
     found = bytearray()
     with open_plain(path) as file:
         size = os.fstat(file.fileno()).st_size
         while size <= longest and (piece := file.read(_PIECE)):
             found += piece
-            size = max(size, len(found))  # some systems' own files say that they are empty
+            size = max(size, len(found))  # files of some systems have a size of 0
     if size > longest:
         raise OSError(errno.EFBIG, f"it is longer than {longest} bytes", os.fsdecode(path))
     return found.decode("utf-8-sig")
@@ -80,5 +79,5 @@ def _check_plain(path: str | PathLike[str], found: os.stat_result) -> None:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fsdecode(path))
     if not stat.S_ISREG(found.st_mode):
         raise OSError(
-            errno.EINVAL, "it is a pipe, socket or device, no plain file", os.fsdecode(path)
+            errno.EINVAL, "it is a pipe, socket or device, not a regular file", os.fsdecode(path)
         )

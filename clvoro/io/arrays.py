@@ -1,4 +1,4 @@
-"""NumPy arrays in a zip file, and single ones, read without trust: what `npz.py` and checkpoints are made of."""
+"""Read and write NumPy arrays in zip files, without trusting the files; for `npz.py` and checkpoints."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from ..files import open_plain
 from .atomic import atomic_file
 
 EXPANSION, LEAST = 16, 1 << 22
-"""A result's file may hold this many times its own size, or this many bytes: meshes compress two- or threefold, and
-lattices, which repeat themselves most, ninefold."""
-_FLATTEST, _SMALL = 256, 1 << 24  # as much for one array, of which most may be the same
-_PIECE = 1 << 22  # bytes read at once
+"""Largest ratio of the expanded to the compressed size of a file, and a number of bytes that is always allowed. Meshes
+compress by a factor of two or three, lattices by nine."""
+_FLATTEST, _SMALL = 256, 1 << 24  # the same for one array, which may be nearly constant
+_PIECE = 1 << 22  # bytes per read
 
 
 class FileError(Exception):
-    """What is wrong with a file; `explained` adds which one."""
+    """The fault of a file. `explained` adds the file's name."""
 
 
 @contextmanager
 def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
-    """Turn whatever goes wrong in reading `path` into an InputError that names it and what was expected."""
+    """Convert all errors while reading `path` into an InputError with the file's name and the expected content."""
     name = fspath(path)
     try:
         yield
@@ -39,13 +39,15 @@ def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
         raise InputError(f"cannot load {name}: {problem}") from problem
     except zipfile.BadZipFile as error:
         raise InputError(
-            f"cannot load {name}: it is no such file, or damaged or cut off ({error}); expected {expected}"
+            f"cannot load {name}: it is another kind of file, damaged or truncated ({error}), expected {expected}"
         ) from error
     except (zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError) as error:
-        raise InputError(f"cannot load {name}: it is damaged or foreign ({error})") from error
+        raise InputError(
+            f"cannot load {name}: it is damaged or of another program ({error})"
+        ) from error
     except (KeyError, IndexError, TypeError, MemoryError) as error:
         raise InputError(
-            f"cannot load {name}: it is damaged or foreign ({error!r:.200})"
+            f"cannot load {name}: it is damaged or of another program ({error!r:.200})"
         ) from error
     except OSError as error:
         raise InputError(f"cannot load {name}: {error.strerror or error}") from error
@@ -58,7 +60,7 @@ def write_arrays(
     arrays: Mapping[str, object],
     compress: bool = True,
 ) -> None:
-    """Write `arrays` by name, atomically; the same arrays give the same bytes.
+    """Write `arrays` by name, completely or not at all. Equal arrays give equal bytes.
 
     Raises
     ------
@@ -68,11 +70,11 @@ def write_arrays(
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_file(path) as file,
-        # Coordinates hardly compress; the graphs do, at any level.
+        # Coordinates hardly compress. Graphs do, at any level.
         zipfile.ZipFile(file, "w", method, compresslevel=1) as archive,
     ):
         for name, array in {"format": kind, "version": version, **arrays}.items():
-            # ZipInfo's own date is fixed, unlike the clock's.
+            # ZipInfo has a fixed date, so the bytes do not depend on the clock.
             member = zipfile.ZipInfo(f"{name}.npy")
             member.compress_type = method
             with archive.open(member, "w", force_zip64=True) as stream:
@@ -80,12 +82,12 @@ def write_arrays(
 
 
 def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
-    """Read all that `write_arrays` wrote; every byte is under a checksum.
+    """Read all arrays that `write_arrays` wrote. Checksums cover every byte.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, cut off, of another kind or of a newer version.
+        If the file is missing, damaged, truncated, of another kind or of a newer version.
     """
     with (
         explained(path, f"a {kind}"),
@@ -97,7 +99,7 @@ def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str,
 
 
 def is_kind(path: str | PathLike[str], kind: str) -> bool:
-    """Tell whether `path` is a file that `write_arrays` wrote for this kind, of whatever version."""
+    """Return whether `path` is a file of this kind from `write_arrays`, of any version."""
     try:
         with (
             explained(path, f"a {kind}"),
@@ -111,11 +113,11 @@ def is_kind(path: str | PathLike[str], kind: str) -> bool:
 
 
 def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str, zipfile.ZipInfo]:
-    """Return the members by name, after a look at what kind of file it is and how much it holds."""
+    """Return the members by name, after checks of the kind, the version and the expanded size of the file."""
     members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     check_expansion(archive, archive.infolist(), EXPANSION, LEAST)
     if "format" not in members or "version" not in members:
-        raise FileError(f"it holds no {kind} (members: {', '.join(sorted(members)[:6]):.200})")
+        raise FileError(f"it is not a {kind} (members: {', '.join(sorted(members)[:6]):.200})")
     found = read_member(archive, members["format"])
     if found.dtype.kind != "U" or found.shape != () or found.item() != kind:
         raise FileError(f"its format is {found!r:.60}, expected {kind!r}")
@@ -134,16 +136,16 @@ def list_members(archive: zipfile.ZipFile, kind: str, version: int) -> dict[str,
 def check_expansion(
     archive: zipfile.ZipFile, members: Iterable[zipfile.ZipInfo], most: int, least: int
 ) -> None:
-    """Refuse members that would fill the memory from next to nothing."""
+    """Refuse members whose expanded size is far larger than the file."""
     held = sum(info.file_size for info in members)
-    # The sizes that the archive says its members are packed to are not relied on.
+    # The compressed sizes in the archive's directory are not trusted.
     there = fstat(archive.fp.fileno()).st_size if archive.fp else 0
     if held > max(least, most * there):
         raise FileError(f"its {there} bytes expand to {held}, more than {most} times as many")
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Read one array; the sizes are checked against the member's before memory is asked for."""
+    """Read one array. Its size is checked against that of the member before memory is allocated."""
     with archive.open(info) as stream:
         return _read(cast(BufferedIOBase, stream), info.filename, info.file_size)
 
@@ -154,13 +156,13 @@ def read_array(path: Path, member: str = "points") -> np.ndarray:
     Raises
     ------
     InputError
-        If there is no such file, or it holds no such array, or one of Python objects.
+        If there is no such file, it does not have the array, or the array holds Python objects.
     """
     with explained(path, "a .npy file"), open_plain(path) as file:
         if file.read(4) == b"PK\x03\x04":
             with zipfile.ZipFile(file) as archive:
                 if f"{member}.npy" not in archive.namelist():
-                    raise FileError(f"it holds no array called {member!r}")
+                    raise FileError(f"it has no array {member!r}")
                 info = archive.getinfo(f"{member}.npy")
                 check_expansion(archive, [info], _FLATTEST, _SMALL)
                 return read_member(archive, info)
@@ -171,27 +173,25 @@ def read_array(path: Path, member: str = "points") -> np.ndarray:
 def _read(stream: BufferedIOBase, name: str, size: int) -> np.ndarray:
     try:
         shape, fortran, dtype = _read_header(stream)
-    except (
-        Exception
-    ) as error:  # NumPy reads it with Python's own parser, which has many ways to complain
-        raise FileError(f"{name} is no array ({error!s:.200})") from error
+    except Exception as error:  # NumPy parses the header as Python source, which raises many errors
+        raise FileError(f"{name} is not an array ({error!s:.200})") from error
     if dtype.hasobject:
         raise FileError(
-            f"{name} holds pickled Python objects, which could run any program; they are never loaded"
+            f"{name} has pickled Python objects, which can run any program; they are never loaded"
         )
     count = 1
     for extent in shape:  # Python's integers do not overflow
         count *= extent
     length = count * dtype.itemsize
     if min(shape, default=1) < 0 or length != size - stream.tell() or not dtype.itemsize:
-        raise FileError(f"{name} has not the length that its shape {shape!s:.60} asks for")
-    data = np.empty(length, np.uint8)  # once, not as bytes first
+        raise FileError(f"{name} does not have the length of its shape {shape!s:.60}")
+    data = np.empty(length, np.uint8)  # read in place, without a copy as bytes
     whole = data.data
     done = 0
     while done < length and (more := stream.readinto(whole[done : done + _PIECE])):
         done += more
-    if done < length or stream.read(1):  # which also compares the checksum
-        raise FileError(f"{name} is cut off")
+    if done < length or stream.read(1):  # the read at the end also checks the checksum
+        raise FileError(f"{name} is truncated")
     array = data.view(dtype).reshape(shape, order="F" if fortran else "C")
     return np.asarray(array, order="C")
 

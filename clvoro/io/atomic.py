@@ -16,18 +16,18 @@ from typing import IO
 from ..errors import InputError, OutputError
 
 _KEPT = 40
-"""Characters, of up to four bytes, that temporary names have of the file's: with more they may become too long."""
+"""Characters of a file's name in the name of its temporary file; each has up to four bytes of at most 255."""
 
 
 def check_writable(path: str | PathLike[str]) -> None:
-    """Check, by trying, that a file can be written to `path`; for before a long run.
+    """Check before a long run that a file can be written to `path`, or to a folder `path`.
 
-    A folder is checked for whether files can be made in it. Nothing is left behind.
+    A temporary file is created there and removed.
 
     Raises
     ------
     OutputError
-        If it cannot; says why.
+        If that fails, with the reason.
     """
     path = Path(path)
     with writing(path):
@@ -38,32 +38,32 @@ def check_writable(path: str | PathLike[str]) -> None:
 
 
 def make_folder(path: str | PathLike[str]) -> None:
-    """Make the folder `path`, and those that it lies in, where there are none.
+    """Create the folder `path` and its parents, if they do not exist.
 
     Raises
     ------
     InputError
-        If it cannot be made: the name is the caller's to choose.
+        If it cannot be created.
     """
     try:
         os.makedirs(path, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"cannot write {path}: no folder can be made there ({error.strerror}); choose another place"
+            f"cannot write {path}: the folder cannot be created ({error.strerror}); choose another place"
         ) from error
 
 
 @contextlib.contextmanager
 def atomic_file(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
-    """Open a temporary file beside `path`; put it in place when the block ends well.
+    """Open a temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
-    The bytes are on the disk (fsync) before the name points to them. If the block raises, the
-    temporary file is removed and what was at `path` stays.
+    The bytes are on the disk (fsync) before the file is renamed. If the block raises, the temporary file is removed,
+    and the file at `path` is unchanged.
 
     Raises
     ------
     OutputError
-        If the file cannot be written: no such folder, no right, no space.
+        If the file cannot be written: no such folder, no permission, no space.
     """
     path = Path(path)
     with writing(path):
@@ -85,9 +85,9 @@ def atomic_file(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | PathLike[str]) -> Iterator[Path]:
-    """Like `atomic_file`, for writers that want a name: yields a path in a folder of its own.
+    """Like `atomic_file`, for writers that take a path: yields one in a temporary folder.
 
-    What the block leaves in that folder is put beside `path`, the file of that name last.
+    All files that the block writes to that folder are moved beside `path`, the one with the name of `path` last.
     """
     path = Path(path)
     with writing(path):
@@ -107,14 +107,14 @@ def atomic_folder(path: str | PathLike[str]) -> Iterator[Path]:
 
 
 def _target(path: Path) -> Path:
-    """Return where `path` leads, through symbolic links; refuse all but plain files in folders."""
+    """Return the target of `path` through symbolic links; refuse it if it is not a regular file in a folder."""
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise OutputError(
             f"cannot write {path}: there is no folder {target.parent}; create it first"
         )
     if target.exists() and not stat.S_ISREG(target.stat().st_mode):
-        kind = "a folder" if target.is_dir() else "no plain file"
+        kind = "a folder" if target.is_dir() else "not a regular file"
         raise OutputError(f"cannot write {path}: it is {kind}; choose another name")
     return target
 
@@ -124,24 +124,24 @@ def _temporary_name(target: Path) -> Path:
 
 
 def _create(path: Path) -> int:
-    """Create `path`, which must be new, with the rights that the user's umask leaves."""
+    """Create the new file `path` with the permissions of the user's umask."""
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn an operating system's error into one that names `path` and the remedy."""
+    """Convert errors of the operating system into an OutputError with `path` and a remedy."""
     try:
         yield
     except OSError as error:
         raise OutputError(
-            f"cannot write {path}: {error.strerror or error}; choose a place that can be written "
+            f"cannot write {path}: {error.strerror or error}; choose a place that is writable "
             "and has space"
         ) from error
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put the new name on the disk too, where the system can."""
+    """Write the new name to the disk (fsync), where the system supports that."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

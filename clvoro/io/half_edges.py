@@ -1,7 +1,7 @@
-"""The edges of a diagram in the plane, as each of the cells beside them sees them.
+"""Half-edges of a diagram in 2D.
 
-A half-edge is a side of one cell: it runs counter-clockwise around that, which lies on its left. An edge between two
-cells is a pair of half-edges in opposite directions, one on the boundary has one.
+A half-edge is a side of one cell. It runs counter-clockwise around the cell, which lies on its left. An edge between
+two cells is a pair of half-edges in opposite directions; an edge on the boundary is a single one.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from ..mesh.diagram import Diagram
 
 @dataclass(frozen=True)
 class HalfEdges:
-    """All half-edges, those of a cell one after the other, loop by loop; faces without length are none.
+    """All half-edges: cell by cell, loop by loop. Faces without length are left out.
 
     Attributes
     ----------
     rows : (h,) int
-        Where in the diagram's graph each is described.
+        Place of each half-edge in the diagram's graph.
     cell : (h,) int
     starts : (n + 1,) int
-        Those of cell i are `starts[i]` to `starts[i + 1]`.
+        Cell i has the half-edges `starts[i]` to `starts[i + 1]`.
     begin, end : (h,) int
-        The diagram's vertices.
+        Vertices of the diagram.
     next, previous : (h,) int
-        Neighbors in the loop.
+        Next and previous half-edge in the loop.
     twin : (h,) int
-        The other half, -1 where there is none.
+        The opposite half-edge; -1 on the boundary.
     edge : (h,) int
-        Number of the edge that each is half of.
+        Number of the edge.
     first : (e,) int
-        Of each edge the half of the lower number; in the same order, so that edges are sorted by the lower cell.
+        The lower-numbered half-edge of each edge, ascending: edges are sorted by their lower cell.
     """
 
     rows: np.ndarray
@@ -56,12 +56,12 @@ class HalfEdges:
 
 
 def half_edges(diagram: Diagram, glued: bool) -> HalfEdges:
-    """Return the half-edges of `diagram`; across the seams of a periodic box they have twins if they are `glued`.
+    """Return the half-edges of `diagram`. With `glued`, those at the seams of a periodic box have twins across.
 
     Raises
     ------
     ClvoroError
-        If a face is not there from both sides.
+        If a face exists on one side only.
     """
     ends = face_ends(diagram)
     rows = np.flatnonzero(ends[:, 0] != ends[:, 1])
@@ -87,7 +87,7 @@ def half_edges(diagram: Diagram, glued: bool) -> HalfEdges:
 
 
 def _twins(diagram: Diagram, rows: np.ndarray, glued: bool) -> np.ndarray:
-    """Return for each of `rows` the place in them of the same face from the other side; -1 where there is none."""
+    """Return for each of `rows` the place in `rows` of the opposite half-face; -1 on the boundary."""
     joined = diagram.neighbors[rows] >= 0
     if not glued:
         joined &= ~diagram.shifts[rows].any(axis=1)
@@ -96,8 +96,7 @@ def _twins(diagram: Diagram, rows: np.ndarray, glued: bool) -> np.ndarray:
     by_here, by_there = np.argsort(here), np.argsort(there)
     if not np.array_equal(here[by_here], there[by_there]):
         raise ClvoroError(
-            "two cells have different faces in common, as rounding makes them of faces that are hardly there; use "
-            "dtype='float64'"
+            "two cells have different common faces, because some are as short as round-off; use dtype='float64'"
         )
     twin = np.full(len(rows), -1)
     twin[inner[by_here]] = inner[by_there]

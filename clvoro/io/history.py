@@ -13,7 +13,7 @@ from .atomic import atomic_file
 def write_history(result: Result, path: str | PathLike[str]) -> None:
     """Write `result.history` as CSV: a line of names, then one line per step.
 
-    Floats are written with as many digits as it takes to read them back exactly.
+    Floats have as many digits as are needed to read them back exactly.
 
     Raises
     ------

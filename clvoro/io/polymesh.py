@@ -30,7 +30,7 @@ PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 
 @dataclass(frozen=True)
 class PolyMesh:
-    """A mesh as OpenFOAM describes it.
+    """A mesh in the arrays of OpenFOAM's polyMesh.
 
     Attributes
     ----------
@@ -38,12 +38,12 @@ class PolyMesh:
     starts : (f + 1,) int, corners : int
         Corners of each face, counter-clockwise as seen from its neighbor or from outside.
     owner : (f,) int
-        Cell behind each face.
+        Owner of each face.
     neighbor : (inner,) int
-        Cell in front of each inner face; owner < neighbor. Inner faces come first, in upper-triangular
-        order: by owner, then by neighbor.
+        Neighbor of each inner face; owner < neighbor. Inner faces come first, in upper-triangular order: by owner, then
+        by neighbor.
     patches : list of Patch
-        One after the other behind the inner faces.
+        The faces of the patches follow the inner faces, patch by patch.
     """
 
     points: np.ndarray
@@ -148,7 +148,7 @@ def _height(diagram: Diagram, thickness: float | None) -> float:
 
 
 def _by_group(faces: FaceTopology, groups: np.ndarray) -> FaceTopology:
-    """Return `faces` with those on the boundary in the order of their groups."""
+    """Return `faces` with the faces on the boundary sorted by the group of their wall."""
     outer = np.argsort(groups[-1 - faces.neighbor[faces.inner :]], kind="stable") + faces.inner
     if (np.diff(outer) > 0).all():
         return faces
@@ -167,7 +167,7 @@ def _by_group(faces: FaceTopology, groups: np.ndarray) -> FaceTopology:
 def _extruded(
     diagram: Diagram, sides: np.ndarray, thickness: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, starts and corners of the prisms' sides, then their bottoms, then their tops."""
+    """Return points, and starts and corners of the faces of prisms: sides, then bottoms, then tops."""
     flat, v = diagram.vertices, len(diagram.vertices)
     points = np.concatenate([np.pad(flat, ((0, 0), (0, 1))), np.pad(flat, ((0, 0), (0, 1)))])
     points[v:, 2] = thickness
@@ -180,7 +180,7 @@ def _extruded(
     if twice.size:
         raise InputError(
             f"cell {twice[0]} ({len(np.unique(twice))} in all) goes around a part of the boundary or touches itself, "
-            "and faces of OpenFOAM's have no holes; use smaller cells there, leave out the hole, or save as .vtu"
+            "and a face in OpenFOAM has no hole; use smaller cells there, leave out the hole, or save as .vtu"
         )
     _, bottoms = take_rows(starts, corners, everyone, np.ones(len(diagram), bool))
     lengths = np.concatenate([np.full(len(walls), 4), np.diff(starts), np.diff(starts)])

@@ -1,12 +1,13 @@
-"""The weights that give C grids their velocities along edges: Thuburn et al., J. Comput. Phys. 228 (2009) 8321.
+"""Weights for tangential velocities on C grids: Thuburn et al., J. Comput. Phys. 228 (2009) 8321.
 
-Of velocities u across edges, the one along edge e is the sum over the other edges e' of the cells i beside it of
+The tangential velocity at edge e is the sum of w(e, e') u(e') over all other edges e' of its two cells i, with the
+normal velocities u and
 
-    w(e, e') u(e'),    w(e, e') = n(e, i) n(e', i) (1/2 - sum R) l(e') / d(e)
+    w(e, e') = n(e, i) n(e', i) (1/2 - sum R) l(e') / d(e)
 
-with the edges' lengths l, the distance d of the generators, n = 1 where the normal of the edge points out of the cell
-and -1 where it points in, and the sum over the vertices on the way from e to e', counter-clockwise around the cell, of
-the shares R that their kites have of the cell's area.
+Here l is the length of an edge, d the distance of its generators, and n is 1 if the normal of the edge points out of
+the cell, -1 if it points inwards. R is the share of a vertex' kite in the area of the cell. The sum of R is over the
+vertices between e and e', counter-clockwise around the cell.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from .half_edges import HalfEdges
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights as ragged rows, one for each edge.
+    """Weights as ragged rows, one per edge.
 
     Attributes
     ----------
     counts : (e,) int
-        Numbers of others.
+        Number of other edges in each row.
     edges : (w,) int
-        The others: counter-clockwise from the edge on, of the lower cell and then of the other one.
+        The other edges, counter-clockwise from the edge on: those of the lower cell, then those of the other cell.
     values : (w,) float
     """
 
@@ -39,9 +40,15 @@ class Weights:
 def find_weights(
     halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray
 ) -> Weights:
-    """Return the weights; `shares` (h,) are those of the kites at the beginnings of half-edges, others are by edge.
+    """Return the weights. The normal of an edge points out of its lower cell.
 
-    The normal of an edge points out of its lower cell.
+    Parameters
+    ----------
+    halves : HalfEdges
+    shares : (h,) float
+        Share of the kite at the begin of each half-edge in the area of its cell.
+    lengths, distances : (e,) float
+        Lengths of edges, and distances between their generators.
     """
     sides = halves.counts[halves.cell]
     first, twin = halves.first, halves.twin[halves.first]

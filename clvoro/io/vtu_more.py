@@ -1,4 +1,4 @@
-"""What `.vtu` files say more than once, for other programs: all of it has to agree."""
+"""Check redundant arrays of `.vtu` files, which are written for other programs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..mesh.straightening import count_sides
 
 
 def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
-    """Check the `arrays` of a file, by group and name, that its `diagram` was made without: others read them.
+    """Check the `arrays` of a file that are not needed to make its `diagram` against that diagram.
 
     Raises
     ------
     ValueError
-        Names the array that does not fit.
+        Names the first array that differs.
     """
     n, v = len(diagram), len(diagram.vertices)
     given = {"CellData.label": arrays["CellData.label"]}
@@ -28,12 +28,12 @@ def check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
             given[f"z of {name}"] = z = arrays[name][:, 2]
             expected[f"z of {name}"] = np.zeros(len(z))
         if not isinstance(diagram.domain, Polygon) or "FieldData.wall_faces" in arrays:
-            # Else the edges behind faces are guessed.
+            # Without wall_faces the edge of each face is only a guess.
             given["CellData.sides"] = arrays["CellData.sides"]
             expected["CellData.sides"] = count_sides(diagram)
     else:
         expected["CellData.faces_of_cell"] = np.diff(diagram.neighbor_starts)
-        # Every corner of a cell once, in ascending order.
+        # The corners of a cell, each once, in ascending order.
         cell = np.repeat(face_owners(diagram).astype(np.int64), np.diff(diagram.face_vertex_starts))
         keys = np.unique(cell * v + diagram.face_vertices)
         expected["Cells.offsets"] = np.cumsum(np.bincount(keys // v, minlength=n))

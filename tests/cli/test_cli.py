@@ -242,7 +242,7 @@ def pressing_run(number):
         (["run", "papre"], cli.BAD_INPUT, "did you mean 'paper'"),
         (["run", "small.toml", "--steps", -1], cli.BAD_INPUT, "run.max_steps is -1"),
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
-        (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "no folder can be made"),
+        (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "folder cannot be created"),
         (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
         (
             ["cases", "papre"],

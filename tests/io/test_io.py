@@ -199,15 +199,15 @@ def huge_array():
     ("changes", "message"),
     [
         ({"format": np.array("somebody-elses")}, "its format is"),
-        ({"format": None}, "holds no clvoro-result"),
+        ({"format": None}, "is not a clvoro-result"),
         ({"version": np.array(99)}, "newer clvoro"),
         ({"version": np.array("one")}, "expected an integer"),
         ({"size_error": None}, "lacks size_error"),
         ({"size_error": np.zeros(41)}, "size_error has shape"),
         ({"size_error": np.array([Bomb()] * 40, dtype=object)}, "pickled"),
         ({"format": np.array(Bomb(), dtype=object)}, "pickled"),
-        ({"size_error": huge_array()}, "has not the length"),
-        ({"size_error": b"no array at all"}, "is no array"),
+        ({"size_error": huge_array()}, "does not have the length"),
+        ({"size_error": b"no array at all"}, "is not an array"),
         ({"size_error": np.zeros(40, int)}, "size_error has dtype"),
         ({"history": np.zeros(3)}, "history has shape"),
         ({"about": np.array("{not json")}, "description is damaged"),
@@ -424,7 +424,7 @@ def unwritable(tmp_path):
         tmp_path / "absent" / "mesh.npz": "create it first",
         tmp_path / "file" / "mesh.npz": "create it first",
         tmp_path / ("n" * 300 + ".npz"): "too long",
-        "/dev/null": "no plain file",
+        "/dev/null": "not a regular file",
     }
 
 
