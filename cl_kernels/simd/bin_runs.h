@@ -1,17 +1,17 @@
-/* Runs of generators in a few balls in 3D, from the bins that these touch, in double precision. */
+/* Ranges of generators in a few balls in 3D, from the bins that the balls touch, in double precision. */
 #include "tessellation/bin_descent.h"
 
 #define RUN_CAPACITY 2048
-#define RUN_LENGTH 64 /* a bit of a word for each */
-#define WHOLE 64      /* generators in divided bins that are taken as they are: to open grids costs more */
+#define RUN_LENGTH 64 /* one bit of a word per range */
+#define WHOLE 64 /* divided bins with at most this many generators are taken whole: opening their grids costs more */
 
-/* Generators by their places in the order of bins: counts[k] of them from firsts[k] on. */
+/* Generators by their index in the order of bins: counts[k] of them from firsts[k] on. */
 typedef struct {
-    int n, total; /* runs; generators */
+    int n, total; /* number of ranges; number of generators */
     int firsts[RUN_CAPACITY], counts[RUN_CAPACITY];
 } runs_t;
 
-/* Add the generators at places first .. end - 1. False if there is no room. */
+/* Add the generators first .. end - 1. False if there is no room. */
 inline bool add_bin_run(runs_t *runs, int first, int end)
 {
     runs->total += end - first;
@@ -32,7 +32,7 @@ inline bool add_bin_run(runs_t *runs, int first, int end)
     return true;
 }
 
-/* Balls: what is in one of them is looked for. */
+/* The balls to search. */
 typedef struct {
     double8 x, y, z, r;
 } balls_t;
@@ -44,22 +44,22 @@ inline double least_of(double8 v)
     return b.s0 < b.s1 ? b.s0 : b.s1;
 }
 
-/* How far rows of bins, from `begin` to `end` on one axis, are from y. */
+/* Distance of rows of bins, from `begin` to `end` on one axis, from y. */
 inline double8 gap_to_rows(double8 begin, double8 end, double y)
 {
     const double8 below = begin - y, above = y - end, gap = below > above ? below : above;
     return gap > 0 ? gap : 0;
 }
 
-/* Of eight rows of a grid's bins, of the bins in the box [least, most], the first and the last bin that may have
-   something in common with the balls: number `pair` on, counted layer by layer, `across` of them in a layer from rows
-   low_y and low_z on. `noise` is by how much positions may be out of their bins. */
+/* For eight rows of bins of a grid, restricted to the box [least, most]: the first and last bin that may touch the
+   balls. The rows are numbers `pair` and following, layer by layer, with `across` rows per layer, from row low_y and
+   layer low_z on. `noise` bounds the distance of positions from their bins. */
 inline void span_rows(int *nexts, int *rights, int *offsets, int pair, int pairs, int across, int low_y, int low_z,
                       FRAME frame, int4 shape, const double *xs, const double *ys, const double *zs, const double *rs,
                       double4 least, double4 most, double noise)
 {
     const double inverse = FRAME_INVERSE(frame), edge = 1 / inverse;
-    /* Below a root is taken in single precision. */
+    /* A square root below is in single precision. */
     const double slack = edge * 1e-6 + noise;
     const int8 pair8 = pair + (int8)(0, 1, 2, 3, 4, 5, 6, 7);
     const int8 layer = convert_int8((convert_float8(pair8) + 0.5f) / across), row = pair8 - layer * across + low_y;
@@ -87,8 +87,8 @@ inline void span_rows(int *nexts, int *rights, int *offsets, int pair, int pairs
     vstore8(shape.s0 + ((layer + low_z) * shape.s2 + row) * shape.s1, 0, offsets);
 }
 
-/* Collect all that is in the balls and in the box [least, most], and some more. False if that is more than `limit`, or
-   in too many runs. */
+/* Collect all generators in the balls and in the box [least, most], and some others. False if there are more than
+   `limit` generators, or too many ranges. */
 inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, double4 most, int limit,
                          global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
@@ -104,7 +104,7 @@ inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, doub
     const double4 far = fmax(fabs(least), fabs(most));
     const double noise = fmax(fmax(bin_noise(far.s0, root.s0), bin_noise(far.s1, root.s1)), bin_noise(far.s2, root.s2));
     runs->n = runs->total = 0;
-    descent_t way; /* through rows and bins */
+    descent_t way; /* position: row and bin */
     begin_descent(&way, (int4)(0));
     while (way.depth >= 0) {
         const int grid = way.grids[way.depth];

@@ -1,12 +1,12 @@
-/* Candidates of eight generators at a time from all that are near; see `hulls.cl`. */
+/* Candidates for the neighbors of eight generators at a time; see `hulls.cl`. */
 #include "simd/lists.h"
 #include "simd/near_rectangle.h"
 
-/* A list that begins with more candidates than MANY is cut to about ENOUGH of the nearest. */
+/* A first list of more than MANY candidates is cut to about ENOUGH of the nearest ones. */
 #define MANY 36
 #define ENOUGH 28
 
-/* Append to the lists what `bits` say of the generators that are near, at most `most` each. */
+/* Append the near generators selected by `bits` to the lists, at most `most` each. */
 inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int most, global const double *binned,
                       int own, double8 x, double8 y)
 {
@@ -55,9 +55,9 @@ inline long8 put_near(list_t *list, const near_t *near, const ulong8 *bits, int 
     return same;
 }
 
-/* Add the generators whose squared distance is in [from2, to2) to the lists of some lanes. Returns to2, which is less
-   than asked for where a first list (from2 = 0) would be long. Lists that do not fit, and those of generators at whose
-   place there is another, are in doubt. */
+/* Add the generators with squared distance in [from2, to2) to the lists of some lanes. Returns to2, reduced where a
+   first list (from2 = 0) would be long. Lists that are full, and those of generators that coincide with another, are in
+   doubt. */
 inline double8 add_near(list_t *list, const near_t *near, global const double *binned, int own, double8 x, double8 y,
                         long8 lanes, double8 from2, double8 to2, long8 *doubt)
 {

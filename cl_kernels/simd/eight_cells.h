@@ -1,5 +1,5 @@
-/* The measures of eight cells at a time, one in each lane of vectors: bit by bit those of `measure_cell`. Cells with a
-   wall among their faces are left to that. */
+/* The measures of eight cells at a time, one per vector lane, with the same bits as `measure_cell`, which handles cells
+   with walls. */
 #include "simd/eight_corners.h"
 #include "tessellation/measures.h"
 
@@ -7,7 +7,7 @@
 #define FACE16 CLVORO_JOIN(FACE, 16)
 #define CONVERT_FACE8 CLVORO_JOIN(convert_, FACE8)
 
-/* Do the bits in `words` keep all of n faces? */
+/* Whether the bits in `words` keep all n faces. */
 inline bool keeps_all(global const uint *words, int n)
 {
     bool all = true;
@@ -29,15 +29,14 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
         const int i = min(first + lane, size - 1), place = rows->places[i];
         int n;
         face_row(rows, i, &n);
-        /* A row that has lost a face is left to `measure_cell`, too. */
+        /* `measure_cell` also handles rows with dropped faces. */
         counts[lane] = n >= 3 && (place < 0 || keeps_all(keep + place, n)) ? n : 0;
         most = max(most, (int)counts[lane]);
         xs[lane] = points[2 * i];
         ys[lane] = points[2 * i + 1];
     }
-    /* All rows are read and written as far as the longest, as counts that differ from lane to lane would be guessed
-       wrong: behind its last face each begins again, and stays there; what it leaves in the next lane's place is
-       overwritten. */
+    /* All rows are processed up to the length of the longest, as branches on different lengths would be mispredicted.
+       Behind its last face a row repeats its first; what it writes into the next row is overwritten later. */
     const int end = to->starts[min(first + LANES, size)];
     for (int lane = 0; lane < LANES; ++lane) {
         const int i = min(first + lane, size - 1), n = counts[lane];
@@ -70,7 +69,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
         lengths[k] = CONVERT_FACE8(sqrt(ex * ex + ey * ey));
         middles[k].even = CONVERT_FACE8(sx / 2);
         middles[k].odd = CONVERT_FACE8(sy / 2);
-        /* As `add_triangle` has it. */
+        /* As in `add_triangle`. */
         const double8 cross = here ? cross_in_plane(vx, wy, vy, wx) : 0;
         area += cross;
         cx += cross * sx;
@@ -81,7 +80,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
         vx = wx;
         vy = wy;
     }
-    /* As `write_moments` has it. */
+    /* As in `write_moments`. */
     const long8 full = area > 0;
     const double8 mx = full ? cx / (3 * area) : cx, my = full ? cy / (3 * area) : cy;
     double results[6 * LANES];

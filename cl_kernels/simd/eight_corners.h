@@ -1,5 +1,5 @@
-/* The corners of eight cells at a time, one in each lane of vectors: bit by bit those of `corner`
-   (tessellation/corner.h) where no wall is concerned. */
+/* The corners of eight cells at a time, one per vector lane, with the same bits as `corner` (tessellation/corner.h)
+   where no wall is involved. */
 #include "tessellation/face_rows.h"
 #include "simd/lanes.h"
 
@@ -10,8 +10,8 @@ inline double8 cross_in_plane(double8 a, double8 b, double8 c, double8 d)
 }
 
 #ifdef FOLD_0
-/* Have rows of points, up to number `most`, as the images of them that are nearest to the points (x, y): there all
-   differences are as `corner` takes them. */
+/* Replace rows of points, up to number `most`, by their images nearest to the points (x, y), so that all differences
+   are those of `corner`. */
 inline void fold_eight_rows(double2 *behind, int most, double8 x, double8 y)
 {
     const double8 even = (double8)(x.s0, y.s0, x.s2, y.s2, x.s4, y.s4, x.s6, y.s6);
@@ -35,8 +35,8 @@ typedef struct {
     double8 x[ROW_CAPACITY], y[ROW_CAPACITY];
 } outlines_t;
 
-/* The `most` first corners of cells whose generators are at (x, y), corner k between faces k and k + 1, from the
-   positions of what is behind the faces. */
+/* The first `most` corners of cells with generators at (x, y), corner k between faces k and k + 1, from the positions
+   of the neighbors. */
 inline void find_corners(outlines_t *corners, const double2 *behind, int most, double8 x, double8 y)
 {
     double8 ax, ay;
@@ -48,7 +48,7 @@ inline void find_corners(outlines_t *corners, const double2 *behind, int most, d
         load_row(behind, k + 1, &bx, &by);
         const double8 vx = bx - x, vy = by - y, wx = bx - ax, wy = by - ay;
         const double8 v2 = vx * vx + vy * vy, w2 = wx * wx + wy * wy;
-        /* As `corner` has it: of u and v, or of w and -u where the two are near each other. */
+        /* As in `corner`: from u and v, or from w and -u if these are near each other. */
         const long8 apart = w2 > 1e-3 * u2;
         const double8 px = apart ? ux : wx, py = apart ? uy : wy, p2 = apart ? u2 : w2;
         const double8 qx = apart ? vx : -ux, qy = apart ? vy : -uy, q2 = apart ? v2 : u2;

@@ -1,4 +1,4 @@
-/* The cells of eight generators at a time that are to be made again in a repair, as hulls of a few candidates. */
+/* Cells to rebuild in an incremental update, eight at a time, as hulls of a few candidates. */
 #include "simd/eight_corners.h"
 #include "simd/hull.h"
 
@@ -16,8 +16,8 @@ inline bool is_found(const int *found, int j)
     return (two.lo | two.hi) < 0;
 }
 
-/* The neighbors of generator i and, beyond each two of them that follow each other, who borders on both: those whom it
-   may border on after one change. Returns their number; 0 where there is a wall, or too many. */
+/* The candidates of generator i: its neighbors and, for each two consecutive ones, the other cell that borders on both.
+   These may be neighbors after one change of topology. Returns their number; 0 if there is a wall, or too many. */
 inline int find_candidates(int *found, int i, const face_rows_t *rows)
 {
     int n, m;
@@ -65,7 +65,7 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
     list_t list;
     for (int lane = 0; lane < LANES; ++lane)
         for (int k = 0; k < most; ++k) {
-            /* The generator itself is no candidate. */
+            /* Skip the generator itself. */
             const int j = k < counts[lane] ? found[lane][k] : own[lane];
             near[ROW_PLACE(k, lane)] = vload2(j, points);
             LANE((int *)list.places, k, lane) = j;
@@ -91,7 +91,7 @@ inline void wrap_eight(int first, int size, global const int *listed, const face
     wrap_hulls(&hull, &list, lanes);
     measure_hulls(&hull, &list, &reach2, &least);
     doubt |= hull.lost | is_uncertain(&hull, &list, reach2, least);
-    /* Walls are not among the candidates: they must be out of reach. */
+    /* Walls are not among the candidates, so they must be out of reach. */
     const double8 away = min(min(x - box_lower.s0, box_upper.s0 - x), min(y - box_lower.s1, box_upper.s1 - y));
     doubt |= !(away > 0) | !(reach2 < away * away);
     long written[LANES], sizes[LANES];

@@ -1,12 +1,12 @@
-/* Rows of eight generators at a time, one in each lane of vectors: are their cells convex, as `check_row` asks? Cells
-   with a wall among their faces are left to that, and those whose rows may not fit their neighbors'. */
+/* The checks of `check_row` for the rows of eight generators at a time, one per vector lane. `check_row` itself handles
+   cells with walls, and rows that may be inconsistent with those of neighbors. */
 #include "simd/eight_corners.h"
 
 #if ROW_CAPACITY < CHECKED_FACES
 #error "there is no room for the corners of cells that are checked"
 #endif
 
-/* Do the neighbors in the row of generator i name it between the same two? */
+/* Whether the neighbors of generator i list it between the right two. */
 inline bool fits_exactly(int i, global const int *row, int n, global const int *starts, global const int *neighbors)
 {
     bool fit = true;
@@ -17,8 +17,7 @@ inline bool fits_exactly(int i, global const int *row, int n, global const int *
     return fit;
 }
 
-/* Check the rows of LANES generators from number `first` on; see `check_rows`. Returns how many are not as they should
-   be. */
+/* Check the rows of LANES generators from number `first` on; see `check_rows`. Returns the number of wrong rows. */
 inline int check_eight(int first, int size, global const int *starts, global const int *neighbors,
                        global const double *points, const double *lower, const double *upper, global int *fits,
                        global int *marks)
@@ -35,8 +34,8 @@ inline int check_eight(int first, int size, global const int *starts, global con
         xs[lane] = points[2 * i];
         ys[lane] = points[2 * i + 1];
     }
-    /* All rows are read as far as the longest, as counts that differ from lane to lane would be guessed wrong: behind
-       its last face each begins again, and stays there. */
+    /* All rows are read up to the length of the longest, as branches on different lengths would be mispredicted. Behind
+       its last face a row repeats its first. */
     for (int lane = 0; lane < LANES; ++lane) {
         const int i = min(first + lane, size - 1), n = counts[lane];
         global const int *row = neighbors + (n > 0 ? starts[i] : 0);
@@ -59,7 +58,7 @@ inline int check_eight(int first, int size, global const int *starts, global con
     dx -= x;
     dy -= y;
     double8 reach2 = 0, least2 = DBL_MAX;
-    /* Bits of faces: where the row is not convex, and where it turns round. */
+    /* Bits per face: where the row is not convex, and where it turns back. */
     long8 bad = 0, turns = 0;
     for (int k = 0; k < most; ++k) {
         double8 after_x, after_y;

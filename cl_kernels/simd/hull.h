@@ -1,41 +1,41 @@
-/* The cells of eight generators at a time as hulls, one in each lane of vectors.
+/* The cells of eight generators at a time as convex hulls, one per vector lane.
 
    Invert every generator at d from x in a circle about x: p = d / |d|^2. The half-plane y.d <= |d|^2 / 2 is y.p <= 1/2,
-   so the neighbors of x are the corners of the convex hull of all p, and the corners of its cell belong to the hull's
-   edges. A wall is the bisector with the mirror image. The hull is wrapped from the nearest generator on: of all
-   candidates the next one is that which has none to its right. These are the same steps in every lane. */
+   so the neighbors of x are the corners of the convex hull of all p, and the corners of its cell are the edges of the
+   hull. A wall is the bisector with the mirror image. Gift wrapping starts at the nearest generator: the next corner is
+   the candidate with no other to its right. All lanes take the same steps. */
 #include "simd/lists.h"
 
 /* Faces of a cell. */
 #define HULL_CAPACITY 16
-/* A turn is certain if it is more than this share of the largest p^2: hundreds of times the rounding of p and of the
-   turn. */
+/* A turn is certain if it exceeds this share of the largest p^2: hundreds of times the round-off of p and of the turn.
+ */
 #define TURN_ROUNDING 1e-13
-/* A cell is certain if it is far from what `is_doubtful` (tessellation/short_faces.h) calls doubtful: least square of a
-   face's length over that of its generator's distance; largest square of the reach over that of the least distance;
-   least square of that. */
+/* A cell is certain if it is far from the limits of `is_doubtful` (tessellation/short_faces.h). Limits: least squared
+   ratio of the length of a face to the distance of its generator; largest squared ratio of the reach to the least
+   distance; least squared distance. */
 #define CERTAIN_FACE2 1e-9
 #define CERTAIN_RATIO2 3e7
 #define CERTAIN_DISTANCE2 1e-16
 
-/* Per lane the corners of a hull, counter-clockwise: inverted positions, which of the candidates they are, and
-   their places. Hulls with fewer than `steps` corners begin again behind the last. */
+/* Per lane the corners of a hull, counter-clockwise: inverted positions, candidate numbers, and items. Hulls with fewer
+   than `steps` corners repeat from the start. */
 typedef struct {
     int steps;
     double8 x[HULL_CAPACITY + 1], y[HULL_CAPACITY + 1];
     long8 at[HULL_CAPACITY];
     int8 places[HULL_CAPACITY];
-    long8 sizes, doubt, lost; /* corners; is a decision near to rounding; does the hull leave out x? */
+    long8 sizes, doubt,
+        lost; /* number of corners; whether a decision is near round-off; whether x is outside the hull */
 } hull_t;
 
-/* A candidate on the right of which none has been found yet: its direction from the hull's last corner, and its
-   number. */
+/* The rightmost candidate so far: its direction from the last corner of the hull, and its number. */
 typedef struct {
     double8 dx, dy;
     long8 at;
 } best_t;
 
-/* Take the candidate in direction (dx, dy) for the best if that is to the right by more than rounding. */
+/* Take the candidate in direction (dx, dy) if it is to the right by more than round-off. */
 inline void take_right(best_t *best, double8 dx, double8 dy, long8 at, double8 rounding)
 {
     const long8 right = fma(dx, best->dy, -dy * best->dx) > rounding;
@@ -57,7 +57,7 @@ inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
         hull->y[steps] = y;
         hull->at[steps] = from;
         sizes -= open;
-        /* x itself lies inside, or the hull is lost. */
+        /* x lies inside, or the hull is invalid. */
         best_t a = {-x, -y, -1}, b = a, c = a, d = a;
         for (int k = 0; k < list->length; k += CHAINS) {
             take_right(&a, list->x[k] - x, list->y[k] - y, k, rounding);
@@ -87,16 +87,16 @@ inline void wrap_hulls(hull_t *hull, const list_t *list, long8 lanes)
     hull->doubt = open & ~lost;
 }
 
-/* Not 1, as compilers then count by more instructions. */
+/* Not 1, for which compilers generate more instructions. */
 #define COUNT 2
 
-/* Measure the cells: squared distance of the farthest corner, and the least ratio of the square of a face's length to
-   that of its generator's distance. A hull is in doubt if any candidate but an edge's own two ends is outside of the
-   edge, or so near to it that rounding may decide.
+/* Measure the cells: squared distance of the farthest corner, and the least squared ratio of the length of a face to
+   the distance of its generator. A hull is in doubt if any candidate, other than the two ends of an edge, is outside of
+   the edge or near it within round-off.
 
-   The face of the nearest, where hulls begin and end, is not looked at: by bisectors no nearer than its own, at an
-   angle t, it is cut off no nearer to its foot than a quarter of t times that generator's distance. Where it is small,
-   the turns there are near to rounding: by the third power of t. */
+   The face of the nearest generator, where hulls begin and end, needs no check. Other bisectors are not nearer; one at
+   an angle t cuts the face at least a quarter of t times the distance of that generator from its foot. If the face is
+   small, the turns there, of order t^3, are near round-off. */
 inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, double8 *least)
 {
     double8 x = 0, y = 0;
@@ -110,7 +110,7 @@ inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, dou
         x = (by - ay) * scale;
         y = (ax - bx) * scale;
         *reach2 = max(*reach2, fma(x, x, y * y));
-        /* From the generator itself to the first corner it is as far as half way to the nearest, or farther. */
+        /* The first corner is at least half as far as the nearest generator. */
         const double8 ex = x - before_x, ey = y - before_y;
         *least = min(*least, fma(ex, ex, ey * ey) * fma(ax, ax, ay * ay));
         const double8 bound = 0.5 - TURN_ROUNDING * list->largest2 * scale;
@@ -121,18 +121,17 @@ inline void measure_hulls(hull_t *hull, const list_t *list, double8 *reach2, dou
     hull->doubt |= outside != 2 * COUNT * hull->steps;
 }
 
-/* Is any decision that made or measured the hulls near to rounding? A hull that leaves out x is of no use, but
-   certain. */
+/* Whether any decision for the hulls is near round-off. A hull with x outside is useless, but certain. */
 inline long8 is_uncertain(const hull_t *hull, const list_t *list, double8 reach2, double8 least)
 {
     return !(list->largest2 < 1 / CERTAIN_DISTANCE2) |
            (~hull->lost & (hull->doubt | !(least > CERTAIN_FACE2) | !(list->largest2 * reach2 < CERTAIN_RATIO2)));
 }
 
-/* Write the labels of a row's faces, the least first. */
+/* Write the labels of the faces of a row, starting with the least. */
 inline void write_labels(const int *labels, int count, global int *row)
 {
-    /* Label and place in one number. */
+    /* Label and index in one number. */
     long least = LONG_MAX;
     for (int k = 0; k < count; ++k)
         least = min(least, (long)labels[k] * HULL_CAPACITY + k);

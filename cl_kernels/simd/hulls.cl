@@ -1,25 +1,25 @@
 #include "simd/candidates.h"
 #include "simd/hull.h"
 
-/* The cells of eight generators at a time, one in each lane of vectors, as hulls (simd/hull.h): for CPUs.
+/* The cells of eight generators at a time, one per vector lane, as hulls (simd/hull.h): for CPUs.
 
-   Where any decision is near to rounding, or something does not fit, a cell is left to be clipped (`cells.cl`): rows do
-   not depend on which of the two has made them. */
+   If a decision is near round-off, or a capacity is exceeded, the cell is left to `clip_polygons` (cells.cl). Both give
+   the same rows. */
 
-/* Lanes are searched for together if they are within so many spacings: rows of bins end within an eight. */
+/* Lanes share a search if they are within this many spacings: a batch may span the end of a row of bins. */
 #define SPREAD 20
 #ifndef EIGHTS
 #error "build with -DEIGHTS=eights of cells that a work-item does"
 #endif
-/* A work-item learns from each eight how far the next should look at first: as far as has been needed in the mean, and
-   WIDTH standard deviations more. What it has learned fades by MEMORY from eight to eight. */
+/* The first search radius of a batch: the mean of the radii that earlier batches needed, plus WIDTH standard
+   deviations. Their weight decays by MEMORY from batch to batch. */
 #define WIDTH 2.4
 #define MEMORY 0.75
-#define GROWTH 1.4 /* of the radius, from round to round: twice the area */
+#define GROWTH 1.4 /* growth of the radius per round: twice the area */
 #define MAX_ROUNDS 10
 
-/* Cut the lists to the corners of the hulls in the lanes that were wrapped, to nothing where a hull is lost, and to the
-   `kept` first candidates in the others. Returns how many are kept now. */
+/* Reduce the lists of the wrapped lanes to the corners of the hulls (to nothing if a hull is invalid), those of the
+   others to the first `kept` candidates. Returns the new numbers. */
 inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, int kept)
 {
     const long8 sizes = wrapped ? (hull->lost ? 0 : hull->sizes) : kept;
@@ -36,8 +36,7 @@ inline int keep_hulls(list_t *list, const hull_t *hull, long8 wrapped, int kept)
     return most;
 }
 
-/* Choose from the lanes to do those near the first of them, no farther than what it calls far; the rectangle is to hold
-   all that is within r of them. */
+/* Choose the lanes near the first one; the rectangle holds everything within r of them. */
 inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 far_away, double2 *lower, double2 *upper)
 {
     long wanted[LANES];
@@ -58,7 +57,7 @@ inline long8 choose_lanes(long8 todo, double8 x, double8 y, double8 r, double8 f
     return chosen;
 }
 
-/* Write the rows of some lanes, whose first place is `own`; see `clip_polygons`. */
+/* Write the rows of some lanes, from item `own` on; see `clip_polygons`. */
 inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, global const int *items,
                        global float *reach, global int *rows, global int *row_counts)
 {
@@ -82,7 +81,7 @@ inline void write_rows(const hull_t *hull, long8 lanes, double8 need, int own, g
     }
 }
 
-/* How far cells have looked in the end, in spacings: their number, sum and sum of squares, lane by lane. */
+/* Final search radii in units of the spacing: count, sum and sum of squares, per lane. */
 typedef struct {
     double8 number, sum, squares;
 } needs_t;
@@ -94,7 +93,7 @@ inline void note_needs(needs_t *needs, long8 lanes, double8 need)
     needs->squares += lanes ? need * need : 0;
 }
 
-/* How far to look at first, at most `most`. */
+/* The first search radius, at most `most`. */
 inline double first_look(needs_t *needs, double most)
 {
     const double number = sum_lanes(needs->number);
@@ -108,9 +107,9 @@ inline double first_look(needs_t *needs, double most)
     return min(mean + WIDTH * sqrt(variance), most);
 }
 
-/* Per eight places in bin order: the rows of the generators there (see `clip_polygons`), or row_counts[i] = 0 where a
-   cell is left to be clipped. `first_reach` is how far the first lists go at most, in units of the spacing. Only the
-   first `rows_wanted` generators get rows. */
+/* Per EIGHTS batches of eight items in bin order: the rows of their generators (see `clip_polygons`), or row_counts[i]
+   = 0 for a cell that remains to be clipped. `first_reach` bounds the first search radius, in units of the spacing.
+   Only the first `rows_wanted` generators get rows. */
 kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, global const double *binned,
                            global const int *items, global const float *spacing, global float *reach,
                            global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
@@ -142,8 +141,7 @@ kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, g
         list.largest2 = 0;
         list.nearest = 0;
         int kept = 0;
-        /* Of the generators nearer than `done` all are in the list that can be neighbors; now those nearer than `r`
-           are added. */
+        /* The list holds all possible neighbors nearer than `done`; now those nearer than `r` are added. */
         const double8 unit = vload8(0, spacings);
         double8 done2 = 0, r = first_look(&needs, first_reach) * unit;
         long8 todo = vload8(0, wanted), walled = 0;

@@ -1,5 +1,4 @@
-/* Eight cells at a time, one in each lane of vectors: for CPUs, whose compilers make no vectors of work-items that
-   branch. */
+/* Eight cells at a time, one per vector lane: for CPUs, whose compilers do not vectorize work-items that branch. */
 #include "opencl/real.h"
 
 #if !IS_DOUBLE
@@ -37,7 +36,7 @@ inline double sum_lanes(double8 values)
     return two.lo + two.hi;
 }
 
-/* Of vector number k[lane] of an array, that lane. */
+/* Gather: lane `lane` of vector k[lane] of an array. */
 inline double8 pick(const double8 *vectors, long8 k)
 {
     const double *values = (const double *)vectors;
@@ -45,8 +44,8 @@ inline double8 pick(const double8 *vectors, long8 k)
                      LANE(values, k.s4, 4), LANE(values, k.s5, 5), LANE(values, k.s6, 6), LANE(values, k.s7, 7));
 }
 
-/* Rows of points, one in each lane: even lanes before odd ones, so that two vectors hold them and each coordinate takes
-   one more instruction. */
+/* Rows of points, one per lane, even lanes before odd ones: two vectors hold them, and each coordinate takes one more
+   instruction. */
 #define ROW_PLACE(k, lane) ((k)*LANES + (lane) / 2 + (lane) % 2 * (LANES / 2))
 
 inline void load_row(const double2 *points, int k, double8 *x, double8 *y)

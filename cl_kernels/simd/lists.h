@@ -1,14 +1,14 @@
-/* Lists of candidates, one in each lane of vectors, as hulls are wrapped from; see simd/hull.h. */
+/* Lists of candidates for hulls, one per vector lane; see simd/hull.h. */
 #include "simd/lanes.h"
 
-/* Candidates of one generator. */
+/* Most candidates of one generator. */
 #define LIST_CAPACITY 48
-/* Candidates are compared in CHAINS that do not wait for each other, as a comparison takes a dozen cycles: lists end
-   with none up to a multiple. */
+/* Candidates are compared in CHAINS independent chains, as a comparison has a latency of a dozen cycles. Lists are
+   padded to a multiple of CHAINS. */
 #define CHAINS 4
 
-/* Per lane a list of candidates: relative positions inverted, NaN where there is none; place, or -1 - wall. The nearest
-   has p^2 = largest2. */
+/* Per lane a list of candidates: inverted relative positions, NaN for padding; item, or -1 - wall. The nearest has
+   p^2 = largest2. */
 typedef struct {
     int length;
     double8 x[LIST_CAPACITY + CHAINS], y[LIST_CAPACITY + CHAINS];
@@ -17,8 +17,8 @@ typedef struct {
     long8 nearest;
 } list_t;
 
-/* Append one candidate per lane, at (dx, dy), NaN where there is none; their places are the caller's to write. The
-   generator itself is none: 0 times infinity is NaN. */
+/* Append one candidate per lane, at (dx, dy), NaN for none; the caller writes the items. The generator itself becomes
+   NaN, as 0 times infinity. */
 inline void put_candidates(list_t *list, double8 dx, double8 dy)
 {
     const double8 square = fma(dx, dx, dy * dy);
@@ -31,7 +31,7 @@ inline void put_candidates(list_t *list, double8 dx, double8 dy)
     list->nearest = nearer ? (long8)k : list->nearest;
 }
 
-/* Fill the lists up to a multiple of CHAINS. */
+/* Pad the lists to a multiple of CHAINS. */
 inline void pad_list(list_t *list)
 {
     for (; list->length % CHAINS; ++list->length)

@@ -1,11 +1,11 @@
-/* Generators near a rectangle, as places in the order of bins. */
+/* Generators near a rectangle, as items in the order of bins. */
 #include "tessellation/bin_descent.h"
 
 #define NEAR_CAPACITY 512
 #define NEAR_STEP 16
-#define WHOLE 32 /* generators in divided bins that are taken as they are: more than that may be too far */
+#define WHOLE 32 /* divided bins with at most this many generators are taken whole */
 
-/* Behind the last place there may be others, of no meaning. */
+/* Entries behind the last one have no meaning. */
 typedef struct {
     int count;
     int places[NEAR_CAPACITY + NEAR_STEP];
@@ -23,11 +23,11 @@ inline bool add_near_run(near_t *near, int first, int end)
     return true;
 }
 
-/* Collect the generators in a rectangle, and some beside it. False if they are too many. */
+/* Collect the generators in a rectangle, and some near it. False if there are too many. */
 inline bool collect_near(near_t *near, double2 lower, double2 upper, global const int2 *bins,
                          global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
-    descent_t way; /* through rows and bins */
+    descent_t way; /* position: row and bin */
     near->count = 0;
     begin_descent(&way, (int4)(-1));
     while (way.depth >= 0) {
