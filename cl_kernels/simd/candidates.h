@@ -1,5 +1,5 @@
 /* Candidates for the neighbors of eight generators at a time; see `hulls.cl`. */
-#include "simd/lists.h"
+#include "simd/candidate_lists.h"
 #include "simd/near_rectangle.h"
 
 /* A first list of more than MANY candidates is cut to about ENOUGH of the nearest ones. */

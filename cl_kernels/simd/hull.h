@@ -4,7 +4,7 @@
    so the neighbors of x are the corners of the convex hull of all p, and the corners of its cell are the edges of the
    hull. A wall is the bisector with the mirror image. Gift wrapping starts at the nearest generator: the next corner is
    the candidate with no other to its right. All lanes take the same steps. */
-#include "simd/lists.h"
+#include "simd/candidate_lists.h"
 
 /* Faces of a cell. */
 #define HULL_CAPACITY 16

@@ -1,20 +1,20 @@
 #include "tessellation/morton.h"
-#include "simd/walked_again.h"
+#include "simd/second_walk.h"
 
-/* The cells in 3D of eight generators at a time, one in each lane of vectors: for CPUs, whose compilers make no vectors
-   of work-items that branch as clipping does.
+/* The cells in 3D of eight generators at a time, one per vector lane: for CPUs, whose compilers do not vectorize
+   clipping.
 
-   Cells are walked among the nearest generators (simd/walk.h), and the walls where these leave them open. What is
-   farther than twice the farthest vertex cannot cut; what is nearer and was not among them is looked for where it may
-   cut off one of the vertices, and such a cell is walked once more, with others of its kind. A cell is left to be
-   clipped (`polyhedra.cl`) where its triangles do not make a closed surface, or a face is so small, or bisectors so
-   nearly parallel, that rounding may decide what there is. */
+   Cells are traced among the nearest generators (edge_walk.h), and the walls if these leave them open. A generator
+   farther than twice the farthest vertex cannot cut. Nearer ones that were not listed are searched around the vertices
+   that they may cut, and such cells are traced again together. A cell is left to `clip_polyhedra` (polyhedra.cl) if its
+   triangles do not form a closed surface, or if a face is so small, or bisectors so nearly parallel, that round-off may
+   decide. */
 
 #if !IS_DOUBLE
 #error "single precision has too few digits to tell which decisions are certain"
 #endif
 #define MAX_ROUNDS 20
-/* Where hardly any of the first cells of a stretch are certain, as in lattices that are off by little, it is left. */
+/* If hardly any of the first cells of a stretch are certain, as in perturbed lattices, the whole stretch is left. */
 #define TRIALS 24
 #ifndef CUBE
 #error "build with -DCUBE=bins each way of the cubes of grid 0 that are gone through one by one, a power of 2"
@@ -30,7 +30,7 @@ inline int4 first_of_cube(int cube, int4 shape)
     return CUBE * (int4)(cube % across, cube / across % deep, cube / across / deep, 0);
 }
 
-/* Per cube: the number of generators there that get cells, the first `rows`. */
+/* Per cube: the number of its generators that get cells, those below `rows`. */
 kernel void count_cubes(const int size, const int rows, global const int *items, global const int2 *bins,
                         global const int4 *grid_shapes, global int *counts)
 {
@@ -48,15 +48,15 @@ kernel void count_cubes(const int size, const int rows, global const int *items,
     counts[cube] = count;
 }
 
-/* Per cube: the places of those generators, from order[starts[cube]] on, so that those which follow each other are near
-   each other: along Morton's curve through its bins, and through those of a divided bin before the next. Rows of bins,
-   in whose order places are, are long where generators are sparse. */
+/* Per cube: the items of those generators, from order[starts[cube]] on, in an order that keeps neighbors close: along
+   Morton's curve through its bins, depth first through divided bins. The order of bins, row by row, would not be local
+   where generators are sparse. */
 kernel void order_places(const int size, const int rows, global const int *items, global const int2 *bins,
                          global const int4 *grid_shapes, global const int *starts, global int *order)
 {
     WORK_ITEM(cube);
     int n = starts[cube];
-    descent_t way; /* along the curve */
+    descent_t way; /* position on the curve */
     begin_descent(&way, (int4)(0));
     while (way.depth >= 0) {
         const int4 shape = grid_shapes[way.grids[way.depth]];
@@ -80,9 +80,9 @@ kernel void order_places(const int size, const int rows, global const int *items
     }
 }
 
-/* Per stretch of that order: the cells of the generators there (see `clip_polyhedra`), or row_counts[i] =
-   UNFINISHED where a cell is left to be clipped. `first_reach` is how far the first lists go, in units of
-   `spacing`. In a periodic box the balls around the vertices of the generators' own cells are looked at. */
+/* Per stretch of that order: the cells of its generators (see `clip_polyhedra`), or row_counts[i] = UNFINISHED for a
+   cell that remains to be clipped. `first_reach` is the first search radius, in units of `spacing`. In a periodic box
+   the balls around the vertices are tested. */
 kernel void walk_all_cells(const int size, const int rows, global const int *order, global const double *binned,
                            global const int *items, global const float *spacing, global float *reach,
                            global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
@@ -117,7 +117,7 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
         xs[lane] = ys[lane] = zs[lane] = rs[lane] = 0;
     }
     for (;;) {
-        /* The next generators take the lanes of those whose cells are done. */
+        /* The next generators take the lanes of finished cells. */
         for (int lane = 0; lane < LANES; ++lane) {
             if (wanted[lane] && rounds[lane]++ < MAX_ROUNDS)
                 continue;
@@ -147,7 +147,7 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
         vstore8(todo & ~chosen, 0, wanted);
         if (!fits)
             continue;
-        /* A cell that is open among what is near is closed by walls, to begin with. */
+        /* Walls close a cell that is open among the near generators. */
         const bool walled = any(chosen & vload8(0, open));
         const long8 full = chosen & list_near(&list, &near, binned, places, xs, ys, zs, lower, upper,
                                               walled ? INFINITY : widest, box_lower, box_upper);

@@ -4,7 +4,7 @@
 #include "tessellation/measures.h"
 #include "tessellation/widening.h"
 #if IN_LANES
-#include "simd/eight_cells.h"
+#include "simd/cell_measures.h"
 #endif
 
 /* Per item p in bin order: the cell of generator i = items[p] as its list of neighbors, counter-clockwise.

@@ -132,8 +132,8 @@ inline bool check_row(int i, global const int *starts, global const int *neighbo
 }
 
 #if IN_LANES
-#include "simd/eight_marked.h"
-#include "simd/eight_rows.h"
+#include "simd/marked_cells.h"
+#include "simd/row_checks.h"
 #endif
 
 /* Per generator i: set marks[i], and the mark of the neighbor at the face in question, where the previous neighbors no

@@ -1,11 +1,10 @@
-/* Cells in 3D that have been walked along their edges (simd/walk.h), one in each lane of vectors: what is kept of
-   them, and their measures. */
-#include "simd/planes.h"
+/* State and measures of cells in 3D that are traced along their edges (edge_walk.h), one per vector lane. */
+#include "simd/plane_lists.h"
 
-#define HULL_CAPACITY 48                    /* faces of a cell */
-#define CORNER_CAPACITY (2 * HULL_CAPACITY) /* its vertices */
-/* Areas below this share of the square of the farthest vertex's distance are measured once more: sums of what may lie
-   far from a face lose digits. */
+#define HULL_CAPACITY 48                    /* most faces of a cell */
+#define CORNER_CAPACITY (2 * HULL_CAPACITY) /* most vertices */
+/* Areas below this share of the squared distance of the farthest vertex are computed again in a more accurate way: sums
+   over points far from a face lose digits. */
 #define SMALL_AREA 3e-3
 
 typedef struct {
@@ -33,31 +32,31 @@ inline vectors_t along8(vectors_t a, double8 s, vectors_t b)
 /* Lane 0 to 7 of four vectors. */
 #define ACROSS(a, b, c, d, lane) ((double4)((a).s##lane, (b).s##lane, (c).s##lane, (d).s##lane))
 
-/* The cells: of their faces, in the order in which they are found, the bisectors, and sums (see `add_corner`). */
+/* The cells: bisectors of their faces, in the order of discovery, and sums (see `add_corner`). */
 typedef struct {
     planes_t planes[HULL_CAPACITY + 1];
     double4 sums[(HULL_CAPACITY + 1) * LANES];
     int places[(HULL_CAPACITY + 1) * LANES];
     int faces[LANES], corners[LANES];
-    long doubt[LANES], lost[LANES];                                  /* is a decision uncertain; is the cell open? */
-    double8 reach2;                                                  /* largest square of a vertex's distance */
+    long doubt[LANES], lost[LANES]; /* whether a decision is uncertain; whether the cell is open */
+    double8 reach2;                 /* largest squared distance of a vertex */
     double8 square_x, square_y, square_z, mixed_x, mixed_y, mixed_z; /* xx, yy, zz; yz, zx, xy */
 } cells_t;
 
-/* What one lane's walk knows. */
+/* The topology that one lane has found. */
 typedef struct {
-    ulong sides[HULL_CAPACITY];           /* bit b of [a]: a and b follow each other at some vertex */
+    ulong sides[HULL_CAPACITY];           /* bit b of [a]: a and b are consecutive at some vertex */
     uchar4 corner_faces[CORNER_CAPACITY]; /* counter-clockwise */
-    uchar4 edges[CORNER_CAPACITY + 4];    /* to be walked: faces that follow each other at a corner, and that */
-    int open;                             /* of these */
-    uchar face_of[LIST_CAPACITY];         /* of an entry of the list, or NO_FACE */
+    uchar4 edges[CORNER_CAPACITY + 4];    /* to be traced: two consecutive faces at a corner, and the corner */
+    int open;                             /* number of edges */
+    uchar face_of[LIST_CAPACITY];         /* face of each entry of the list, or NO_FACE */
 } lane_walk_t;
 
-/* How the walk stands. */
+/* Progress of the walk. */
 typedef struct {
     planes_t corners[CORNER_CAPACITY];
     lane_walk_t lanes[LANES];
-    long a[LANES], b[LANES], from[LANES]; /* the faces of the present edge, and the corner that it comes from */
+    long a[LANES], b[LANES], from[LANES]; /* the faces of the current edge, and its first corner */
     long active[LANES];
 } walk_t;
 
@@ -67,8 +66,8 @@ inline vectors_t planes_at(const planes_t *planes, const long *at)
     return p;
 }
 
-/* What faces p and q get from a vertex at the end of their common edge, along w = p x q: the foot of x on the edge at
-   -g w from it; the parts that make up areas, and for the second moments their sum by volume. */
+/* Contributions of a vertex at the end of the common edge of faces p and q, along w = p x q: the foot of x on the edge
+   is at -g w from the vertex; parts of the areas, and of the second moments weighted by volume. */
 typedef struct {
     double8 g, part_p, part_q, both;
 } share_t;
@@ -80,14 +79,13 @@ inline share_t share_edge(double8 g, vectors_t p, vectors_t q, double8 p2, doubl
     return share;
 }
 
-/* Add what belongs to vertex y of faces a, b, c (counter-clockwise), numbers at_*, for some lanes; of others these are
-   HULL_CAPACITY.
+/* Add the contributions of vertex y to its faces a, b, c (counter-clockwise), numbers at_*, for some lanes; for the
+   others these are HULL_CAPACITY.
 
-   x, the foot of x on a face, that on an edge of the face and a vertex of the edge make a tetrahedron, with a sign
-   where a foot lies outside: six at every vertex. For a face at p the triangle of the feet and the vertex has area g
-   (p^2 - p.q) / (4 |p|) and the tetrahedron volume g (p^2 - p.q) / (24 p^2). First moments are those of the sums of
-   foot and vertex. Of second moments here is the part of the two, of which the foot on the face is no factor: v v + f f
-   + (v + f) (v + f). */
+   x, the foot of x on a face, the foot f of x on an edge of the face, and a vertex v of the edge form a tetrahedron,
+   with a negative volume if a foot lies outside: six at every vertex. For a face at p, the triangle of the feet and the
+   vertex has the area g (p^2 - p.q) / (4 |p|), and the tetrahedron the volume g (p^2 - p.q) / (24 p^2). First moments
+   follow from f + v. Second moments: here the terms without the foot on the face, v v + f f + (v + f) (v + f). */
 inline void add_corner(cells_t *cells, long8 some, const long *at_a, const long *at_b, const long *at_c, vectors_t y,
                        vectors_t a, vectors_t b, vectors_t c, vectors_t ab, vectors_t bc, vectors_t ca, double8 a2,
                        double8 b2, double8 c2)
@@ -139,8 +137,8 @@ inline void add_corner(cells_t *cells, long8 some, const long *at_a, const long 
         some ? fma(zx, y.y, zy * y.x) + fma(uu_ab, ab.x * ab.y, fma(uu_bc, bc.x * bc.y, uu_ca * ca.x * ca.y)) : 0;
 }
 
-/* Of the cells, but for factors: volumes, their first and second moments; the least area of a face, in units of the
-   square of the distance of its farthest vertex, if that is small. */
+/* Measures of the cells, up to factors: volumes, first and second moments; the least area of a face relative to the
+   squared distance of its farthest vertex, if that is small. */
 typedef struct {
     double8 volume, x, y, z, xx, yy, zz, yz, zx, xy, least;
 } moments_t;
@@ -151,11 +149,11 @@ inline double4 corner_at(const walk_t *walk, int v, int lane)
                      PLANE_LANE(walk->corners, v, 2, lane), 0);
 }
 
-/* Area and centroid of a lane's face from triangles about its first vertex: to the digits of the vertices, also of
-   small ones. `normal` has length 1; `far2` becomes the square of the distance of the farthest vertex. */
+/* Area and centroid of a face of a lane from triangles around its first vertex: as accurate as the vertices, also for
+   small faces. `normal` has length 1; `far2` becomes the squared distance of the farthest vertex. */
 inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, int lane, double4 normal, double *far2)
 {
-    /* At each of its vertices, the faces before and after it. */
+    /* For each vertex of the face, the faces before and after it. */
     uchar ins[HULL_CAPACITY], outs[HULL_CAPACITY], at[HULL_CAPACITY];
     int n = 0;
     for (int v = 0; v < cells->corners[lane] && n < HULL_CAPACITY; ++v) {
@@ -185,7 +183,7 @@ inline double4 measure_small(const cells_t *cells, const walk_t *walk, int f, in
     return (double4)(twice / 2, centroid.s0, centroid.s1, centroid.s2);
 }
 
-/* Put areas and centroids of faces in the place of their sums, and sum up what the cells get from faces. */
+/* Replace the sums of the faces by areas and centroids, and add up the contributions of faces to cells. */
 inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
 {
     int most = 0;
@@ -220,7 +218,7 @@ inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
         const double8 sum = there ? sums[0] : 0, sum_x = there ? sums[1] : 0;
         const double8 sum_y = there ? sums[2] : 0, sum_z = there ? sums[3] : 0;
         const double8 length = sqrt(d2), area = sum * length / 4, inverse = 1 / sum;
-        /* The centroid, on the plane. */
+        /* The centroid, projected to the plane. */
         double8 cx = fma(sum_x, inverse, foot_x) / 3, cy = fma(sum_y, inverse, foot_y) / 3;
         double8 cz = fma(sum_z, inverse, foot_z) / 3;
         const planes_t *p = &cells->planes[f];
@@ -258,7 +256,7 @@ inline moments_t finish_cells(cells_t *cells, const walk_t *walk, long8 closed)
         m.x += x;
         m.y += y;
         m.z += z;
-        /* What add_corner leaves out: twice the product of the foot with itself, and its products with the others. */
+        /* The terms that add_corner omits: twice the square of the foot, and its products with f and v. */
         m.xx = fma(2 * foot_x, x, m.xx);
         m.yy = fma(2 * foot_y, y, m.yy);
         m.zz = fma(2 * foot_z, z, m.zz);

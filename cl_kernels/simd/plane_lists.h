@@ -1,5 +1,5 @@
-/* Per lane of vectors a list of half-spaces: those nearer to the lane's generator x than to another, y.p <= 1/2 with p
-   = d / |d|^2 for one at x + d. A wall is the bisector with the mirror image. */
+/* Per vector lane a list of half-spaces: the points nearer to the generator x of the lane than to another at x + d,
+   y.p <= 1/2 with p = d / |d|^2. A wall is the bisector with the mirror image. */
 #include "simd/bin_runs.h"
 
 #define LANES 8
@@ -10,7 +10,7 @@ typedef struct {
     double8 x, y, z, d2;
 } planes_t;
 
-/* In each lane a component (0: x, 1: y, 2: z, 3: d2) of that of the planes which `at` says. */
+/* Gather: in each lane a component (0: x, 1: y, 2: z, 3: d2) of plane `at` of the lane. */
 #define PLANE_LANE(planes, k, component, lane) (((double *)(planes))[((k)*4 + (component)) * LANES + (lane)])
 #define PLANE_LANES(planes, at, component)                                                                             \
     (double8)(PLANE_LANE(planes, (at)[0], component, 0), PLANE_LANE(planes, (at)[1], component, 1),                    \
@@ -18,25 +18,25 @@ typedef struct {
               PLANE_LANE(planes, (at)[4], component, 4), PLANE_LANE(planes, (at)[5], component, 5),                    \
               PLANE_LANE(planes, (at)[6], component, 6), PLANE_LANE(planes, (at)[7], component, 7))
 
-/* Lists have shells, by distance: the outer ends of all, as shares of the radius. */
+/* Lists are divided into shells by distance: the outer radii, as shares of the whole radius. */
 #define SHELLS 2
 constant const double SHELL_ENDS[SHELLS] = {0.86, 1};
 #define SHELL_CAPACITY 64
 #define LIST_CAPACITY (SHELLS * SHELL_CAPACITY + 8)
-/* Lists of more than MANY or fewer than FEW, before the walls, are made to hold about ENOUGH. */
+/* Lists with more than MANY or fewer than FEW generators get another radius, to hold about ENOUGH. */
 #define MANY 92
 #define ENOUGH 66
 #define FEW 24
-/* What may be near the generators of all lanes. */
+/* Generators that may be near those of the lanes. */
 #define NEAR_CAPACITY 1024
 #define NEAR_WORDS (NEAR_CAPACITY / 64)
 
-/* Shells are the same in length for all lanes: spare entries are p = 0, which cuts nothing. */
+/* Shells have the same length in all lanes; padding entries have p = 0, which cuts nothing. */
 typedef struct {
     planes_t planes[LIST_CAPACITY];
-    int places[LIST_CAPACITY * LANES]; /* of the other generator, or -1 - wall */
+    int places[LIST_CAPACITY * LANES]; /* item of the other generator, or -1 - wall */
     int ends[SHELLS];
-    double8 radii2[SHELLS]; /* all that is nearer is in the shell, or in those before */
+    double8 radii2[SHELLS]; /* everything nearer is in this shell or an earlier one */
     double8 nearest2;       /* least d2 */
     long8 nearest;          /* its entry */
 } list_t;
@@ -49,14 +49,14 @@ inline void put_plane(list_t *list, int k, int lane, double x, double y, double 
     LANE(list->places, k, lane) = place;
 }
 
-/* Which of the generators that may be near are so: bits for each shell; how many, with those of the shells before. */
+/* The generators near x: bits for each shell, and cumulative counts. */
 typedef struct {
     int length;
     int places[NEAR_CAPACITY + LANES];
     long8 bits[SHELLS][NEAR_WORDS], totals[SHELLS];
 } near_t;
 
-/* Find out which generators are nearer than r, and in which shells. */
+/* Find the generators nearer than r, and their shells. */
 inline void see_near(near_t *near, list_t *list, global const double *binned, double8 x, double8 y, double8 z,
                      double8 r2)
 {
@@ -82,7 +82,7 @@ inline void see_near(near_t *near, list_t *list, global const double *binned, do
     }
 }
 
-/* See to it that about ENOUGH are near one lane's generator, of those that are. */
+/* Adjust the radius of one lane so that it holds about ENOUGH generators. */
 inline void see_less(near_t *near, list_t *list, global const double *binned, int lane, const double *xs,
                      const double *ys, const double *zs, double *radii)
 {
@@ -117,7 +117,7 @@ inline void see_less(near_t *near, list_t *list, global const double *binned, in
     }
 }
 
-/* Add the generators of a shell, but those at places own[lane], to the lists of counts[lane] entries. */
+/* Append the generators of a shell, except items own[lane], to the lists with counts[lane] entries. */
 inline void add_seen(list_t *list, const near_t *near, int shell, global const double *binned, const int *own,
                      const double *xs, const double *ys, const double *zs, int *counts)
 {
@@ -135,10 +135,10 @@ inline void add_seen(list_t *list, const near_t *near, int shell, global const d
     }
 }
 
-/* Fill the lists up to a common, even number of entries, which is returned, with what is infinitely far. */
+/* Pad the lists with infinitely distant entries to a common, even length, which is returned. */
 inline int pad_lists(list_t *list, int *counts)
 {
-    int length = 2; /* some entry is there always */
+    int length = 2; /* there is always an entry */
     for (int lane = 0; lane < LANES; ++lane)
         length = max(length, counts[lane]);
     length += length % 2;
@@ -160,8 +160,8 @@ inline void add_wall(list_t *list, double8 distances, int wall, int *counts)
                   wall > 3 ? along[lane] : 0, -1 - wall);
 }
 
-/* List what has been seen near, and the walls that [lower, upper] and `reach` about it touch. Lists that do not fit are
-   left empty; returns those lanes. */
+/* List the near generators, and the walls within `reach` of [lower, upper]. Lists that are too long stay empty; returns
+   those lanes. */
 inline long8 list_near(list_t *list, near_t *near, global const double *binned, const int *own, const double *xs,
                        const double *ys, const double *zs, double4 lower, double4 upper, double reach,
                        double4 box_lower, double4 box_upper)
@@ -209,10 +209,10 @@ inline long8 list_near(list_t *list, near_t *near, global const double *binned, 
     return full;
 }
 
-/* Lanes are searched for together if they are within SPREAD times the radius: rows of bins end within an eight. */
+/* Lanes share a search if they are within SPREAD times the radius: a batch may span the end of a row of bins. */
 #define SPREAD 3
 
-/* Where to look for generators and walls. */
+/* The arrays to search for generators and walls. */
 typedef struct {
     global const double *binned;
     global const int2 *bins;
@@ -221,7 +221,7 @@ typedef struct {
     double4 box_lower, box_upper;
 } search_t;
 
-/* Choose from the lanes to do those near that of the least rank; the box holds them, r is their greatest radius. */
+/* Choose the lanes near that of the least rank; the box holds them, r is their largest radius. */
 inline long8 choose_planes(long8 todo, const int *ranks, const double *xs, const double *ys, const double *zs,
                            double8 radii, double spread, double4 *lower, double4 *upper, double *r)
 {
@@ -246,8 +246,8 @@ inline long8 choose_planes(long8 todo, const int *ranks, const double *xs, const
     return vload8(0, chosen);
 }
 
-/* Choose lanes, and see what is near them. Radii that were guessed are changed where they hold too many or too few.
-   False if too much is near the chosen ones. */
+/* Choose lanes and find the generators near them. A guessed radius that holds too many or too few generators is
+   changed. False if too many are near the chosen lanes. */
 inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, long8 fresh, const int *ranks,
                        const double *xs, const double *ys, const double *zs, double8 *r, long8 *chosen, double4 *lower,
                        double4 *upper, double *widest, const search_t *in)
@@ -264,7 +264,7 @@ inline bool see_enough(near_t *near, list_t *list, runs_t *runs, long8 todo, lon
         if (!fits) {
             if (attempt == 12)
                 return false;
-            /* Fewer lanes, then less about one. */
+            /* First fewer lanes, then a smaller radius. */
             *r = (*chosen & (spread < SPREAD / 4.0 ? -1L : 0L)) ? 0.7 * *r : *r;
             spread = spread < SPREAD / 4.0 ? 0 : spread / 2;
             continue;

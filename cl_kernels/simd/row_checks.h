@@ -1,6 +1,6 @@
 /* The checks of `check_row` for the rows of eight generators at a time, one per vector lane. `check_row` itself handles
    cells with walls, and rows that may be inconsistent with those of neighbors. */
-#include "simd/eight_corners.h"
+#include "simd/cell_corners.h"
 
 #if ROW_CAPACITY < CHECKED_FACES
 #error "there is no room for the corners of cells that are checked"

@@ -1,28 +1,27 @@
-/* Cells in 3D walked along their edges, one in each lane of vectors. An edge leaves a vertex on two bisectors and ends
-   where the next one cuts it off: the same steps in every lane. Vertices are triangles of the three faces that meet
-   there, counter-clockwise seen from outside. */
-#include "simd/walked.h"
+/* Cells in 3D, traced along their edges, one per vector lane. An edge starts at a vertex, lies on two bisectors and
+   ends where the next bisector cuts it. All lanes take the same steps. A vertex is the triangle of its three faces,
+   counter-clockwise seen from outside. */
+#include "simd/walk_state.h"
 
-/* Bisectors are put off by this share of the generator's distance, so that those which an edge lies on do not end it.
-   Other than theirs, faces that are missed are smaller than what is certain. */
+/* Bisectors are moved outwards by this share of the distance of the generator, so that those of an edge do not end it.
+   Faces missed by this are smaller than the limit of certainty. */
 #define BIAS 1e-14
-/* Least square of the volume that is spanned by the normals of three faces at a certain vertex. */
+/* Least squared volume spanned by the normals of the three faces at a certain vertex. */
 #define CERTAIN_SINE2 1e-10
 
 #define NO_FACE 255
 
-/* Where a ray is cut off first: slack / speed from its beginning, by entry `at` of the list or, yet, by none (-1). */
+/* The first cut of a ray: at slack / speed from its start, by entry `at` of the list, or none so far (-1). */
 typedef struct {
     double8 slack, speed;
     long8 at;
 } stop_t;
 
-/* Cut a ray from `y` (given as -y) along `ray` off by entry k. */
+/* Cut a ray from `y` (given as -y) along `ray` by entry k. */
 inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t minus_y, vectors_t ray)
 {
     const double8 x = list->planes[k].x, y = list->planes[k].y, z = list->planes[k].z;
-    /* Not less than none: rounding may put y beyond the bisectors that it lies on, and a ray that leaves them would
-       then seem to be cut off by them, whatever had cut it off before. */
+    /* At least 0: round-off may put y beyond its own bisectors, which would then seem to cut a ray that leaves them. */
     double8 slack = fma(minus_y.x, x, fma(minus_y.y, y, fma(minus_y.z, z, 0.5 + BIAS)));
     slack = slack > 0 ? slack : 0;
     const double8 speed = fma(ray.x, x, fma(ray.y, y, ray.z * z));
@@ -32,11 +31,11 @@ inline void cut_ray(stop_t *stop, const list_t *list, int k, vectors_t minus_y, 
     stop->at = sooner ? (long8)k : stop->at;
 }
 
-/* Walk from y along `ray`, to the vertex that is returned; `inverse` is that of the speed. */
+/* Go from y along `ray` to the next vertex, which is returned; `inverse` is 1 / speed. */
 inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, vectors_t y, vectors_t ray, long8 active)
 {
     const vectors_t minus_y = {-y.x, -y.y, -y.z};
-    /* Two chains of comparisons, as a processor works on both at a time. */
+    /* Two independent chains of comparisons, which the processor overlaps. */
     stop_t even = {1, 0, -1}, odd = even;
     int k = 0;
     for (int shell = 0; shell < SHELLS; ++shell) {
@@ -48,7 +47,7 @@ inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, ve
         stop->slack = sooner ? odd.slack : even.slack;
         stop->speed = sooner ? odd.speed : even.speed;
         stop->at = sooner ? odd.at : even.at;
-        /* Nothing farther from x than twice the vertex can cut it off. */
+        /* A generator farther from x than twice the vertex cannot cut it. */
         const vectors_t scaled = {fma(stop->speed, y.x, stop->slack * ray.x),
                                   fma(stop->speed, y.y, stop->slack * ray.y),
                                   fma(stop->speed, y.z, stop->slack * ray.z)};
@@ -60,8 +59,8 @@ inline vectors_t walk_ray(stop_t *stop, double8 *inverse, const list_t *list, ve
     return along8(y, (stop->slack - BIAS) * *inverse, ray);
 }
 
-/* The face of a lane that entry k of its list has; a new one if need be, HULL_CAPACITY if there is no room. What is
-   known is written once more: branches that cannot be foreseen cost more. */
+/* The face of entry k of the list of a lane, a new one if needed; HULL_CAPACITY if there is no room. Known data is
+   written again, as mispredicted branches cost more. */
 inline int face_of_entry(cells_t *cells, lane_walk_t *own, const list_t *list, int k, int lane)
 {
     const int known = own->face_of[k], next = cells->faces[lane];
@@ -75,7 +74,7 @@ inline int face_of_entry(cells_t *cells, lane_walk_t *own, const list_t *list, i
     return f;
 }
 
-/* Note that vertex number `corner` is between faces a, b, c. False if there is such a vertex already. */
+/* Record vertex number `corner` between faces a, b, c. False if this vertex exists already. */
 inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
 {
     const ulong sides_a = own->sides[a] | 1UL << b, sides_b = own->sides[b], sides_c = own->sides[c];
@@ -85,7 +84,7 @@ inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
     own->sides[b] = sides_b | 1UL << c;
     own->sides[c] = sides_c | 1UL << a;
     own->corner_faces[corner] = (uchar4)(a, b, c, 0);
-    /* Edges of which the other side is not known are to be walked. */
+    /* Edges with an unknown other side must be traced. */
     int open = own->open;
     own->edges[open] = (uchar4)(b, c, corner, 0);
     open += !((sides_c >> b) & 1);
@@ -95,7 +94,7 @@ inline bool put_corner(lane_walk_t *own, int a, int b, int c, int corner)
     return true;
 }
 
-/* Choose the next edge of a lane, if there is one. */
+/* Choose the next edge of a lane, if any. */
 inline void next_edge(walk_t *walk, int lane)
 {
     lane_walk_t *own = &walk->lanes[lane];
@@ -105,7 +104,7 @@ inline void next_edge(walk_t *walk, int lane)
         const uchar4 edge = own->edges[--open];
         if ((own->sides[edge.s1] >> edge.s0) & 1)
             continue;
-        /* On the other side the faces follow each other the other way round. */
+        /* At the other end the faces are in the opposite order. */
         walk->a[lane] = edge.s1;
         walk->b[lane] = edge.s0;
         walk->from[lane] = edge.s2;
@@ -115,7 +114,7 @@ inline void next_edge(walk_t *walk, int lane)
     own->open = open;
 }
 
-/* Walk the cells of the chosen lanes. */
+/* Trace the cells of the chosen lanes. */
 inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 chosen)
 {
     cells->reach2 = cells->square_x = cells->square_y = cells->square_z = 0;
@@ -131,7 +130,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         for (int k = 0; k < LIST_CAPACITY; ++k)
             own->face_of[k] = NO_FACE;
     }
-    /* The face of the nearest is there for sure; from its foot to the edge of the face, whichever it is. */
+    /* The face of the nearest generator exists. Go from its foot point to any edge of the face. */
     long first[LANES], second[LANES];
     vstore8(list->nearest, 0, first);
     const double8 middle = PLANE_LANES(list->planes, first, 3) / 2;
@@ -152,7 +151,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         face_of_entry(cells, &walk->lanes[lane], list, first[lane], lane);
         face_of_entry(cells, &walk->lanes[lane], list, max(second[lane], 0L), lane);
         walk->a[lane] = walk->from[lane] = 0;
-        walk->b[lane] = cells->faces[lane] - 1; /* 1, but where the second is lost */
+        walk->b[lane] = cells->faces[lane] - 1; /* 1, unless the second face is missing */
     }
     vstore8(chosen & usable & ~vload8(0, cells->lost), 0, walk->active);
     a = planes_at(cells->planes, walk->a);
@@ -165,7 +164,7 @@ inline void walk_cells(cells_t *cells, walk_t *walk, const list_t *list, long8 c
         const vectors_t c = planes_at(list->planes, entries);
         const vectors_t bc = cross_in_space(b, c), ca = cross_in_space(c, a);
         const double8 a2 = dot8(a, a), b2 = dot8(b, b), c2 = dot8(c, c);
-        /* What rounding has left over from step to step does not add up. */
+        /* Round-off of the steps does not accumulate. */
         y = along8(end, (0.5 - dot8(a, end)) * inverse, bc);
         y = along8(y, (0.5 - dot8(b, end)) * inverse, ca);
         y = along8(y, (0.5 - dot8(c, end)) * inverse, ab);

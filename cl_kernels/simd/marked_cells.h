@@ -1,5 +1,5 @@
 /* Cells to rebuild in an incremental update, eight at a time, as hulls of a few candidates. */
-#include "simd/eight_corners.h"
+#include "simd/cell_corners.h"
 #include "simd/hull.h"
 
 #define WRAPPED_CAPACITY 32 /* candidates */

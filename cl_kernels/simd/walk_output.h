@@ -1,15 +1,15 @@
-/* Which cells of a walk are certain, and where they are written. */
+/* The test of traced cells for certainty, and their output. */
 #include "tessellation/row_counts.h"
 #include "tessellation/periodic/halo.h"
-#include "simd/walk.h"
+#include "simd/edge_walk.h"
 
-/* What is certain: least ratio of squares of the distances of the nearest generator and of the farthest vertex; least
-   ratio of a face's area and the square of the distance of its own farthest vertex, as far as which vertices round:
-   that distance is the same from both sides of the face. */
+/* Limits of certainty: least squared ratio of the distance of the nearest generator to that of the farthest vertex;
+   least ratio of the area of a face to the squared distance of its farthest vertex, which is the same for both cells.
+ */
 #define CERTAIN_NEAREST2 1e-7
 #define CERTAIN_AREA 1e-8
 
-/* Where cells are written to, in the layout of `clip_polyhedra` (polyhedra.cl). */
+/* The output arrays, in the layout of `clip_polyhedra` (polyhedra.cl). */
 typedef struct {
     int room;
     global const int *items;
@@ -22,7 +22,7 @@ typedef struct {
 } output_t;
 
 #ifdef SEAMS
-/* Look at the ball around vertex v of one lane's cell, of generator i at x. */
+/* Test the ball around vertex v of the cell of one lane, of generator i at x. */
 inline void look_at_corner(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
                            const output_t *out)
 {
@@ -40,7 +40,7 @@ inline void look_at_corner(const cells_t *cells, const walk_t *walk, int v, int 
     look_at_vertex(x, i, corner_at(walk, v, lane), ways, labels, &out->seams);
 }
 
-/* Look at the balls around the vertices of some lanes' cells, as far as they are of generators in the box. */
+/* Test the balls around the vertices of the cells of some lanes, for generators in the box. */
 inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
                            global const double *binned, const output_t *out)
 {
@@ -52,7 +52,7 @@ inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some,
     for (int lane = 0; lane < LANES; ++lane) {
         own[lane] = own[lane] && out->items[places[lane]] < seams->own ? -1 : 0;
         most = own[lane] ? max(most, cells->corners[lane]) : most;
-        /* Lanes without a cell have no place. */
+        /* Lanes without a cell have no item. */
         for (int a = 0; a < 3; ++a)
             x[lane][a] = own[lane] ? binned[3 * places[lane] + a] : 0;
     }
@@ -81,8 +81,8 @@ inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some,
 }
 #endif
 
-/* Write the cells of some lanes, of generators at `places`, and return how many. `reach` is twice the distance of the
-   farthest vertex. */
+/* Write the cells of some lanes, of items `places`; return their number. `reach` is twice the distance of the farthest
+   vertex. */
 inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t *m, long8 done, const int *places,
                        double8 reach, global const double *binned, const output_t *out)
 {
@@ -132,7 +132,7 @@ inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t
     return made;
 }
 
-/* Lanes in which the cell, walked among all that is nearer than `reach`, is certain. */
+/* Lanes whose cell, traced among all generators nearer than `reach`, is certain. */
 inline long8 certain_cells(const cells_t *cells, const moments_t *m, const list_t *list)
 {
     return (list->nearest2 > CERTAIN_NEAREST2 * cells->reach2) & (m->least > CERTAIN_AREA);

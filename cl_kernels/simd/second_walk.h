@@ -1,24 +1,24 @@
-/* Cells whose vertices reach beyond what they were walked among: what may cut these off is looked for, and they are
-   walked once more, with others of their kind. */
-#include "simd/walked_cells.h"
+/* Cells with vertices beyond the searched radius: generators that may cut these vertices are searched, and such cells
+   are traced again together. */
+#include "simd/walk_output.h"
 
-#define GROWTH 1.4     /* of the radius from shell to shell */
-#define THINNEST 1.001 /* ratio of the radii of a shell that still holds too much */
-#define MOST_SHELLS 64 /* that are looked at about one cell where some hold too much */
+#define GROWTH 1.4     /* growth of the radius from shell to shell */
+#define THINNEST 1.001 /* least ratio of the radii of a shell */
+#define MOST_SHELLS 64 /* most shells for one cell */
 
-/* Cells to be walked once more, among their faces and what else may cut them. */
+/* Cells to trace again, among their faces and further generators that may cut them. */
 typedef struct {
     int n;                            /* lanes in use */
-    int places[LANES], counts[LANES]; /* of their generators; entries of their lists */
-    double seen[LANES];               /* all that is nearer has been looked at */
+    int places[LANES], counts[LANES]; /* items of their generators; lengths of their lists */
+    double seen[LANES];               /* everything nearer has been searched */
     list_t list;
     cells_t cells;
     walk_t walk;
 } later_t;
 
-/* Of eight generators at places first, first + 1, ... those less than `end` that are from `from` to `to` away from x
-   and cut off one of the vertices, `far` of them, are added to list entries `k` on. Returns the next entry; no more
-   than LIST_CAPACITY are written. */
+/* Among eight items first, first + 1, ... below `end`, append to the list, from entry `k` on, those at a distance
+   between `from` and `to` from x that cut one of the `far` vertices. Returns the next entry; at most LIST_CAPACITY are
+   written. */
 inline int add_cutters(list_t *list, int k, int slot, global const double *binned, int first, int end, double4 x,
                        double from2, double to2, int far, const double *far_x, const double *far_y, const double *far_z)
 {
@@ -53,8 +53,8 @@ inline int add_cutters(list_t *list, int k, int slot, global const double *binne
     return k;
 }
 
-/* Balls that hold what is farther than `from` from x and nearer to one of the vertices than x. Vertices that follow
-   each other, as a rule near each other, share one where they are many. */
+/* Balls that cover all points farther than `from` from x and nearer to one of the vertices than x. If there are many
+   vertices, consecutive ones, which are usually close, share a ball. */
 inline balls_t balls_about(double4 x, double from, int far, const double *far_x, const double *far_y,
                            const double *far_z)
 {
@@ -62,7 +62,7 @@ inline balls_t balls_about(double4 x, double from, int far, const double *far_x,
     double radii[CORNER_CAPACITY], xs[LANES], ys[LANES], zs[LANES], rs[LANES];
     for (int v = 0; v < far; ++v) {
         const double4 y = (double4)(far_x[v], far_y[v], far_z[v], 0);
-        /* The spheres about x and about the vertex cross at this share of the way to it. */
+        /* The spheres around x and around the vertex intersect at this share of the way. */
         const double y2 = dot(y, y), share = from * from / (2 * y2);
         centers[v] = fmax(share, 1.0) * y;
         radii[v] = share > 1 ? sqrt(fmax(from * from - share * share * y2, 0.0)) + 1e-9 * from : sqrt(y2) * (1 + 1e-9);
@@ -87,11 +87,10 @@ inline balls_t balls_about(double4 x, double from, int far, const double *far_x,
     return balls;
 }
 
-/* Look for generators farther than `from`, and walls, that cut off vertices of one lane's cell, in shell after shell up
-   to `need`. If there are any, put the cell among those for later. Returns how many; -1 if they are too many.
+/* Search generators farther than `from`, and walls, that cut vertices of the cell of one lane, shell by shell up to
+   `need`. If there are any, queue the cell. Returns their number; -1 if there are too many.
 
-   What cuts a vertex off is nearer to it than x is: of a cell that is long and thin no more than what is about its ends
-   is looked at. */
+   A generator that cuts a vertex is nearer to it than x. For a long, thin cell only its ends are searched. */
 inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const walk_t *walk, int lane, int place,
                      double from, double need, const search_t *in)
 {
@@ -107,8 +106,7 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
         far_x[far] = y.s0;
         far_y[far] = y.s1;
         far_z[far] = y.s2;
-        far +=
-            !(4 * dot(y, y) * (1 + 64 * DBL_EPSILON) < from * from); /* the farthest, at least, whatever is rounded */
+        far += !(4 * dot(y, y) * (1 + 64 * DBL_EPSILON) < from * from); /* at least the farthest, despite round-off */
     }
     list_t *list = &later->list;
     const int slot = later->n, faces = cells->faces[lane];
@@ -139,7 +137,7 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
             fits = k < LIST_CAPACITY - 1;
         }
         if (!fits) {
-            /* A thinner shell. */
+            /* Try a thinner shell. */
             k = known_faces;
             to = sqrt(seen * to);
             if (!(to > THINNEST * seen) || trial >= MOST_SHELLS)
@@ -165,7 +163,7 @@ inline int find_more(later_t *later, runs_t *runs, const cells_t *cells, const w
     return k - faces;
 }
 
-/* Walk the cells that were put off; write them, or put them off again. */
+/* Trace the queued cells; write them, or queue them again. */
 inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const output_t *out)
 {
     global const double *binned = in->binned;
@@ -175,7 +173,7 @@ inline void walk_later(later_t *later, runs_t *runs, const search_t *in, const o
         later->counts[lane] = 0;
     const long8 some = convert_long8(vload8(0, later->counts) > 0);
     const int length = pad_lists(list, later->counts);
-    /* Not the first face for sure: that is a wall's where no generator had been seen. */
+    /* The first face may be a wall, if no generator was found before. */
     list->nearest = 0;
     list->nearest2 = some ? (double8)INFINITY : 1;
     for (int k = 0; k < length; ++k) {

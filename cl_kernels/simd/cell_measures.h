@@ -1,6 +1,6 @@
 /* The measures of eight cells at a time, one per vector lane, with the same bits as `measure_cell`, which handles cells
    with walls. */
-#include "simd/eight_corners.h"
+#include "simd/cell_corners.h"
 #include "tessellation/measures.h"
 
 #define FACE8 CLVORO_JOIN(FACE, 8)
