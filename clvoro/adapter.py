@@ -316,7 +316,7 @@ class Adapter:
         CheckpointWarning
             If a checkpoint cannot be written, for example on a full disk. The run continues, and the previous
             checkpoint is kept.
-        MisfitWarning, CoarseSizeWarning
+        MismatchWarning, CoarseSizeWarning
             If a part of the input hardly meets the domain, for example in another unit of length.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.

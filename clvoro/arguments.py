@@ -1,4 +1,4 @@
-"""Checks at the door: what a caller passes is looked at once, here, and trusted from then on."""
+"""Checks of arguments: values are checked once, where the caller passes them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
     Raises
     ------
     InputTypeError
-        If it holds something else than real numbers.
+        If it holds anything but real numbers.
     InputError
         If its shape is another one, or numbers are masked.
     """
@@ -72,7 +72,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
     expected = f"expected an array of real numbers of shape (n, {d}), one row per point"
     try:
         array = np.asarray(value)
-    except Exception as error:  # whatever an array of another library says
+    except Exception as error:  # arrays of other libraries raise anything
         kind = InputError if isinstance(error, ValueError) else InputTypeError
         raise kind(f"{name} is no array ({error}); {expected}") from error
     if array.ndim == 0:
@@ -127,10 +127,10 @@ def check_path(name: str, value: object) -> str:
 
 
 def check_callable(name: str, value: Callable[..., object], argument: str, hint: str) -> None:
-    """Refuse a callable that cannot be called with one argument, before it is; most tell what they take."""
+    """Reject a callable that does not take one argument, as far as its signature is known."""
     try:
         signature = inspect.signature(value)
-    except (TypeError, ValueError):  # that of many built-in functions is not known
+    except (TypeError, ValueError):  # many built-in functions have no signature
         return
     try:
         signature.bind(None)
@@ -155,7 +155,7 @@ def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
 def check_integer(
     name: str, value: object, least: int, most: float = 2**63 - 1, beside: str = ""
 ) -> int:
-    """Return `value` as an int of at least `least`, at most `most`; errors say what is allowed `beside` integers."""
+    """Return `value` as an int from `least` to `most`; errors name what is allowed `beside` integers."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         expected = f"an integer or {beside}" if beside else "an integer"
         raise InputTypeError(
@@ -171,9 +171,9 @@ def check_integer(
 def check_number(
     name: str, value: object, *, above: float = -np.inf, least: float = -np.inf
 ) -> float:
-    """Return `value` as a finite float above `above` and not under `least`."""
+    """Return `value` as a finite float > `above` and >= `least`."""
     try:
-        if isinstance(value, str | bytes):  # in which float() would find a number
+        if isinstance(value, str | bytes):  # float() would accept them
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -189,13 +189,13 @@ def check_number(
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    """Refuse `value` if it is none of `choices`."""
+    """Reject `value` unless it is one of `choices`."""
     if value not in choices:
         raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
 class Naming:
-    """Says which of the caller's points coincide, when the device has found that some do."""
+    """A context that names the caller's coincident points, after the device has found that some coincide."""
 
     def __init__(self, points: np.ndarray, domain: Domain, real: np.dtype) -> None:
         self.points, self.domain, self.real = points, domain, real

@@ -13,7 +13,7 @@ class ClvoroError(Exception):
 
 
 class InputError(ClvoroError, ValueError):
-    """An argument has the wrong value or shape: what arrived, what was expected, the remedy."""
+    """An argument has the wrong value or shape. The message says what arrived, what was expected, and the remedy."""
 
 
 class InputTypeError(ClvoroError, TypeError):
@@ -21,19 +21,19 @@ class InputTypeError(ClvoroError, TypeError):
 
 
 class OutputError(InputError):
-    """A file cannot be written: no such folder, no right, no space."""
+    """A file cannot be written: the folder does not exist, permission is missing, or the disk is full."""
 
 
 class DeviceError(ClvoroError, RuntimeError):
-    """No usable OpenCL device, or the device lacks what was asked of it."""
+    """No OpenCL device works, or the device lacks a required feature."""
 
 
 class BuildError(DeviceError):
-    """A kernel did not compile; the message carries the compiler's log."""
+    """A kernel did not compile; the message contains the compiler's log."""
 
 
 class MemoryLimitError(ClvoroError, MemoryError):
-    """A run needs more memory than the device has; says how many cells and bytes."""
+    """A run needs more memory than the device has; the message names cells and bytes."""
 
 
 class SizeFieldError(InputError):
@@ -75,24 +75,24 @@ class Aborted(BaseException):
 
 
 class CheckpointWarning(UserWarning):
-    """A checkpoint could not be written; the run goes on, and the one from before is still there."""
+    """A checkpoint could not be written. The run continues, and the previous checkpoint is kept."""
 
 
 class CoarseSizeWarning(UserWarning):
-    """A size field asks for less than half a cell in the whole domain: units that do not agree, most likely."""
+    """The size field gives less than half a cell in the whole domain: probably the units differ."""
 
 
-class MisfitWarning(UserWarning):
-    """A part of the input hardly meets the domain or the sizes: units or places that do not agree, most likely."""
+class MismatchWarning(UserWarning):
+    """A part of the input hardly fits the domain or the sizes: probably units or positions differ."""
 
 
 class PrecisionWarning(UserWarning):
-    """A run cannot meet its size field as well as usual in the precision asked for; says what limits it."""
+    """The precision is too low for a run to reach its target sizes as well as usual; the message says why."""
 
 
 class SizeErrorWarning(UserWarning):
-    """A mesh does not meet its size field, which changes faster than cells can follow; says where."""
+    """The cells of a finished mesh are far from their target sizes; the message says where and why."""
 
 
 class UnusedOptionWarning(UserWarning):
-    """An option of a run was given that its method does not use; names the methods that do."""
+    """An option was given that the method of a run does not use; the message names the methods that do."""

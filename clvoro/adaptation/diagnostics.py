@@ -1,4 +1,4 @@
-"""What could be meant, but hardly is: units and places that do not agree, and sizes that no cells can follow."""
+"""Warnings for plausible input mistakes: units and positions that differ, and sizes that cells cannot follow."""
 
 from __future__ import annotations
 
@@ -8,47 +8,47 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arguments import warn
-from ..errors import MisfitWarning, SizeErrorWarning
+from ..errors import MismatchWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.box import Domain
 from ..mesh.results import Result
 from ..sizing.field import Field
 
 COARSER, FINER = 2.0, 1e-3
-"""Layers so much coarser or finer than the size field asks for beside them are a mistake."""
+"""Ratios of the size of layers to the size field beside them from which on there is a mistake."""
 SAMPLE = 64
-"""Places along a layer at which that is seen."""
+"""Number of places along a layer that are compared."""
 MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
-"""Of finished meshes of fields that cells can follow means of |e| are 0.02 at most, and the largest 0.3; where sizes
-jump 1 : 2 from one cell to the next, the largest is 1."""
+"""Bounds of |e| above which a finished mesh causes a warning. For fields that cells can follow the mean is at most
+0.02, the largest 0.3; where sizes jump 1 : 2 from one cell to the next, the largest is 1."""
 STEEP = 1.25
-"""Ratio of sizes of adjacent cells from which on their change is why a cell does not have its size."""
+"""Ratio of the sizes of adjacent cells from which on the change of sizes causes the error."""
 
 
-def warn_of_misfits(field: Field, domain: Domain, layers: Sequence[Layers]) -> None:
-    """Warn of each part of the input that hardly meets `domain`, or of layers that hardly meet `field`.
+def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -> None:
+    """Warn of each part of the input that hardly fits `domain`, and of layers that hardly fit `field`.
 
     Parameters
     ----------
     field : Field
-        As the caller gave it, without what layers add to it.
+        The field as the caller gave it, without the bounds of layers.
 
     Warns
     -----
-    MisfitWarning
+    MismatchWarning
     """
     found = field.warnings(domain)
     for k, layer in enumerate(layers):
-        found += misfits_of_layer(f"layers[{k}]", layer, field, domain)
+        found += layer_mismatches(f"layers[{k}]", layer, field, domain)
     for text in found:
-        warn(text, MisfitWarning)
+        warn(text, MismatchWarning)
 
 
-def misfits_of_layer(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
-    """Return what is to be said of `layer` if its cells are of quite another size than `field` asks for there.
+def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
+    """Return warnings if the cells of `layer` have quite another size than `field` has there.
 
-    Flat cells are what layers are for, so that finer ones are right; but a width along the wall that nobody has asked
-    for may be far too small.
+    Layers have flat cells, so that finer ones are right. But a width along the wall that is a default may be far too
+    small.
     """
     feet, normals = columns_of(domain, layer)
     some = slice(None, None, -(-len(feet) // SAMPLE))
@@ -58,7 +58,7 @@ def misfits_of_layer(name: str, layer: Layers, field: Field, domain: Domain) -> 
         if not len(places):
             continue
         h, height = float(np.median(field(places))), float(layer.heights[row])
-        what = f"{name} has cells {layer.width:.3g} wide and {height:.3g} high where the size field asks for {h:.3g}"
+        what = f"{name} has cells {layer.width:.3g} wide and {height:.3g} high where the size field is {h:.3g}"
         if math.sqrt(layer.width * height) > COARSER * h:
             remedy = "make the layers finer or the size field larger along these walls"
             return [f"{what}: sizes jump there; {remedy}"]

@@ -14,7 +14,7 @@ from ..geometry.geojson import may_be_degrees
 from ..geometry.polygon import Polygon
 from ..sizing import Sizing, as_field
 from ..sizing.layers import limit_beside_layers
-from .diagnostics import warn_of_misfits
+from .diagnostics import warn_of_mismatches
 from .estimates import check_memory, memory_needed
 from .forecast import images_expected, shore_expected, surplus_expected
 from .methods import Relaxation, make_method
@@ -105,7 +105,7 @@ class Preparation:
         else:
             self._tree = density_tree(self.sizing, self.free)
             asked = self._tree.integral + len(self.rows)
-        warn_of_misfits(given_field, domain, options.layers)
+        warn_of_mismatches(given_field, domain, options.layers)
         self.target = n_cells if n_cells is not None else max(1, round(asked))
         if n_cells is None and asked < 0.5:
             message = (

@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from ..arguments import warn
-from ..errors import InputError, InputTypeError, MisfitWarning
+from ..errors import InputError, InputTypeError, MismatchWarning
 from ..files import LONGEST_GEOMETRY, read_text
 
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
@@ -130,7 +130,7 @@ def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:
             f"{name} has longitudes and latitudes ({system}), which are used as lengths in the plane: at latitude "
             f"{latitude:.3g} cells would be {math.cos(math.radians(latitude)):.2g} times as wide as high; project the "
             "coordinates first, or remove the crs if they are projected",
-            MisfitWarning,
+            MismatchWarning,
         )
 
 

@@ -1,1 +1,1 @@
-"""What the caller gets, as NumPy arrays: diagrams and results, connectivity, quality, checks."""
+"""Diagrams and results as NumPy arrays: connectivity, faces, quality, verification."""

@@ -1,4 +1,4 @@
-"""The faces of a diagram on the host: their corners, each face once; for files, pictures and measures."""
+"""Faces and corners of a diagram on the host: half-faces, loops around cells, each face once."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from .diagram import Diagram
 
 
 def face_owners(diagram: Diagram) -> np.ndarray:
-    """Return the cell in whose row each face of the graph stands, (m,) int32."""
+    """Return the cell of each half-face, (m,) int32."""
     starts = diagram.neighbor_starts
     return np.repeat(np.arange(len(diagram), dtype=np.int32), np.diff(starts))
 
 
 def neighbor_points(diagram: Diagram, faces: np.ndarray) -> np.ndarray:
-    """Return where the neighbors across `faces` (k,) stand, which lead to generators: (k, d), images where they do."""
+    """Return the generators, or their images, behind the half-faces `faces` (k,) between two cells: (k, d)."""
     shifts = diagram.shifts[faces] * diagram.domain.extent
     return diagram.points[diagram.neighbors[faces]] + shifts
 
 
 def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers that name each of `faces` (k,), which lead to generators, and the same face from the other side.
+    """Return keys of the half-faces `faces` (k,) between two cells, and keys of their opposite half-faces.
 
-    Both are in the order of cell, neighbor and shift; in a polygon, where two cells may have several faces in common,
-    then of their vertices; (k,) int64 each.
+    Keys sort by cell, neighbor and shift, and in a polygon, where two cells may share several faces, then by vertices;
+    (k,) int64 each.
     """
     n, dim = len(diagram), diagram.domain.dim
     i, j = face_owners(diagram)[faces].astype(np.int64), diagram.neighbors[faces].astype(np.int64)
@@ -45,7 +45,7 @@ def face_keys(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def face_ends(diagram: Diagram) -> np.ndarray:
-    """Return the vertices that each face of the graph runs from and to, (m, 2); its cell is on the left."""
+    """Return the first and last vertex of each half-face in 2D, (m, 2); its cell is on the left."""
     if isinstance(diagram.domain, Polygon):
         return diagram.face_vertices.reshape(-1, 2)
     starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
@@ -53,9 +53,9 @@ def face_ends(diagram: Diagram) -> np.ndarray:
 
 
 def next_faces(diagram: Diagram) -> np.ndarray:
-    """Return the face that comes after each face in its loop around the cell, (m,).
+    """Return for each half-face in 2D the next one in its loop around the cell, (m,).
 
-    In a row the loops stand one after the other, and each goes on until its vertices do not.
+    In the row of a cell one loop follows the other. A loop ends where the next face does not begin in its last vertex.
     """
     ends, starts = face_ends(diagram), diagram.neighbor_starts
     m = len(ends)
@@ -70,7 +70,7 @@ def next_faces(diagram: Diagram) -> np.ndarray:
 
 
 def following(starts: np.ndarray) -> np.ndarray:
-    """Return, for each item of ragged rows that are loops, where the next one of its loop stands."""
+    """Return for each item of ragged rows, taken as loops, the place of the next item of its loop."""
     places = np.arange(1, starts[-1] + 1)
     filled = starts[1:] > starts[:-1]
     places[starts[1:][filled] - 1] = starts[:-1][filled]
@@ -80,9 +80,9 @@ def following(starts: np.ndarray) -> np.ndarray:
 def take_rows(
     starts: np.ndarray, items: np.ndarray, rows: np.ndarray, backwards: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ragged `rows` (indices) of `starts` and `items`, in that form again.
+    """Return the selected `rows` (indices) of the ragged array `starts` and `items`, as starts and items.
 
-    A row where `backwards` (bool, one per row) is set has its items in reverse, the first one staying first.
+    Where `backwards` (bool, one per row) is set, the items of a row are reversed, but the first stays first.
     """
     counts = np.diff(starts)[rows]
     taken = np.concatenate([[0], np.cumsum(counts)])
@@ -94,11 +94,11 @@ def take_rows(
 
 
 def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of each face of the graph as ragged rows: starts (m + 1,) and vertices.
+    """Return the corners of each half-face as ragged rows: starts (m + 1,) and vertices.
 
-    In 2D a face runs from its first to its second corner, its cell to the left. In 3D the corners go around
-    the face counter-clockwise as seen from outside of its cell. A corner that comes twice in a row is given
-    once; a face that has then no measure (fewer than 2 corners in 2D, 3 in 3D) has an empty row.
+    In 2D the cell is on the left of the way from the first to the second corner. In 3D the order is counter-clockwise
+    as seen from outside of the cell. A repeated corner is given once. A face that then has no measure (fewer than 2
+    corners in 2D, 3 in 3D) has an empty row.
     """
     if diagram.domain.dim == 2:
         ends = face_ends(diagram)
@@ -118,7 +118,7 @@ def face_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
 def cell_corners(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of each cell in 2D as ragged rows: starts (n + 1,) and vertices, counter-clockwise.
 
-    A corner that comes twice in a row is given once. Several loops are joined by bridges, as in the diagram.
+    A repeated corner is given once. Several loops are joined by bridges, as in the diagram.
     """
     starts, corners = diagram.cell_vertex_starts, diagram.cell_vertices
     cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
@@ -134,13 +134,13 @@ class FaceTopology:
     Attributes
     ----------
     owner, neighbor : (f,) int32
-        Cells on both sides, owner < neighbor (or the same, in a periodic box); on a wall b the neighbor is
-        -1 - b. The walls stand one after the other, each in the order of the owners.
+        Cells on both sides, owner < neighbor (or equal, in a periodic box); on wall k the neighbor is -1 - k. One wall
+        follows the other, each in the order of the owners.
     rows : (f,) int
-        Where in the diagram's graph the face is described.
+        A half-face of each face.
     starts : (f + 1,) int, corners : int
-        Vertices of each face; in 2D from the first to the second with the owner to the left, in 3D
-        counter-clockwise as seen from the neighbor.
+        Vertices of each face: in 2D the owner is on the left of the way from the first to the second, in 3D the
+        order is counter-clockwise as seen from the neighbor.
     flipped : (f,) bool
         Whether only the neighbor's half-face is there, so that `rows` leads to that one.
     """
@@ -166,7 +166,7 @@ def face_topology(diagram: Diagram) -> FaceTopology:
     inner = np.flatnonzero(filled & (neighbor >= 0))
     low = np.minimum(owner[inner], neighbor[inner]).astype(np.int64)
     high = np.maximum(owner[inner], neighbor[inner])
-    # Of both descriptions the one from the lower cell comes first, if there are both.
+    # Of two half-faces the one of the lower cell comes first.
     here, there = face_keys(diagram, inner)
     flipped = here > there
     key = np.minimum(here, there) * 2 + flipped

@@ -17,7 +17,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
         )
     n, starts = len(diagram), diagram.cell_vertex_starts
     cells = np.repeat(np.arange(n, dtype=np.int64), np.diff(starts))
-    # A cell of several loops passes its bridges' ends twice.
+    # A cell with several loops lists the ends of its bridges twice.
     pairs = np.unique(diagram.cell_vertices * np.int64(n) + cells)
     vertices, cells = pairs // n, pairs % n
     arms = diagram.points[cells] - diagram.vertices[vertices]
@@ -26,7 +26,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     cells = cells[order]
     first = np.flatnonzero(np.diff(vertices, prepend=-1))
     counts = np.diff(first, append=len(vertices))
-    # Fans of counts - 2 triangles; at most vertices of one.
+    # A fan of counts - 2 triangles; one triangle at most vertices.
     fans = np.maximum(counts - 2, 0)
     apex = np.repeat(first, fans)
     step = 1 + np.arange(len(apex)) - np.repeat(np.cumsum(fans) - fans, fans)

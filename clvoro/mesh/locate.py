@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..arguments import check_rows
 from ..geometry.polygon import Polygon
@@ -27,7 +27,7 @@ class Locator:
         self.origin = np.array(self.domain.lower)
         periods = np.where(self.domain.periodic, self.domain.extent, 0.0)
         self.last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
-        self.tree = cKDTree(self._place(diagram.points), boxsize=periods)
+        self.tree = KDTree(self._place(diagram.points), boxsize=periods)
 
     def _place(self, points: np.ndarray) -> np.ndarray:
         """Return positions relative to the lower corner, in periodic directions within one period."""

@@ -1,4 +1,4 @@
-"""Measures of a mesh that matter to finite-volume methods, from a `Diagram` on the host."""
+"""Measures of mesh quality for finite-volume methods, computed on the host from a `Diagram`."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from .straightening import straighten
 
 @dataclass(frozen=True, repr=False)
 class Measures:
-    """What `measure_mesh` finds: per cell (n,), or per face of the diagram's graph (m,).
+    """Measures of a mesh, one per cell (n,) or one per half-face (m,).
 
-    The line between the generators x_i and x_j meets the plane of their face at a right angle and in its middle
-    (x_i + x_j) / 2, by the definition of a Voronoi diagram: with the unknowns at the generators a mesh has no
-    non-orthogonality. Behind a wall the generator's mirror image takes the place of x_j.
+    The line between the generators x_i and x_j crosses the plane of their face at a right angle, in (x_i + x_j) / 2, by
+    the definition of a Voronoi diagram: with the unknowns at the generators a mesh has no non-orthogonality. At a wall
+    the mirror image of the generator takes the place of x_j.
 
     Attributes
     ----------
     quality : (n,) float
-        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon, less for all others; n is the number of
-        faces. Those on the boundary of a polygonal domain are taken together and straightened as long as they turn by
-        no more than 30 degrees: Q is that of the polygon with these sides.
+        2D: 4 A n tan(pi / n) / P^2 (the paper's 4.1), 1 for a regular polygon and less for all others; n is the number
+        of faces. Faces on the boundary of a polygonal domain count as one straight side while they turn by at most 30
+        degrees in sum.
         3D: the isoperimetric quotient 36 pi V^2 / S^3, 1 for a ball, .753 for a truncated octahedron, .524 for a cube.
     skewness : (m,) float
-        Distance from the centroid of the face to the point where the line between the generators meets its
-        plane, over the distance of the generators; infinite for a generator on a wall, or behind it (a cell may reach
-        around a corner of a polygon). A linear interpolation along the line is off the face's centroid by so much.
+        Distance from the centroid of the face to the point where the line between the generators crosses its plane,
+        over the distance of the generators: the offset of linear interpolation along the line. It is infinite for a
+        generator on a wall or behind it (a cell may reach around a corner of a polygon).
     centroid_angle : (m,) float
         Angle in degrees between the normal of the face and the line from centroid to centroid: the
         non-orthogonality of solvers that keep their unknowns at the centroids. 0 on walls.
@@ -42,7 +42,7 @@ class Measures:
     faces : (n,) int
         Number of faces of the cell.
     inner : (m,) bool
-        Which faces are between two cells.
+        Whether the face is between two cells.
     polygonal : bool
         Whether the domain is a polygon.
     """
@@ -60,7 +60,7 @@ class Measures:
         return f"Measures({self.line()})"
 
     def line(self) -> str:
-        """Return in a line what finite-volume methods ask of a mesh."""
+        """Return faces per cell, skewness and angles as one line of text."""
         s = self.summary()
         return (
             f"{s['mean_faces']:.2f} faces per cell; skewness mean {s['mean_skewness']:.3f}, "
@@ -106,9 +106,9 @@ class Measures:
 
 
 def measure_mesh(diagram: Diagram) -> Measures:
-    """Measure the cells and faces of a diagram in 2D or 3D.
+    """Measure the cells and half-faces of a diagram in 2D or 3D.
 
-    A wall is a plane, whatever part of it is in the domain: one of a box, or through an edge of a polygon.
+    A wall counts as an infinite plane, through a side of a box or an edge of a polygon.
     """
     owner, neighbor = face_owners(diagram), diagram.neighbors
     points, centroids, volumes = diagram.points, diagram.centroids, diagram.volumes
@@ -123,9 +123,9 @@ def measure_mesh(diagram: Diagram) -> Measures:
     line[walls] = 2 * gaps[:, None] * normals
     distance = np.linalg.norm(line, axis=1)
     distance[walls[gaps <= 0]] = 0
-    meeting = points[owner] + 0.5 * line
-    offset = np.linalg.norm(middles - meeting, axis=1)
-    skewness = np.where(offset > 0, np.inf, 0.0)  # stays where the distance is none
+    crossing = points[owner] + 0.5 * line
+    offset = np.linalg.norm(middles - crossing, axis=1)
+    skewness = np.where(offset > 0, np.inf, 0.0)  # remains where the distance is 0
     np.divide(offset, distance, out=skewness, where=distance > 0)
 
     angle = np.zeros(len(line))
@@ -146,7 +146,7 @@ def measure_mesh(diagram: Diagram) -> Measures:
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angles in degrees between vectors (m, d), to full precision also where they are small."""
+    """Return the angles in degrees between vectors (m, d), accurate for small angles, too."""
     a = a / np.linalg.norm(a, axis=1)[:, None]
     b = b / np.linalg.norm(b, axis=1)[:, None]
     halves = np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))

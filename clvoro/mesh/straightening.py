@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from .diagram import Diagram
 
 SIDE_TURN = np.pi / 6 * (1 + 2.0**-10)
-"""A side of a cell on the boundary turns by no more than this: 30 degrees, and a little so that it is never met.
+"""Largest turn of a side on the boundary: 30 degrees and a little more.
 
-Sums of turns round, by some roundings each; yet an arc of 2 x 15 degrees shall be one side in any precision. Regular
-rings turn by a fraction of 360 degrees with a denominator that is no more than their number of edges.
+Sums of turns have round-off, but an arc of 2 x 15 degrees is one side in any precision. The margin is smaller than the
+difference to the next possible sum in regular rings, whose turns are 360 degrees over their number of edges.
 """
 
 
@@ -49,19 +49,19 @@ class Straightened:
 
 
 def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
-    """Return sides, areas and perimeters of cells in 2D, the boundary between two of their corners made straight.
+    """Return sides, areas and perimeters of cells in 2D with a straightened boundary.
 
-    Each face between cells is a side. So is each stretch of the boundary along which it turns by no more than 30
-    degrees (`SIDE_TURN`) in sum, as a straight line from its first end to its last; where it turns farther a new side
-    begins. Stretches go along the rings of the domain, from where the cell's part of a ring begins to where it ends; in
-    a ring that is all one cell's the first begins in its sharpest corner. Holes within a cell are no sides of it. Cells
-    with less than three sides are left as they are. In a box the sides are the faces.
+    Each face between cells is a side. A stretch of the boundary that turns by at most 30 degrees (`SIDE_TURN`) in sum
+    is one side, a straight line from its first to its last end; where it turns farther a new side begins. Stretches
+    follow the rings of the domain, from the beginning to the end of the cell's part of a ring. If a cell has a whole
+    ring, the first stretch begins in its sharpest corner. Holes within a cell are not sides. Cells with fewer than
+    three sides remain as they are. In a box the sides are the faces.
 
     Parameters
     ----------
     diagram : Diagram
     real : dtype
-        Precision in which turns are added up, as the device does.
+        Precision of the sums of turns, as on the device.
     """
     starts = diagram.neighbor_starts
     counts, n = np.diff(starts), len(diagram)
@@ -71,7 +71,7 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
         return Straightened(counts, diagram.volumes, perimeters)
     of, first, final = _stretches(diagram, diagram.domain, owner, np.dtype(real))
     rows, cells, last = np.flatnonzero(of >= 0), owner[first], len(first)
-    # From the generator, with what is known of it: of sides of one face nothing is left.
+    # Positions are relative to the generator. A side of a single face changes nothing.
     ends = face_ends(diagram)
     p, q = (diagram.vertices[v] - diagram.points[owner] for v in ends.T)
     length, area = (np.bincount(of[rows], x[rows], last) for x in (measures, _cross(p, q) / 2))
@@ -96,7 +96,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _stretches(
     diagram: Diagram, domain: Polygon, owner: np.ndarray, real: np.dtype
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which stretch each face is a part of, (m,), -1 for none; and the first and last face of each, (s,)."""
+    """Return the stretch of each half-face, (m,), or -1; and the first and the last half-face of each stretch, (s,)."""
     following = _along_rings(diagram, domain)
     edges = _places(diagram, domain)
     begins = _beginnings(domain, following, edges, owner)
@@ -135,11 +135,11 @@ def _places(diagram: Diagram, domain: Polygon) -> np.ndarray:
 
 
 def _along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
-    """Return for each face on the boundary the next one on its ring, (m,); -1 for others, and where there is none."""
+    """Return for each half-face on the boundary the next one on its ring, (m,); -1 if there is none."""
     rows = np.flatnonzero(diagram.neighbors < 0)
     edge = _places(diagram, domain)[rows]
     begin, end = face_ends(diagram)[rows].T.astype(np.int64)
-    # Edges may be too short for a face.
+    # Very short edges have no face.
     used = np.unique(edge)
     ring = np.searchsorted(domain.oriented.ring_starts, used, side="right")
     starts = np.flatnonzero(np.diff(ring, prepend=-1))
@@ -161,7 +161,7 @@ def _along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
 def _beginnings(
     domain: Polygon, following: np.ndarray, edges: np.ndarray, owner: np.ndarray
 ) -> list[int]:
-    """Return the faces on the boundary with which a cell's part of a ring begins; none where that is a whole hole."""
+    """Return the half-faces on the boundary with which a cell's part of a ring begins; none for a whole hole."""
     rows = np.flatnonzero(edges >= 0)
     goes_on = rows[following[rows] >= 0]
     before = np.full(len(edges), -1)
@@ -172,7 +172,7 @@ def _beginnings(
     divided = np.zeros(len(oriented.sharpest), bool)
     divided[ring[begins]] = True
     is_outer = np.diff(domain.piece_of_ring, prepend=-1) > 0
-    # Of those that are all one cell's the first faces of edges, the nearest behind the sharpest corner.
+    # In rings that one cell has as a whole: the first face behind the sharpest corner.
     firsts = rows[(edges[before[rows]] != edges[rows]) & (is_outer & ~divided)[ring[rows]]]
     size = np.diff(oriented.ring_starts)[ring[firsts]]
     away = (edges[firsts] - oriented.sharpest[ring[firsts]]) % size

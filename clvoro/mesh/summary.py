@@ -1,4 +1,4 @@
-"""The figures that describe a run."""
+"""Figures that describe a run."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from .results import Result
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """Return cells, steps, error, quality, share of changed cells, why it stopped, seconds.
-
-    Of a polygonal domain also those of the cells on the boundary and of the others; see `beside_boundary`.
-    """
+    """Return the figures of a run; see `Result.summary`."""
     error, history = np.abs(result.size_error), result.history
     parts = beside_boundary(result) if isinstance(result.diagram.domain, Polygon) else {}
     apart = {
@@ -37,7 +34,10 @@ def summary(result: Result) -> dict[str, Any]:
 
 
 def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
-    """Return the number, mean |e|, mean and least Q of cells on the `boundary` and of `inner` ones; None of none."""
+    """Return number, mean |e|, mean and least Q of the cells on the `boundary` and of the `inner` ones.
+
+    The values are None if there is no such cell.
+    """
     d = result.diagram
     owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
     on_boundary = np.bincount(owner, d.neighbors < 0, len(d)) > 0
@@ -55,7 +55,7 @@ def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
 
 
 def boundary_line(result: Result) -> str:
-    """Return in a line how cells on the boundary differ from the others."""
+    """Return the figures of cells on the boundary and of the others as one line of text."""
     return "; ".join(
         f"{s['cells']} {name} cells: mean |e| {s['mean_error']:.4f}, mean Q {s['mean_quality']:.4f}, "
         f"min Q {s['min_quality']:.3f}"

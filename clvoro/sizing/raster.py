@@ -46,7 +46,7 @@ class Raster(Field):
     outside : "nearest" or "error", optional
         Whether points outside of the box get the nearest value of the array, or raise an error. (With "centers" the
         nearest value is used within half a pixel of the sides in any case.) By default "nearest", and a run warns
-        (`MisfitWarning`) if less than half of the domain is covered.
+        (`MismatchWarning`) if less than half of the domain is covered.
 
     Raises
     ------

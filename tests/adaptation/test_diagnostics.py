@@ -9,9 +9,9 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.diagnostics import misfits_of_layer
+from clvoro.adaptation.diagnostics import layer_mismatches
 from clvoro.cli import command as cli
-from clvoro.errors import CoarseSizeWarning, InputError, MisfitWarning, SizeErrorWarning
+from clvoro.errors import CoarseSizeWarning, InputError, MismatchWarning, SizeErrorWarning
 
 BOX = clvoro.Box((0, 0), (2, 1))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -130,17 +130,17 @@ def test_layers_of_other_sizes_than_the_field(layer, size, message, domain):
     # The field is coarse far away: what counts is beside the layers.
     field = sizing.Distance(sizing.Segment((0, 0), (2, 0)), h_min=size, slope=0.05)
     edges = (2,) if domain is BOX else (0,)
-    found = misfits_of_layer("layers[0]", clvoro.Layers(**layer, edges=edges), field, domain)
+    found = layer_mismatches("layers[0]", clvoro.Layers(**layer, edges=edges), field, domain)
     assert len(found) == (message is not None)
     assert message is None or message in found[0]
 
 
 def test_runs_warn(ctx):
     adapter, options = clvoro.Adapter(ctx), {"method": "lloyd", "max_steps": 0}
-    with pytest.warns(MisfitWarning, match="change nothing") as given:
+    with pytest.warns(MismatchWarning, match="change nothing") as given:
         adapter.run(BOX, near(sizing.Circle((900, 400), 200)), **options)
     assert given[0].filename == __file__
-    with pytest.warns(MisfitWarning, match="sizes jump"):
+    with pytest.warns(MismatchWarning, match="sizes jump"):
         adapter.run(BOX, 0.05, layers=clvoro.Layers(0.2, edges=[2]), **options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -161,7 +161,7 @@ def test_longitudes_and_latitudes(tmp_path, crs):
     path = tmp_path / "lake.geojson"
     path.write_text(json.dumps(lake(46.2, crs)))
     with pytest.warns(
-        MisfitWarning, match=r"lake\.geojson has longitudes and latitudes.* 0\.69 times"
+        MismatchWarning, match=r"lake\.geojson has longitudes and latitudes.* 0\.69 times"
     ):
         clvoro.Polygon.from_geojson(path)
 
@@ -209,6 +209,27 @@ def test_the_command_line_warns(tmp_path, capfd, center, said):
 
 JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
 """Of a twentieth of a cell at the wall: the cells beside it ask for what no neighbor of theirs can be."""
+
+
+@pytest.mark.parametrize(
+    ("size", "n_cells", "category", "advice"),
+    [
+        (0.8, None, SizeErrorWarning, "do not fill evenly: use smaller sizes, or n_cells"),
+        (3.0, None, CoarseSizeWarning, "are h and the domain in the same unit"),
+        (0.8, 2, None, None),
+        (0.1, None, None, None),
+    ],
+)
+def test_sizes_near_or_above_that_of_the_domain(ctx, size, n_cells, category, advice):
+    """Nothing grows there: a bound of the growth would not help, and it is not advised."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (1, 1)), size, n_cells=n_cells, effort="fast")
+    assert [w.category for w in caught] == ([] if category is None else [category])
+    for w in caught:
+        assert advice in str(w.message)
+        assert "Graded" not in str(w.message)
+        assert w.filename == __file__
 
 
 @pytest.mark.parametrize(

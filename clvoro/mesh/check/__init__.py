@@ -1,4 +1,4 @@
-"""Is a mesh what it claims to be? Recomputed on the host, from its arrays alone."""
+"""Verification of meshes on the host, from their arrays alone."""
 
 from .mesh import check_diagram, check_result
 

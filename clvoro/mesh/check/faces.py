@@ -1,4 +1,4 @@
-"""What holds of faces beside what `check.py` asks: both cells have the same corners, measures fit each other."""
+"""Checks of faces: both cells have the same corners, and measures fit each other."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def check_corners(check: Check) -> None:
-    """Check that a face has the same corners from both sides: a vertex that is stored twice is found here.
+    """Check that a face has the same corners from both sides, which finds vertices that are stored twice.
 
-    In a polygon corners tell faces apart, and the graph is not symmetric otherwise. Across a seam each side has
+    Polygons need no such check: there the symmetry of the graph depends on the corners. Across a seam each side has
     vertices of its own.
     """
     d = check.diagram
@@ -46,7 +46,7 @@ def check_corners(check: Check) -> None:
         lambda k: f"the face of cells {owner[here[k]]} and {owner[there[k]]} has other vertices from either side",
     )  # fmt: skip
     if d.domain.dim == 2 and not any(d.domain.periodic):
-        # Of what covers a rectangle; across seams vertices have several numbers.
+        # For a rectangle; across seams a vertex has several numbers.
         v, e = len(d.vertices), len(d.neighbors) - len(inner) // 2
         check.note(
             "Euler's formula", np.array([v - e + len(d) != 1]),
@@ -56,10 +56,10 @@ def check_corners(check: Check) -> None:
 
 
 def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
-    """Check that the faces' measures close each cell, and give its volume, with their places as generators have them.
+    """Check that the measures of the faces close each cell and give its volume, on the bisectors of the generators.
 
-    A cell is cut out around its generator: its measures round by its own size, not the domain's, as `positions` do,
-    unless they were made anew from a file's corners.
+    The device computes a cell relative to its generator. The round-off of its measures is therefore relative to the
+    size of the cell, not of the domain as that of `positions`, unless they come from the corners in a file.
     """
     d = check.diagram
     if g.remade:
@@ -73,8 +73,8 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
     loose = np.zeros(len(g.owner), bool)
     if isinstance(d.domain, Polygon):
-        # Parts that were cut off from their generators have faces anywhere: these are where their corners are. Such a
-        # part lies at the boundary, and so does the cell that has it now, on one side of the face or the other.
+        # Faces of parts that the boundary has cut off from their generators are not on bisectors: their corners give
+        # their places. Such a part lies at the boundary, and so does the cell that it belongs to.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
         at_boundary = np.bincount(g.owner[walls], minlength=n) > 0
         at_wall = (
@@ -84,10 +84,10 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         adopted = off > np.where(at_wall, doubts.measures, positions.measures)
         adopted &= (d.neighbors >= 0) & (g.measures > 0)
         normals = np.where(adopted[:, None], there, normals)
-        # Edges meet their corners to rounding.
+        # Edges of the domain pass through their corners within round-off.
         loose = adopted | (d.neighbors < 0)
     rounding = np.where(loose, 2 * positions.measures, 0.0)
-    # Across seams neighbors are off by what the device's periods are.
+    # The round-off of the device's periods moves neighbors across seams.
     across = np.where(d.shifts.any(axis=1), g.period_off, 0.0) * d.face_measures
     turned = across / g.spacings
     width = np.bincount(g.owner, doubts.measures + rounding + turned, n)
@@ -99,7 +99,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         "measures close", np.maximum(gap - width, 0),
         lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
     )  # fmt: skip
-    if isinstance(d.domain, Polygon):  # how far off a part's faces are only corners tell
+    if isinstance(d.domain, Polygon):  # corners alone give the places of cut faces
         return
     volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
     gap = np.abs(d.volumes - volumes)

@@ -1,4 +1,4 @@
-"""What a check of a mesh finds, and how it is told."""
+"""The report of a check: which properties of a mesh hold, and which do not."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ if TYPE_CHECKING:
     from ..diagram import Diagram
 
 ROUNDINGS = 256
-"""How many roundings of a position (eps times the domain's size and its distance from 0) count as none. A corner may be
-off by more, where the faces that meet there say so: see `Rebuilt.doubts`."""
+"""Tolerance of positions, in units of round-off: eps times the size of the domain and its distance from 0.
+
+The tolerance of a corner is larger where its faces are nearly parallel; see `Rebuilt.doubts`."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong.
+    """One property that does not hold.
 
     Attributes
     ----------
     name : str
-        Of the property that does not hold, such as ``"volumes sum"``.
+        Name of the property, such as ``"volumes sum"``.
     message : str
-        What was found, what was expected, and where it is worst.
+        The value, the expected value, and the place with the largest deviation.
     count : int
-        In how many places.
+        Number of places.
     """
 
     name: str
@@ -43,16 +44,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """What a check has found; true if that is nothing.
+    """The result of a check; it is true if every property holds.
 
     Attributes
     ----------
     findings : tuple of Finding
     checked : tuple of str
-        Names of the properties that were looked at. The check stops early where arrays do not fit each other.
+        Names of the properties that were checked. The check stops early if arrays do not fit each other.
     cells, faces : int
     precision : str
-        The precision in which the mesh was made, told by its numbers; tolerances follow it.
+        The precision in which the mesh was computed, as its numbers show it; it determines the tolerances.
     """
 
     findings: tuple[Finding, ...]
@@ -63,7 +64,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether every property holds."""
         return not self.findings
 
     def __bool__(self) -> bool:
@@ -77,11 +78,11 @@ class Report:
                           *(f"  {finding}" for finding in self.findings)])  # fmt: skip
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the report as plain values."""
         return {"ok": self.ok, **asdict(self)}
 
     def demand(self) -> None:
-        """Raise if something is wrong.
+        """Raise an error if a property does not hold.
 
         Raises
         ------
@@ -92,11 +93,11 @@ class Report:
 
 
 class CheckError(ClvoroError):
-    """A mesh is not what it claims to be."""
+    """A mesh is not a valid Voronoi mesh of its domain."""
 
 
-class MisfitError(Exception):
-    """Arrays do not fit each other: what builds on them cannot be looked at."""
+class StopError(Exception):
+    """Arrays do not fit each other, so that the check cannot continue."""
 
 
 class Check:
@@ -110,7 +111,10 @@ class Check:
     def note(
         self, name: str, wrong: ArrayLike, say: Callable[[int], str], stop: bool = False
     ) -> None:
-        """Record whether `name` holds: `wrong` (k,) is true (or large) where it does not."""
+        """Record whether the property `name` holds: `wrong` (k,) is true, or a positive deviation, where it does not.
+
+        `say` returns the message for a place. With `stop` a property that does not hold ends the check.
+        """
         self.checked.append(name)
         places = np.flatnonzero(wrong)
         if places.size:
@@ -118,10 +122,10 @@ class Check:
             more = f" ({places.size} such)" if places.size > 1 else ""
             self.findings.append(Finding(name, say(worst) + more, int(places.size)))
             if stop:
-                raise MisfitError
+                raise StopError
 
     def shape(self, name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str = "f") -> None:
-        """Record whether an array has its shape, and finite numbers."""
+        """Record whether an array has the expected shape and finite numbers."""
         fits = array.shape == shape and array.dtype.kind in kinds
         self.note(
             "shapes", np.array([not fits]),

@@ -1,4 +1,4 @@
-"""The history of a run: is it one, and does its last row tell of the mesh beside it? See `check.py`."""
+"""Check of the history of a run: order of its rows, and the last row against the mesh."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
     from .findings import Check
 
 LOOSE = 256 * float(np.finfo(np.float32).eps)
-"""Rounding of the history's means, in every precision: the device takes the quality's in float32."""
+"""Tolerance of means in the history, in any precision: the device sums the quality in float32."""
 
 
 def check_history(check: Check, result: Result, eps: float) -> None:
-    """Check numbers and order of the history, and its last row against the mesh, whose errors round by `eps`."""
+    """Check numbers and order of the history, and its last row against the mesh, whose errors have round-off `eps`."""
     rows = result.history
-    if not len(rows):  # as of a .vtu file
+    if not len(rows):  # read from a .vtu file
         return
     for name in rows.dtype.names or ():
         values = rows[name]
-        least = int(name == "cells")  # nothing there is negative
+        least = int(name == "cells")  # all others are at least 0
         check.note(
             "history", ~(np.isfinite(values) & (values >= least)),
             lambda r, name=name, values=values: f"{name} in row {r} of the history is {values[r]}",
         )  # fmt: skip
-    # One row more may follow the last step.
+    # A second row may follow the last step.
     steps = rows["step"].astype(np.int64)
     rises = np.diff(steps)
     wrong = rises != 1
@@ -59,11 +59,11 @@ def check_history(check: Check, result: Result, eps: float) -> None:
         lambda _: f"the history ends on level {rows['level'][-1]}, expected 0",
     )  # fmt: skip
     error = np.abs(result.size_error)
-    told = {
+    expected = {
         "mean_error": error.mean(), "max_error": error.max(),
         "mean_quality": result.quality.mean(), "min_quality": result.quality.min(),
     }  # fmt: skip
-    for name, value in told.items():
+    for name, value in expected.items():
         last = rows[name][-1]
         check.note(
             "history", [not abs(last - value) <= LOOSE * abs(value) + 64 * eps],

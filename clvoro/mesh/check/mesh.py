@@ -1,8 +1,8 @@
-"""Is a mesh what it claims to be? Everything that can be known of it is computed anew, by NumPy on the host.
+"""Verification of a mesh: everything is recomputed by NumPy on the host, independently of the device's code.
 
-Nothing here comes from the device's code: cells are rebuilt from their corners, errors and quality from the paper's
-formulas, and the diagram's one defining property - no generator is nearer to a corner than the cell's own - is asked
-of a search tree over all generators.
+Cells are rebuilt from their corners, errors and quality follow from the paper's formulas. A search tree over all
+generators verifies the property that defines a Voronoi diagram: no generator is nearer to a corner of a cell than the
+cell's own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ...geometry.boundary import boundary_measure, wall_distance
 from ...geometry.polygon import Polygon
 from ..connectivity import face_keys
 from .faces import check_corners, check_measures
-from .findings import ROUNDINGS, Check, MisfitError, Report
+from .findings import ROUNDINGS, Check, Report, StopError
 from .polygon import check_cells, check_edges, check_outlines, hidden
 from .rebuilt import Doubts, Rebuilt
 from .values import check_values
@@ -45,14 +45,14 @@ def _finish(
 ) -> Report:
     diagram, geometry = check.diagram, None
     try:
-        # What is wrong may divide by 0, and is told as a finding.
+        # Wrong numbers may cause divisions by 0; they become findings.
         with np.errstate(all="ignore"):
             _check_structure(check)
             geometry = Rebuilt(diagram, dtype)
             _check_geometry(check, geometry)
             if more is not None:
                 more(geometry)
-    except MisfitError:
+    except StopError:
         pass
     names = tuple(dict.fromkeys(check.checked))
     real = "unknown precision" if geometry is None else geometry.real.name
@@ -61,7 +61,7 @@ def _finish(
 
 
 def _check_structure(check: Check) -> None:
-    """Check that the arrays fit each other, and that the graph is one."""
+    """Check that the arrays fit each other, and the graph."""
     d = check.diagram
     dim, n = d.domain.dim, len(d.points)
     m = len(d.neighbors)
@@ -109,8 +109,17 @@ def _check_structure(check: Check) -> None:
     )  # fmt: skip
     used = np.bincount(corners, minlength=len(d.vertices))
     check.note("vertices used", used == 0, lambda v: f"vertex {v} is no cell's corner")
-
     _check_shifts(check)
+    _check_graph(check)
+    check_corners(check)
+    if isinstance(d.domain, Polygon):
+        check_outlines(check)
+
+
+def _check_graph(check: Check) -> None:
+    """Check that no cell lists a neighbor twice, and that neighbors list each other."""
+    d = check.diagram
+    n, j = len(d), d.neighbors
     i = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
     check.note(
         "neighbors", (i == j) & ~d.shifts.any(axis=1),
@@ -136,13 +145,10 @@ def _check_structure(check: Check) -> None:
         "graph symmetric", np.ones(len(lone)),
         lambda k: "cell {} lists cell {}, which does not list it".format(*pair(lone[k])), stop=True,
     )  # fmt: skip
-    check_corners(check)
-    if isinstance(d.domain, Polygon):
-        check_outlines(check)
 
 
 def _check_shifts(check: Check) -> None:
-    """Check that only faces in periodic directions lead to images, and none to walls there."""
+    """Check that faces lead to images only in periodic directions, and to walls only in the others."""
     d = check.diagram
     periodic = np.array(d.domain.periodic)
     shifts, j = d.shifts, d.neighbors
@@ -162,6 +168,7 @@ def _check_shifts(check: Check) -> None:
 
 
 def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> None:
+    """Check that `starts` are ascending offsets from 0 to `total`."""
     good = len(starts) > 0 and starts[0] == 0 and starts[-1] == total
     rises = np.diff(starts.astype(np.int64)) if len(starts) else np.zeros(0)
     check.note(
@@ -171,6 +178,7 @@ def _check_starts(check: Check, name: str, starts: np.ndarray, total: int) -> No
 
 
 def _check_geometry(check: Check, g: Rebuilt) -> None:
+    """Check positions, volumes and faces against the rebuilt cells `g`."""
     d = check.diagram
     n, dim, domain = len(d), d.domain.dim, d.domain
     slack = ROUNDINGS * g.unit
@@ -180,7 +188,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         lambda i: f"generator {i} at {d.points[i]} lies outside {domain}",
     )  # fmt: skip
     outside = np.flatnonzero(~domain.contains(d.vertices))
-    if isinstance(domain, Polygon):  # slanted edges are met to rounding only
+    if isinstance(domain, Polygon):  # vertices on oblique edges have round-off
         outside = outside[domain.boundary_distance(d.vertices[outside]) > slack]
     check.note(
         "vertices inside", np.ones(len(outside)),
@@ -207,7 +215,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     _check_faces(check, g, slack, doubts)
     check_measures(check, g, doubts)
     off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
-    # A centroid is a quotient: where rounding is much of the cell, so it is of the centroid.
+    # The error of a centroid is relative to the volume.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)
     check.note(
         "centroids", np.maximum(off - doubt, 0),
@@ -221,7 +229,29 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
 
 
 def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None:
-    """Check faces: closed around each cell, measured right, outward, on their walls, the same from both sides."""
+    """Check faces: closed around each cell, right measures, outward, on their walls, equal on both sides."""
+    _check_closed(check, g, slack)
+    d, width = check.diagram, doubts.measures
+    wrong = np.abs(d.face_measures - g.measures) - width
+    check.note(
+        "face measures", np.maximum(wrong, 0),
+        lambda f: f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
+        f"{g.measures[f]:.17g}",
+    )  # fmt: skip
+    middle = d.face_centroids - d.points[g.owner]
+    off = np.linalg.norm(middle - g.middles, axis=1)
+    if d.domain.dim == 3:  # the centroid of a needle is uncertain along it: compare first moments
+        off = np.minimum(off, off * g.measures / np.maximum(g.reach[g.owner], 1e-150) ** 2)
+    check.note(
+        "face centroids", np.maximum(off - 4 * doubts.middles, 0),
+        lambda f: f"face_centroids[{f}] of cell {g.owner[f]} is {d.face_centroids[f]}, its corners give "
+        f"{d.points[g.owner[f]] + g.middles[f]}",
+    )  # fmt: skip
+    _check_sides(check, g, slack, width)
+
+
+def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
+    """Check that the faces of each cell close it: at edges in 3D, and as a sum of vectors."""
     d = check.diagram
     dim, n = d.domain.dim, len(d)
     if dim == 3:
@@ -243,34 +273,23 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
     gap = np.linalg.norm(gap, axis=1)
     bound = np.full(n, slack)
     if dim == 3:
-        # Between the corners of neighboring faces slits may be left, as wide as their bisectors round.
+        # Between neighboring faces slits may remain, as wide as the round-off of their bisectors.
         near = np.full(n, np.inf)
         np.minimum.at(near, g.owner, g.spacings)
         bound *= 2 * g.reach * (1 + g.reach / near)
     check.note(
         "faces closed", np.maximum(gap - bound, 0), lambda i: f"the faces of cell {i} do not close"
     )
-    width = doubts.measures
-    wrong = np.abs(d.face_measures - g.measures) - width
-    check.note(
-        "face measures", np.maximum(wrong, 0),
-        lambda f: f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
-        f"{g.measures[f]:.17g}",
-    )  # fmt: skip
-    middle = d.face_centroids - d.points[g.owner]
-    off = np.linalg.norm(middle - g.middles, axis=1)
-    if dim == 3:  # a needle's may be anywhere along it: what rounds by so much is the first moment
-        off = np.minimum(off, off * g.measures / np.maximum(g.reach[g.owner], 1e-150) ** 2)
-    check.note(
-        "face centroids", np.maximum(off - 4 * doubts.middles, 0),
-        lambda f: f"face_centroids[{f}] of cell {g.owner[f]} is {d.face_centroids[f]}, its corners give "
-        f"{d.points[g.owner[f]] + g.middles[f]}",
-    )  # fmt: skip
+
+
+def _check_sides(check: Check, g: Rebuilt, slack: float, width: np.ndarray) -> None:
+    """Check that faces point outward, lie on their walls, and have one measure on both sides (within `width`)."""
+    d = check.diagram
     inner, walls = np.flatnonzero(d.neighbors >= 0), np.flatnonzero(d.neighbors < 0)
     inward = -np.einsum("ij,ij->i", g.areas, g.directions)
     if isinstance(d.domain, Polygon):
-        # A part that is cut off from its generator goes to the cell beyond a face, and its faces lie otherwise: some of
-        # those between the same two cells may look back.
+        # A part that the boundary cuts off from its generator belongs to an adjacent cell. Its faces are not on the
+        # bisector, and single ones between the same two cells may point inward.
         pair = np.unique(
             g.owner * (len(d) + 1) + np.maximum(d.neighbors, -1) + 1, return_inverse=True
         )[1]
@@ -282,12 +301,11 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
     )  # fmt: skip
     middles = g.middles[walls] + d.points[g.owner[walls]]
     height = wall_distance(d.domain, -1 - d.neighbors[walls], middles)
-    height[g.measures[walls] == 0] = 0  # no polygon, no place
+    height[g.measures[walls] == 0] = 0  # a face without measure has no place
     check.note(
         "walls", np.maximum(height - slack, 0),
         lambda k: f"face {walls[k]} of cell {g.owner[walls[k]]} is off its wall by {height[k]:.3g}",
     )  # fmt: skip
-    # The same face from both sides.
     here, there = (inner[np.argsort(keys)] for keys in face_keys(d, inner))
     off = np.abs(d.face_measures[here] - d.face_measures[there])
     wide = np.maximum(width[here], width[there])
@@ -299,11 +317,11 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
 
 
 def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
-    """Check what makes it a Voronoi diagram: no generator is nearer to a cell's corner than the cell's own."""
+    """Check the property of a Voronoi diagram: no generator is nearer to a corner of a cell than the cell's own."""
     d = check.diagram
     corners = d.vertices[g.corners]
     own = np.linalg.norm(corners - d.points[g.cells], axis=1)
-    # A length of 0 is that of no period.
+    # For the tree a period of 0 means none.
     lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
     last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
     tree = KDTree(np.minimum(d.points - lower, last), boxsize=periods)

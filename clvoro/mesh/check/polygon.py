@@ -1,4 +1,4 @@
-"""What holds of diagrams of polygonal domains beside what holds of all (`check.py`)."""
+"""Checks of diagrams in polygonal domains, beside those of all diagrams."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from .rebuilt import Rebuilt
 
 ASIDE = 16 + 2 * max(BOUNDARY_SHIFTS)
-"""How many roundings of a position corners may be off the domain: where it could not be followed, the boundary was put
-aside (in units of the device, which are up to twice the domain's size)."""
+"""Distance of corners from the domain, in units of round-off, that is allowed: the device shifts the boundary where it
+cannot follow it exactly (in its own unit, which is up to twice the size of the domain)."""
 
 
 def check_outlines(check: Check) -> None:
-    """Check that faces chain up to loops, and that the corners go along all of them, and bridges there and back."""
+    """Check that faces form loops, and that the corners of a cell follow the loops, with bridges there and back."""
     d = check.diagram
     n, ends, following = len(d), face_ends(d), next_faces(d)
     owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
@@ -36,7 +36,7 @@ def check_outlines(check: Check) -> None:
     filled = starts[1:] > starts[:-1]
     places[starts[1:][filled] - 1] = starts[:-1][filled]
     cell = np.repeat(np.arange(n), np.diff(starts))
-    # Each way from vertex to vertex, less the ways back: what is left over of a bridge is nothing.
+    # Count each way from vertex to vertex, minus the ways back: the two ways of a bridge cancel.
     of = np.concatenate([owner, cell])
     a = np.concatenate([ends[:, 0], corners])
     b = np.concatenate([ends[:, 1], corners[places]])
@@ -55,7 +55,7 @@ def check_outlines(check: Check) -> None:
 
 
 def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
-    """Check that the faces on each edge of the polygon cover it, one after the other."""
+    """Check that the faces on each edge of the polygon cover it without gap or overlap."""
     d = check.diagram
     rows = np.flatnonzero(d.neighbors < 0)
     oriented = domain.oriented
@@ -68,7 +68,7 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     )
     order = np.lexsort((first + last, edge))
     edge, first, last = edge[order], first[order], last[order]
-    # Each begins where the one before ends, the first at 0; and behind the last one is the end.
+    # Each face begins where the previous one ends, the first at 0; the last one ends with the edge.
     new = np.diff(edge, prepend=-1) != 0
     gap = np.abs(first - np.where(new, 0.0, np.roll(last, 1)))
     check.note(
@@ -87,12 +87,12 @@ def check_edges(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
 
 
 def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None:
-    """Check that each cell holds its generator: its faces go around it once."""
+    """Check that each cell contains its generator: its faces wind around it once."""
     d = check.diagram
     begin, end = (d.vertices[v] - d.points[g.owner] for v in face_ends(d).T)
     angle = np.arctan2(begin[:, 0] * end[:, 1] - begin[:, 1] * end[:, 0], (begin * end).sum(axis=1))
     turns = np.bincount(g.owner, angle, len(d)) / (2 * np.pi)
-    # A generator on the boundary is half inside, or as rounding will have it.
+    # A generator on the boundary is inside or outside by round-off.
     edge = end - begin
     t = -(begin * edge).sum(axis=1) / np.maximum((edge**2).sum(axis=1), 1e-300)
     off = np.linalg.norm(begin + np.clip(t, 0, 1)[:, None] * edge, axis=1)
@@ -100,7 +100,7 @@ def check_cells(check: Check, domain: Polygon, g: Rebuilt, slack: float) -> None
     np.minimum.at(near, g.owner, off)
     wrong = np.flatnonzero((np.abs(turns - 1) > 1e-3) & (near > slack))
     if wrong.size and len(d) > 1:
-        # Of two on the boundary in the same place but for roundings, either may be the one inside, and have all of it.
+        # Of two generators on the boundary at one place within round-off, either one may have all of the cell.
         beside = KDTree(d.points).query(d.points[wrong], k=2)[0][:, 1]
         wrong = wrong[(beside > slack) | (domain.boundary_distance(d.points[wrong]) > slack)]
     check.note(
@@ -118,14 +118,14 @@ def hidden(
     slack: float,
     unit: float,
 ) -> np.ndarray:
-    """Return those of `places` in the cells' `corners` from which one of the nearest generators cannot be seen.
+    """Return those of `places` in the cells' `corners` from which one of the nearest generators is not visible.
 
-    A corner belongs to the cell of the generator nearest to it if the way between them is all in the domain. Otherwise
-    the boundary may have cut off the part of the region that it lies in, which is then another cell's. Where pieces of
-    the domain touch in a point, either side sees both; a generator in that point belongs to one side alone. Likewise
-    what is seen from a corner that the boundary goes around may be hidden just beside it.
+    A corner belongs to the cell of its nearest generator if the line between them lies in the domain. Otherwise the
+    boundary may have cut off that part of the region, which then belongs to another cell. Where pieces of the domain
+    touch in a point, both pieces are visible from it, but a generator there belongs to one of them. Also, a generator
+    that is visible from a re-entrant corner may be hidden right beside it.
 
-    Corner k of `corners` is where face k begins.
+    Face k begins in corner k of `corners`.
     """
     at = d.vertices[corners[places]]
     distances = tree.query(at - np.array(domain.lower))[0]
@@ -133,12 +133,12 @@ def hidden(
     place = np.repeat(np.arange(len(places)), [len(some) for some in nearest])
     goal = d.points[np.array([j for some in nearest for j in some], int)]
     way = goal - at[place]
-    # The corner itself may be off the domain.
+    # The corner itself may be outside of the domain within round-off.
     part = np.minimum(ASIDE * unit / np.maximum(np.linalg.norm(way, axis=1), 1e-300), 1)
     ends = np.stack([at[place] + part[:, None] * way, goal], axis=1)
     lines = np.asarray(shapely.linestrings(ends))
     away = np.bincount(place, ~shapely.covers(domain.geometry, lines), len(places)) > 0
-    # Which leads over slits that are no wider: from their sides nothing behind them is seen.
+    # The line crosses slits that are no wider: nothing behind them is visible from their sides.
     before = np.argsort(next_faces(d))
     for faces in (places, before[places]):
         begin, end = domain.edge_ends(np.maximum(-1 - d.neighbors[faces], 0))
@@ -146,23 +146,23 @@ def hidden(
         along /= np.linalg.norm(along, axis=1)[:, None]
         right = along[place, 1] * way[:, 0] - along[place, 0] * way[:, 1]
         away[place[(right > 4 * unit) & (d.neighbors[faces] < 0)[place]]] = True
-    # In those of a few roundings nobody can tell what is on this side, nor on which side a generator is.
+    # In a slit as narrow as round-off the side of a corner or generator is not determined.
     away |= domain.is_slit(at, ASIDE * unit)
     away[place[domain.is_slit(goal, ASIDE * unit)]] = True
     away |= near_shared_corners(domain, at, slack) | near_places(at, _reflex_corners(domain), slack)
-    # Nor is anything seen through a point, or from one.
+    # Nothing is visible through a point where pieces touch.
     away[place[near_shared_corners(domain, lines, slack)]] = True
     return places[away]
 
 
 def near_shared_corners(domain: Polygon, places: np.ndarray, slack: float) -> np.ndarray:
-    """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of a corner that several rings have."""
+    """Return which of `places`, points (k, 2) or shapes (k,), are within `slack` of a corner of several rings."""
     once, times = np.unique(domain.oriented.vertices, axis=0, return_counts=True)
     return near_places(places, once[times > 1], slack)
 
 
 def near_places(places: np.ndarray, others: np.ndarray, slack: float) -> np.ndarray:
-    """Tell which of `places`, points (k, 2) or shapes (k,), are within `slack` of one of `others` (m, 2)."""
+    """Return which of `places`, points (k, 2) or shapes (k,), are within `slack` of one of `others` (m, 2)."""
     near = np.zeros(len(places), bool)
     if len(places) and len(others):
         tree = shapely.STRtree(np.asarray(shapely.points(others)))
@@ -172,7 +172,7 @@ def near_places(places: np.ndarray, others: np.ndarray, slack: float) -> np.ndar
 
 
 def _reflex_corners(domain: Polygon) -> np.ndarray:
-    """Return the corners (m, 2) where the domain takes more than half of the surroundings."""
+    """Return the re-entrant corners (m, 2) of the domain."""
     after, vertices = domain.oriented.next_vertex, domain.oriented.vertices
     edges = vertices[after] - vertices
     turn = edges[:, 0] * edges[after, 1] - edges[:, 1] * edges[after, 0]

@@ -1,4 +1,4 @@
-"""The cells of a diagram rebuilt from their corners, by NumPy on the host: for checks, and for what files leave out."""
+"""Cells rebuilt from their corners by NumPy on the host: for checks, and for arrays that files do not hold."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from ..diagram import Diagram
 
 ADOPTED = 1024
-"""Roundings of a position by which a face may be off the bisector of its generators and still be a part of it."""
+"""Distance of a face from the bisector of its generators, in units of round-off, up to which it is part of it."""
 
 
 @dataclass(frozen=True)
 class Doubts:
-    """By how much rounding may have put off what is known of a diagram.
+    """Bounds of the round-off in the numbers of a diagram.
 
     Attributes
     ----------
     measures, middles : (m,) float
-        Of the faces.
+        Bounds for the measures and the centroids of faces.
     volumes : (n,) float
     """
 
@@ -37,7 +37,7 @@ class Doubts:
 
 
 class Rebuilt:
-    """The cells of a diagram, from nothing but generators, corners and the graph.
+    """The cells of a diagram, computed from generators, corners and the graph alone.
 
     Attributes
     ----------
@@ -53,65 +53,32 @@ class Rebuilt:
     cells, corners : (k,) int
         Every corner of every cell: the cell and the vertex.
     unit : float
-        The rounding of a position.
+        Round-off of a position.
     unit_of_cell : (n,) float
-        The rounding of a corner's place relative to its generator.
+        Round-off of a corner relative to its generator.
     period_off : float
-        By how much a periodic box's periods round, together: see `Box`.
+        Round-off of the periods of a periodic box, together; see `Box`.
     remade : bool
-        Whether the diagram's own measures of faces were made from its corners, too: they round as positions do.
+        Whether the diagram's own measures of faces come from its corners, too, so that their round-off is that of
+        positions.
     """
 
     directions: np.ndarray
-    """(m, d): from the cell's generator to the neighbor's or the wall, of length 1; of adopted faces the normal."""
+    """(m, d): unit vectors from the generator to that of the neighbor or to the wall; normals of adopted faces."""
     adopted: np.ndarray
-    """(m,) bool: faces between cells of a polygon that do not lie between their generators, as the boundary has cut one
-    of the parts beside them off from its own generator."""
+    """(m,) bool: faces in a polygon that are not on the bisector of their generators, since the boundary has cut off a
+    part of a cell there, which another cell has adopted."""
 
     def __init__(self, d: Diagram, dtype: object = None) -> None:
         dim, n = d.domain.dim, len(d)
         self.real = _precision(d, dtype)
         far = max(map(abs, (*d.domain.lower, *d.domain.upper)))
         size = float(np.linalg.norm(d.domain.extent))
-        # What is on the host is in float64 again: the way from the origin rounds in that.
+        # The host adds the origin in float64.
         self.unit = float(np.finfo(self.real).eps) * size + np.finfo(float).eps * far
         self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
         self.directions, self.spacings = _across(d, self.owner)
-        x = d.vertices
-        # All lengths relative to the cell's generator: small cells far from the origin keep their digits.
-        at = d.points[self.owner]
-        if dim == 2:
-            first, last = face_ends(d).T
-            a, b = x[first] - at, x[last] - at
-            edge = b - a
-            self.areas = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
-            self.middles = (a + b) / 2
-            self.cells, self.corners = self.owner, first
-            self._on_wall = d.neighbors < 0
-            self._following = next_faces(d)
-        else:
-            face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
-            first = d.face_vertex_starts[:-1][face]
-            following = np.arange(1, len(face) + 1)
-            last = np.flatnonzero(np.diff(face, append=-1))
-            following[last] = first[last]
-            a = x[d.face_vertices] - at[face]
-            b = x[d.face_vertices[following]] - at[face]
-            o = x[d.face_vertices[first]] - at[face]
-            triangle = np.cross(a - o, b - o) / 2
-            m = len(self.owner)
-            self.areas = np.stack([np.bincount(face, triangle[:, k], m) for k in range(3)], axis=1)
-            total = np.linalg.norm(self.areas, axis=1)
-            normal = self.areas / np.where(total > 0, total, 1)[:, None]
-            weight = np.einsum("ij,ij->i", triangle, normal[face])
-            moment = weight[:, None] * (a + b + o) / 3
-            sums = np.stack([np.bincount(face, moment[:, k], m) for k in range(3)], axis=1)
-            self.middles = np.where(
-                (total > 0)[:, None], sums / np.where(total > 0, total, 1)[:, None], 0.0
-            )
-            self.cells, self.corners = self.owner[face], d.face_vertices
-            self.edges = (face, d.face_vertices, d.face_vertices[following])
-            self._tails, self._edge, self._before = a, b - a, np.argsort(following)
+        (self._set_polygons if dim == 2 else self._set_polyhedra)(d)
         self.measures = np.linalg.norm(self.areas, axis=1)
         self._find_adopted(d)
         # The cell as the sum of the cones from its generator to its faces.
@@ -124,34 +91,75 @@ class Rebuilt:
         safe = np.where(self.volumes > 0, self.volumes, 1)
         self.centroids = np.stack(moments, axis=1) / safe[:, None]
         self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
-        self._distances = np.linalg.norm(x[self.corners] - d.points[self.cells], axis=1)
+        self._distances = np.linalg.norm(d.vertices[self.corners] - d.points[self.cells], axis=1)
         self.reach = np.zeros(n)
         np.maximum.at(self.reach, self.cells, self._distances)
-        self._vertex_count = len(x)
+        self._vertex_count = len(d.vertices)
         self.unit_of_cell = float(np.finfo(self.real).eps) * self.reach + np.finfo(float).eps * far
         self.period_off = float(np.finfo(self.real).eps) * d.domain.frame[1] * dim**0.5 / 2
-        told = getattr(d, "face_measures", None)
-        self.remade = told is not None and np.array_equal(told, self.measures)
+        given = getattr(d, "face_measures", None)
+        self.remade = given is not None and np.array_equal(given, self.measures)
+
+    def _set_polygons(self, d: Diagram) -> None:
+        """Set areas and middles of faces, and the corners of cells, in 2D."""
+        at = d.points[
+            self.owner
+        ]  # relative to the generator small cells far from the origin keep their digits
+        first, last = face_ends(d).T
+        a, b = d.vertices[first] - at, d.vertices[last] - at
+        edge = b - a
+        self.areas = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+        self.middles = (a + b) / 2
+        self.cells, self.corners = self.owner, first
+        self._on_wall = d.neighbors < 0
+        self._following = next_faces(d)
+
+    def _set_polyhedra(self, d: Diagram) -> None:
+        """Set areas and middles of faces, and the corners and edges of cells, in 3D."""
+        at, x = d.points[self.owner], d.vertices
+        face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
+        first = d.face_vertex_starts[:-1][face]
+        following = np.arange(1, len(face) + 1)
+        last = np.flatnonzero(np.diff(face, append=-1))
+        following[last] = first[last]
+        a = x[d.face_vertices] - at[face]
+        b = x[d.face_vertices[following]] - at[face]
+        o = x[d.face_vertices[first]] - at[face]
+        triangle = np.cross(a - o, b - o) / 2
+        m = len(self.owner)
+        self.areas = np.stack([np.bincount(face, triangle[:, k], m) for k in range(3)], axis=1)
+        total = np.linalg.norm(self.areas, axis=1)
+        normal = self.areas / np.where(total > 0, total, 1)[:, None]
+        weight = np.einsum("ij,ij->i", triangle, normal[face])
+        moment = weight[:, None] * (a + b + o) / 3
+        sums = np.stack([np.bincount(face, moment[:, k], m) for k in range(3)], axis=1)
+        self.middles = np.where(
+            (total > 0)[:, None], sums / np.where(total > 0, total, 1)[:, None], 0.0
+        )
+        self.cells, self.corners = self.owner[face], d.face_vertices
+        self.edges = (face, d.face_vertices, d.face_vertices[following])
+        self._tails, self._edge, self._before = a, b - a, np.argsort(following)
 
     def _find_adopted(self, d: Diagram) -> None:
+        """Set `adopted`, and the directions of such faces."""
         self.adopted = np.zeros(len(self.owner), bool)
         if not isinstance(d.domain, Polygon):
             return
         inner = d.neighbors >= 0
         across = np.where(inner, self.spacings, 0.0)
-        # By both ends: the middle of an adopted face may lie on the bisector, too.
+        # Both ends decide: the middle of an adopted face may lie on the bisector by chance.
         half = np.stack([-self.areas[:, 1], self.areas[:, 0]], axis=1) / 2
         ends = [self.middles - half, self.middles + half]
         off = np.max(
             [np.abs((end * self.directions).sum(axis=1) - across / 2) for end in ends], axis=0
         )
         far = np.max([np.linalg.norm(end, axis=1) for end in ends], axis=0)
-        # Nearer than that, shares would overflow.
+        # At smaller distances the quotient would overflow.
         least = np.maximum(1e-200 * far, np.finfo(float).tiny)
         noise = ADOPTED * self.unit * (1 + far / np.maximum(across, least))
         self.adopted = inner & (off > noise) & (self.measures > 0)
-        # On its bisector as well, by chance or where either generator has a part of the other's region: then another is
-        # nearer there, or neither sees it.
+        # An adopted face can lie on the bisector, too, if each cell has adopted a part of the other's region. Then
+        # another generator is nearer there, or neither of the two sees the face.
         inward = np.flatnonzero(
             inner & ~self.adopted & ((self.areas * self.directions).sum(axis=1) < 0)
         )
@@ -167,11 +175,11 @@ class Rebuilt:
         self.directions[self.adopted] = normals[self.adopted]
 
     def are_slits(self, places: np.ndarray, slack: float) -> np.ndarray:
-        """Tell which edges of faces' loops (3D), open ones of their cells, border slits as narrow as rounding.
+        """Return which open edges of cells in 3D, (k,) bool, border slits as narrow as round-off.
 
-        Where faces meet in the middle of an edge, give or take a rounding, one may have a vertex there that the other
-        lacks. Such an edge's middle lies on another open edge of the cell; that of a missing face does not. A face is
-        off as its bisector is (see `doubts`), where a position may be off by `slack`.
+        Where faces end in the middle of an edge, within round-off, one face may have a vertex there that the other
+        lacks. The middle of such an edge lies on another open edge of the cell; at a missing face it does not. The
+        tolerance is that of bisectors (see `doubts`) for a tolerance `slack` of positions.
         """
         spacings = self.spacings[self.edges[0][places]]
         width = slack * (1 + np.linalg.norm(self._tails[places], axis=1) / spacings)
@@ -190,13 +198,13 @@ class Rebuilt:
         return result
 
     def doubts(self, slack: float | np.ndarray) -> Doubts:
-        """Return what may be off by how much where a position may be off by `slack`, in all or each of the cells (n,).
+        """Return bounds of the round-off, for positions with the tolerance `slack`: one number or one per cell (n,).
 
-        The bisector of two generators, d apart, is off by e = ``slack (1 + r / d)`` at the distance r: what two
-        near-duplicates round by is their distance's share of r. A corner lies where its cell's bisectors meet, and
-        is off by more the more nearly parallel they are: with unit normals n, within the ellipsoid of
-        ``C = (sum n n^T / e^2)^-1``, but not beyond the cell. What follows from the corners is off by the sum of
-        what each changes it by, sqrt(g^T C g) for the gradient g.
+        The bisector of two generators at the distance d has the error e = ``slack (1 + r / d)`` at the distance r: the
+        error of its direction grows as the generators approach each other. A corner is the intersection of bisectors,
+        and its error is larger the more parallel they are: with unit normals n it lies within the ellipsoid of
+        ``C = (sum n n^T / e^2)^-1``, but not beyond the cell. A number that depends on corners has the error
+        sqrt(g^T C g) from each corner, with the gradient g.
         """
         doubts = self._doubts_2d if self.directions.shape[1] == 2 else self._doubts_3d
         return doubts(np.broadcast_to(slack, self.reach.shape))
@@ -213,7 +221,7 @@ class Rebuilt:
         off = np.where(off < self.reach[self.cells], off, self.reach[self.cells])
         of_domain = self._on_wall[before] & self._on_wall[here]
         off[of_domain] = slack[of_domain]
-        # A vertex is where several cells have a corner, of which it is one.
+        # A vertex is the corner of several cells, and any of them may have placed it.
         worst = np.zeros(self._vertex_count)
         np.maximum.at(worst, self.corners, np.maximum(off, slack))
         off = worst[self.corners]
@@ -233,11 +241,11 @@ class Rebuilt:
             for j in range(i, 3):
                 m[:, i, j] = m[:, j, i] = np.bincount(group, normal[:, i] * normal[:, j], k)
         values, axes = np.linalg.eigh(m)
-        # Below rounding an eigenvalue is 0: along this axis the corner may be anywhere in the cell.
+        # An eigenvalue below round-off counts as 0: along this axis the corner may be anywhere in the cell.
         sure = values > 16 * np.finfo(float).eps * values[:, -1:]
         off = slack[:, None] / np.sqrt(np.where(sure, values, 1.0))
         off = np.where(sure & (off < reach[:, None]), off, np.maximum(reach, slack)[:, None])
-        # A vertex has the position of the corner that is sharpest.
+        # A vertex has the position of its most accurate corner.
         best = np.full(self._vertex_count, np.inf)
         np.minimum.at(best, self.corners[first], off.max(axis=1))
         placed = np.maximum(best[self.corners[first]], slack)
@@ -271,28 +279,28 @@ def _across(d: Diagram, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _precision(d: Diagram, dtype: object) -> np.dtype:
-    """Return the precision in which `d` was made, which cannot be float32 if `dtype` is ``"float64"``.
+    """Return the precision in which `d` was computed; if `dtype` is ``"float64"``, it is not float32.
 
-    float32 shows in volumes and in generators or lengths, as the device's unit is a power of two.
+    In float32, volumes and generators or lengths are float32 numbers in the device's unit, which is a power of two.
     """
     origin, scale = d.domain.frame
     volumes = d.volumes / scale**d.domain.dim
     points = (d.points - origin) / scale
     lengths = getattr(d, "face_measures", points) / scale ** (d.domain.dim - 1)
-    # The way from the origin and back rounds. Some generators are put on a wall exactly, or back into a polygon, where
-    # all may be: where a quarter are in float32, all were.
+    # Adding and subtracting the origin has round-off. Some generators were moved onto a wall or into a polygon on the
+    # host: if a quarter are float32 numbers, all were.
     noise = 4 * np.finfo(float).eps * np.maximum(np.abs(np.array(origin)) / scale, 1)
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(points - points.astype(np.float32))
         single = bool((volumes == volumes.astype(np.float32)).all())
-        told = bool((lengths == lengths.astype(np.float32)).all())
-    single &= (told or bool((off <= noise).mean() >= 0.25)) and dtype != "float64"
+        short = bool((lengths == lengths.astype(np.float32)).all())
+    single &= (short or bool((off <= noise).mean() >= 0.25)) and dtype != "float64"
     return np.dtype(np.float32 if single else np.float64)
 
 
 def rebuild(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return what the corners of a diagram give of its other arrays: measures and centroids of faces, centroids."""
-    with np.errstate(all="ignore"):  # what is not finite is for the check to name
+    """Return the arrays of a diagram that follow from its corners: measures and centroids of faces, centroids."""
+    with np.errstate(all="ignore"):  # the check reports numbers that are not finite
         g = Rebuilt(diagram)
     return {
         "face_measures": g.measures,

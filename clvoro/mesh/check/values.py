@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def check_values(check: Check, result: Result, g: Rebuilt) -> None:
-    """Check the values of a result, whose diagram is right."""
+    """Check sizes, errors, quality and history of a result, given its checked diagram."""
     d = result.diagram
     n, dim = len(d), d.domain.dim
     for name in ("target_size", "size_error", "quality"):
@@ -47,7 +47,7 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         "size_error", np.maximum(np.abs(e - error) - 64 * eps * (1 + np.abs(error)), 0),
         lambda i: f"size_error[{i}] is {e[i]:.10g}, volume and size give {error[i]:.10g} (the paper's 3.1)",
     )  # fmt: skip
-    # Where measures were made anew from a file's corners they round as positions do, as straightened boundaries do.
+    # Measures from the corners in a file, and straightened boundaries, have the round-off of positions.
     rounding = ROUNDINGS * g.unit * counts * (1 if dim == 2 else g.reach) / perimeter
     off = np.abs(q - quality) - 64 * eps * (1 + quality)
     if not g.remade:
@@ -55,7 +55,7 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
         if isinstance(d.domain, Polygon):
             loose = np.bincount(g.owner, d.neighbors < 0, minlength=n) > 0
         elif dim == 3:
-            # The device has measured faces that have been left out, too.
+            # The device includes faces that the diagram leaves out as narrow as round-off.
             doubtful = np.flatnonzero(off > 0)
             loose[doubtful[borders_on_lost_faces(d, g, doubtful)]] = True
         rounding *= loose
@@ -68,13 +68,13 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
 
 
 def borders_on_lost_faces(d: Diagram, g: Rebuilt, cells: np.ndarray) -> np.ndarray:
-    """Tell at which of `cells` (k,), in 3D, faces may have been left out as they were as narrow as vertices round.
+    """Return which of `cells` (k,), in 3D, may lack faces that were as narrow as the round-off of vertices, (k,) bool.
 
-    Such a face lay along an edge, or a part of it: two others meet there that are not neighbors of each other, or
-    whose edge has more than one part.
+    Such a face lay along an edge or a part of it. Two other faces meet there whose cells are not neighbors of each
+    other, or whose edge has more than one part.
     """
     n, walls = len(d), len(d.domain.boundary_index)
-    half = np.flatnonzero(np.isin(g.cells, cells))  # edges, as one of two faces has them
+    half = np.flatnonzero(np.isin(g.cells, cells))  # half-edges: each edge in one of its two faces
     face, one, other = (ends[half] for ends in g.edges)
     order = np.lexsort((np.maximum(one, other), np.minimum(one, other), g.owner[face]))
     key = np.stack([g.owner[face], np.minimum(one, other), np.maximum(one, other)])[:, order]
