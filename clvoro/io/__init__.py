@@ -1,6 +1,6 @@
-"""Files: save and load results, write meshes for other programs.
+"""Files: save and load meshes, and write them for other programs.
 
-Every writer works on a temporary file beside the target and puts it in place when it is complete.
+Every writer works on a temporary file beside the target and renames it when it is complete.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas}
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
-    """Read a result or a diagram that its `save` wrote to a ``.npz`` or ``.vtu`` file.
+    """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`.
 
-    A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is made anew,
-    the history is empty, and a plain box is taken as the bounding box of the cells. The file is not trusted: nothing in
-    it is executed, sizes are compared with the bytes that are there before memory is asked for, and the arrays must fit
-    each other.
+    A ``.npz`` file holds everything. A ``.vtu`` file holds cells, sizes, errors and quality: the graph is computed
+    again, the history is empty, and a box without periodic directions is the bounding box of the cells. The file is not
+    trusted: nothing in it is executed, sizes are compared with the bytes in the file before memory is allocated, and
+    arrays must be consistent.
 
     Parameters
     ----------
@@ -62,19 +62,18 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
     Returns
     -------
     Result or Diagram
-        What was saved.
+        The object that was saved.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, cut off, of another format or of a newer version; names the file and what is
-        wrong.
-
+        If the file is missing, damaged, truncated, of another format or of a newer version; names the file and the
+        fault.
     """
     path = check_path("path", path)
     if Path(path).suffix.lower() == ".nc":
         raise InputError(
-            f"cannot load {path}: netCDF files are written for other programs and not read; load a .npz or .vtu"
+            f"cannot load {path}: clvoro writes netCDF for other programs only, expected a .npz or .vtu file"
         )
     return (load_vtu if Path(path).suffix.lower() == ".vtu" else load_npz)(path)
 
@@ -113,7 +112,7 @@ def save(
     Parameters
     ----------
     mesh : Result or Diagram
-        A diagram has no sizes, errors and history, and neither has its file.
+        The file of a diagram has no sizes, errors and history.
     path : str or path
     cell_data : mapping, optional
         Data of your own by name, (n,) or (n, k) arrays of real numbers: cell data in ``.vtu`` and ``.vtk``, variables
@@ -127,9 +126,9 @@ def save(
     thickness : float, optional
         For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
     convention : {"ugrid", "mpas"}, optional
-        For netCDF: what is in the file. With "ugrid", the default, cells as polygons with size, error, quality and
-        area, and for each edge the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas" what the
-        MPAS mesh specification asks for: cells, edges and vertices with all that models on C grids take, seams joined.
+        For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each edge
+        the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and vertices with
+        all variables of the MPAS mesh specification for C grids; cells at seams are connected.
     units : str, optional
         For netCDF: unit of the coordinates, as UDUNITS writes it. By default "m". In UGRID, "degrees" stands for
         longitudes and latitudes.
@@ -137,8 +136,8 @@ def save(
     Raises
     ------
     InputError, InputTypeError
-        If the format is unknown or cannot hold the cells, an argument is for another format or wrong, or the file
-        cannot be written. An existing file is then as before.
+        If the format is unknown or cannot hold the cells, an argument is wrong or for another format, or the file
+        cannot be written. An existing file is then unchanged.
     """
     contents = Contents.of(mesh, cell_data)
     path = Path(check_path("path", path))

@@ -1,4 +1,4 @@
-"""The files of OpenFOAM's polyMesh (`polymesh.py`)."""
+"""Write the files of OpenFOAM's polyMesh; `polymesh` makes the mesh."""
 
 from __future__ import annotations
 
@@ -36,9 +36,8 @@ def write_foam(
     Parameters
     ----------
     path : Path
-        The folder ``.../constant/polyMesh``, made if need be; its five files are replaced, others there are left.
-        Or a case's marker ``CASE/name.foam``, an empty file which ParaView opens, with the mesh in
-        ``CASE/constant/polyMesh``; the case's folder is made, too.
+        The folder ``.../constant/polyMesh``, which is created if it does not exist; its five files are replaced, others
+        are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in ``CASE/constant/polyMesh``.
     patches, types, thickness : optional
         See `poly_mesh`.
     """
@@ -47,7 +46,7 @@ def write_foam(
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:
         make_folder(marker.parent)
-        with atomic_file(marker):  # first: it says whether the case's folder can be written
+        with atomic_file(marker):  # first, because it fails if the folder is not writable
             pass
     make_folder(folder)
     note = (
@@ -61,7 +60,7 @@ def write_foam(
         "neighbour": (len(mesh.neighbor), _labels(mesh.neighbor)),
         "boundary": (len(mesh.patches), [_boundary(mesh)]),
     }
-    # `faces` is put in place last: a case without it is plainly incomplete.
+    # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
         for name, kind in _FILES.items():
             count, body = bodies[name]
@@ -82,7 +81,7 @@ def _header(name: str, kind: str, note: str) -> str:
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    """Cut `count` rows into parts, as text in Python takes ten times the room of the numbers."""
+    """Cut `count` rows into parts: text takes ten times the memory of numbers."""
     return (slice(k, min(k + _CHUNK, count)) for k in range(0, count, _CHUNK))
 
 
@@ -95,7 +94,7 @@ def _labels(values: np.ndarray) -> Iterator[str]:
 def _vectors(values: np.ndarray) -> Iterator[str]:
     for part in _chunks(len(values)):
         rows = values[part]
-        # The shortest text that reads back as the same number.
+        # repr is the shortest text that is read as the same number.
         yield "(%r %r %r)\n" * len(rows) % tuple(rows.ravel().tolist())
 
 

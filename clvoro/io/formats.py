@@ -1,4 +1,4 @@
-"""Formats of other programs, through meshio."""
+"""Write formats of other programs with meshio."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .atomic import atomic_folder
 from .contents import Contents
 from .convert import to_meshio
 
-# Formats in which meshio keeps polygons of any number of sides: it drops them from others with no
-# more than a warning. The value tells whether cell data are kept, too.
+# Formats in which meshio writes polygons with any number of sides. In others it drops them with a warning only. The
+# value says whether it writes cell data, too.
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
 _SAFE = (
@@ -24,9 +24,8 @@ def write_foreign(contents: Contents, path: Path) -> None:
     """Write the cells in the format that the suffix of `path` names."""
     suffix = path.suffix.lower()
     if suffix not in _POLYGONS:
-        what = f"the format {suffix} is unknown or cannot hold" if suffix else "no suffix chooses"
-        tail = " polygons" if suffix else " a format"
-        raise InputError(f"cannot write {path}: {what}{tail}; use {_SAFE}")
+        why = f"{suffix} is unknown or cannot hold polygons" if suffix else "it has no suffix"
+        raise InputError(f"cannot write {path}: {why}; use {_SAFE}")
     check_plane(contents, path)
     with_data = _POLYGONS[suffix]
     if contents.extra and not with_data:
@@ -40,7 +39,7 @@ def write_foreign(contents: Contents, path: Path) -> None:
             f'cannot write {path}: {suffix} needs meshio; run `pip install "clvoro[formats]"`, or '
             "save as .vtu or .npz"
         ) from error
-    # meshio prints to the terminal; what matters of it arrives as an exception.
+    # meshio prints warnings to the terminal. Errors are exceptions.
     with atomic_folder(path) as temporary, contextlib.redirect_stdout(io.StringIO()):
         mesh.write(temporary)
 

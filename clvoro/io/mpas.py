@@ -1,8 +1,8 @@
-"""Meshes in the plane by the MPAS mesh specification 1.0, for models on C grids of Voronoi cells and their dual.
+"""Write meshes in 2D by the MPAS mesh specification 1.0, for models on C grids of Voronoi cells and their dual.
 
-Cells, edges and vertices are numbered from 1, and 0 is what is not there. An edge on the boundary is placed in its
-middle, and its `dcEdge` is sqrt(3) times its length, as MPAS's own tools have it. `vertexDegree` is 3 unless more edges
-meet somewhere, as they do between cocircular generators.
+Cells, edges and vertices are numbered from 1; 0 stands for a missing item. The place of an edge on the boundary is its
+middle, and its `dcEdge` is sqrt(3) times its length, as in the tools of MPAS. `vertexDegree` is 3 unless more edges
+meet at a vertex, as between cocircular generators.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from .trisk import find_weights
 
 
 def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:
-    """Write the mesh, with coordinates in `unit`; in a periodic box each edge and vertex at a seam is once in the box.
+    """Write the mesh with coordinates in `unit`. In a periodic box each edge and vertex at a seam exists once.
 
     Raises
     ------
     InputError
-        If a cell has several loops of edges, or something of it is half a period away: MPAS takes the nearest image.
+        If a cell has several loops of edges, or reaches half a period from its generator: MPAS uses nearest images.
     """
     _describe(contents, path, unit).write()
 
@@ -89,7 +89,7 @@ def _add_graph(file: NetCDF, halves: HalfEdges, around: _Around) -> None:
     first, corners = halves.first, around.corners
     across = np.where(halves.twin >= 0, halves.cell[halves.twin] + 1, 0)
     ends = around.vertex[halves.next]
-    # On a cell the k-th vertex lies between edges k and k + 1, at a vertex the k-th cell.
+    # Around a cell, vertex k lies between edges k and k + 1. Around a vertex, so does cell k.
     on_cell = {"cells": across, "edges": halves.edge + 1, "vertices": ends + 1}
     for name, items in on_cell.items():
         file.add_rows(f"{name}OnCell", ("nCells", "maxEdges"), halves.counts, items, 0)
@@ -118,22 +118,22 @@ def _add_measures(file: NetCDF, around: _Around, shape: _Shape, unit: str) -> No
 
 @dataclass(frozen=True)
 class _Shape:
-    """Where things are, as seen from the generators, and how large.
+    """Geometry of half-edges relative to the generators of their cells, and measures of cells and edges.
 
     Attributes
     ----------
     corner : (h, 2) float
-        Beginnings of half-edges.
+        Begin of each half-edge.
     foot : (h, 2) float
-        The places of edges: where the line between the generators crosses them.
+        Place of the edge, where the line between its generators crosses it.
     line : (h, 2) float
-        To the generators across; zeros on walls.
+        Vector to the generator across; 0 on walls.
     kites : (h,) float
-        Signed areas between generator, edge, the half-edge's beginning and the edge before it.
+        Signed area of the kite of generator, foot, begin of the half-edge, and foot of the previous one.
     areas : (n,) float
-        Of the cells, as sums of their kites: what leaves one arrives elsewhere.
+        Areas of cells as sums of their kites, so that both add up to the same total.
     lengths, distances, angles : (e,) float
-        Of the edges: their own length, the distance of the generators, and the angle of the normal to the x axis.
+        Length of each edge, distance of its generators, and angle between its normal and the x axis.
     """
 
     corner: np.ndarray
@@ -154,7 +154,7 @@ def _measure(diagram: Diagram, halves: HalfEdges) -> _Shape:
     line[inner] = neighbor_points(diagram, halves.rows[inner]) - own[inner]
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
-    # In polygons a cell may have got a piece of another one, whose edges are on no bisector of its generator.
+    # In polygons a cell may include a part of another region, whose edges lie on no bisector of its generator.
     off = np.abs(((middle - line / 2) * line).sum(axis=1))[first] / distances
     on_bisector = inner[first] & (off <= _roundings(diagram, distances))
     foot = np.where(on_bisector[edge][:, None], line / 2, middle)
@@ -169,13 +169,13 @@ def _measure(diagram: Diagram, halves: HalfEdges) -> _Shape:
 
 
 def _roundings(diagram: Diagram, distances: np.ndarray) -> np.ndarray:
-    """Return how far edges may be off the bisectors of generators `distances` (e,) apart, (e,)."""
+    """Return the tolerance for the distance of edges to bisectors, for generators `distances` (e,) apart; (e,)."""
     domain = diagram.domain
     single, double = (domain.place(diagram.points, np.dtype(t)) for t in (np.float32, np.float64))
-    # What single precision holds is of no more.
+    # Positions that single precision represents exactly were computed in it.
     eps = np.finfo(np.float32 if np.array_equal(single, double) else np.float64).eps
     places = eps * domain.extent.max() + np.finfo(np.float64).eps * np.abs(diagram.vertices).max()
-    # Corners round by more, the sharper the angle in which two bisectors meet: then they are off a third one.
+    # Round-off of a corner grows as the angle between two bisectors shrinks. Then it is off the third one.
     return np.sqrt(eps) * distances + 64 * places
 
 
@@ -185,17 +185,16 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Around:
-    """What meets at each vertex, counter-clockwise; on the boundary from the boundary on.
+    """Cells and edges around each vertex, counter-clockwise; at the boundary they begin at the boundary.
 
     Attributes
     ----------
     vertex : (h,) int
-        Number of the vertex in which each half-edge begins.
+        Number of the vertex where each half-edge begins.
     corners : (v, k) int
-        Of each vertex the half-edges that begin there, -1 behind them. Each follows its edge, and is a corner of its
-        cell.
+        The half-edges that begin at each vertex, then -1. Each stands for the corner of its cell.
     edges : (v, k) int
-        Of each vertex its edges; on the boundary one more than corners.
+        The edges at each vertex, then -1; on the boundary one more than corners.
     """
 
     vertex: np.ndarray
@@ -204,13 +203,13 @@ class _Around:
 
 
 def _walk_around(halves: HalfEdges) -> _Around:
-    """Find the vertices from how half-edges are joined: a seam is none for them, and both sides of a slit differ."""
+    """Find the vertices from the connectivity of half-edges: once at a seam, but once for each side of a slit."""
     h = len(halves.cell)
     onward = halves.twin[halves.previous]
     joined = np.flatnonzero(onward >= 0)
     graph = coo_array((np.ones(len(joined), np.int8), (joined, onward[joined])), shape=(h, h))
     label = connected_components(graph, directed=False)[1]
-    # The least half-edge numbers the vertex; an open round begins with the edge on the boundary.
+    # Vertices are numbered by their lowest half-edge. At the boundary the round begins with the edge on it.
     rank = np.lexsort((np.arange(h), halves.twin >= 0, label))
     begins = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]
     least = np.full(len(begins), h)
@@ -242,16 +241,17 @@ def _check_loops(halves: HalfEdges, path: Path) -> None:
     if several.size:
         raise InputError(
             f"cannot write {path}: cell {several[0]} ({several.size} in all) goes around a part of the boundary, and "
-            "MPAS's cells have no holes; use smaller cells there, leave out the hole, or leave out convention='mpas'"
+            "cells in MPAS have no holes; use smaller cells there, leave out the hole, or leave out convention='mpas'"
         )
 
 
 def _check_reach(shape: _Shape, periods: np.ndarray, path: Path) -> None:
-    """Refuse what readers would take for its image: they know places up to whole periods."""
+    """Refuse cells that reach half a period, because readers of the file assume nearest images."""
     reach = np.abs([shape.corner, shape.line]).max(axis=(0, 1))
     far = np.flatnonzero((periods > 0) & (reach > 0.499 * periods))
     if far.size:
         raise InputError(
             f"cannot write {path}: cells reach {reach[far[0]]:.3g} across a period of {periods[far[0]]:.3g}, and MPAS "
-            "takes the nearest image of what is half a period away; use more cells, or leave out convention='mpas'"
+            "uses nearest images, which half a period away are ambiguous; use more cells, or leave out "
+            "convention='mpas'"
         )

@@ -1,4 +1,4 @@
-"""Files of netCDF-3 with 64-bit offsets, which every version of its library reads."""
+"""Write netCDF-3 files with 64-bit offsets, which every version of the netCDF library reads."""
 
 from __future__ import annotations
 
@@ -15,14 +15,12 @@ from ..errors import InputError
 from .atomic import atomic_file
 from .contents import Contents
 
-_MOST = (
-    2**31 - 4
-)  # bytes of a variable, which the format's readers take for a signed number of 32 bits
+_MOST = 2**31 - 4  # bytes of a variable: readers store its size in a signed integer of 32 bits
 
 
 @dataclass(frozen=True)
 class _Variable:
-    """Values, or the items of ragged rows, and the type in which they are written."""
+    """One variable: its values, or the items of ragged rows. Integers are written as int32, others as float64."""
 
     dimensions: tuple[str, ...]
     values: np.ndarray
@@ -36,7 +34,7 @@ class _Variable:
 
 
 class NetCDF:
-    """What a file is going to hold.
+    """The contents of a file, which `write` writes.
 
     Parameters
     ----------
@@ -46,7 +44,7 @@ class NetCDF:
     dimensions : mapping
         Lengths by name.
     attributes : mapping
-        Of the file: texts and NumPy's numbers.
+        Attributes of the file: texts and numbers of NumPy.
     """
 
     def __init__(
@@ -73,7 +71,7 @@ class NetCDF:
         Raises
         ------
         InputError
-            If the format has no room for it.
+            If the variable is too large for the format.
         """
         assert values.shape == tuple(self.dimensions[d] for d in dimensions), name
         self._add(name, _Variable(dimensions, values, attributes))
@@ -87,12 +85,12 @@ class NetCDF:
         missing: int,
         **attributes: str | np.generic,
     ) -> None:
-        """Add a table of ragged rows: row i has `counts[i]` of the `items`, and `missing` behind them.
+        """Add a table of ragged rows: row i has `counts[i]` of the `items`, then `missing`.
 
         Raises
         ------
         InputError
-            If the format has no room for it.
+            If the variable is too large for the format.
         """
         self._add(name, _Variable(dimensions, items, attributes, counts, missing))
 
@@ -102,12 +100,12 @@ class NetCDF:
         Raises
         ------
         InputError
-            If the file has a variable of that name, or the format has no room for it.
+            If the file has another variable of that name, or the data are too large for the format.
         """
         for name, values in self.extra.items():
             if name in self._variables:
                 raise InputError(
-                    f"cell_data has the name {name!r}, which {self.path} has for a variable of its own; choose another"
+                    f"cell_data has the name {name!r}, which is that of another variable in {self.path}; choose another"
                 )
             if values.dtype.kind != "f" and abs(values).max() >= 2**31:  # netCDF-3 has no 64 bits
                 values = values.astype(float)
@@ -122,13 +120,13 @@ class NetCDF:
         size = math.prod(lengths) * variable.kind.itemsize
         if size > _MOST:
             raise InputError(
-                f"cannot write {self.path}: {name} ({' x '.join(map(str, lengths))}) takes {size} bytes, and variables "
-                f"of netCDF-3 have at most {_MOST}; use fewer cells, or save as .npz or .vtu"
+                f"cannot write {self.path}: {name} ({' x '.join(map(str, lengths))}) has {size} bytes, and a variable "
+                f"in netCDF-3 has at most {_MOST}; use fewer cells, or save as .npz or .vtu"
             )
         self._variables[name] = variable
 
     def write(self) -> None:
-        """Write the file, once; the same contents give the same bytes."""
+        """Write the file; call it once. Equal contents give equal bytes."""
         with atomic_file(self.path) as file:
             made = netcdf_file(file, "w", version=2)
             for name, value in self.attributes.items():
@@ -136,7 +134,7 @@ class NetCDF:
             for name, length in self.dimensions.items():
                 made.createDimension(name, length)
             for name in list(self._variables):
-                # What has been converted is let go of.
+                # Each variable is freed when it is written.
                 given = self._variables.pop(name)
                 variable = made.createVariable(name, given.kind, given.dimensions)
                 for key, value in given.attributes.items():
@@ -147,7 +145,7 @@ class NetCDF:
                     filled = np.arange(variable.shape[1]) < given.counts[:, None]
                     variable[...] = given.missing
                     variable[filled] = given.values
-            made.flush()  # closing it would write it all once more, and close the file
+            made.flush()  # close() would write everything again and close the file
 
 
 def squared(unit: str) -> str:

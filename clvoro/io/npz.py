@@ -1,9 +1,9 @@
-"""The format that loses nothing: NumPy arrays in a zip file, read back without trusting it.
+"""The complete format: NumPy arrays in a zip file. The reader does not trust the file. `numpy.load` reads it, too.
 
-Members, each one array (`.npy`): `format`, `version`, `about` (JSON: domain, settings, and what of
-a `Result` is a single value), the arrays of a `Result` under their names, `diagram.<name>` for
-those of its `Diagram`, `initial.<name>`, `final.<name>` for `Displacements`, and `cell_data.<name>` for data of the
-caller, which `load` leaves out. The file of a diagram has no arrays of a `Result`. `numpy.load` reads it, too.
+Each member is one array (`.npy`): `format`; `version`; `about`, JSON with the domain, the settings and the scalars of a
+`Result`; the arrays of a `Result` by name; `diagram.<name>` of its `Diagram`; `initial.<name>` and `final.<name>` of
+`Displacements`; and `cell_data.<name>`, data of the caller, which `load` skips. The file of a diagram has no arrays of
+a `Result`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _PARTS = {
     "final": tuple(field.name for field in dataclasses.fields(Displacements)),
 }
 
-# What each array must look like: sizes named by a letter are the same everywhere (d: dimension).
+# Shape of each array: a letter stands for the same size everywhere (d: dimension).
 _SHAPES = {
     "points": "nd", "target_size": "n", "size_error": "n", "quality": "n", "history": "h",
     "diagram.points": "nd", "diagram.volumes": "n", "diagram.centroids": "nd",
@@ -57,7 +57,7 @@ _INTEGERS = {
 
 
 def write_npz(contents: Contents, path: Path) -> None:
-    """Write all of `contents` to `path`; the same contents give the same bytes."""
+    """Write all of `contents` to `path`. Equal contents give equal bytes."""
     diagram, result = contents.diagram, contents.result
     domain = diagram.domain
     about: dict[str, Any] = {
@@ -69,7 +69,7 @@ def write_npz(contents: Contents, path: Path) -> None:
     for name in _FIELDS if result is not None else ("diagram",):
         value = getattr(contents if result is None else result, name)
         if name in _PARTS:
-            # A diagram knows which of its arrays it has; they are fetched here.
+            # Arrays of a diagram that are still on the device are fetched here.
             names = getattr(value, "_arrays", _PARTS[name]) if value is not None else ()
             arrays |= {f"{name}.{k}": getattr(value, k) for k in _PARTS[name] if k in names}
         elif isinstance(value, np.ndarray):
@@ -82,16 +82,16 @@ def write_npz(contents: Contents, path: Path) -> None:
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
-    """Read what `Result.save` or `Diagram.save` wrote to a ``.npz`` file.
+    """Read a ``.npz`` file of `Result.save` or `Diagram.save`.
 
-    The file is not trusted: nothing in it is executed, sizes are compared with the bytes that are
-    there before memory is asked for, and the arrays must fit each other.
+    The file is not trusted: nothing in it is executed, sizes are compared with the bytes in the file before memory is
+    allocated, and arrays must be consistent.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, cut off, of another format or of a newer version; names the
-        file and what is wrong.
+        If the file is missing, damaged, truncated, of another format or of a newer version; names the file and the
+        fault.
     """
     with explained(path, "a file written by Result.save"):
         with open_plain(path) as file, zipfile.ZipFile(file) as archive:
@@ -113,7 +113,7 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
 
 
 def _check(arrays: Mapping[str, np.ndarray]) -> None:
-    """Check that the arrays fit each other, so that nobody indexes out of bounds later."""
+    """Check that the arrays are consistent, so that no index is out of bounds later."""
     sizes: dict[str, int] = {}
     for name, axes in _SHAPES.items():
         if name not in arrays:
@@ -128,7 +128,7 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
             raise FileError(f"{name} has dtype {array.dtype}")
         expected = tuple(sizes.setdefault(a, s) for a, s in zip(axes, array.shape, strict=False))
         if array.ndim != len(axes) or array.shape != expected:
-            raise FileError(f"{name} has shape {array.shape}, which does not fit the other arrays")
+            raise FileError(f"{name} has shape {array.shape}, which differs from the other arrays")
     for starts, items, rows, bound in (
         ("diagram.neighbor_starts", "diagram.neighbors", ("cell", "n"), sizes["n"]),
         ("diagram.cell_vertex_starts", "diagram.cell_vertices", ("cell", "n"), sizes.get("v", 0)),
@@ -141,22 +141,24 @@ def _check(arrays: Mapping[str, np.ndarray]) -> None:
         s, j = arrays[starts], arrays[items]
         piece, count = rows[0], sizes.get(rows[1], 0)
         if len(s) != count + 1 or s[0] != 0 or s[-1] != len(j) or (np.diff(s) < 0).any():
-            raise FileError(f"{starts} does not cut {items} into one piece per {piece}")
+            raise FileError(f"{starts} does not divide {items} into one row per {piece}")
         lowest = 0 if items.endswith("vertices") else np.iinfo(j.dtype).min
         if j.size and not (lowest <= j.min() and j.max() < bound):
-            raise FileError(f"{items} points to what does not exist")
+            raise FileError(f"{items} has an index out of range")
 
 
 def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
     about, alone = arrays["about"], "points" not in arrays
     try:
         if about.dtype.kind != "U" or about.shape != ():
-            raise TypeError("about is no text")
+            raise TypeError("about is not text")
         facts = json.loads(about.item())
         description = dict(facts["domain"])
         kind = description.pop("kind")
         if kind not in _DOMAINS:
-            raise FileError(f"its domain is a {kind!r:.40}, which this version of clvoro lacks")
+            raise FileError(
+                f"its domain is a {kind!r:.40}, which this version of clvoro does not have"
+            )
         domain = _DOMAINS[kind](**description)
         settings = dict(facts["settings"])
         values = {name: value for name, value in facts["values"].items() if name in _FIELDS}
@@ -193,7 +195,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
 
 
 def _not_in(domain: Domain) -> tuple[str, ...]:
-    """Return how the names of those arrays begin that a diagram of `domain` does without."""
+    """Return prefixes of the arrays that a diagram of `domain` does not have."""
     others = [] if any(domain.periodic) else ["shifts"]
     if domain.dim == 3:
         others.append("cell_vert")
@@ -203,13 +205,13 @@ def _not_in(domain: Domain) -> tuple[str, ...]:
 
 
 def _check_domain(arrays: Mapping[str, np.ndarray], domain: Domain) -> None:
-    """Check what must fit the domain, so that nobody indexes out of bounds later."""
+    """Check the arrays against the domain, so that no index is out of bounds later."""
     neighbors = arrays["diagram.neighbors"]
     if neighbors.size and neighbors.min() < -len(domain.boundary_index):
-        raise FileError("diagram.neighbors points to what does not exist")
+        raise FileError("diagram.neighbors has an index out of range")
     shifts = arrays.get("diagram.shifts")
     if shifts is not None and shifts.size and not (shifts.min() >= -1 and shifts.max() <= 1):
-        raise FileError("diagram.shifts has others than -1, 0 and 1")
+        raise FileError("diagram.shifts has values other than -1, 0 and 1")
     if isinstance(domain, Polygon):
         starts = arrays["diagram.face_vertex_starts"]
         if not np.array_equal(starts, 2 * np.arange(len(neighbors) + 1)):
@@ -231,7 +233,7 @@ def _displacements(arrays: Mapping[str, np.ndarray], part: str) -> Displacements
 
 
 def _plain(value: Any) -> object:
-    """Turn what JSON does not know into what it does; a function into how it prints."""
+    """Convert values for JSON: arrays to lists, other objects to their representation."""
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
     return repr(value)

@@ -1,8 +1,8 @@
-"""Meshes in the plane by the UGRID conventions, for QGIS, ParaView, xarray and its kin.
+"""Write meshes in 2D by the UGRID conventions, for QGIS, ParaView, xarray and similar programs.
 
-https://ugrid-conventions.github.io/ugrid-conventions: vertices are nodes, cells are faces. Indices begin with 0, what
-is not there is -1. As in VTK's files cells are not cut at seams, on both sides of which nodes and edges are there for
-each, and a cell with an island in it has its loops joined by bridges there and back.
+See https://ugrid-conventions.github.io/ugrid-conventions. Vertices are nodes and cells are faces. Indices begin with 0;
+-1 stands for a missing item. As in VTK files, cells are not cut at seams: each side of a seam has nodes and edges of
+its own. The loops of a cell around an island are joined by bridges, edges that are passed in both directions.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ..mesh.connectivity import cell_corners
+from ..mesh.diagram import Diagram
 from .contents import Contents
-from .half_edges import half_edges
+from .half_edges import HalfEdges, half_edges
 from .netcdf import NetCDF, squared
 
 _CONNECTIVITY = {
@@ -29,7 +30,8 @@ _FACE_DATA = {
     "quality": "cell quality",
     "area": "cell area",
 }
-"""With what programs call them."""
+"""Names of cell data, and what programs show for them."""
+_NONE = np.int32(-1)
 
 
 def write_ugrid(contents: Contents, path: Path, unit: str = "m") -> None:
@@ -46,29 +48,36 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     diagram = contents.diagram
     halves = half_edges(diagram, glued=False)
     starts, corners = cell_corners(diagram)
-    sides = np.diff(starts)
-    n, e, first = len(diagram), len(halves.first), halves.first
-    width = int(sides.max())
-    file = NetCDF(
-        path,
-        contents,
-        {
-            "mesh_nodes": len(diagram.vertices),
-            "mesh_edges": e,
-            "mesh_faces": n,
-            "mesh_most_corners": width,
-            "two": 2,
-        },
-        {"Conventions": "CF-1.11 UGRID-1.0"},
-    )
+    dimensions = {
+        "mesh_nodes": len(diagram.vertices),
+        "mesh_edges": len(halves.first),
+        "mesh_faces": len(diagram),
+        "mesh_most_corners": int(np.diff(starts).max()),
+        "two": 2,
+    }
+    file = NetCDF(path, contents, dimensions, {"Conventions": "CF-1.11 UGRID-1.0"})
+    places = ("node", "edge", "face")
     file.add(
         "mesh", (), np.zeros((), np.int32),
         cf_role="mesh_topology", long_name="topology of the cells", topology_dimension=np.int32(2),
         face_dimension="mesh_faces", edge_dimension="mesh_edges",
-        **{f"{place}_coordinates": f"mesh_{place}_x mesh_{place}_y" for place in ("node", "edge", "face")},
+        **{f"{place}_coordinates": f"mesh_{place}_x mesh_{place}_y" for place in places},
         **{f"{name}_connectivity": f"mesh_{name}s" for name in _CONNECTIVITY},
     )  # fmt: skip
-    ends = np.stack([halves.begin, halves.end], axis=1)[first]
+    ends = np.stack([halves.begin, halves.end], axis=1)[halves.first]
+    _add_coordinates(file, diagram, ends, unit)
+    _add_connectivity(file, halves, ends, np.diff(starts), corners)
+    of_faces = {"mesh": "mesh", "location": "face", "coordinates": "mesh_face_x mesh_face_y"}
+    units = {"size": unit, "area": squared(unit)}
+    for name, values in {**contents.of_run, "area": diagram.volumes}.items():
+        about = {"long_name": _FACE_DATA[name], "units": units.get(name, "1")}
+        file.add(name, ("mesh_faces",), values, **about, **of_faces)
+    _add_walls(file, diagram, halves)
+    file.add_extra("mesh_faces", **of_faces)
+    return file
+
+
+def _add_coordinates(file: NetCDF, diagram: Diagram, ends: np.ndarray, unit: str) -> None:
     places = {
         "node": ("corners of the cells", diagram.vertices),
         "edge": ("middles of the edges", diagram.vertices[ends].mean(axis=1)),
@@ -80,8 +89,12 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
                 f"mesh_{place}_{axis}", (f"mesh_{place}s",), values,
                 **_coordinate(axis, unit), long_name=f"{axis} of the {what}", axis=axis.upper(),
             )  # fmt: skip
+
+
+def _add_connectivity(
+    file: NetCDF, halves: HalfEdges, ends: np.ndarray, sides: np.ndarray, corners: np.ndarray
+) -> None:
     across = np.where(halves.twin >= 0, halves.cell[halves.twin], -1)
-    minus = np.int32(-1)
     rows = {
         "face_node": (sides, corners),
         "face_edge": (halves.counts, halves.edge),
@@ -89,40 +102,32 @@ def _describe(contents: Contents, path: Path, unit: str) -> NetCDF:
     }
     for name, (counts, items) in rows.items():
         columns = ("mesh_faces", "mesh_most_corners")
-        file.add_rows(f"mesh_{name}s", columns, counts, items, -1, **_role(name), _FillValue=minus)
+        file.add_rows(f"mesh_{name}s", columns, counts, items, -1, **_role(name), _FillValue=_NONE)
     pairs = ("mesh_edges", "two")
-    # No edge lacks an end, and the conventions want no value for that.
+    # Every edge has two ends, so the conventions want no fill value here.
     file.add("mesh_edge_nodes", pairs, ends, **_role("edge_node"))
-    beside = np.stack([halves.cell, across], axis=1)[first]
-    file.add("mesh_edge_faces", pairs, beside, **_role("edge_face"), _FillValue=minus)
-    of_faces = {"mesh": "mesh", "location": "face", "coordinates": "mesh_face_x mesh_face_y"}
-    units = {"size": unit, "area": squared(unit)}
-    for name, values in {**contents.of_run, "area": diagram.volumes}.items():
-        file.add(
-            name, ("mesh_faces",), values,
-            long_name=_FACE_DATA[name], units=units.get(name, "1"), **of_faces,
-        )  # fmt: skip
-    walls = np.maximum(-1 - diagram.neighbors[halves.rows[first]], -1)
-    file.add(
-        "wall", ("mesh_edges",), walls,
-        long_name="number of the wall that the edge lies on", mesh="mesh", location="edge",
-        coordinates="mesh_edge_x mesh_edge_y", _FillValue=minus,
-    )  # fmt: skip
+    beside = np.stack([halves.cell, across], axis=1)[halves.first]
+    file.add("mesh_edge_faces", pairs, beside, **_role("edge_face"), _FillValue=_NONE)
+
+
+def _add_walls(file: NetCDF, diagram: Diagram, halves: HalfEdges) -> None:
+    """Add the number of the wall of each edge, and the name of its boundary as a flag."""
+    of_edges: dict[str, str | np.generic] = {
+        "mesh": "mesh", "location": "edge", "coordinates": "mesh_edge_x mesh_edge_y", "_FillValue": _NONE,
+    }  # fmt: skip
+    walls = np.maximum(-1 - diagram.neighbors[halves.rows[halves.first]], -1)
+    file.add("wall", ("mesh_edges",), walls, long_name="number of the wall of the edge", **of_edges)
     names = diagram.domain.boundary_names
     if names:
         parts = np.where(walls >= 0, diagram.domain.boundary_index[np.maximum(walls, 0)], -1)
         file.add(
-            "boundary", ("mesh_edges",), parts,
-            long_name="boundary that the edge lies on", mesh="mesh", location="edge",
-            coordinates="mesh_edge_x mesh_edge_y", flag_values=np.arange(len(names), dtype=np.int32),
-            flag_meanings=" ".join(names), _FillValue=minus,
+            "boundary", ("mesh_edges",), parts, long_name="boundary that the edge is part of",
+            flag_values=np.arange(len(names), dtype=np.int32), flag_meanings=" ".join(names), **of_edges,
         )  # fmt: skip
-    file.add_extra("mesh_faces", **of_faces)
-    return file
 
 
 def _coordinate(axis: str, unit: str) -> dict[str, str]:
-    """Return what CF asks of a horizontal coordinate."""
+    """Return the attributes of a horizontal coordinate by the CF conventions."""
     if unit == "degrees":
         name, direction = ("longitude", "east") if axis == "x" else ("latitude", "north")
         return {"standard_name": name, "units": f"degrees_{direction}"}

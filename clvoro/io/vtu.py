@@ -1,7 +1,7 @@
-"""VTK's XML format for unstructured grids, for ParaView and its kin.
+"""Write VTK's XML format for unstructured grids (`.vtu`), for ParaView and similar programs.
 
-The arrays follow the XML as raw bytes ("appended" data): exact, compact, and read in one go. Each
-is preceded by its length, or, compressed, by a table of its blocks.
+The arrays follow the XML as raw bytes ("appended" data), which are exact and compact. Before each array stands its
+length, or a table of its compressed blocks.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": 
 
 
 def write_vtu(contents: Contents, path: Path, compress: bool = True) -> None:
-    """Write the cells as polygons or polyhedra with their data; the settings go along in a comment.
+    """Write the cells as polygons or polyhedra with cell data.
 
-    Cell data: `size` (h), `error` (signed) and `quality` of a result, `volume` (area in 2D), `sides` (in 3D
-    `faces_of_cell`), `label` (row of the cell), `boundary` (see `largest_boundary`), the vector `generator`, from the
-    origin to the cell's generator, and data of the caller. Names of boundaries that the caller gave go along in a
-    comment, a polygonal or periodic domain as field data. In a periodic box cells are not cut at the seams.
+    Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
+    `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); the vector `generator`, from the
+    origin to the cell's generator; and data of the caller. Comments hold the settings and the caller's names of
+    boundaries, field data a polygonal or periodic domain. In a periodic box cells are not cut at the seams.
     """
     diagram = contents.diagram
     n = len(diagram)
@@ -81,11 +81,11 @@ _"""
 
 
 def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return what describes a domain, and its graph, that the cells' corners do not."""
+    """Return field data with the domain, and with the parts of the graph that corners of cells do not define."""
     domain = diagram.domain
     if any(domain.periodic):
         starts = face_corners(diagram)[0]
-        written = np.cumsum(np.diff(starts) > 0) - 1  # in 3D a face without a loop is left out
+        written = np.cumsum(np.diff(starts) > 0) - 1  # in 3D faces without vertices are left out
         seam = np.flatnonzero(diagram.shifts.any(axis=1) & (np.diff(starts) > 0))
         if domain.dim == 2:
             written = np.arange(len(diagram.neighbors))
@@ -107,16 +107,16 @@ def _domain_data(diagram: Diagram) -> dict[str, np.ndarray]:
 
 
 def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return which ways from corner to corner are bridges between loops, and the edges behind faces on the boundary.
+    """Return the places of bridges between loops among corners, and the numbers of the edges at boundary faces.
 
-    Corners alone do not tell a bridge from the two sides of a slit that has no width in single precision.
+    Corners alone do not distinguish a bridge from a slit without width in single precision.
     """
     starts, following = diagram.neighbor_starts, next_faces(diagram)
     cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
     ends = following != np.arange(1, len(following) + 1)
     loop = np.concatenate([[0], np.cumsum(ends)[:-1]])
     earlier = loop - loop[starts[:-1]][cell]
-    # A way to the second loop stands before it, ways back and on before each later one.
+    # One bridge precedes the second loop; two, back and forth, precede each later one.
     place = np.arange(len(following)) - starts[cell] + np.maximum(2 * earlier - 1, 0)
     bridge = np.ones(len(diagram.cell_vertices), bool)
     bridge[diagram.cell_vertex_starts[cell] + place] = False
@@ -129,7 +129,7 @@ def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
 
 
 def _polygons(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return the cells' corners, counter-clockwise, and where each cell's end."""
+    """Return the corners of cells, counter-clockwise, and the end of each cell's part."""
     return {
         "connectivity": diagram.cell_vertices,
         "offsets": diagram.cell_vertex_starts[1:],
@@ -137,10 +137,10 @@ def _polygons(diagram: Diagram) -> dict[str, np.ndarray]:
 
 
 def polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return the cells' corners and the streams that describe their faces.
+    """Return the corners and faces of cells in VTK's arrays.
 
-    `faces` has for each cell the number of its faces, then for each face the number of its corners and the
-    corners, counter-clockwise as seen from outside; `faceoffsets` tells where each cell's part ends.
+    `faces` has for each cell the number of its faces, and then for each face the number of its corners and the corners,
+    counter-clockwise as seen from outside. `faceoffsets` has the end of each cell's part.
     """
     n, v = len(diagram), len(diagram.vertices)
     starts, corners = face_corners(diagram)
@@ -151,13 +151,13 @@ def polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
     index = np.int32 if len(ends) == 0 or ends[-1] < 2**31 else np.int64
     stream = np.empty(ends[-1] if n else 0, index)
     counts = np.concatenate([[0], ends[:-1]])
-    # Before a face stand those of the same and of earlier cells, and the counts of these cells.
+    # A face follows all faces of earlier cells and of its own cell, and the counts of these cells.
     headers = np.cumsum(sides + 1) - (sides + 1) + owner + 1
     rest = np.ones(len(stream), bool)
     rest[counts] = rest[headers] = False
     stream[counts], stream[headers], stream[rest] = faces, sides, corners
 
-    # Every corner of a cell is one of at least three of its faces, and listed once.
+    # A corner belongs to at least three faces of its cell. List it once.
     keys = np.repeat(owner.astype(np.int64) * v, sides) + corners
     keys.sort()
     keys = keys[np.concatenate([[True], keys[1:] != keys[:-1]])]
@@ -171,10 +171,10 @@ def polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
 
 
 def cell_data(contents: Contents) -> dict[str, np.ndarray]:
-    """Return what is known of each cell, by name; vectors have three coordinates, as VTK's do."""
+    """Return the cell data by name. Vectors have three coordinates, as VTK requires."""
     diagram = contents.diagram
     flat, n = diagram.domain.dim == 2, len(diagram)
-    # In 3D of the faces that are written: those with a loop.
+    # In 3D count the faces that are written: those with vertices.
     seen = np.diff(face_corners(diagram)[0]) > 0
     counts = count_sides(diagram) if flat else np.bincount(face_owners(diagram)[seen], minlength=n)
     return {
@@ -205,7 +205,7 @@ def in_space(points: np.ndarray) -> np.ndarray:
 
 
 class _Appended:
-    """The bytes after the XML, and where each array begins in them."""
+    """The appended bytes, and the XML elements that refer to them."""
 
     def __init__(self, compress: bool) -> None:
         self.chunks: list[bytes] = []
@@ -213,7 +213,7 @@ class _Appended:
         self._offset = 0
 
     def add(self, name: str | None, array: np.ndarray, tuples: bool = False) -> str:
-        """Append `array` and return the XML element that refers to it; it says how long it is if `tuples`."""
+        """Append `array` and return its XML element; with `tuples`, the element has its length."""
         data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("="), copy=False)
         components = f' NumberOfComponents="{data.shape[1]}"' if data.ndim == 2 else ""
         label = "" if name is None else f" Name={quoteattr(name)}"
@@ -234,16 +234,16 @@ def _measured(raw: bytes) -> bytes:
 
 
 def _packed(raw: bytes) -> bytes:
-    """Compress `raw` in blocks: their number, their size, the last one's, each one's compressed."""
+    """Compress `raw` in blocks, after a table of their number, their size, that of the last, and compressed sizes."""
     blocks = [raw[i : i + _BLOCK] for i in range(0, len(raw), _BLOCK)]
     packed = [zlib.compress(block, 1) for block in blocks]
-    partial = len(raw) % _BLOCK  # 0 if the last block is a full one
+    partial = len(raw) % _BLOCK  # 0 if the last block is full
     table = struct.pack(f"={3 + len(packed)}Q", len(packed), _BLOCK, partial, *map(len, packed))
     return table + b"".join(packed)
 
 
 def _comment(text: str) -> str:
-    # A field of type String would show up in ParaView, but meshio cannot read such a file.
+    # Not a field of type String, because meshio cannot read such a file.
     return f"<!-- {text.replace('--', '- -')} -->"
 
 

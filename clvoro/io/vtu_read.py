@@ -1,7 +1,7 @@
-"""Read back the `.vtu` files that `vtu.py` writes, without trusting them: for checks.
+"""Read the `.vtu` files that `vtu` writes, without trusting them.
 
-The XML is read by a parser that refuses document types and entities, so that nothing expands and nothing is fetched;
-every array's size is known from the numbers of points and cells, or bounded by the file's, before memory is asked for.
+The XML parser refuses document types and entities, so that nothing is expanded or fetched. The size of each array is
+known from the numbers of points and cells, or bounded by the size of the file, before memory is allocated.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from ..files import open_plain
 from ..geometry.box import Box, Domain
 from ..geometry.polygon import Polygon
 from ..mesh.check.rebuilt import rebuild
+from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
 from .arrays import EXPANSION, LEAST
@@ -48,20 +49,20 @@ _USED = {
 
 
 class _FileError(Exception):
-    """What is wrong with a file; `load_vtu` adds which one."""
+    """The fault of a file. `load_vtu` adds the file's name."""
 
 
 def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
-    """Read the cells and what is known of them from a `.vtu` file that `Result.save` or `Diagram.save` wrote.
+    """Read the cells and cell data of a `.vtu` file of `Result.save` or `Diagram.save`.
 
-    The domain is the polygon or periodic box that the file describes, or else the vertices' bounding box. The graph is
-    made anew from the corners that cells share; volumes, sizes, errors and quality are those of the file, the history
-    is empty.
+    The domain is the polygon or periodic box in the file, or else the bounding box of the vertices. The graph is
+    computed again from the corners that cells share. Volumes, sizes, errors and quality are those of the file. The
+    history is empty.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, cut off or not of clvoro's kind; names the file and what is wrong.
+        If the file is missing, damaged, truncated or of another program; names the file and the fault.
     """
     name = fspath(path)
     try:
@@ -69,12 +70,12 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
             head = file.read(_LONGEST_HEAD)
             end = head.find(_MARK)
             if end < 0:
-                raise _FileError("it has no appended raw data, as clvoro's have")
+                raise _FileError("it has no appended raw data, as files of clvoro do")
             start = end + len(_MARK)
             size = os.fstat(file.fileno()).st_size
             file.seek(max(0, size - len(_END)))
             if file.read() != _END:
-                raise _FileError("its end is missing: it is cut off, or something follows")
+                raise _FileError("it is truncated, or has bytes behind its end")
             reader = _Reader(head[:end], start, size)
             arrays = reader.read_all(file)
         return _assemble(arrays, reader.names)
@@ -90,18 +91,20 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
         RecursionError,
         expat.ExpatError,
     ) as error:
-        raise InputError(f"cannot read {name}: it is damaged or foreign ({error})") from error
+        raise InputError(
+            f"cannot read {name}: it is damaged or of another program ({error})"
+        ) from error
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from error
 
 
 class _Reader:
-    """The head of a file: which arrays there are, and where."""
+    """The head of a file: its arrays and their places."""
 
     def __init__(self, head: bytes, start: int, size: int) -> None:
         self.start, self.size = start, size
-        self.left = max(LEAST, EXPANSION * size)  # bytes of arrays
-        self.there = size  # bytes of the file, none of which two arrays share
+        self.left = max(LEAST, EXPANSION * size)  # bytes that arrays may still expand to
+        self.there = size  # bytes of the file that no array has used
         self.points = self.cells = -1
         self.compressed = False
         self.entries: dict[str, tuple[str, int, int]] = {}
@@ -118,7 +121,7 @@ class _Reader:
             raise _FileError("it has no piece with points and cells")
 
     def _refuse(self, *_: object) -> NoReturn:
-        raise _FileError("it declares a document type or entities, which clvoro's never do")
+        raise _FileError("it declares a document type or entities, which files of clvoro do not")
 
     def _comment(self, text: str) -> None:
         text = text.strip()
@@ -129,7 +132,7 @@ class _Reader:
         if tag == "VTKFile":
             native = f"{sys.byteorder.title()}Endian"
             if given.get("type") != "UnstructuredGrid" or given.get("byte_order") != native:
-                raise _FileError(f"it is no UnstructuredGrid in {native}")
+                raise _FileError(f"it is not an UnstructuredGrid in {native}")
             if given.get("header_type") != "UInt64":
                 raise _FileError("its header_type is not UInt64")
             compressor = given.get("compressor")
@@ -148,18 +151,18 @@ class _Reader:
             if width not in (1, 3) and key in _USED:
                 raise _FileError(f"its array {name!r:.60} has {width} components")
             if key in self.entries:
-                raise _FileError(f"it has two arrays called {key!r:.60}")
+                raise _FileError(f"it has two arrays {key!r:.60}")
             self.entries[key] = (_TYPES[given["type"]], width, int(given["offset"]))
         self._within.append(tag)
 
     def read_all(self, file) -> dict[str, np.ndarray]:
-        """Return all arrays that a result is made of, by group and name."""
+        """Return the arrays that a mesh needs, by group and name."""
         used = {name: entry for name, entry in self.entries.items() if name in _USED}
         return {name: self._read(file, name, *entry) for name, entry in used.items()}
 
     def _read(self, file, name: str, kind: str, width: int, offset: int) -> np.ndarray:
         if not 0 <= offset <= self.size - self.start - 8:
-            raise _FileError(f"{name} lies beyond the file's end")
+            raise _FileError(f"{name} is beyond the end of the file")
         file.seek(self.start + offset)
         if self.compressed:
             raw = bytearray()
@@ -168,7 +171,7 @@ class _Reader:
         else:
             (length,) = struct.unpack("=Q", file.read(8))
             raw = self._take(file, name, length)
-        array = np.frombuffer(raw, kind)  # raises if it is no whole number of items
+        array = np.frombuffer(raw, kind)  # raises unless the length is a multiple of the item size
         if width > 1:
             array = array.reshape(-1, width)
         rows = {"Points": self.points, "CellData": self.cells}.get(name.split(".")[0])
@@ -179,20 +182,20 @@ class _Reader:
         return array
 
     def _take(self, file, name: str, length: int) -> bytes:
-        """Read `length` bytes, of which there are that many."""
+        """Read `length` bytes; refuse more than the file has, and bytes of other arrays."""
         if length > self.size - file.tell():
-            raise _FileError(f"{name} is cut off")
+            raise _FileError(f"{name} is truncated")
         self.there -= length
         if self.there < 0:
-            raise _FileError("its arrays lie in each other")
+            raise _FileError("its arrays overlap")
         return file.read(length)
 
     def _blocks(self, file, name: str) -> Iterator[bytes]:
         count, block, partial = struct.unpack("=3Q", self._take(file, name, 24))
         if not 0 < block <= _BLOCK or partial >= block:
-            raise _FileError(f"{name} is in blocks of {block} bytes")
+            raise _FileError(f"{name} has blocks of {block} bytes")
         sizes = struct.unpack(f"={count}Q", self._take(file, name, 8 * min(count, self.size)))
-        # Before any is expanded.
+        # Checked before any block is expanded.
         self.left -= (count - 1) * block + (partial or block) if count else 0
         if self.left < 0:
             raise _FileError(f"it expands to more than {EXPANSION} times its size")
@@ -201,7 +204,7 @@ class _Reader:
             part = zlib.decompressobj()
             data = part.decompress(self._take(file, name, size), expected)
             if len(data) != expected or part.decompress(part.unconsumed_tail, 1):
-                raise _FileError(f"block {k} of {name} has not the length that its table says")
+                raise _FileError(f"block {k} of {name} does not have the length in its table")
             yield data
 
 
@@ -212,73 +215,80 @@ def _assemble(
     kinds = arrays["Cells.types"]
     if not len(kinds) or not len(vertices) or not np.isfinite(vertices).all():
         raise _FileError("it has no cells, or vertices that are not finite")
-    if (kinds == 7).all():
-        dim, (cell_starts, corners) = 2, _polygons(arrays, len(vertices))
-        face_starts = None
-    elif (kinds == 42).all():
-        dim, (cell_starts, face_starts, corners) = 3, _polyhedra(arrays, len(vertices))
-    else:
+    flat = bool((kinds == 7).all())
+    if not flat and not (kinds == 42).all():
         raise _FileError("its cells are neither all polygons nor all polyhedra")
-    lower, upper = vertices.min(axis=0)[:dim], vertices.max(axis=0)[:dim]
-    if not (lower < upper).all():
-        raise _FileError("its vertices lie on a line")
-    polygon = _polygon(arrays, names) if dim == 2 else None
-    periodic = "FieldData.box_periodic" in arrays
-    if periodic:
-        domain = _periodic_box(arrays, dim, names)
-    else:
-        domain = polygon or Box(tuple(lower), tuple(upper), names=names)
+    dim = 2 if flat else 3
     x = np.ascontiguousarray(vertices[:, :dim])
-    points = arrays["CellData.generator"][:, :dim].astype(float)
-    owner = np.repeat(np.arange(len(kinds)), np.diff(cell_starts))
-    if face_starts is None:
-        following = np.arange(1, len(corners) + 1)
-        following[cell_starts[1:] - 1] = cell_starts[:-1]
-        loops = np.stack([corners, corners[following]], axis=1)
-        if polygon is not None:
-            faces = ~_bridges(arrays, owner, loops)
-            owner, loops = owner[faces], loops[faces]
-        face = np.repeat(np.arange(len(loops)), 2)
-        flat, starts = loops.ravel(), 2 * np.arange(len(loops) + 1)
-    else:
-        flat, starts = corners, face_starts
-        face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    neighbors = _neighbors(owner, face, flat, starts, x, domain)
+    domain = _domain(arrays, x, names)
+    faces = _cell_polygons(arrays, len(x), domain) if flat else _cell_polyhedra(arrays, len(x))
+    owner = np.repeat(np.arange(len(kinds)), np.diff(faces["neighbor_starts"]))
+    neighbors = _neighbors(owner, faces.pop("starts"), faces.pop("corners"), x, domain)
     if "FieldData.wall_faces" in arrays:
         _set_walls(arrays, neighbors, domain)
-    across = _seam(arrays, neighbors, dim, len(kinds)) if periodic else {}
-    known = {
-        "points": points, "volumes": arrays["CellData.volume"].astype(float),
-        "neighbor_starts": cell_starts, "neighbors": neighbors, "vertices": x,
-        **across,
-    }  # fmt: skip
-    if polygon is not None:
-        rows = np.bincount(owner, minlength=len(kinds))
-        known["neighbor_starts"] = np.concatenate([[0], np.cumsum(rows)])
-        known |= {"face_vertex_starts": starts, "face_vertices": flat}
-    if face_starts is None:
-        known |= {"cell_vertex_starts": cell_starts, "cell_vertices": corners}
-    else:
-        known |= {"face_vertex_starts": face_starts, "face_vertices": corners}
-    # What the file does not hold is what its corners give.
+    across = _seam(arrays, neighbors, dim, len(kinds)) if any(domain.periodic) else {}
+    points = arrays["CellData.generator"][:, :dim].astype(float)
+    volumes = arrays["CellData.volume"].astype(float)
+    known = {"points": points, "volumes": volumes, "neighbors": neighbors, "vertices": x}
+    known |= {**faces, **across}
+    # The other arrays follow from the corners.
     diagram = Diagram(domain, {**known, **rebuild(Diagram(domain, known))})
     check_repeated(arrays, diagram)
-    if not {f"CellData.{name}" for name in ("size", "error", "quality")} & set(arrays):
+    of_run = [f"CellData.{name}" for name in ("size", "error", "quality")]
+    if not set(of_run) & set(arrays):
         return diagram
-    size, error, quality = (
-        arrays[f"CellData.{name}"].astype(float) for name in ("size", "error", "quality")
-    )
+    size, error, quality = (arrays[name].astype(float) for name in of_run)
     return Result(
         points=points, diagram=diagram, target_size=size, size_error=error, quality=quality,
-        history=np.zeros(0, HISTORY_DTYPE),
-        converged=False, stop_reason="read from a .vtu file",
+        history=np.zeros(0, HISTORY_DTYPE), converged=False, stop_reason="read from a .vtu file",
     )  # fmt: skip
+
+
+def _domain(
+    arrays: dict[str, np.ndarray], x: np.ndarray, names: dict[str, list[int]] | None
+) -> Domain:
+    """Return the domain in the file, or else the bounding box of the vertices."""
+    lower, upper, dim = x.min(axis=0), x.max(axis=0), x.shape[1]
+    if not (lower < upper).all():
+        raise _FileError("its vertices lie on a line")
+    if "FieldData.box_periodic" in arrays:
+        return _periodic_box(arrays, dim, names)
+    polygon = _polygon(arrays, names) if dim == 2 else None
+    return polygon or Box(tuple(lower), tuple(upper), names=names)
+
+
+def _cell_polygons(arrays: dict[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
+    """Return the diagram's arrays of cells and faces in 2D, and `starts` and `corners` of the faces."""
+    cell_starts, corners = _polygons(arrays, v)
+    owner = np.repeat(np.arange(len(cell_starts) - 1), np.diff(cell_starts))
+    ends = np.stack([corners, corners[following(cell_starts)]], axis=1)
+    found = {"cell_vertex_starts": cell_starts, "cell_vertices": corners}
+    if not isinstance(domain, Polygon):
+        rows = cell_starts
+    else:
+        kept = ~_bridges(arrays, owner, ends)
+        ends = ends[kept]
+        counts = np.bincount(owner[kept], minlength=len(cell_starts) - 1)
+        rows = np.concatenate([[0], np.cumsum(counts)])
+    starts = 2 * np.arange(len(ends) + 1)
+    if isinstance(domain, Polygon):
+        found |= {"face_vertex_starts": starts, "face_vertices": ends.ravel()}
+    return {**found, "neighbor_starts": rows, "starts": starts, "corners": ends.ravel()}
+
+
+def _cell_polyhedra(arrays: dict[str, np.ndarray], v: int) -> dict[str, np.ndarray]:
+    """Return the diagram's arrays of faces in 3D, and again `starts` and `corners` of the faces."""
+    cell_starts, starts, corners = _polyhedra(arrays, v)
+    return {
+        "neighbor_starts": cell_starts, "face_vertex_starts": starts, "face_vertices": corners, "starts": starts,
+        "corners": corners,
+    }  # fmt: skip
 
 
 def _periodic_box(
     arrays: dict[str, np.ndarray], dim: int, names: dict[str, list[int]] | None
 ) -> Box:
-    """Return the periodic box that the file has."""
+    """Return the periodic box in the file."""
     corners = arrays["FieldData.box_corners"].reshape(2, 3)[:, :dim].astype(float)
     axes = arrays["FieldData.box_periodic"]
     if axes.shape != (dim,):
@@ -289,12 +299,12 @@ def _periodic_box(
 def _seam(
     arrays: dict[str, np.ndarray], neighbors: np.ndarray, dim: int, n: int
 ) -> dict[str, np.ndarray]:
-    """Put in the neighbors across the seams, whose faces share no corners, and return the shifts."""
+    """Set the neighbors across the seams, where faces share no corners, and return the shifts."""
     faces = _indices(arrays["FieldData.seam_faces"], len(neighbors), "seam_faces")
     others = _indices(arrays["FieldData.seam_neighbors"], n, "seam_neighbors")
     steps = arrays["FieldData.seam_shifts"].reshape(-1, 3)[:, :dim]
     if not len(faces) == len(others) == len(steps) or (np.abs(steps.astype(float)) > 1).any():
-        raise _FileError("its seams do not fit its cells")
+        raise _FileError("its seams differ from its cells")
     neighbors[faces] = others
     shifts = np.zeros((len(neighbors), dim), np.int8)
     shifts[faces] = steps
@@ -302,7 +312,7 @@ def _seam(
 
 
 def _polygon(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) -> Polygon | None:
-    """Return the polygonal domain, if the file has one."""
+    """Return the polygonal domain in the file; None without one."""
     prefix = "FieldData.domain_"
     values = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
     if not values:
@@ -313,18 +323,18 @@ def _polygon(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) 
 
 
 def _set_walls(arrays: dict[str, np.ndarray], neighbors: np.ndarray, domain: Domain) -> None:
-    """Put in the edges behind faces on the boundary, as the file has them."""
+    """Set the edges at boundary faces that the file lists."""
     faces = _indices(arrays["FieldData.wall_faces"], len(neighbors), "wall_faces")
     edges = _indices(arrays["FieldData.wall_edges"], len(domain.boundary_index), "wall_edges")
     if len(faces) != len(edges):
-        raise _FileError("its faces on walls do not fit each other")
+        raise _FileError("wall_faces and wall_edges differ in length")
     neighbors[faces] = -1 - edges
 
 
 def _bridges(arrays: dict[str, np.ndarray], owner: np.ndarray, loops: np.ndarray) -> np.ndarray:
-    """Tell which ways from corner to corner (m, 2) join loops of a cell, and are no faces.
+    """Return which pairs of consecutive corners (m, 2) are bridges between loops of a cell, and not faces.
 
-    Where the file does not say it, those that their cell also goes back.
+    Without a list in the file, these are the pairs that the cell passes in both directions.
     """
     if "FieldData.bridges" in arrays:
         found = np.zeros(len(loops), bool)
@@ -340,16 +350,16 @@ def _bridges(arrays: dict[str, np.ndarray], owner: np.ndarray, loops: np.ndarray
 
 def _indices(array: np.ndarray, bound: int, name: str) -> np.ndarray:
     if array.dtype.kind not in "iu" or array.ndim != 1:
-        raise _FileError(f"{name} are no indices")
+        raise _FileError(f"{name} are not indices")
     if len(array) and not (array.min() >= 0 and array.max() < bound):
-        raise _FileError(f"{name} point to what does not exist")
+        raise _FileError(f"{name} have an index out of range")
     return array.astype(np.int64)
 
 
 def _starts(ends: np.ndarray, total: int, name: str) -> np.ndarray:
     starts = np.concatenate([[0], _indices(ends, total + 1, name)])
     if starts[-1] != total or (np.diff(starts) < 3).any():
-        raise _FileError(f"{name} do not cut the list into cells")
+        raise _FileError(f"{name} do not divide the list into cells")
     return starts
 
 
@@ -359,12 +369,12 @@ def _polygons(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nda
 
 
 def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Take the streams of faces apart: starts of cells in faces, of faces in corners, corners."""
+    """Return the starts of cells in the faces, the starts of faces in the corners, and the corners."""
     stream = _indices(arrays["Cells.faces"], max(v, len(arrays["Cells.faces"])), "faces")
     ends = _starts(arrays["Cells.faceoffsets"], len(stream), "faceoffsets")
-    counts, cells = array("q"), array("q", [0])  # places of faces' numbers of corners
+    counts, cells = array("q"), array("q", [0])  # places of the corner counts of faces
     for begin, end in pairwise(ends.tolist()):
-        part = stream[begin:end].tolist()  # whose items are got at sooner
+        part = stream[begin:end].tolist()  # faster to index than an array
         at = 1
         for _ in range(part[0]):
             if at >= len(part):
@@ -372,7 +382,7 @@ def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nd
             counts.append(begin + at)
             at += 1 + part[at]
         if at != len(part) or len(counts) - cells[-1] != part[0]:
-            raise _FileError("faces do not fit their cells")
+            raise _FileError("faces differ from the counts of their cells")
         cells.append(len(counts))
     headers = np.array(counts, np.int64)
     faces = np.concatenate([[0], np.cumsum(stream[headers])])
@@ -381,39 +391,30 @@ def _polyhedra(arrays: dict[str, np.ndarray], v: int) -> tuple[np.ndarray, np.nd
 
 
 def _neighbors(
-    owner: np.ndarray,
-    face: np.ndarray,
-    corners: np.ndarray,
-    starts: np.ndarray,
-    x: np.ndarray,
-    domain: Domain,
+    owner: np.ndarray, starts: np.ndarray, corners: np.ndarray, x: np.ndarray, domain: Domain
 ) -> np.ndarray:
-    """Return the cell behind each face: the one whose face has the same corners; or else the wall it lies on."""
-    order = np.lexsort((corners, face))
-    ragged = corners[order]
+    """Return the neighbor across each face: the cell with a face of the same corners, or else the nearest wall."""
     sides = np.diff(starts)
+    face = np.repeat(np.arange(len(sides)), sides)
+    ragged = corners[np.lexsort((corners, face))]
     result = np.full(len(sides), np.iinfo(np.int64).min)
     for k in np.unique(sides):
         rows = np.flatnonzero(sides == k)
         if k < 2:
-            raise _FileError("a face has fewer corners than it takes")
+            raise _FileError("a face has fewer than 2 corners")
         keys = ragged[starts[rows][:, None] + np.arange(k)]
         by = np.lexsort(keys.T[::-1])
         same = (keys[by][1:] == keys[by][:-1]).all(axis=1)
         a, b = rows[by[:-1][same]], rows[by[1:][same]]
         result[a], result[b] = owner[b], owner[a]
     alone = np.flatnonzero(result < 0)
-    middle = (
-        np.stack([np.bincount(face, x[corners, k], len(sides)) for k in range(x.shape[1])], axis=1)[
-            alone
-        ]
-        / sides[alone][:, None]
-    )
+    sums = np.stack([np.bincount(face, column, len(sides)) for column in x[corners].T], axis=1)
+    middle = sums[alone] / sides[alone][:, None]
     if isinstance(domain, Polygon):
         result[alone] = -1 - domain.nearest_edge(middle)[0]
         return result
     gaps = np.stack([middle - domain.lower, domain.upper - middle], axis=2)
-    gaps[:, np.array(domain.periodic)] = np.inf  # these are seams
+    gaps[:, np.array(domain.periodic)] = np.inf  # seams are not walls
     gaps = gaps.reshape(len(alone), -1)
     result[alone] = -1 - gaps.argmin(axis=1)
     return result

@@ -93,7 +93,7 @@ def test_own_data_in_other_formats(diagram, result, tmp_path):
                 np.testing.assert_array_equal(file.variables[name][:], values)
             assert ("size" in file.variables) is False
         diagram.save(tmp_path / "b.nc", convention=convention)
-    with pytest.raises(InputError, match="has for a variable of its own"):
+    with pytest.raises(InputError, match="is that of another variable"):
         result.save(tmp_path / "c.nc", cell_data={"mesh_node_x": result.quality})
 
 

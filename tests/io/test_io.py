@@ -215,8 +215,8 @@ def huge_array():
         ({"about": np.array("7")}, "description is damaged"),
         ({"about": np.array("[" * 100000)}, "description is damaged"),
         ({"diagram.neighbors": None}, "lacks diagram.neighbors"),
-        ({"diagram.neighbor_starts": np.arange(41)}, "does not cut"),
-        ({"diagram.vertices": np.zeros((2, 2))}, "points to what does not exist"),
+        ({"diagram.neighbor_starts": np.arange(41)}, "does not divide"),
+        ({"diagram.vertices": np.zeros((2, 2))}, "has an index out of range"),
         ({"diagram.points": np.zeros((40, 3))}, r"diagram.points has shape \(40, 3\)"),
     ],
 )

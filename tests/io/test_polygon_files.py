@@ -365,9 +365,9 @@ def test_npz_loses_nothing(ctx, tmp_path, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "says"),
     [
-        ("diagram.neighbors", lambda j: np.where(j == -1, -17, j), "neighbors points to what"),
-        ("diagram.face_vertex_starts", lambda s: s // 2 * 3, "face_vertex_starts does not cut"),
-        ("diagram.face_vertices", lambda v: v + 10_000, "face_vertices points to what"),
+        ("diagram.neighbors", lambda j: np.where(j == -1, -17, j), "neighbors has an index out of"),
+        ("diagram.face_vertex_starts", lambda s: s // 2 * 3, "face_vertex_starts does not divide"),
+        ("diagram.face_vertices", lambda v: v + 10_000, "face_vertices has an index out of"),
         ("diagram.face_vertices", None, "lacks diagram.face_vertices"),
     ],
 )  # fmt: skip

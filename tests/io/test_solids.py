@@ -243,10 +243,10 @@ def test_npz_returns_what_was_saved(result, tmp_path):
     ("changes", "message"),
     [
         ({"diagram.face_vertices": None}, "lacks diagram.face_vertices"),
-        ({"diagram.face_vertex_starts": np.arange(91)}, "one piece per face"),
+        ({"diagram.face_vertex_starts": np.arange(91)}, "one row per face"),
         ({"diagram.face_vertex_starts": np.zeros(91)}, "has dtype float64"),
-        ({"diagram.vertices": np.zeros((5, 3))}, "face_vertices points to what does not exist"),
-        ({"diagram.vertices": np.zeros((500, 2))}, "does not fit"),
+        ({"diagram.vertices": np.zeros((5, 3))}, "face_vertices has an index out of range"),
+        ({"diagram.vertices": np.zeros((500, 2))}, "differs from the other arrays"),
     ],
 )
 def test_bad_npz_is_refused(result, tmp_path, changes, message):
