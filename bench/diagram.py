@@ -46,9 +46,9 @@ import numpy as np
 from _common import Report, best, clock_of, counts, heading, make_adapter, markdown, names, parser
 
 import clvoro
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.hooks import watching
 from clvoro.opencl.profile import Profile, profiled_queue
-from clvoro.opencl.program import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.incremental import IncrementalUpdate

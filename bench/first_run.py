@@ -53,9 +53,9 @@ RECORDER = """
 import json, sys
 import numpy as np, pyopencl as cl
 import clvoro
-from clvoro.opencl import prebuild, program
+from clvoro.opencl import engine as engines, kernels as kernel_objects, prebuild
 made, launches, programs, kinds = {{}}, {{}}, [], []
-plain = program.Engine.kernels, program.KernelPool.take, cl.Kernel.set_args, cl.enqueue_nd_range_kernel
+plain = engines.Engine.kernels, cl.Kernel.set_args, cl.enqueue_nd_range_kernel
 def kernels(engine, stage, defines=None, prelude=""):
     taken = plain[0](engine, stage, defines, prelude)
     kinds.append(prebuild.kind_of(engine))
@@ -66,10 +66,10 @@ def getattribute(taken, name):
     if isinstance(kernel, cl.Kernel):
         kernel.made = made[id(taken)][1:]
     return kernel
-old = program.Kernels.__getattr__
+old = kernel_objects.Kernels.__getattr__
 def set_args(kernel, *args):
     kernel.sizes = [a.nbytes if isinstance(a, (np.generic, np.ndarray)) else 0 for a in args]
-    plain[2](kernel, *args)
+    plain[1](kernel, *args)
 def enqueue(queue, kernel, size, group, *args, **options):
     program_of, prelude = getattr(kernel, "made", (None, "x"))
     if not prelude:
@@ -77,8 +77,8 @@ def enqueue(queue, kernel, size, group, *args, **options):
             programs.append(list(program_of))
         key = programs.index(list(program_of)), kernel.function_name, group[0]
         launches.setdefault(key, kernel.sizes)
-    return plain[3](queue, kernel, size, group, *args, **options)
-program.Engine.kernels, program.Kernels.__getattr__ = kernels, getattribute
+    return plain[2](queue, kernel, size, group, *args, **options)
+engines.Engine.kernels, kernel_objects.Kernels.__getattr__ = kernels, getattribute
 cl.Kernel.set_args, cl.enqueue_nd_range_kernel = set_args, enqueue
 prebuild._is_new = lambda *_: False
 clvoro.Adapter().run({domain}, {size})

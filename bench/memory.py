@@ -45,7 +45,7 @@ from _kinds import CUBE, KINDS, SQUARE, Kind
 import clvoro
 from clvoro import sizing
 from clvoro.adaptation.sampling.start import count_cells
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.remapping.remap import transfer_values
 from clvoro.remapping.transfer import transfer_needed
 

@@ -22,7 +22,7 @@ import scipy.sparse.linalg as sla
 from _common import Report, best, clock_of, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.solvers.poisson import Poisson
 
 try:

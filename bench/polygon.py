@@ -37,7 +37,7 @@ from _common import (
 
 import clvoro
 from clvoro.adaptation.stages import Stages
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
 
 MOST_RATIO = 1.3
@@ -84,7 +84,7 @@ class Sets:
     """Generators of one domain, in the order of their bins, and what tessellates them."""
 
     def __init__(self, adapter: clvoro.Adapter, domain: Any, n: int) -> None:
-        engine = Engine(adapter.ctx, adapter.queue, 2, adapter.dtype, domain.defines(adapter.dtype))
+        engine = Engine(adapter.ctx, adapter.queue, 2, adapter.dtype, domain.kind(adapter.dtype))
         stages = Stages(engine)
         unsorted = engine.upload(domain.place(random_points(domain, n), adapter.dtype))
         items = stages.bins.build(domain, unsorted, n).items[:n].copy()

@@ -46,8 +46,8 @@ from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
 from clvoro.adaptation.schedule import Step, plan_adaptive
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import Mesh
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.profile import Profile, profiled_queue
-from clvoro.opencl.program import Engine
 from clvoro.sizing import Sizing
 from clvoro.solvers.conjugate_gradient import Solution
 

@@ -35,8 +35,8 @@ from .mesh.diagram import Diagram
 from .mesh.results import Result
 from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, noticed_builds
+from .opencl.engine import Engine
 from .opencl.probe import check_process
-from .opencl.program import Engine
 from .tessellation.readback.fetch import fetch_diagram
 from .tessellation.tessellator import Tessellator
 
@@ -106,7 +106,7 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._stages: dict[tuple[object, ...], Stages] = {}
+        self._stages: dict[tuple[int, bool, bool], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
@@ -180,11 +180,14 @@ class Adapter:
             raise InputTypeError(
                 f"domain is a {type(domain).__name__}, expected a clvoro.Box or a clvoro.Polygon{hint}"
             )
-        kind = domain.dim, domain.defines(self.dtype)
-        if kind not in self._stages:
-            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, kind[1])
-            self._stages[kind] = Stages(engine)
-        return self._stages[kind]
+        kind = domain.kind(self.dtype)
+        key = domain.dim, kind.periodic, kind.polygonal
+        stages = self._stages.get(key)
+        if stages is None or stages.engine.domain_kind != kind:
+            # Those of the last periods are dropped: their programs are kept elsewhere, and serve these.
+            engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, kind)
+            stages = self._stages[key] = Stages(engine)
+        return stages
 
     def diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
         """Return the Voronoi diagram of `points` in `domain`.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl.array as cla
 
-from ..opencl.program import Engine
+from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 
 

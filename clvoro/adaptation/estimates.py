@@ -8,9 +8,9 @@ import pyopencl as cl
 from ..errors import MemoryLimitError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..opencl.engine import Engine
 from ..opencl.host_memory import host_memory
 from ..opencl.primitives import scan_width
-from ..opencl.program import Engine
 from ..solvers.poisson import max_jacobi_iterations
 from ..tessellation.periodic.halo import block_count
 from .forecast import IMAGE_REACH, shore_expected
@@ -54,7 +54,7 @@ def fixed_bytes(engine: Engine, n: float) -> float:
 def spare_bytes(engine: Engine) -> float:
     """Return the part of these bytes that one diagram takes, too."""
     unit = max(64, engine.queue.device.mem_base_addr_align // 8)
-    periodic = any(name == "PERIODIC" for name, _ in engine.domain_defines)
+    periodic = engine.domain_kind.periodic
     margins = 3 * 4 * block_count(engine.dim) if periodic else 0
     return ARRAYS * unit + SCANS * 4 * scan_width(engine) + margins
 

@@ -10,8 +10,8 @@ import pyopencl.array as cla
 
 from ..geometry.box import Domain
 from ..opencl.device_array import read_number
+from ..opencl.engine import Engine
 from ..opencl.primitives import Room, Scan
-from ..opencl.program import Engine
 from ..tessellation.device_diagram import Tessellation
 
 THETA = 0.06

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
-from ..opencl.program import Engine
+from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 
 

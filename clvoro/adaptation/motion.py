@@ -6,8 +6,8 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.box import Domain
+from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
-from ..opencl.program import Engine
 from ..tessellation.device_diagram import Tessellation
 
 

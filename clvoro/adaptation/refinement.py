@@ -8,8 +8,8 @@ from scipy.spatial import KDTree
 
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from ..opencl.program import Engine
 from ..tessellation.device_diagram import Tessellation
 
 SHORT_FACE = 0.02

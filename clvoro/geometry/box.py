@@ -13,12 +13,13 @@ import numpy as np
 
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
+from ..opencl.engine import DomainKind
 from .boundary_names import BoundaryNames, Walls
 from .shapes import Edges
 from .surface import Surface, box_surface
 
 if TYPE_CHECKING:
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
 
 LARGEST_EDGE = 1e50
 """Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
@@ -160,10 +161,10 @@ class Domain(ABC):
             known[real] = corners[0], corners[1]
         return known[real]
 
-    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Return the macros, as names and values, of kernels for this kind of domain; see geometry/domain.h."""
+    def kind(self, real: np.dtype) -> DomainKind:
+        """Return the kind of domain, for which kernels are built; `real` is the precision of periods."""
         del real
-        return ()
+        return DomainKind()
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the arguments of kernels with DOMAIN_ARGS; see geometry/domain.h."""
@@ -351,16 +352,12 @@ class Box(Domain):
             upper[: self.dim] = np.where(self.periodic, self.periods(real), upper[: self.dim])
         return lower, upper
 
-    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Return macros with the lengths of periods. A kernel that does not use them takes PERIOD_ARGS instead."""
+    def kind(self, real: np.dtype) -> DomainKind:
+        """Return the kind of domain and its periods, in the device's coordinates."""
         if not any(self.periodic):
-            return ()
-        lengths = np.zeros(3)
-        lengths[: self.dim] = self.periods(real)
-        return (
-            ("PERIODIC", 1),
-            *((f"PERIOD_{a}", float(length).hex()) for a, length in enumerate(lengths)),
-        )
+            return DomainKind()
+        x, y, z = [float(period) for period in self.periods(real)] + [0.0] * (3 - self.dim)
+        return DomainKind(periodic=True, periods=(x, y, z))
 
 
 def _directions(periodic: object, dim: int) -> tuple[bool, ...]:

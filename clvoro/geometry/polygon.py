@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ..errors import InputError, InputTypeError
+from ..opencl.engine import DomainKind
 from .boundary_names import BoundaryNames, Walls
 from .edge_grid import bin_edges
 from .geojson import pieces_of_geojson, pieces_of_shape, pieces_of_wkt
@@ -22,7 +23,7 @@ from .rings import OrientedRings, make_rings, signed_area
 from .shapes import Edges
 
 if TYPE_CHECKING:
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
     from ..opencl.workspace import Workspace
 
 _MARGIN = (
@@ -342,10 +343,10 @@ class Polygon(Region):
         lower, upper = self.clip_box
         return lower, 2.0 ** math.ceil(math.log2((upper - lower).max()))
 
-    def defines(self, real: np.dtype) -> tuple[tuple[str, object], ...]:
-        """Return the macro of kernels for polygons."""
+    def kind(self, real: np.dtype) -> DomainKind:
+        """Return the kind of domain, for which kernels are built."""
         del real
-        return (("POLYGON", 1),)
+        return DomainKind(polygonal=True)
 
     def device_args(self, engine: Engine) -> tuple[object, ...]:
         """Return the corners of the clip box and the edges in bins; see geometry/edges.h."""

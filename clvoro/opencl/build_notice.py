@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from .prebuild import build_ahead
 
 if TYPE_CHECKING:
-    from .program import Engine
+    from .engine import Engine
 
 PATIENCE = 0.5
 """Seconds that kernels are built before a line on the terminal says so."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pyopencl as cl
 
-from .program import Engine, bind, plain, set_args
+from .engine import Engine
+from .kernels import bind, set_args, with_buffers
 
 
 def most_alone(engine: Engine) -> int:
@@ -38,7 +39,7 @@ class Launch:
     def set_first(self, value: int) -> None:
         """Set the kernel's first argument, an int."""
         if not self._given:
-            self._given = plain(self._args)
+            self._given = with_buffers(self._args)
         self._given[0] = np.int32(value)
         set_args(self._kernel, self._given)
 

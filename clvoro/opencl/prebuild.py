@@ -26,7 +26,7 @@ from .program import POCL, program_text, shortened
 from .runtimes import cache_home
 
 if TYPE_CHECKING:
-    from .program import Engine
+    from .engine import Engine
 
 MOST_WORKERS = 3
 """Processes beside this one."""
@@ -82,8 +82,7 @@ def build_ahead(engine: Engine) -> int:
 
 def kind_of(engine: Engine) -> str:
     """Return by what runs are told apart: dimension, precision and kind of domain."""
-    names = [name for name, _ in engine.domain_defines if "_" not in name]
-    return " ".join([f"{engine.dim}D", engine.real.name, *names])
+    return " ".join([f"{engine.dim}D", engine.real.name, *engine.domain_kind.defines])
 
 
 @cache

@@ -15,7 +15,7 @@ import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
 from .device_array import buffer_of, make_array
-from .program import Engine
+from .engine import Engine
 
 AT_ONCE = 8
 """Arrays that are summarized by one launch, at most."""

@@ -15,7 +15,7 @@ from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..opencl.devices import create_context
-from ..opencl.program import Engine
+from ..opencl.engine import Engine
 from ..tessellation.bins import Bins
 from .overlap import transfer_on_host
 from .transfer import Content, Graph, Transfer, transfer_needed

@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from ..errors import ClvoroError, InputError
 from ..geometry.box import ClipBox
-from ..opencl.program import Engine
+from ..opencl.engine import Engine
 from ..tessellation.bins import BinnedPoints
 
 FACES = {2: 32, 3: 64}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import DTypeLike
 
     from ..geometry.box import Domain
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
     from .field import Field
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from ..geometry.box import Domain
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
 
 _ALL_VALID = np.iinfo(np.int32).max
 

@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
 
 _TILE = {2: 16, 3: 8}  # nodes along a side
 _PASSES = 16  # between two reads of the active tiles by the host

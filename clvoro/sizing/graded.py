@@ -19,7 +19,7 @@ from .field import Field, as_field, count_parts
 from .raster import Raster
 
 if TYPE_CHECKING:
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
     from .codegen import CodeWriter
 
 _MAX_NODES = 1 << 22  # by default
@@ -309,7 +309,7 @@ def _default_engine(dim: int) -> Engine:
     import pyopencl as cl
 
     from ..opencl.devices import create_context
-    from ..opencl.program import Engine
+    from ..opencl.engine import Engine
 
     ctx = create_context()
     return Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))

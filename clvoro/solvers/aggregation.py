@@ -11,8 +11,9 @@ import pyopencl.array as cla
 from numpy.typing import DTypeLike
 
 from ..opencl.device_array import read_number
+from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from ..opencl.primitives import Room, Scan
-from ..opencl.program import Engine, Kernels
 
 MATCHING_ROUNDS = 3
 """Rounds of matching per pass. The third still matches every fifth cell; a fourth is not worth its time."""

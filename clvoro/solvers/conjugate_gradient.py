@@ -11,8 +11,9 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..errors import SolverError
+from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, most_alone
-from ..opencl.program import Engine, Kernels
 from ..opencl.workspace import framed
 
 Apply = Callable[[cla.Array, cla.Array], object]

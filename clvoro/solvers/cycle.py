@@ -10,9 +10,10 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ..opencl.engine import Engine
+from ..opencl.kernels import bind, comparison_key
 from ..opencl.launch import most_alone
 from ..opencl.primitives import Room
-from ..opencl.program import Engine, bind, key_of
 from .aggregation import WORK_GROUP, Aggregates, Graph, PairInverse, round_to_work_group
 
 # Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as the damping factors of two steps. Smaller eigenvalues are left
@@ -68,7 +69,7 @@ class Cycle:
 
     def enqueue(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
         """Enqueue u = M^-1 r. The content of `work`, if given, is overwritten."""
-        key = key_of([a for a in (r, u, work) if a is not None])
+        key = comparison_key([a for a in (r, u, work) if a is not None])
         if self._key != key:
             self._key, self._launches = None, []
             self._set_launches(r, u, work)

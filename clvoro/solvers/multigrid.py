@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyopencl.array as cla
 
+from ..opencl.engine import Engine
 from ..opencl.primitives import Room
-from ..opencl.program import Engine
 from .aggregation import Aggregates, Aggregation, Graph, PairInverse
 from .cycle import Cycle, Level
 

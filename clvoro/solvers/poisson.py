@@ -14,8 +14,9 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..errors import InputError
+from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, most_alone
-from ..opencl.program import Engine, Kernels
 from .conjugate_gradient import (
     CURVATURE,
     BreakdownError,

@@ -12,8 +12,9 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..errors import SolverError
+from ..opencl.engine import Engine
+from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, most_alone
-from ..opencl.program import Engine, Kernels
 from ..opencl.workspace import framed
 from ..tessellation.device_diagram import Tessellation
 from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING, Limits, Solution

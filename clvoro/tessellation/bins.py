@@ -11,8 +11,8 @@ from numpy.typing import DTypeLike
 
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of, read_number
+from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from ..opencl.program import Engine
 
 OCCUPANCY = 2
 """Mean number of generators per bin: a compromise between bins to open and generators to test."""

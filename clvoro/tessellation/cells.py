@@ -13,8 +13,8 @@ import pyopencl.array as cla
 from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of
+from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from ..opencl.program import Engine
 from ..opencl.workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .device_diagram import (
@@ -396,7 +396,7 @@ class Cells:
 
     def _enlarge(self, n: int) -> None:
         """Double the capacities, for a mesh of `n` cells."""
-        many = self.engine.group_size == 1 and not self.engine.trims
+        many = self.engine.group_size == 1 and not self.engine.domain_kind.polygonal
         if self.row_capacity >= (LARGEST_ROW if many else LARGEST_ELSEWHERE):
             raise ClvoroError(
                 f"a cell has more than {self.row_capacity} faces, expected fewer; remove or perturb cocircular "

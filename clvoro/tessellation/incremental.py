@@ -11,8 +11,8 @@ import pyopencl.array as cla
 
 from ..geometry.box import ClipBox
 from ..opencl.device_array import read_number
+from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from ..opencl.program import Engine
 from .cells import Cells
 from .device_diagram import Tessellation
 from .face_rows import spare_slots

@@ -14,8 +14,8 @@ import pyopencl.array as cla
 from ..errors import ClvoroError, MemoryLimitError
 from ..geometry.box import ClipBox
 from ..opencl.device_array import buffer_of
+from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from ..opencl.program import Engine
 from ..opencl.workspace import framed
 from .bins import MAX_LEVELS, BinnedPoints
 from .device_diagram import (

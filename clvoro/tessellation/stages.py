@@ -7,8 +7,8 @@ from typing import ClassVar
 import pyopencl.array as cla
 
 from ..geometry.box import Domain
+from ..opencl.engine import Engine
 from ..opencl.primitives import Gather
-from ..opencl.program import Engine
 from .bins import BinnedPoints, Bins
 from .cells import Cells
 from .clipped.trim import Trim
@@ -57,7 +57,7 @@ class TessellationStages:
         for name in self.CLASSES:
             self.__dict__.pop(name, None)
         self.engine.workspace.clear()
-        self.engine.pool.take_back()
+        self.engine.pool.release()
 
 
 def tessellate_box(

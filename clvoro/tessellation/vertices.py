@@ -8,8 +8,8 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.box import ClipBox
+from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from ..opencl.program import Engine
 from .device_diagram import Tessellation
 
 

@@ -35,7 +35,7 @@ from clvoro.adaptation.schedule import MOST_SURPLUS
 from clvoro.cli import command as cli
 from clvoro.cli import jobs
 from clvoro.errors import MemoryLimitError, SizeErrorWarning
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.remapping import remap
 from clvoro.remapping.remap import transfer_values
 from clvoro.remapping.transfer import transfer_needed

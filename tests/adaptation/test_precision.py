@@ -9,7 +9,7 @@ import pytest
 import clvoro
 from clvoro.adaptation import precision
 from clvoro.errors import InputError, PrecisionWarning
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.sizing import Circle, Distance, Expression, Sizing
 
 BOX = clvoro.Box((1, 0), (3, 1))

@@ -7,7 +7,7 @@ import pytest
 import clvoro
 from clvoro.adaptation.quality_descent import Shape
 from clvoro.adaptation.stages import Stages
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import diagrams as reference
 from tests.reference import patch
@@ -81,7 +81,7 @@ def test_gradient_in_a_polygon(ctx):
     # Where a piece changes cells, where it goes is no smooth function.
     assert all(piece.root == piece.home for piece in cells.pieces)
     real = np.dtype("float64")
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.defines(real))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real))
     placed = domain.place(points, real)
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
     q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)

@@ -10,7 +10,7 @@ import shapely
 import clvoro
 from clvoro.adaptation.motion import Motion
 from clvoro.geometry.edge_grid import bin_edges
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from tests.reference.shores import POLYGONS, coast, scattered
 
 NAMES = (
@@ -31,7 +31,7 @@ def move(ctx, request):
     """Positions (n, 2) after a displacement, both in the device's coordinates."""
     queue = cl.CommandQueue(ctx)
     real = np.dtype(request.param)
-    engine = Engine(ctx, queue, 2, real, POLYGONS["square"]().defines(real))
+    engine = Engine(ctx, queue, 2, real, POLYGONS["square"]().kind(real))
     motion = Motion(engine)
 
     def moved(domain, points, way):

@@ -10,7 +10,7 @@ from clvoro import Box, sizing
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.bvh import Tree
 from clvoro.geometry.triangles import crossing
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 
 DOMAIN = Box((3.0, -1.0, 10.0), (5.0, 1.0, 11.5))
 

@@ -6,8 +6,9 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+from clvoro.opencl.engine import Engine
+from clvoro.opencl.kernels import bind
 from clvoro.opencl.launch import Launch
-from clvoro.opencl.program import Engine, bind
 
 SOURCE = """
 kernel void put(const int n, const double x, const int2 shift, global const double *from, global double *to)

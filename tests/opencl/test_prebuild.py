@@ -14,7 +14,8 @@ import pytest
 import clvoro
 from clvoro.opencl import build_notice, prebuild
 from clvoro.opencl.build_notice import BuildNotice, noticed_builds
-from clvoro.opencl.program import POCL, Engine
+from clvoro.opencl.engine import Engine
+from clvoro.opencl.program import POCL
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
 import first_run
@@ -23,7 +24,7 @@ BUILD = """
 import json, os, sys
 import clvoro
 from clvoro.opencl import prebuild
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 prebuild._record = lambda: {"2D float64": json.loads(sys.argv[1])}
 adapter = clvoro.Adapter()
 engine = adapter._stages_for(clvoro.Box((0, 0), (1, 1))).engine

@@ -12,8 +12,8 @@ from clvoro.cli import command as cli
 from clvoro.errors import InputError
 from clvoro.opencl import costs, profile
 from clvoro.opencl import hooks as _hooks
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.profile import Profile, copy_bandwidth, profiled_queue
-from clvoro.opencl.program import Engine
 from clvoro.solvers.multigrid import Multigrid
 
 BOX = clvoro.Box((0, 0), (1.4, 1))

@@ -4,8 +4,9 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+import clvoro
 from clvoro.opencl import program
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 
 
 @pytest.fixture
@@ -56,3 +57,20 @@ def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch)
     programs_of_all_kinds(ctx, dtype, monkeypatch)
     full = [text for text in built if "DECLARE_REALS" not in text]
     assert all("size_at" in text for text in full)
+
+
+def test_programs_are_the_same_for_all_periods(ctx):
+    """And stages, with their memory, are kept for one of them."""
+    adapter = clvoro.Adapter(ctx)
+    engines = [
+        adapter._stages_for(clvoro.Box((0, 0, 0), (1, 1, z), periodic=True)).engine
+        for z in (1, 0.9)
+    ]
+    assert len(adapter._stages) == 1
+    assert (
+        adapter._stages_for(clvoro.Box((0, 0, 0), (2, 2, 1.8), periodic=True)).engine is engines[1]
+    )
+    assert [engine.period_args[0][2] for engine in engines] == pytest.approx([1, 0.9])
+    texts = [engine.all_defines("adaptation/motion", {}) for engine in engines]
+    assert texts[0] == texts[1]
+    assert texts[0]["PERIODIC"] == 1

@@ -11,7 +11,7 @@ from clvoro import sizing
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import Mesh
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.workspace import MOST_VIEWS
 from tests.reference import patch
 
@@ -207,7 +207,7 @@ def test_a_kernel_is_in_one_hand_until_all_are_taken_back(engine):
     held = {kernels.scan_few.int_ptr for kernels in (first, second)}
     assert first.scan_few is first.scan_few
     assert len(held) == 2
-    engine.pool.take_back()
+    engine.pool.release()
     third, fourth = (
         engine.kernels("opencl/primitives"),
         engine.single().kernels("opencl/primitives"),

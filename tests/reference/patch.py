@@ -10,7 +10,7 @@ import pyopencl as cl
 from clvoro.adaptation.refinement import SHORT_FACE
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells
 from clvoro.tessellation.tessellator import Tessellator
@@ -29,7 +29,7 @@ BOXES = {
 def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
     """Return an engine for `box`; with `group_size` as on a GPU also where the device is a CPU."""
     real = np.dtype(real)
-    engine = Engine(ctx, cl.CommandQueue(ctx), dim, real, box.defines(real))
+    engine = Engine(ctx, cl.CommandQueue(ctx), dim, real, box.kind(real))
     if group_size is not None:
         object.__setattr__(engine, "group_size", group_size)
     return engine

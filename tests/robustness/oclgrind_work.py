@@ -22,6 +22,7 @@ import clvoro
 from clvoro.adaptation.insertion_deletion import Population, PopulationControl
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl import program as _program
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import (
     Circle,
@@ -338,7 +339,7 @@ def fields(adapter: clvoro.Adapter) -> None:
     )
     for box, size in (*((BOX, size) for size in flat), *((CUBE, size) for size in solid)):
         n, d = 40, box.dim
-        engine = _program.Engine(adapter.ctx, adapter.queue, d, np.dtype(adapter.dtype))
+        engine = Engine(adapter.ctx, adapter.queue, d, np.dtype(adapter.dtype))
         origin, scale = box.frame
         at = engine.upload((points(n, d) * box.extent - origin) / scale)
         stage, h = Sizing(engine, box, size), engine.empty(n)
@@ -418,7 +419,7 @@ def scan(adapter: clvoro.Adapter) -> None:
 
 
 def stages_of(adapter: clvoro.Adapter, dim: int = 2) -> Stages:
-    return Stages(_program.Engine(adapter.ctx, adapter.queue, dim, np.dtype(adapter.dtype)))
+    return Stages(Engine(adapter.ctx, adapter.queue, dim, np.dtype(adapter.dtype)))
 
 
 def broken(kernel: str) -> Callable[[clvoro.Adapter], None]:
@@ -511,25 +512,25 @@ def buffers_of_their_own() -> Callable[[], None]:
 
     Returns what ends that.
     """
-    shared = _program.Engine.scratch
-    _program.Engine.scratch = _program.Engine.empty
-    return lambda: setattr(_program.Engine, "scratch", shared)
+    shared = Engine.scratch
+    Engine.scratch = Engine.empty
+    return lambda: setattr(Engine, "scratch", shared)
 
 
-def domain_of(engine: _program.Engine) -> str:
+def domain_of(engine: Engine) -> str:
     """Return the kind of domain that an engine is for: "plane", "torus", "polygon", "space" or "periodic space"."""
-    names = dict(engine.domain_defines)
+    kind = engine.domain_kind
     if engine.dim == 3:
-        return "periodic space" if "PERIODIC" in names else "space"
-    return "torus" if "PERIODIC" in names else "polygon" if "POLYGON" in names else "plane"
+        return "periodic space" if kind.periodic else "space"
+    return "torus" if kind.periodic else "polygon" if kind.polygonal else "plane"
 
 
 def name_domains() -> None:
     """Have kernels know the kind of `domain` that they work for; those of no engine are "none"."""
-    made = _program.Engine.__post_init__
+    made = Engine.__init__
 
-    def told(self: _program.Engine) -> None:
-        made(self)
+    def told(self: Engine, *args: object, **options: object) -> None:
+        made(self, *args, **options)
         take, domain = self.pool.take, domain_of(self)
 
         def taken(program: cl.Program, name: str) -> cl.Kernel:
@@ -539,7 +540,7 @@ def name_domains() -> None:
 
         self.pool.take = taken
 
-    _program.Engine.__post_init__ = told
+    Engine.__init__ = told
 
 
 def main(name: str, *options: str) -> None:

@@ -14,7 +14,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SHORE = [(0, 0), (3, -0.3), (4, 1), (2.6, 1.2), (2.5, 2.2), (1, 2)]

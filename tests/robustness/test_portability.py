@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro.opencl import engine
 from clvoro.opencl import program as _program
-from clvoro.opencl.program import Engine
 from tests.robustness import oclgrind_work
 from tests.robustness.gpu_like import use_groups
 
@@ -26,7 +26,7 @@ MOST_STACK = 32 * 1024
 
 @pytest.fixture
 def gpu_like(monkeypatch):
-    monkeypatch.setattr(Engine, "__post_init__", Engine.__post_init__)
+    monkeypatch.setattr(engine, "group_sizes", engine.group_sizes)
     use_groups(32)
 
 
@@ -49,7 +49,7 @@ def test_groups_change_nothing_but_rounding(ctx, dtype, domain, size, monkeypatc
         )
 
     plain = run()
-    monkeypatch.setattr(Engine, "__post_init__", Engine.__post_init__)
+    monkeypatch.setattr(engine, "group_sizes", engine.group_sizes)
     use_groups(32)
     other = run()
     assert np.abs(plain.points - other.points).max() < 1e-3 * plain.target_size.min()

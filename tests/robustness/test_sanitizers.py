@@ -13,8 +13,8 @@ import pyopencl as cl
 import pytest
 
 import clvoro
+from clvoro.opencl import engine
 from clvoro.opencl import program as _program
-from clvoro.opencl.program import Engine
 from tests.robustness import sanitizers as sanitized
 from tests.robustness.gpu_like import use_groups
 from tests.robustness.oclgrind_work import WORK
@@ -107,7 +107,7 @@ ORDERED = {
 @pytest.fixture
 def grouped(monkeypatch):
     """Work-groups of many work-items, with barriers, as on a GPU."""
-    monkeypatch.setattr(Engine, "__post_init__", Engine.__post_init__)
+    monkeypatch.setattr(engine, "group_sizes", engine.group_sizes)
     use_groups(16, 3)
 
 

@@ -35,7 +35,7 @@ from clvoro.errors import (
 from clvoro.io import npz
 from clvoro.opencl import host_memory as _host_memory
 from clvoro.opencl import runtimes as _runtimes
-from clvoro.opencl.program import KernelPool, Kernels
+from clvoro.opencl.kernels import KernelPool, Kernels
 
 ROOT = Path(__file__).parents[2]
 BOX = clvoro.Box((0, 0), (1, 1))
@@ -458,8 +458,8 @@ def test_kernels_lost_from_a_cache(ctx, monkeypatch):
     monkeypatch.delenv("POCL_CACHE_DIR", raising=False)
     program = cl.Program(ctx, "kernel void other(global int *x) { x[0] = 0; }").build()
     lost = Kernels(lambda: program, "sizing/size_field", KernelPool())
-    with pytest.raises(BuildError, match=r"without its kernel evaluate\. If .* remove .*pocl"):
-        _ = lost.evaluate
+    with pytest.raises(BuildError, match=r"without its kernel evaluate_size\. If .* remove .*pocl"):
+        _ = lost.evaluate_size
     with pytest.raises(AttributeError, match="has no kernel evalate"):
         _ = lost.evalate
 

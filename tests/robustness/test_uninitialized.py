@@ -10,7 +10,7 @@ import pyopencl.array as cla
 import pytest
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from tests.robustness.test_concurrency import BOX, SIZE, WORK, digest
 
 PATTERNS = (0xFF, 0x00, 0x4B)

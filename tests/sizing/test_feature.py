@@ -11,7 +11,7 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.sampling.start import sample_uniform
 from clvoro.errors import InputError, InputTypeError
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.sizing.gaps import FACING
 from tests.reference.polygons import HOLE, SQUARE, ragged
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 import clvoro
 from clvoro import Box, sizing
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError, SizeFieldError
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.host_memory import host_memory
-from clvoro.opencl.program import Engine
 from clvoro.sizing.gradation import Gradation
 
 

@@ -10,7 +10,7 @@ from clvoro import sizing
 from clvoro.adapter import Adapter
 from clvoro.errors import InputError, InputTypeError, SizeFieldError
 from clvoro.geometry.box import Box
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 
 N = 3001
 PLANE = Box((-0.7, 100.2), (1.8, 101.7))  # away from the origin: normalization matters

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from clvoro import Box, sizing
 from clvoro.errors import InputError, InputTypeError
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 
 
 def grid(lower, upper, counts):

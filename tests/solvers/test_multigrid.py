@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 
 from clvoro import create_context
 from clvoro.errors import SolverError
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.solvers import cycle
 from clvoro.solvers.aggregation import Aggregation, Graph
 from clvoro.solvers.multigrid import Multigrid

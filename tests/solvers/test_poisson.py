@@ -8,7 +8,7 @@ import scipy.sparse.linalg as sla
 
 from clvoro import Box, create_context
 from clvoro.errors import InputError, SolverError
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.solvers import conjugate_gradient
 from clvoro.solvers.conjugate_gradient import ConjugateGradient, Limits, Operator
 from clvoro.solvers.poisson import Poisson, expected_costs
@@ -153,7 +153,7 @@ def test_cells_with_several_faces():
     ctx = create_context()
     domain = Box((0, 0), (1, 1), periodic=(True, False))
     engine = Engine(
-        ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.defines(np.dtype(np.float64))
+        ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64), domain.kind(np.dtype(np.float64))
     )
     points = np.array([[0.2, 0.5], [0.6, 0.5], [0.5, 0.9]])
     starts, neighbors = np.array([0, 4, 8, 10]), np.array([1, -3, 1, 2, 0, 2, 0, -3, 0, 1])

@@ -7,7 +7,7 @@ import pytest
 
 from clvoro.adaptation.density import Density
 from clvoro.errors import SolverError
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.solvers import volume_projection as projection
 from clvoro.solvers.conjugate_gradient import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection

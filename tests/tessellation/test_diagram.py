@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import ROW_CAPACITY, Cells
 from clvoro.tessellation.device_diagram import DOUBT

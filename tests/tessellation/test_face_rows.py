@@ -5,7 +5,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation import cells as cells_module
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation import incremental as repair
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.cells import Cells

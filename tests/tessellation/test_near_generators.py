@@ -12,7 +12,8 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.opencl.program import Engine, source_text
+from clvoro.opencl.engine import Engine
+from clvoro.opencl.program import source_text
 from clvoro.tessellation.cells import Cells
 
 UNIT = clvoro.Box((0, 0), (1, 1))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import CUBE as CUBE_SIDE
 from clvoro.tessellation.polyhedra import FIRST_REACH, STRETCH, Polyhedra

@@ -9,8 +9,8 @@ import pyopencl.array as cla
 
 from ...errors import InputError
 from ...geometry.polygon import Polygon
+from ...opencl.engine import Engine
 from ...opencl.primitives import Room, Scan
-from ...opencl.program import Engine
 from ..device_diagram import Tessellation
 
 LOST, OUTSIDE = 1, 2  # bits of the flags in boundary_crossings.cl

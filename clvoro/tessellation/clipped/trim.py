@@ -8,8 +8,8 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...geometry.polygon import Polygon
+from ...opencl.engine import Engine
 from ...opencl.primitives import Room, Scan
-from ...opencl.program import Engine
 from ..device_diagram import Tessellation
 from .boundary_crossings import LOST, BoundaryError, Chords
 

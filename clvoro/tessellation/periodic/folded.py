@@ -5,7 +5,7 @@ Their kernels have the periods built in: all that is said of corners takes diffe
 
 from __future__ import annotations
 
-from ...opencl.program import Engine
+from ...opencl.engine import Engine
 from ..cells import Cells
 
 
@@ -15,8 +15,7 @@ class FoldedCells(Cells):
     searches = False
 
     def __init__(self, engine: Engine) -> None:
-        periods = dict(engine.domain_defines)
-        self._folds = {f"FOLD_{a}": periods[f"PERIOD_{a}"] for a in range(2)}
+        self._folds = {f"FOLD_{a}": engine.domain_kind.periods[a].hex() for a in range(2)}
         super().__init__(engine)
 
     @property

@@ -8,8 +8,8 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...geometry.box import Box
+from ...opencl.engine import Engine
 from ...opencl.primitives import Room, Scan
-from ...opencl.program import Engine
 from ..bins import BinnedPoints
 from ..device_diagram import Tessellation
 from .halo import Margins, block_count, block_counts, seam_defines

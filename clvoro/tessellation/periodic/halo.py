@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...opencl.program import Engine
+from ...opencl.engine import Engine
 
 BLOCKS = {2: 128, 3: 32}
 """Blocks per axis along a seam by dimension, at most."""
@@ -16,7 +16,7 @@ FINENESS = 2.0
 
 def seam_defines(engine: Engine) -> dict[str, object]:
     """Return the defines of kernels that take SEAM_ARGS (see halo.h): none where there are no seams."""
-    if not any(name == "PERIODIC" for name, _ in engine.domain_defines):
+    if not engine.domain_kind.periodic:
         return {}
     return {"SEAMS": 1, "BLOCKS": BLOCKS[engine.dim]}
 

@@ -11,7 +11,7 @@ import pyopencl.array as cla
 from ...geometry.box import Box, ClipBox, Domain
 from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
-from ...opencl.program import Engine
+from ...opencl.engine import Engine
 from ..device_diagram import UNEVEN, CloseError, Tessellation
 from ..periodic.torus import Unfolded
 from ..topology3d.consistency import SharedFaces, share_faces

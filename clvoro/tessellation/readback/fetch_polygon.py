@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...geometry.polygon import Polygon
-from ...opencl.program import Engine
+from ...opencl.engine import Engine
 from ..clipped.boundary_crossings import UNTOUCHED
 from ..device_diagram import Tessellation
 from ..vertices import VertexNumbering, Vertices

@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...geometry.box import Box
-from ...opencl.program import Engine
+from ...opencl.engine import Engine
 from ..device_diagram import Tessellation
 from ..periodic.torus import Unfolded
 from ..vertices import VertexNumbering, Vertices

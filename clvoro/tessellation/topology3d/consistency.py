@@ -18,8 +18,8 @@ import pyopencl.array as cla
 
 from ...geometry.box import ClipBox
 from ...opencl.device_array import buffer_of
+from ...opencl.engine import Engine
 from ...opencl.primitives import Scan
-from ...opencl.program import Engine
 from ..device_diagram import CloseError, Tessellation
 from .half_faces import HalfFaces, list_half_faces
 

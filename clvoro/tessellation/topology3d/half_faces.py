@@ -9,8 +9,8 @@ import pyopencl.array as cla
 
 from ...errors import MemoryLimitError
 from ...geometry.box import ClipBox
+from ...opencl.engine import Engine
 from ...opencl.primitives import Scan
-from ...opencl.program import Engine
 from ..device_diagram import Tessellation
 
 FACE_CAPACITY = 64

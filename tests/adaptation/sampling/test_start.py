@@ -11,7 +11,7 @@ from clvoro.adaptation.sampling.quadrature import DensityTree
 from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
 from clvoro.errors import InputError, InputTypeError, SizeFieldError
 from clvoro.geometry.box import Box
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 
 BOX = Box((0, 0), (2.5, 1.5))
 CUBE = Box((1, 1, 1), (2, 2, 2))

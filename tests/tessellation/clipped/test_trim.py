@@ -7,7 +7,7 @@ import pytest
 import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.errors import InputError
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.readback.fetch import fetch_diagram
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.polygon_diagrams import euler_excess, faults, polygon_voronoi
@@ -296,7 +296,7 @@ def read(stages, domain, t):
 def stages(ctx, request):
     domain = POLYGONS["star"]()
     real = np.dtype(request.param)
-    return Stages(Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.defines(real)))
+    return Stages(Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real)))
 
 
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "koch", "comb"])

@@ -7,7 +7,7 @@ import pytest
 import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.mesh.straightening import SIDE_TURN, straighten
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.shores import DIAMOND, POLYGONS, TOUCHING, UNIT, comb, scattered
 from tests.reference.wall_sides import outlines
@@ -128,7 +128,7 @@ def test_missing_neighbors(ctx, real):
     """A cell along a straight wall lacks 2, one in a corner of 90 degrees 3.5, in one of 270 degrees 0.5 of them."""
     for domain in (clvoro.Polygon(comb(2, 0.5, 0.3)), blunt_holes(), POLYGONS["islands"]()):
         dtype = np.dtype(real)
-        engine = Engine(ctx, cl.CommandQueue(ctx), 2, dtype, domain.defines(dtype))
+        engine = Engine(ctx, cl.CommandQueue(ctx), 2, dtype, domain.kind(dtype))
         points = scattered(domain, 90, 4)
         stages = Stages(engine)
         t = Tessellator(stages, domain).tessellate(

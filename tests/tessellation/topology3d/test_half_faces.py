@@ -6,7 +6,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import clvoro
-from clvoro.opencl.program import Engine
+from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
 from clvoro.tessellation.topology3d.consistency import FaceSharing

@@ -1,0 +1,218 @@
+"""The device that stages work on: its queue, the precision, memory, and launches of kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from . import program
+from .device_array import make_array
+from .kernels import KernelPool, Kernels, bind
+from .workspace import Workspace
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
+
+ITEM_GROUP = 64
+"""Work-items per group of a kernel that does one item each."""
+
+
+class DomainKind(NamedTuple):
+    """The kind of a domain, for which kernels are built; they take the periods as an argument.
+
+    Attributes
+    ----------
+    periodic, polygonal : bool
+        Whether it is a periodic box, or a polygon.
+    periods : tuple of 3 floats
+        In the device's coordinates; 0 where there are walls.
+    """
+
+    periodic: bool = False
+    polygonal: bool = False
+    periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """Macros for kernels; see geometry/domain.h."""
+        macros = {"PERIODIC": self.periodic, "POLYGON": self.polygonal}
+        return {name: 1 for name, is_set in macros.items() if is_set}
+
+
+WALLED_BOX = DomainKind()
+
+
+class GroupSizes(NamedTuple):
+    """Work-groups of block-wise kernels (scans, reductions).
+
+    Attributes
+    ----------
+    groups : int
+        Number of groups.
+    group_size : int
+        Work-items per group.
+    """
+
+    groups: int
+    group_size: int
+
+
+def group_sizes(device: cl.Device) -> GroupSizes:
+    """Return the work-groups for `device`.
+
+    On a CPU a group is one work-item, which loops over its part of the items. The number of parts does not depend on
+    the number of cores, so that sums have the same bits on all CPUs.
+    """
+    if device.type & cl.device_type.CPU:
+        return GroupSizes(32, 1)
+    return GroupSizes(min(512, 8 * device.max_compute_units), 128)
+
+
+class Engine:
+    """A device with a queue, a dimension and a precision.
+
+    Parameters
+    ----------
+    ctx : pyopencl.Context
+    queue : pyopencl.CommandQueue
+        In order.
+    dim : 2 or 3
+    real : numpy.dtype
+        float64 or float32.
+    domain_kind : DomainKind
+        The kind of domain for which kernels are built.
+    workspace : Workspace, optional
+        Memory that stages use in turn; see `scratch`.
+    pool : KernelPool, optional
+        Kernels that stages take.
+
+    Attributes
+    ----------
+    groups, group_size : int
+        See `GroupSizes`.
+    period_args : tuple of arrays
+        PERIOD_ARGS of kernels: the periods, padded to four numbers, or nothing.
+    """
+
+    def __init__(
+        self,
+        ctx: cl.Context,
+        queue: cl.CommandQueue,
+        dim: int,
+        real: np.dtype,
+        domain_kind: DomainKind = WALLED_BOX,
+        *,
+        workspace: Workspace | None = None,
+        pool: KernelPool | None = None,
+    ) -> None:
+        self.ctx, self.queue = ctx, queue
+        self.dim, self.real, self.domain_kind = dim, real, domain_kind
+        self.groups, self.group_size = group_sizes(queue.device)
+        self.period_args: tuple[np.ndarray, ...] = ()
+        if domain_kind.periodic:
+            vector = np.array([*domain_kind.periods, 0], real)
+            vector.setflags(write=False)
+            self.period_args = (vector,)
+        self.workspace = Workspace(queue) if workspace is None else workspace
+        self.pool = KernelPool() if pool is None else pool
+
+    def single(self) -> Engine:
+        """Return an engine in float32 that shares workspace and kernels with this one."""
+        return Engine(
+            self.ctx, self.queue, self.dim, np.dtype(np.float32), self.domain_kind, workspace=self.workspace,
+            pool=self.pool,
+        )  # fmt: skip
+
+    @property
+    def face(self) -> np.dtype:
+        """Precision of the measures and centroids of faces during a run.
+
+        They are relative to the generator. So single precision is enough to move generators, and halves most of the
+        memory of a diagram in 2D. Cells in polygons and in 3D are measured only while they are clipped: there the
+        precision is `real`.
+        """
+        full = self.dim == 3 or self.domain_kind.polygonal
+        return self.real if full else np.dtype(np.float32)
+
+    @staticmethod
+    def name_of(real: np.dtype) -> str:
+        """Return the type of `real` in OpenCL C."""
+        return "double" if real == np.float64 else "float"
+
+    def kernels(
+        self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = ""
+    ) -> Kernels:
+        """Return the kernels of `cl_kernels/<stage>.cl`; see `Kernels`.
+
+        Parameters
+        ----------
+        stage : str
+        defines : dict, optional
+            Macros besides those of the engine.
+        prelude : str
+            OpenCL C before the file.
+        """
+        name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
+        # By the module: tests replace the function.
+        return Kernels(
+            lambda: program.build_program(self.ctx, name, full, prelude), stage, self.pool
+        )
+
+    def all_defines(self, stage: str, defines: Mapping[str, object]) -> dict[str, object]:
+        """Return `defines` and those macros of the engine that `cl_kernels/<stage>.cl` names."""
+        # With others the same program would be built again for each kind of domain.
+        text = program.source_text(f"{stage}.cl")
+        optional = {"FACE": self.name_of(self.face), **self.domain_kind.defines}
+        named = {name: value for name, value in optional.items() if name in text}
+        return {
+            "DIM": self.dim, "REAL": self.name_of(self.real), "GROUP_SIZE": self.group_size, **named, **defines,
+        }  # fmt: skip
+
+    def run(
+        self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
+    ) -> cl.Event:
+        """Enqueue `kernel` over at least `size` work-items; arrays are passed as their buffers.
+
+        `size` is rounded up to whole work-groups of `group` items. The kernel must skip the items beyond `size`.
+        """
+        group = ITEM_GROUP if group is None else group
+        bind(kernel, args)
+        whole = -(-max(int(size), 1) // group) * group
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, (whole,), (group,))
+
+    def run_each(
+        self, kernel: cl.Kernel, size: int, *args: object, group: int | None = None
+    ) -> cl.Event:
+        """Enqueue `kernel` over `size` work-items; `size` is its first argument (see WORK_ITEM in opencl/real.h)."""
+        return self.run(kernel, size, np.int32(size), *args, group=group)
+
+    def run_blocks(self, kernel: cl.Kernel, *args: object) -> cl.Event:
+        """Enqueue a block-wise `kernel` over `groups` work-groups of `group_size` items (see opencl/blocks.h)."""
+        bind(kernel, args)
+        size = (self.groups * self.group_size,)
+        return cl.enqueue_nd_range_kernel(self.queue, kernel, size, (self.group_size,))
+
+    def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
+        """Return an uninitialized device array; `dtype` defaults to the engine's precision."""
+        return make_array(self.queue, shape, np.dtype(self.real if dtype is None else dtype))
+
+    def scratch(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
+        """Return an uninitialized array of the workspace, valid to its frame's end; outside of one, a new array."""
+        real = np.dtype(self.real if dtype is None else dtype)
+        taken = self.workspace.take(shape, real)
+        return self.empty(shape, real) if taken is None else taken
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: DTypeLike | None = None) -> cla.Array:
+        """Return a device array of zeros."""
+        return self.empty(shape, dtype).fill(0)
+
+    def upload(self, host: ArrayLike, dtype: DTypeLike | None = None) -> cla.Array:
+        """Copy a host array to the device in the engine's precision (or `dtype`)."""
+        given = np.ascontiguousarray(host, self.real if dtype is None else dtype)
+        array = self.empty(given.shape, given.dtype)
+        array.set(given)
+        return array

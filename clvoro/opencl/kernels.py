@@ -1,0 +1,132 @@
+"""Kernels of built programs, and the setting of their arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+
+from ..errors import BuildError
+from .device_array import DeviceArray
+from .program import source_text
+from .runtimes import cache_remedy
+
+_UNTYPED_CALLS = 3
+"""Calls of a kernel before PyOpenCL gets the types of its arguments."""
+
+
+class KernelPool:
+    """Kernel objects that are used again.
+
+    To make one, and to set the types of its arguments, takes as long as a hundred launches. Stages are made for each
+    run, and take their kernels from here. No two stages have the same one, because a kernel holds its arguments.
+    """
+
+    def __init__(self) -> None:
+        self._free: dict[tuple[int, str], list[cl.Kernel]] = {}
+        self._taken: list[tuple[tuple[int, str], cl.Kernel]] = []
+        self.on_kernel: Callable[[int], object] | None = None
+        """Called with the number of kernels that have been taken, when there is a new one."""
+
+    def take(self, program: cl.Program, name: str) -> cl.Kernel:
+        """Return a kernel that is not in use."""
+        key = program.int_ptr, name
+        if key not in self._free:
+            self._free[key] = []
+            if self.on_kernel is not None:
+                self.on_kernel(len(self._free))
+        free = self._free[key]
+        kernel = free.pop() if free else cl.Kernel(program, name)
+        self._taken.append((key, kernel))
+        return kernel
+
+    def release(self) -> None:
+        """Make all kernels free. Who has one must not rely on its arguments any more."""
+        for key, kernel in self._taken:
+            self._free[key].append(kernel)
+        self._taken.clear()
+
+
+class Kernels(SimpleNamespace):
+    """The kernels of a program as attributes. The program is built when the first of them is used.
+
+    Each kernel has arguments of its own. Its attribute `stage` is the name of the program, for profiles.
+    """
+
+    def __init__(self, build: Callable[[], cl.Program], stage: str, pool: KernelPool) -> None:
+        super().__init__(_build=build, _stage=stage, _pool=pool)
+
+    def __getattr__(self, name: str) -> cl.Kernel:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        program = self._build()
+        try:
+            kernel = self._pool.take(program, name)
+        except cl.LogicError as error:
+            if f"void {name}(" in source_text(f"{self._stage}.cl"):
+                raise BuildError(
+                    f"cl_kernels/{self._stage}.cl was built without its kernel {name}. {cache_remedy()}"
+                ) from error
+            raise AttributeError(f"cl_kernels/{self._stage}.cl has no kernel {name}") from error
+        kernel.stage = self._stage.rpartition("/")[2]  # type: ignore[attr-defined]
+        setattr(self, name, kernel)
+        return kernel
+
+
+def bind(kernel: cl.Kernel, args: Sequence[object]) -> None:
+    """Set the arguments of `kernel` if they are not set already. Arrays are passed as their buffers.
+
+    From step to step the arguments are mostly the same. To compare them takes a quarter of the time of setting them.
+    """
+    key = comparison_key(args)
+    if key == getattr(kernel, "bound", None):
+        return
+    set_args(kernel, with_buffers(args))
+    kernel.bound = key  # type: ignore[attr-defined]
+
+
+def comparison_key(args: Sequence[object]) -> list[object]:
+    """Return a key that is equal for equal arguments only. It does not keep the arrays in memory."""
+    return [
+        a.mark if type(a) is DeviceArray else a if type(a) is np.int32 else _key_of(a) for a in args
+    ]
+
+
+def with_buffers(args: Sequence[object]) -> list[Any]:
+    """Return the arguments with arrays replaced by their buffers."""
+    return [a.data if isinstance(a, cla.Array) else a for a in args]
+
+
+def _key_of(argument: object) -> object:
+    """Return the key of an argument that is neither a device array nor an int."""
+    # The bytes of 0 and -0 differ. A new object is equal to nothing else.
+    return argument.tobytes() if isinstance(argument, (np.generic, np.ndarray)) else object()
+
+
+def set_args(kernel: cl.Kernel, given: list[Any]) -> None:
+    """Set the arguments of `kernel`: buffers, numbers and vectors.
+
+    PyOpenCL tries one type after the other for each argument. For a number this takes five times as long as the launch.
+    `set_arg_types` avoids it, but takes as long as twenty numbers. So it is called for kernels that are launched often.
+    An argument must have the same type in every call.
+    """
+    kernel.bound = None  # type: ignore[attr-defined]
+    calls = getattr(kernel, "calls", 0)
+    if calls == _UNTYPED_CALLS:
+        kernel.set_arg_types([_type_of(a) for a in given])
+    if calls <= _UNTYPED_CALLS:
+        kernel.calls = calls + 1  # type: ignore[attr-defined]
+    kernel.set_args(*given)
+
+
+def _type_of(argument: object) -> np.dtype | None:
+    """Return the type of a number, raw bytes for a vector, None for a buffer."""
+    if isinstance(argument, np.number):
+        return argument.dtype
+    if isinstance(argument, np.ndarray):
+        return np.dtype((np.void, argument.nbytes))
+    return None
