@@ -48,7 +48,7 @@ def distance_to_polygon() -> Example:
         (0.35, 0.25), (1.1, 0.2), (1.2, 0.45), (0.8, 0.5), (1.05, 0.8), (0.5, 0.8), (0.6, 0.5),
     ]  # fmt: skip
     size = sizing.Distance(sizing.ClosedPolyline(corners), h_min=0.013, growth=1.2, h_max=0.11)
-    return Example("Distance(Polygon(...), growth=1.2)", size, [np.array([*corners, corners[0]])])
+    return Example("Distance(ClosedPolyline(...), growth=1.2)", size, [np.array([*corners, corners[0]])])
 
 
 def raster_with_gaps() -> Example:
@@ -132,8 +132,7 @@ def draw(results: list[tuple[Example, clvoro.Result]], path: Path) -> None:
             for lines, style in ((example.lines, "-"), (example.dashed, (0, (4, 3)))):
                 for line in lines:
                     ax.plot(*line.T, color=LINE, linewidth=1.1, linestyle=style, path_effects=halo)
-            ax.set_xticks([])
-            ax.set_yticks([])
+            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
             ax.set_title(example.title, family="monospace", fontsize=8.5, loc="left")
             ax.text(
                 0.985, 0.03, f"{len(result.points):,} cells", transform=ax.transAxes, ha="right",

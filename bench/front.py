@@ -221,8 +221,7 @@ def draw_defects(results: dict[str, clvoro.Result], path: Path) -> None:
             f = figures(result.diagram, result.target_size, result.quality)
             error = np.abs(result.size_error).mean()
             plot_cells(result, "sides", ax, window=window, key=False)
-            ax.set_xticks([])
-            ax.set_yticks([])
+            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
             ax.set_title(
                 f"({'abcd'[k]}) {title}: {f['six_sided']:.1%} six-sided\n"
                 f"mean |e| {error:.4f}, mean Q {f['mean_quality']:.4f}, "

@@ -55,9 +55,11 @@ print(
 print(f"total after a transfer off by {np.abs(lost).max():.0e} at most")
 
 # %%
-figure, axes = plt.subplots(3, 1, figsize=(7, 10.4), layout="constrained")
-for ax, k in zip(axes, (0, 12, 25), strict=True):
+# The temperature and the sizes of the first mesh, of one in the middle, and of the last one.
+
+figure, axes = plt.subplots(3, 2, figsize=(10, 8), layout="constrained")
+for row, k in zip(axes, (0, 12, 25), strict=True):
     result, data = frames[k]
-    result.plot(data, label="temperature [K]", ax=ax)
-    ax.set_title(f"mesh {k}: {len(result.points):,} cells")
+    result.plot(data, label="temperature [K]", ax=row[0], edges=False)
+    result.plot("size", ax=row[1], title=f"mesh {k}: {len(result.points):,} cells")
 plt.show()

@@ -18,16 +18,9 @@ from clvoro import sizing
 # %%
 # The catchment, the river and the wells, in meters.
 
-catchment = [
-    (0, 300),
-    (500, 0),
-    (1500, -100),
-    (2300, 300),
-    (2400, 1100),
-    (1700, 1600),
-    (700, 1500),
-    (100, 1000),
-]
+x = [0, 500, 1500, 2300, 2400, 1700, 700, 100]
+y = [300, 0, -100, 300, 1100, 1600, 1500, 1000]
+catchment = np.column_stack([x, y])
 river = np.array([(300, 400), (700, 550), (1000, 500), (1400, 700), (1800, 680), (2200, 900)])
 wells = np.array([(800, 1000), (1250, 1150), (1500, 350)])
 pumping = np.array([0.02, 0.03, 0.015])  # m3/s
@@ -64,9 +57,8 @@ stage = 100 - 0.004 * cells.points[:, 0]
 head = scipy.sparse.linalg.spsolve(
     (matrix + scipy.sparse.diags_array(leak)).tocsc(), water + leak * stage
 )
-print(
-    f"into the river {(leak * (head - stage)).sum():.4f} m3/s, recharge less wells {water.sum():.4f} m3/s"
-)
+print(f"recharge {6e-9 * domain.measure:.4f}, wells {pumping.sum():.4f} m3/s")
+print(f"from the river {(leak * (stage - head)).sum():.4f} m3/s")
 
 # %%
 # The mesh is colored by the head.
