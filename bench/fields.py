@@ -48,7 +48,9 @@ def distance_to_polygon() -> Example:
         (0.35, 0.25), (1.1, 0.2), (1.2, 0.45), (0.8, 0.5), (1.05, 0.8), (0.5, 0.8), (0.6, 0.5),
     ]  # fmt: skip
     size = sizing.Distance(sizing.ClosedPolyline(corners), h_min=0.013, growth=1.2, h_max=0.11)
-    return Example("Distance(ClosedPolyline(...), growth=1.2)", size, [np.array([*corners, corners[0]])])
+    return Example(
+        "Distance(ClosedPolyline(...), growth=1.2)", size, [np.array([*corners, corners[0]])]
+    )
 
 
 def raster_with_gaps() -> Example:
