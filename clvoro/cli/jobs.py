@@ -1,4 +1,4 @@
-"""What `clvoro run` does: run a case's methods from one start and write everything down."""
+"""The command `clvoro run`: run the methods of a case from one start and write all files."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _REPEATED = (
     "effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k",
     "seed", "dtype",
 )  # fmt: skip
-"""Settings that a run reports and that its `case.toml` fixes, whatever later defaults are."""
+"""Settings that `case.toml` of the output fixes, so that other defaults of later versions do not change the run."""
 
 _MANY = 5000
-"""Cells from which files and pictures take so long that one says so."""
+"""From this many cells on, the writing of files and pictures is announced."""
 _STOPPING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGXCPU")
-"""Signals after which a run ends, with what there is: Ctrl-C, a batch system's, a lost terminal's."""
+"""Signals that end a run after its step and keep the mesh: Ctrl-C, batch systems, a lost terminal."""
 _MUCH = 2**26
-"""Bytes on the device from which on one says how many."""
+"""From this many bytes on, the memory on the device is announced."""
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Job:
     ----------
     case : Case
     out : Path
-        Folder for the files; made if it does not exist.
+        Folder for the files; created if needed.
     device : str or None
         As `clvoro.create_context` takes it.
     report : bool
@@ -84,7 +84,7 @@ class Job:
     interrupted: bool = field(default=False, init=False)
 
     def run(self) -> bool:
-        """Run all methods, write the files, print the summary; tell whether it was interrupted.
+        """Run all methods, write the files, print the summary; return whether it was interrupted.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class Job:
         profiles: dict[str, Profile] = {}
         with self._stopping_cleanly():
             try:
-                for method in self.case.methods:  # the same seed gives all the same start
+                for method in self.case.methods:  # the same seed: the same start
                     profile = Profile(adapter) if self.profile else None
                     with profile or nullcontext():
                         result = self._run_one(adapter, size, method, arguments, files)
@@ -126,7 +126,7 @@ class Job:
                     if self.interrupted:
                         break
             except ClvoroError:
-                if results:  # a later method's failure does not cost the earlier ones' meshes
+                if results:  # keep the meshes of earlier methods
                     self._write(adapter, size, results, where)
                 raise
             self._write(adapter, size, results, where)
@@ -188,7 +188,7 @@ class Job:
         return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
 
     def _now_and_then(self) -> Callable[[str], None]:
-        """Return what prints a text for people, if the last one was long enough ago."""
+        """Return a function that prints a progress text, but not too often."""
         from .progress import EVERY
 
         shown = time.monotonic()
@@ -219,7 +219,7 @@ class Job:
                 )
 
     def _checkpoints(self) -> Checkpoint | None:
-        """Return where checkpoints are written and read."""
+        """Return the checkpoint of the run, if any."""
         given = {
             "checkpoint": self.checkpoint,
             "checkpoint_every": self.checkpoint_every,
@@ -254,10 +254,10 @@ class Job:
         previous = {}
         try:
             for number in (getattr(signal, name, None) for name in _STOPPING):
-                # What is ignored stays so: nohup does that, and a shell with what it starts in the background.
+                # Ignored signals stay ignored, as under nohup and in background jobs.
                 if number and signal.getsignal(number) not in (None, signal.SIG_IGN):
                     previous[number] = signal.signal(number, stop)
-        except ValueError:  # not the main thread: signals are someone else's
+        except ValueError:  # not the main thread: no signal handlers
             pass
         try:
             yield
@@ -314,7 +314,7 @@ class Job:
         )
 
     def _repeatable(self, results: dict[str, Result]) -> Case:
-        """Return the case with all settings that took their default values written out."""
+        """Return the case with all default settings written out."""
         settings: dict[str, Any] = {}
         for result in results.values():  # the last one is the main one
             settings |= result.settings
@@ -333,7 +333,7 @@ class Job:
         return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
 
     def _announce(self, name: str, result: Result, where: str, profile: Profile | None) -> None:
-        """Print the run as JSON if that was asked for."""
+        """Print the run as JSON, if requested."""
         if self.as_json:
             entry = {
                 "case": self.case.name,
@@ -350,7 +350,7 @@ class Job:
     def _summarize(
         self, results: dict[str, Result], where: str, profiles: dict[str, Profile]
     ) -> None:
-        """Print a table for people."""
+        """Print a table."""
         if self.quiet or self.as_json:
             return
         print(f"{self.case.title} on {where}")
@@ -377,5 +377,5 @@ class Job:
 
 
 def _plain(value: Any) -> Any:
-    """Turn NumPy's numbers and arrays, and whatever else, into what JSON has."""
+    """Convert NumPy numbers and arrays, and any other object, for JSON."""
     return value.tolist() if hasattr(value, "tolist") else str(value)

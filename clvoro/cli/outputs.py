@@ -1,4 +1,4 @@
-"""What a run leaves in its folder: checked before it begins, and written whatever else cannot be."""
+"""The output folder of a run: checks before it begins, and writing that continues after an error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .cases import WRITTEN
 
 
 def refuse_own_files(folder: Path, named: Mapping[str, Path | None]) -> None:
-    """Refuse files, by what they are for, that the results of a run in `folder` would replace.
+    """Reject input files that the results of a run in `folder` would replace; `named` maps their purpose to the path.
 
     Raises
     ------
@@ -31,12 +31,12 @@ def refuse_own_files(folder: Path, named: Mapping[str, Path | None]) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Make `folder` if need be and check that a file can be written there.
+    """Create `folder` if needed and check that a file can be written there.
 
     Raises
     ------
     InputError, OutputError
-        Before any work is done that would then be lost.
+        Before any work that would be lost.
     """
     make_folder(folder)
     check_writable(folder)
@@ -48,7 +48,7 @@ def check_folder(folder: Path) -> None:
 
 
 def do_all(tasks: Iterable[Callable[[], object]]) -> None:
-    """Call all `tasks`, whichever of them fail, as for want of space; raise the last error, print those before."""
+    """Call all `tasks`, even if some fail; raise the last error and print the earlier ones."""
     failed: Exception | None = None
     for task in tasks:
         try:
@@ -62,8 +62,8 @@ def do_all(tasks: Iterable[Callable[[], object]]) -> None:
 
 
 def require_plots() -> None:
-    """Say before the run that the report cannot be drawn."""
-    # Pictures become files: nothing is shown, and what a notebook has its processes use need not be there.
+    """Raise an error before the run if the report cannot be drawn."""
+    # Pictures are only written to files, whatever backend a notebook has set.
     os.environ["MPLBACKEND"] = "agg"
     try:
         import matplotlib
@@ -74,7 +74,7 @@ def require_plots() -> None:
             "the report needs Matplotlib, which is not installed; pip install 'clvoro[plot]', "
             "or run with --no-report"
         ) from error
-    except Exception as error:  # whatever is wrong with its settings or folders
+    except Exception as error:  # for example broken settings
         raise ClvoroError(
             f"the report needs Matplotlib, which cannot be used ({error}); mend that, or run with --no-report"
         ) from error

@@ -1,4 +1,4 @@
-"""The live progress of a run, for people: one line that changes, or now and then a new one."""
+"""The progress of a run: one line that changes in place, or a new line from time to time."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from typing import Any, TextIO
 import numpy as np
 
 EVERY = 5.0
-"""Seconds between lines where the line cannot change in place (a file, a pipe)."""
+"""Seconds between new lines in a file or a pipe."""
 REFRESH = 0.1
-"""Seconds between changes of a line that can."""
+"""Seconds between changes of the line on a terminal."""
 PACED = 4
-"""Steps whose pace is known before the time left is told: the first ones build kernels."""
+"""Steps before the remaining time is shown: the first ones build kernels."""
 
 
 class Progress:
-    """Shows the rows of a run's history as they come; call it with each row.
+    """Shows the rows of the history of a run; call it with each row.
 
     Parameters
     ----------
     title : str
-        What runs: the case and its method.
+        The case and its method.
     max_steps : int or None
-        If it is known; a run may stop earlier, so that the time left is a bound.
+        Largest number of steps, if known. A run may stop earlier, so the remaining time is a bound.
     stream : text stream
         Usually the standard error.
     """
@@ -35,7 +35,7 @@ class Progress:
         self.title, self.max_steps = title, max_steps
         self.stream = sys.stderr if stream is None else stream
         self.steps, self._cells = -1, 0
-        # Seconds, share that was done and cells that had been moved at each step of the latter half of the time.
+        # For each step of the latter half of the time: seconds, completed share, and number of cells moved so far.
         self._past: deque[tuple[float, float, int]] = deque()
         self._shown, self._began = 0.0, time.monotonic()
         self._status = _rich_status(self.stream)
@@ -57,7 +57,7 @@ class Progress:
             self.stream.flush()
 
     def __call__(self, row: np.void) -> None:
-        """Show `row`, a row of `HISTORY_DTYPE`, if the last one was shown long enough ago."""
+        """Show `row`, a row of `HISTORY_DTYPE`, but not too often."""
         self.steps += 1
         if self.steps > 0:
             self._cells += int(row["cells"])
@@ -68,7 +68,7 @@ class Progress:
         if now - self._shown < (REFRESH if self.live else EVERY):
             return
         if not self.live and now - self._began < EVERY:
-            return  # a short run needs no lines of progress in a log
+            return  # no progress lines in a log for short runs
         self._shown = now
         text = self.line(row)
         self._change(text)
@@ -77,11 +77,11 @@ class Progress:
             self.stream.flush()
 
     def show_builds(self, built: int, total: int) -> None:
-        """Show that so many of the kernels that a first run needs are built."""
+        """Show how many of the kernels of a first run are built."""
         self._change(f"{self.title}: building kernels, once for this device: {built} of {total}")
 
     def tell(self, text: str) -> None:
-        """Write a line that stays, above the one that changes."""
+        """Write a permanent line above the changing one."""
         if self._status is not None:
             self._status.tell(text)
             return
@@ -89,7 +89,7 @@ class Progress:
         self.stream.flush()
 
     def _change(self, text: str) -> None:
-        """Replace the text of the line, if it can change."""
+        """Replace the text of the changing line, if there is one."""
         if self._status is not None:
             self._status.update(text)
         elif self.live:
@@ -111,7 +111,7 @@ class Progress:
             f"Q {row['mean_quality']:.3f} min {row['min_quality']:.2f}",
         ]
         if len(self._past) > 1:
-            # The pace is that of the latter half: kernels are built in the first steps, and before.
+            # The speed of the latter half: the first steps include builds of kernels.
             began, done_then, cells = self._past[0]
             seconds, done = float(row["seconds"]) - began, self._done(row) - done_then
             if seconds > 0:
@@ -121,12 +121,12 @@ class Progress:
         return "  ".join(parts)
 
     def _done(self, row: np.void) -> float:
-        """Share of the work that is done, at least."""
+        """Lower bound of the completed share of the work."""
         return max(float(row["progress"]), self.steps / self.max_steps if self.max_steps else 0.0)
 
 
 class _Status:
-    """A line drawn by rich: fits any terminal's width and survives other output."""
+    """A line drawn by rich, which fits the width of the terminal and tolerates other output."""
 
     def __init__(self, stream: TextIO) -> None:
         from rich.console import Console
@@ -152,7 +152,7 @@ class _Status:
 
 
 def _rich_status(stream: TextIO) -> _Status | None:
-    """Return rich's line if there is a terminal and rich is installed."""
+    """Return a line of rich, on a terminal and with rich installed."""
     if not stream.isatty():
         return None
     try:
@@ -162,7 +162,7 @@ def _rich_status(stream: TextIO) -> _Status | None:
 
 
 def _short(number: float) -> str:
-    """Write a number with three figures and k or M."""
+    """Format a number with three significant digits and k or M."""
     for unit, size in (("M", 1e6), ("k", 1e3)):
         if number >= size:
             return f"{number / size:.3g}{unit}"
@@ -170,7 +170,7 @@ def _short(number: float) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Write a time as people say it."""
+    """Format a time in seconds, minutes or hours."""
     if seconds < 60:
         return f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)

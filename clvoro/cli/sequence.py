@@ -1,4 +1,4 @@
-"""Frames of a case whose size field moves: each mesh adapted from the one before it."""
+"""Frames of a case with a moving size field: each mesh starts from the previous one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .cases import Case
 
 _KEPT = ("n_cells", "max_steps", "tol", "alpha", "k", "seed", "effort", "error_target")
-"""Settings of a run that its later frames keep."""
+"""Settings of the run that later frames keep."""
 COLUMNS = (
     "frame",
     "time",
@@ -43,8 +43,8 @@ def run_frames(
 ) -> list[dict[str, Any]]:
     """Adapt `first`, the mesh of frame 0, to the later ones in turn, and write them into `out`.
 
-    Frame k of n has the time k / n. Written are ``frames/mesh-KKK.vtu``, ``frames.csv`` with `COLUMNS`, and with
-    `pictures` ``pictures/frames.png``. It ends early where `stop` returns True, and has `tell` say how far it has come.
+    Frame k of n has the time k / n. The files are ``frames/mesh-KKK.vtu``, ``frames.csv`` with `COLUMNS`, and with
+    `pictures` ``pictures/frames.png``. The sequence ends early if `stop` returns True; `tell` gets progress texts.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def run_frames(
             rows.append(_row(frame, time, result))
             if pictures and frame in wanted:
                 shown[time] = result
-    finally:  # a frame that fails does not cost what is known of those before
+    finally:  # write the rows of earlier frames also if a frame fails
         _write_rows(rows, out / "frames.csv")
     if shown and case.domain.dim == 2:
         _draw(shown, out / "pictures" / "frames.png")
@@ -130,7 +130,7 @@ def _draw(shown: Mapping[float, Result], path: Path) -> None:
 
 
 def frames_line(rows: list[dict[str, Any]]) -> str:
-    """Return in a line how the frames behind the first went."""
+    """Return a one-line summary of the frames after the first."""
     later = rows[1:] or rows
     worst = max(row["mean_error"] for row in later)
     return (

@@ -1,4 +1,4 @@
-"""Standard streams that end no run: missing or closed ones, full disks, readers that went away, characters unknown."""
+"""Standard streams that never end a run: closed streams, full disks, closed pipes, unsupported characters."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any, TextIO, cast
 
 
 class Steady:
-    """A text stream to which everything can be written, though it may be lost.
+    """A text stream whose writes never fail; after an error the text is lost.
 
     Attributes
     ----------
     error : OSError or None
-        Why what was written since is lost.
+        The first error; later text is lost.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -25,14 +25,14 @@ class Steady:
         return getattr(self.stream, name)
 
     def write(self, text: str) -> int:
-        """Write `text`, with escapes for what the stream has no characters for."""
+        """Write `text`, with escapes for unsupported characters."""
         known = getattr(self.stream, "encoding", None) or "utf-8"
         with self._going_on():
             self.stream.write(text.encode(known, "backslashreplace").decode(known))
         return len(text)
 
     def flush(self) -> None:
-        """Hand on what has been written."""
+        """Flush the stream."""
         with self._going_on():
             self.stream.flush()
 
@@ -42,18 +42,18 @@ class Steady:
             yield
         except OSError as error:
             self.error = self.error or error
-            # What is in its buffer would fail once more when the process ends.
+            # Its buffer would fail again when the process ends.
             with contextlib.suppress(OSError, ValueError), open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self.stream.fileno())
-        except RuntimeError:  # by a signal's handler, in the middle of another message
+        except RuntimeError:  # called by a signal handler during another write
             pass
 
 
 @contextlib.contextmanager
 def steady_streams() -> Iterator[Steady]:
-    """Have `sys.stdout` and `sys.stderr` be `Steady`; yields the former.
+    """Replace `sys.stdout` and `sys.stderr` by `Steady` streams; yield the former.
 
-    A stream that is missing, as it was closed when the process began, is one that leads nowhere.
+    A stream that was closed when the process began discards its text.
     """
     with contextlib.ExitStack() as stack:
         kept, steady = (sys.stdout, sys.stderr), []

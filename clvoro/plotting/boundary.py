@@ -1,4 +1,4 @@
-"""The boundary of polygonal domains in pictures: its line, and what is left white beyond it."""
+"""The boundary of polygonal domains in pictures: its line, and clipping to the domain."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def outline_path(domain: Polygon) -> Path:
 def frame_part(ax: Any, domain: Domain, lower: Any, upper: Any, ticks: bool = True) -> None:
     """Show the part of the domain from `lower` to `upper` to scale: a frame, and of a polygon its boundary.
 
-    A polygon that is shown as a whole has no other frame.
+    A polygon shown as a whole has no other frame.
     """
     if not isinstance(domain, Polygon):
         frame_domain(ax, lower, upper, ticks)
@@ -40,7 +40,7 @@ def frame_part(ax: Any, domain: Domain, lower: Any, upper: Any, ticks: bool = Tr
 
 
 def clip_to_domain(ax: Any, domain: Domain, *artists: Any) -> None:
-    """Show of `artists` only what is in the domain."""
+    """Clip `artists` to the domain."""
     if isinstance(domain, Polygon):
         for artist in artists:
             artist.set_clip_path(outline_path(domain), ax.transData)

@@ -54,13 +54,13 @@ def plot_cells(
     ax : matplotlib axes, optional
         Drawn into; a new figure by default.
     label : str, optional
-        Text at the color bar; by default what `color` names.
+        Text at the color bar; by default that of `color`.
     limits : (low, high), optional
-        Ends of the color scale; by default those that 99 % of the cells keep.
+        Ends of the color scale; by default limits that hold 99 % of the cells.
     window : (lower, upper), optional
         Corners of the part to show; the whole domain by default.
     edges : bool
-        Draw the faces, as thin as their cells are small.
+        Draw the faces; the line width follows the size of the cells.
     key : bool
         Add the color bar (for "sides" the legend with the shares).
     title : str, optional
@@ -117,7 +117,7 @@ def draw_cells(
         array=without_ends(values[shown]),
         cmap=scheme.color_map,
         norm=cell_norm(scheme, limits),
-        # An outline in the cell's own color hides the seams that smoothing leaves between cells.
+        # An outline in the color of the cell hides gaps between cells from antialiasing.
         edgecolors="face",
         linewidths=0.25,
         rasterized=len(shown) > 3000,
@@ -129,11 +129,11 @@ def draw_cells(
 def draw_edges(
     ax: Any, diagram: Diagram, shown: np.ndarray, offsets: np.ndarray, extent: np.ndarray
 ) -> None:
-    """Add each face once, as a line whose width follows the size of the cells beside it."""
+    """Add each face once, as a line; its width follows the size of its cells."""
     neighbors, owner = diagram.neighbors, face_owners(diagram)
     if not len(shown):
         return
-    # A wall has no thickness of its own: there the cell counts twice.
+    # At a wall there is only one cell.
     beyond = np.where(neighbors >= 0, neighbors, owner)
     lengths = np.sqrt(diagram.volumes)
     thin, colors = edge_style(ax, np.minimum(lengths[owner], lengths[beyond]), extent)
@@ -162,13 +162,13 @@ def draw_edges(
 def edge_style(ax: Any, lengths: np.ndarray, extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return line widths in points and colors (n, 4) for edges of cells as long as `lengths`.
 
-    `extent` is what `ax` shows of the plane. Edges of cells too small to be seen have no width.
+    `extent` is the width and height of the shown part. Edges of very small cells get no width.
     """
     box = ax.get_position()
     width, height = ax.figure.get_size_inches() * (box.width, box.height) * 72
     points_per_unit = min(width / extent[0], height / extent[1])
     widths = np.clip(0.045 * points_per_unit * lengths, 0.0, 0.7)
-    # The thinnest fade out: a sudden end of all lines would look like a feature of the mesh.
+    # The thinnest lines fade out: a sudden end of all lines would look like a feature of the mesh.
     colors = np.full((len(widths), 4), 0.1)
     colors[:, 3] = np.clip((widths - 0.06) / 0.14, 0, 1)
     return widths, colors
@@ -180,9 +180,9 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
     Parameters
     ----------
     size : callable h(points (n, 2)) -> (n,)
-        Any field of `clvoro.sizing`, or a function of one's own.
+        A field of `clvoro.sizing`, or any function.
     domain : Box or Polygon
-        The field is asked for sizes inside only.
+        The field is evaluated inside only.
     ax : matplotlib axes, optional
         Drawn into; a new figure by default.
 
@@ -235,9 +235,9 @@ def plot_size(size: Callable[[np.ndarray], np.ndarray], domain: Any, ax: Any = N
 
 
 def _inside(domain: Domain, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Tell which of `points` are in the domain or nearer to it than `reach`, (n,) bool, and where inside to ask them.
+    """Return which `points` are in the domain or within `reach` of it, (n,) bool, and the nearest points inside.
 
-    What is drawn up to the boundary is interpolated from some that lie beyond.
+    Drawing up to the boundary interpolates between points inside and points just outside.
     """
     shown = domain.contains(points)
     if isinstance(domain, Polygon):
@@ -258,7 +258,7 @@ def _cells_in(
     cells, offsets = [], []
     for step in product(*((-1, 0, 1) if p else (0,) for p in diagram.domain.periodic)):
         by = step * diagram.domain.extent
-        # An image has to come in; the rounding of a cell that ends at the seam is not enough.
+        # An image must reach in by more than round-off.
         slack = 1e-9 * diagram.domain.extent * any(step)
         seen = np.flatnonzero(
             ((high + by >= lower + slack) & (low + by <= upper - slack)).all(axis=1)

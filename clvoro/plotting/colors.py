@@ -1,4 +1,4 @@
-"""What the colors of cells stand for: error, quality, size, number of sides, skewness."""
+"""The quantities that color cells: error, quality, size, number of sides, skewness, volume."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _DIVERGING = LinearSegmentedColormap.from_list(
 
 @dataclass(frozen=True)
 class Coloring:
-    """What a color stands for.
+    """A quantity that colors cells.
 
     Attributes
     ----------
@@ -52,10 +52,10 @@ class Coloring:
     color_map : str or color map
         Perceptually uniform; diverging around zero for a signed quantity.
     limits : function of the values
-        The scale's two ends.
+        The two ends of the scale.
     logarithmic : bool
     classes : tuple of str
-        Names of the whole numbers that are the values, from the lower limit on; none for a continuous quantity.
+        Names of integer values, from the lower limit on; empty for a continuous quantity.
     """
 
     label: str
@@ -67,7 +67,7 @@ class Coloring:
 
 
 def _symmetric(values: np.ndarray) -> tuple[float, float]:
-    """Limits that 99 % of the values keep, the same on both sides of zero."""
+    """Limits that hold 99 % of the values, symmetric about zero."""
     bound = nice(float(np.quantile(np.abs(values), 0.99))) if values.size else 1.0
     return -bound, bound
 
@@ -86,7 +86,7 @@ def _around_most(values: np.ndarray) -> tuple[float, float]:
 
 
 def _from_zero(values: np.ndarray) -> tuple[float, float]:
-    """Limits from 0 to a round number that 99 % of the values keep, of those that are finite."""
+    """Limits from 0 to a round number that hold 99 % of the finite values."""
     values = values[np.isfinite(values)]
     return 0.0, nice(float(np.quantile(values, 0.99))) if values.size else 1.0
 
@@ -97,7 +97,7 @@ def _span(values: np.ndarray) -> tuple[float, float]:
 
 
 def _most(values: np.ndarray) -> tuple[float, float]:
-    """Limits that 98 % of the finite values keep, at least a little apart."""
+    """Limits that hold 98 % of the finite values, never equal."""
     values = values[np.isfinite(values)]
     if not values.size:
         return 0.0, 1.0
@@ -142,7 +142,7 @@ COLORINGS = {
         logarithmic=True,
     ),
 }
-"""What `plot_cells` can color by."""
+"""The quantities that `plot_cells` knows."""
 
 _SOLID_COLORINGS = {
     **COLORINGS,
@@ -163,12 +163,12 @@ _SOLID_COLORINGS = {
 
 
 Color = Literal["error", "quality", "size", "sides", "skewness", "volume"]
-"""Names of what cells are colored by."""
+"""Names of the quantities."""
 _OF_RUNS = ("error", "size")
 
 
 class DiagramPicture:
-    """A diagram as pictures take a result: with quality, and the widths of cells in the place of sizes."""
+    """A diagram with the attributes of a result that pictures use: quality, and cell widths as sizes."""
 
     def __init__(self, diagram: Diagram) -> None:
         self.diagram, self.points = diagram, diagram.points
@@ -186,7 +186,7 @@ class DiagramPicture:
 
 
 def picture_of(mesh: Result | Diagram) -> Result:
-    """Return what pictures are made of: a result, or a diagram in its place.
+    """Return a result as it is, and a diagram as a `Result`-like object.
 
     Raises
     ------
@@ -240,13 +240,13 @@ def coloring(name: str, dim: int = 2) -> Coloring:
 
 
 def shared_limits(results: Sequence[Result], color: str) -> tuple[float, float]:
-    """Return the scale that suits the cells of all `results` together."""
+    """Return one scale for the cells of all `results`."""
     scheme = coloring(color, results[0].diagram.domain.dim)
     return scheme.limits(np.concatenate([scheme.values(r) for r in results]))
 
 
 def cell_norm(scheme: Coloring, limits: tuple[float, float]) -> Normalize:
-    """Return the map from values to [0, 1] that `scheme` asks for."""
+    """Return the map of `scheme` from values to [0, 1]."""
     low, high = limits
     if isinstance(scheme.color_map, ListedColormap):
         classes = scheme.color_map.N
@@ -255,5 +255,5 @@ def cell_norm(scheme: Coloring, limits: tuple[float, float]) -> Normalize:
 
 
 def without_ends(values: np.ndarray) -> np.ndarray:
-    """Return `values` with large numbers in the place of infinite ones, for which Matplotlib has no color."""
+    """Return `values` with infinite numbers replaced by large ones, as Matplotlib has no color for them."""
     return np.clip(values, -1e30, 1e30)

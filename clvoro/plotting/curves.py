@@ -19,7 +19,7 @@ _PANELS = {
     "error": ("metric error $|e|$ [–]", ("mean_error", "mean"), ("max_error", "largest")),
     "quality": ("cell quality $Q$ [–]", ("mean_quality", "mean"), ("min_quality", "worst cell")),
 }
-_LONG = 0.97  # share of the arrows that are to be no longer than a spacing
+_LONG = 0.97  # share of the arrows that are at most one spacing long
 MOST_ARROWS = 2500
 """Of a mesh with more generators, the displacements are shown where the cells are smallest."""
 
@@ -27,7 +27,7 @@ MOST_ARROWS = 2500
 def plot_history(results: Mapping[str, Result], figure: Any = None) -> Any:
     """Draw error (log scale) and quality against the step, one color per method.
 
-    Dotted lines mark where a run went on to a finer level.
+    Dotted lines mark the starts of finer levels.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def _history_panel(ax: Any, results: Mapping[str, Result], quantity: str) -> Non
     longest = 1
     for (_, result), color in zip(results.items(), METHOD_COLORS * len(results), strict=False):
         history = result.history
-        steps = np.arange(len(history))  # counts on where the levels' own step numbers start anew
+        steps = np.arange(len(history))  # step numbers start again on each level
         longest = max(longest, len(steps) - 1)
         for change in np.flatnonzero(np.diff(history["level"])):
             ax.axvline(change + 0.5, color=color, lw=0.7, ls=":")
@@ -85,7 +85,7 @@ def _history_panel(ax: Any, results: Mapping[str, Result], quantity: str) -> Non
 
 
 def _drawable(values: np.ndarray, quantity: str) -> np.ndarray:
-    """Leave gaps where a logarithmic axis has no place for a value."""
+    """Replace values that a logarithmic axis cannot show by gaps."""
     return np.where(values > 0, values, np.nan) if quantity == "error" else values
 
 
@@ -137,7 +137,7 @@ def plot_displacements(result: Result, figure: Any = None) -> Any:
 
 
 def displacements_height(result: Result) -> float:
-    """Height in inches that suits `plot_displacements`."""
+    """Return a height in inches for `plot_displacements`."""
     extent = np.subtract(*_shown_part(result)[::-1])
     rows = (result.initial is not None) + (result.final is not None)
     ticks = 0.5 if len(result.points) > MOST_ARROWS else 0.0
@@ -161,7 +161,7 @@ def _inside(field: Displacements, lower: np.ndarray, upper: np.ndarray) -> Displ
 def _magnifications(field: Displacements) -> tuple[float, float]:
     """Round factors that bring the long arrows of each half to about one spacing of the generators.
 
-    The halves share the smaller factor where theirs are close, so that they can be compared.
+    If their factors are close, both use the smaller one, so that they can be compared.
     """
     if len(field.points) < 2:
         return 1.0, 1.0
@@ -170,7 +170,7 @@ def _magnifications(field: Displacements) -> tuple[float, float]:
     factors = []
     for arrows in (field.lloyd, field.poisson):
         reaches = np.hypot(*arrows.T) / spacing
-        # Generators that are held, and rounding noise of a half that vanishes, are not worth showing.
+        # Skip fixed generators, and a displacement that is only round-off.
         moving = reaches[reaches > 1e-6]
         factors.append(nice(1.0 / np.quantile(moving, _LONG), up=False) if moving.size else 1.0)
     if max(factors) <= 2.5 * min(factors):

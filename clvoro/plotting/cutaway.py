@@ -43,7 +43,7 @@ def kept_cells(diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndar
     """Return which cells stay, (n,) bool: `cut` is "octant", a vector, None, or that array itself."""
     if cut is None:
         return np.ones(len(diagram), bool)
-    if isinstance(cut, str):  # the corner between the point and the viewer goes
+    if isinstance(cut, str):  # remove the corner between the point and the viewer
         return ~np.all((diagram.points - through) * np.where(towards >= 0, 1, -1) > 0, axis=1)
     cut = np.asarray(cut)
     return cut if cut.dtype == bool else (diagram.points - through) @ cut <= 0
@@ -84,7 +84,7 @@ def draw_cutaway(
     edges: bool = True,
     labels: bool = True,
 ) -> ScalarMappable:
-    """Add the view to `ax`; returns what a color bar describes."""
+    """Add the view to `ax`; return the mappable for a color bar."""
     diagram = result.diagram
     right, up, towards = view_axes(view)
     kept = kept_cells(diagram, cut, through, towards)
@@ -155,14 +155,14 @@ def _outline(diagram: Diagram) -> np.ndarray:
 def _label_axes(
     ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, towards: np.ndarray
 ) -> None:
-    """Write each axis' name and range beside an edge on the rim of the picture."""
+    """Write the name and range of each axis beside an edge on the outline of the picture."""
     box = np.array([diagram.domain.lower, diagram.domain.upper])
     center = box.mean(axis=0)
     flat_center = np.array([center @ right, center @ up])
     gap = 0.02 * float(np.linalg.norm(box[1] - box[0]))
     front = (towards > 0).astype(int)
     for axis, name in enumerate("xyz"):
-        # Edges on the rim lie between a wall that is seen and one that is not; take the lowest, for z the left one.
+        # An edge of the outline lies between a visible and a hidden wall. Take the lowest, for z the leftmost.
         others = [a for a in range(3) if a != axis]
         best, place = math.inf, flat_center
         for flip in others:

@@ -1,4 +1,4 @@
-"""What the colors of a picture mean: a color bar, or a legend of classes with their shares."""
+"""Keys of pictures: a color bar, or a legend of classes with their shares."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .style import is_flat
 
 _BELOW: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 45}
 _GAP, _THICKNESS = 0.12, 0.14  # between picture and color bar, and of the bar; inches
-_PER_LETTER = 0.066  # width of a label's letters at the size that labels have, inches
+_PER_LETTER = 0.066  # mean width of a letter in labels, inches
 _PER_TICK = (0.24, 0.65)  # room for a number beside, and below a bar, inches
 _APART = (0.15, 0.45)  # least distance of two numbers there, inches
 _BELOW_TICKS = 26  # from the axes to a legend below their numbers, points
@@ -30,7 +30,7 @@ def add_key(
     limits: tuple[float, float],
     below: bool = False,
 ) -> None:
-    """Say what the colors mean, beside or below `axes` (one or several): a color bar, or the classes' shares."""
+    """Add a color bar, or the legend of classes, beside or below `axes` (one or several)."""
     if scheme.classes:
         _add_classes(axes, scheme, values, limits)
     else:
@@ -58,7 +58,7 @@ def add_color_bar(
     if not (several or options) and _is_flat(axes):
         options = dict(_BELOW)
     if not (several or options) and isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
-        # As high as the picture, whatever room the layout has for both.
+        # As high as the picture, not as the space of the layout.
         bar = figure.colorbar(cells, cax=_beside(axes), extend=extend)
         if _PER_LETTER * len(label.replace("$", "")) > _height(axes):
             label = label.replace("   ", "\n")
@@ -90,14 +90,14 @@ def _is_flat(ax: Any) -> bool:
 
 
 def _height(ax: Any) -> float:
-    """Return about how high `ax` will be, inches."""
+    """Return the approximate height of `ax` in inches."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     width, height = ax.figure.get_size_inches()
     return float(min(0.8 * width * (top - bottom) / (right - left), 0.9 * height))
 
 
 def short(value: float) -> str:
-    """Write a number with two figures, without an exponent where zeros do as well."""
+    """Format a number with two significant digits, with an exponent only for very small or large numbers."""
     text = f"{value:.2g}"
     if 1e-4 <= abs(value) < 1e6:
         text = np.format_float_positional(float(text), trim="-")
@@ -105,7 +105,7 @@ def short(value: float) -> str:
 
 
 def _length(axis: Any) -> tuple[float, bool]:
-    """Return the length of a color bar's long axis in inches, and whether it lies."""
+    """Return the length of a color bar in inches, and whether it is horizontal."""
     lies = axis.axis_name == "x"
     box, dpi = axis.axes.bbox, axis.axes.figure.dpi
     return float((box.width if lies else box.height) / dpi), lies
@@ -124,7 +124,7 @@ class _RoundSteps(MaxNLocator):
 
 
 class _EndsAndRound(Locator):
-    """Both ends of a logarithmic scale, which makes them readable, and round numbers that stand clear of them."""
+    """Both ends of a logarithmic scale, and round numbers at a distance from them."""
 
     def __init__(self, low: float, high: float) -> None:
         self._ends = low, high
@@ -151,7 +151,7 @@ def round_numbers(low: float, high: float) -> list[float]:
 def _add_classes(
     axes: Any, scheme: Coloring, values: np.ndarray, limits: tuple[float, float]
 ) -> None:
-    """Put the classes with their shares of all cells under the picture."""
+    """Write the classes and their shares of all cells below the picture."""
     first = round(limits[0] + 0.5)
     handles = [
         Patch(

@@ -1,4 +1,4 @@
-"""The report: one HTML page that holds its pictures, and the pictures as files beside it."""
+"""The report: one HTML page with embedded pictures, and the pictures as files beside it."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ def write_report(
     results : Result or mapping
         One result, or several by the method's name from one start; the last is the main one.
     folder : path
-        Made if it does not exist; the pictures go into `pictures/` inside.
+        Created if needed; the pictures go into its subfolder `pictures/`.
     initial : Result, optional
         The mesh before the first step.
     size : callable, optional
         The size field h(points (n, d)), for its picture.
     title : str
     case : str
-        The case file's text, shown at the end.
+        Text of the case file, shown at the end.
     facts : mapping, optional
-        More figures for the page's head.
+        Further facts for the head of the page.
     formats : sequence of {"png", "pdf", "svg"}
         Files per picture; the page itself always holds PNG.
     dpi : int
@@ -79,7 +79,7 @@ def write_report(
     Raises
     ------
     OutputError, MemoryError, or whatever Matplotlib raises
-        The first of what went wrong, after all that can be written is.
+        The first error, after everything else has been written.
     """
     if isinstance(results, Result):
         method = results.settings.get("method") or "result"
@@ -97,7 +97,7 @@ def write_report(
                 path = target / "pictures" / f"{name}.{kind}"
                 _write(path, png if kind == "png" else render(figure, kind, dpi))
                 written.append(path)
-        except Exception as error:  # raised below: the other pictures are drawn all the same
+        except Exception as error:  # raised below, after the other pictures
             failed = failed or error
     page = target / "report.html"
     _write(page, _page(results, title, case, facts or {}, figures).encode())
@@ -165,7 +165,7 @@ def _page(
 
 
 def _measures(name: str, result: Result) -> str:
-    """Return the table of `Result.measures`, and what they mean."""
+    """Return the table of `Result.measures`, with explanations."""
     s = result.measures.summary()
     rows = (
         ("faces per cell", s["mean_faces"], None),
@@ -191,7 +191,7 @@ def _measures(name: str, result: Result) -> str:
 
 
 def _apart(results: Mapping[str, Result], main: str) -> str:
-    """Return the table of cells on the boundary, whose shape it decides, and of the others."""
+    """Return the table of boundary cells and inner cells."""
     rows = []
     for method, result in results.items():
         for part, s in beside_boundary(result).items():

@@ -19,12 +19,12 @@ from .solids import cutaway_height, plot_cutaway, plot_distributions
 from .style import WIDTH, grid_height, new_figure, single_height, styled, window_around_smallest
 
 Picture = tuple[str, str, Callable[[], Any]]
-"""Name of its file, caption, and the function that draws it."""
+"""A picture: file name, caption, and the function that draws it."""
 
 FINE_MESH = 10_000
-"""From so many cells on the mesh itself shows the size field."""
+"""From this many cells on, the cells show the size field, not a raster."""
 MANY_SOLID_CELLS = 20_000
-"""From so many cells on a 3D mesh is shown closer, too."""
+"""From this many cells on, there is also a closer view of a 3D mesh."""
 
 
 def pictures_of(
@@ -32,7 +32,7 @@ def pictures_of(
     initial: Result | None = None,
     size: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> list[Picture]:
-    """List the pictures that `results` allow; nothing is drawn yet.
+    """List the pictures of `results`; nothing is drawn yet.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _comparisons(panels: Mapping[str, Result]) -> list[Picture]:
 def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
     """Return a figure as the bytes of a PNG, PDF or SVG file."""
     with styled(), io.BytesIO() as buffer:
-        # No date or version inside: the same run gives the same file.
+        # Without date and version: the same run gives the same file.
         metadata = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
         figure.savefig(
             buffer,
@@ -192,7 +192,7 @@ def _one(result: Result, color: str, **options: Any) -> Any:
 
 
 def _size(result: Result, size: Callable[[np.ndarray], np.ndarray] | None) -> Any:
-    """Show the target size: the field, or the cells' where they resolve it better than a raster."""
+    """Draw the target size: the field, or that of the cells if they resolve it better than a raster."""
     if size is None or len(result.points) > FINE_MESH:
         return _one(result, "size", edges=False)
     with styled():
@@ -206,7 +206,7 @@ def _grid(panels: Mapping[str, Result], color: str) -> Any:
     results = list(panels.values())
     box = results[0].diagram.domain
     scheme, limits = coloring(color, box.dim), shared_limits(results, color)
-    if color == "error":  # beyond this all is equally wrong, and what is nearly right shows no more
+    if color == "error":  # a larger limit would hide small errors
         limits = (max(limits[0], -1.0), min(limits[1], 1.0))
     plot: Callable[..., Any] = draw.plot_cells
     lower, upper = np.array(box.lower), np.array(box.upper)

@@ -18,7 +18,7 @@ class Section:
     Attributes
     ----------
     cells : (k,) int
-        Which cells are cut.
+        The cut cells.
     starts : (k + 1,) int, corners : (c, 3) float
         Corners of each polygon, counter-clockwise around the plane's normal.
     edges : (c, 2, 3) float
@@ -91,7 +91,7 @@ def _inside(section: Section, lower: np.ndarray, upper: np.ndarray) -> Section:
 def _cut(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Section:
     vertices = diagram.vertices
     height = (vertices - point) @ normal
-    # What lies in the plane but for rounding is on its upper side, whichever cell asks.
+    # Vertices in the plane, up to round-off, count as above, for all cells.
     height[np.abs(height) < 1e-12 * diagram.domain.extent.max()] = 0.0
     starts, corners = face_corners(diagram)
     above = height[corners] >= 0
@@ -99,14 +99,14 @@ def _cut(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Section:
     face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     ups = np.flatnonzero(~above & above[nexts])
     downs = np.flatnonzero(above & ~above[nexts])
-    # A face is convex: the plane enters and leaves it once. One that rounding has bent is left out.
+    # A face is convex: the plane enters and leaves it once. Faces bent by round-off are skipped.
     entered, left = (
         np.bincount(face[places], minlength=len(starts) - 1) for places in (ups, downs)
     )
     sound = (entered == 1) & (left == 1)
     ups, downs = ups[sound[face[ups]]], downs[sound[face[downs]]]
     rows = face[ups]
-    # The cell lies behind the face: around the normal its polygon runs from where it leaves to where it enters.
+    # The cell lies behind the face: counter-clockwise, its polygon runs from the exit to the entry.
     edges = np.stack(
         [
             _meetings(vertices, height, corners[nexts[downs]], corners[downs]),
@@ -128,7 +128,7 @@ def plane_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
         up /= np.linalg.norm(up)
         right = np.cross(up, normal)
-        # Seen from whichever side has the larger coordinates to the right.
+        # Seen from the side with increasing coordinates to the right.
         return (right if right[np.argmax(np.abs(right))] > 0 else -right), up
     return np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
@@ -136,7 +136,7 @@ def plane_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _meetings(
     vertices: np.ndarray, height: np.ndarray, below: np.ndarray, above: np.ndarray
 ) -> np.ndarray:
-    """Return where the edges between vertices below and above the plane meet it, the same from either side."""
+    """Return the intersections of the plane with edges between vertices below and above it."""
     t = height[below] / (height[below] - height[above])
     return vertices[below] + t[:, None] * (vertices[above] - vertices[below])
 
@@ -148,7 +148,7 @@ def _around(
     counts: np.ndarray,
     normal: np.ndarray,
 ) -> np.ndarray:
-    """Return the order of the sides of convex polygons, one polygon after the other, by the angles of their middles."""
+    """Return the order of the sides of convex polygons, polygon by polygon, by the angles of their midpoints."""
     if not len(owner):
         return np.zeros(0, np.intp)
     right, _ = plane_axes(normal)

@@ -31,13 +31,13 @@ def require_space(diagram: Diagram) -> None:
 
 
 def focus(result: Result) -> np.ndarray:
-    """Return where a 3D mesh is looked at: amid its smallest cells, well inside of the domain."""
+    """Return the point of view of a 3D mesh: among its smallest cells, well inside of the domain."""
     box = result.diagram.domain
     smallest = result.points[result.target_size <= 1.1 * result.target_size.min()]
     lower, extent = np.array(box.lower), box.extent
-    if len(smallest) > 0.5 * len(result.points):  # all alike
+    if len(smallest) > 0.5 * len(result.points):  # a uniform mesh
         return lower + 0.5 * extent
-    # A round place, as titles name it; half a cell makes no difference.
+    # A round number for the titles; half a cell makes no difference.
     step = nice(0.5 * float(result.target_size.min()), up=False)
     center = np.round(smallest.mean(axis=0) / step) * step + 0.0
     return np.clip(center, lower + 0.25 * extent, lower + 0.75 * extent)
@@ -82,7 +82,7 @@ def plot_slice(
     normal : {"x", "y", "z"} or 3 floats
         Direction at right angles to the plane.
     through : 3 floats, optional
-        A point of the plane; by default amid the smallest cells.
+        A point of the plane; by default among the smallest cells.
     label, limits, edges, key, title
         As for `plot_cells`.
     window : (lower, upper), optional
@@ -95,7 +95,7 @@ def plot_slice(
     Raises
     ------
     InputError
-        For a 2D mesh, an unknown color, or a plane beside the domain.
+        For a 2D mesh, an unknown color, or a plane outside of the domain.
     """
     result = picture_of(mesh)
     diagram = result.diagram
@@ -167,7 +167,7 @@ def plot_slices(
 ) -> Any:
     """Draw a 3D mesh on planes along the axes, all to one scale, with a cut-away view beside them.
 
-    Of a long domain the two planes along it are shown.
+    For a long domain: the two planes along it.
 
     Parameters
     ----------
@@ -219,12 +219,12 @@ def slices_height(diagram: Diagram) -> float:
 
 
 def new_slices(result: Result, color: str, **options: Any) -> Any:
-    """Return `plot_slices` on a figure of its own that no global state knows of."""
+    """Return `plot_slices` on a new figure, outside of pyplot."""
     return plot_slices(result, color, new_figure(WIDTH, slices_height(result.diagram)), **options)
 
 
 def _panels(diagram: Diagram) -> tuple[list[str], int, list[tuple[float, float]]]:
-    """Return the planes' normals, in how many columns they stand, and each place's extent."""
+    """Return the normals of the planes, the number of columns, and the extent of each panel."""
     x, y, z = (float(e) for e in diagram.domain.extent)
     if max(x, y, z) <= 2.5 * min(x, y, z):
         return ["y", "x", "z"], 2, [(x, z), (y, z), (x, y), (y, y)]
@@ -265,12 +265,12 @@ def _draw_sides(
     axes: tuple[np.ndarray, np.ndarray],
     extent: np.ndarray,
 ) -> None:
-    """Add each side once, as a line whose width follows the size of the cells beside it."""
+    """Add each side once, as a line; its width follows the size of its cells."""
     owner, neighbor = face_owners(diagram)[section.rows], diagram.neighbors[section.rows]
     lengths = np.cbrt(diagram.volumes)
     beyond = np.where(neighbor >= 0, neighbor, owner)
     widths, colors = edge_style(ax, np.minimum(lengths[owner], lengths[beyond]), extent)
-    # A face in the plane itself has its sides from one cell alone.
+    # For a face in the plane, only one cell has the sides.
     cut = np.zeros(len(diagram), bool)
     cut[section.cells] = True
     seam = diagram.shifts[section.rows].any(axis=1)

@@ -1,4 +1,4 @@
-"""Pictures of a whole mesh: whatever suits its dimension, the view into a 3D mesh, and how measures are distributed."""
+"""Pictures of a whole mesh by its dimension, the cut-away view of a 3D mesh, and histograms of measures."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def plot_mesh(
     through : 3 floats, optional
         For 3D: a point of the planes or of the cut.
     cut, angles
-        For "cutaway": what is taken out, and azimuth and elevation of the viewer in degrees; `cut` and `view` of
+        For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; `cut` and `view` of
         `plot_cutaway`.
 
     Returns
@@ -119,7 +119,7 @@ def plot_cutaway(
     key: bool = True,
     title: str | None = None,
 ) -> Any:
-    """Draw a 3D mesh with part of its cells taken out, as seen from far away.
+    """Draw a 3D mesh with part of its cells removed, in parallel projection.
 
     Parameters
     ----------
@@ -128,13 +128,13 @@ def plot_cutaway(
     ax : matplotlib axes, optional
         Two-dimensional ones to draw into; a new figure by default.
     cut : "octant", "x", "y", "z", 3 floats, (n,) bool or None
-        What is taken out: the cells with generators between the point and the viewer, in all three directions;
+        The removed part: the cells with generators between the point and the viewer, in all three directions;
         those in front of a plane with this normal, on the viewer's side for "x", "y" and "z"; those that are not
         marked as kept; or nothing.
     through : 3 floats, optional
-        The point; by default amid the smallest cells.
+        The point; by default among the smallest cells.
     view : (azimuth, elevation), degrees
-        Where the viewer is.
+        Direction of the viewer.
     label, limits, edges, key, title
         As for `plot_cells`.
 
@@ -196,9 +196,9 @@ def _cut(cut: Any, n: int, view: tuple[float, float]) -> Any:
 
 
 def plot_distributions(result: Result, figure: Any = None) -> Any:
-    """Draw how error, quality and number of faces are distributed over the cells, and skewness over the faces.
+    """Draw histograms of error, quality and number of faces of the cells, and of the skewness of faces.
 
-    Bars have the colors that the cells have in the other pictures.
+    Bars have the colors of the cells in the other pictures.
 
     Returns
     -------
@@ -207,7 +207,7 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
     with styled():
         figure = interactive_figure(WIDTH, 4.2) if figure is None else figure
         panels = figure.subplots(2, 2).ravel()
-        if figure.get_layout_engine() is not None:  # titles stand clear of the numbers above
+        if figure.get_layout_engine() is not None:  # space between titles and the numbers above
             figure.get_layout_engine().set(hspace=0.08)
         dim = result.diagram.domain.dim
         for ax, name in zip(panels, ("error", "quality", "sides", "skewness"), strict=True):
@@ -250,7 +250,7 @@ def plot_distributions(result: Result, figure: Any = None) -> Any:
 
 
 def _range(values: np.ndarray, name: str) -> tuple[float, float]:
-    """Return the ends of a histogram: what 99.8 % of the values keep, with zero where it has a meaning."""
+    """Return the range of a histogram: 99.8 % of the values, with zero where it is meaningful."""
     low, high = (float(q) for q in np.quantile(values, (0.001, 0.999)))
     if name == "skewness":
         low = 0.0

@@ -16,7 +16,7 @@ WIDTH = 7.0
 """Width of a full-width picture, inches."""
 
 METHOD_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#555555")
-"""Okabe and Ito's palette: told apart by color-blind readers too."""
+"""Okabe and Ito's palette, readable for color-blind people."""
 
 SETTINGS: Any = {
     "font.size": 9,
@@ -41,7 +41,7 @@ def styled() -> Any:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure, in inches, that no global state knows of."""
+    """Return an empty figure of this size in inches, outside of pyplot."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -88,7 +88,7 @@ def grid_height(
 
 
 def is_flat(lower: Any, upper: Any) -> bool:
-    """Tell whether a picture is too flat for a color bar beside it."""
+    """Return whether a picture is too flat for a color bar beside it."""
     extent = np.subtract(upper, lower)
     return bool(extent[1] < 0.3 * extent[0])
 

@@ -1,4 +1,4 @@
-"""Cases: a domain, a size field and a run, as a TOML file describes them; and the built-in ones."""
+"""Cases: TOML files with a domain, a size field and settings of a run; and the built-in ones."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class Case:
     run : dict
         The keys of the file's `[run]` table.
     folder : Path
-        Files that the case names are looked for here, then among those of the built-in cases.
+        Folder of the files that the case names; those of the built-in cases are found, too.
     place : dict
-        The keys of the file's `[domain]` table; empty for a box that is not from a file.
+        The keys of the file's `[domain]` table; empty for a box made in Python.
     layers : tuple of dict
         The tables of the file's `[[layers]]`.
     frames : int
-        Meshes that the size field's motion is followed by, the first included; see `clvoro.cli.sequence`.
+        Number of meshes that follow a moving size field, the first included; see `clvoro.cli.sequence`.
     """
 
     name: str
@@ -66,12 +66,12 @@ class Case:
 
     @classmethod
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
-        """Read a case from TOML text; `name` is what errors call it, and its name if it gives none.
+        """Read a case from TOML text; `name` is its name in errors, and the default of its key `name`.
 
         Raises
         ------
         InputError
-            Naming the key, what it holds and what was expected.
+            With the key, its value and what was expected.
         """
         place = f"{name}:"
         try:
@@ -110,7 +110,7 @@ class Case:
     def with_run(self, **changes: Any) -> Case:
         """Return this case with other keys in `[run]`; those that are None stay as they are.
 
-        With the case's own methods go the keys that the new ones do not use, unless they are among `changes`.
+        With another method, settings that it does not use are dropped, unless they are in `changes`.
         """
         changes = {key: value for key, value in changes.items() if value is not None}
         dropped: set[str] = set()
@@ -122,11 +122,11 @@ class Case:
         return replace(self, run=schema.run({**run, **changes}, f"{self.name}: run"))
 
     def size_field(self, time: float = 0.0) -> Any:
-        """Build the size field (an object of `clvoro.sizing`), with `time` in the place of {t} in expressions."""
+        """Build the size field (an object of `clvoro.sizing`), with `time` for {t} in expressions."""
         return build_size(_at(self.size, time), self.folder, self.domain)
 
     def run_arguments(self) -> dict[str, Any]:
-        """Return what the case sets of `Adapter.run`'s arguments, method and dtype apart."""
+        """Return the arguments of `Adapter.run` that the case sets, except method and dtype."""
         apart = ("method", "methods", "dtype")
         arguments = {key: value for key, value in self.run.items() if key not in apart}
         if "points" in arguments:
@@ -152,14 +152,14 @@ class Case:
         return [locate(self.folder, node[key]).resolve() for node, key in self._entries()]
 
     def _entries(self) -> list[tuple[dict[str, Any], str]]:
-        """Return where the case names files: tables, and the keys in them."""
+        """Return the tables of the case that name files, and the keys with the names."""
         entries = [(node, "file") for node in named_files(self.size)]
         entries += [(self.place, "file")] * ("file" in self.place)
         entries += [(self.run, "points")] * ("points" in self.run)
         return entries
 
     def _moved(self) -> tuple[Case, dict[str, Path]]:
-        """Return the case with all its files beside it, and where these are now: {name: source}."""
+        """Return the case with all its files in one folder, and their present paths: {name: source}."""
         moved = replace(
             self, size=copy.deepcopy(self.size), run=dict(self.run), place=dict(self.place)
         )
@@ -172,13 +172,13 @@ class Case:
         return moved, taken
 
     def text(self, header: tuple[str, ...] = ()) -> str:
-        """Return what `write` writes into `case.toml`."""
+        """Return the text of `case.toml`."""
         return toml.write(self._moved()[0].table(), header)
 
     def write(self, folder: Path, header: tuple[str, ...] = ()) -> Path:
         """Write `case.toml` into `folder`, with copies of the files that it names; return its path.
 
-        Reading it gives this case again, wherever the folder is moved to.
+        The folder is self-contained: it can be moved and read again.
         """
         for target, source in self._moved()[1].items():
             if source != (folder / target).resolve():

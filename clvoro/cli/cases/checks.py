@@ -15,7 +15,7 @@ from ...errors import InputError
 Check = Callable[[object, str], Any]
 """Takes a value and its place in the file; returns it in its final type or raises InputError."""
 
-_LONGEST_NAME = 200  # bytes: systems take 255, and files beside it add an ending
+_LONGEST_NAME = 200  # bytes: file systems allow 255, and some files get a further suffix
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
@@ -41,12 +41,12 @@ def text(value: object, place: str) -> str:
 
 
 def file_name(value: object, place: str) -> str:
-    """Check for what can name a file or folder here, and none elsewhere, on any system."""
+    """Check for a name that is valid for a file or folder, without a path, on any system."""
     name = text(value, place)
-    alone = PureWindowsPath(name).name == name != ".."  # it knows all separators, and drives
-    spelt = name.encode(
-        "utf-8", "replace"
-    )  # with a ? for what is no character, as in names of files
+    alone = (
+        PureWindowsPath(name).name == name != ".."
+    )  # Windows paths know all separators and drives
+    spelt = name.encode("utf-8", "replace")  # with a ? for invalid characters
     if not alone or len(spelt) > _LONGEST_NAME or _CONTROL.search(name) or spelt.decode() != name:
         raise refuse(
             place,
@@ -172,7 +172,7 @@ def names_of(*allowed: str) -> Check:
 
 @dataclass(frozen=True)
 class Table:
-    """A table's keys: those it must have, may have, and those of which exactly one is wanted."""
+    """The keys of a table: required ones, optional ones, and a group of which exactly one is required."""
 
     required: Mapping[str, Check]
     optional: Mapping[str, Check]

@@ -1,4 +1,4 @@
-"""A coast of our own making: fractal rings by displaced midpoints, as in the built-in case "lake".
+"""A synthetic coast: fractal rings by displaced midpoints, for the built-in case "lake".
 
 ``python -m clvoro.cli.cases.coast lake.geojson`` writes that lake again, to the same bytes.
 """
@@ -21,8 +21,8 @@ def fractal_ring(
 ) -> np.ndarray:
     """Return the ring `corners` (k, 2) with each edge's midpoint displaced sideways, `levels` times.
 
-    Displacements are normal with a standard deviation of `roughness` edge lengths, at most 0.45; where edges would
-    cross they are halved until none do.
+    Displacements are normal, with a standard deviation of `roughness` edge lengths, at most 0.45. They are
+    halved where edges would cross.
 
     Returns
     -------

@@ -24,7 +24,7 @@ def build_domain(node: Mapping[str, Any], folder: Path) -> Domain:
     node : mapping
         A table that `schema.DOMAIN` has passed.
     folder : Path
-        Where the file that it names is looked for.
+        Folder of the file that it names.
     """
     rest = {key: value for key, value in node.items() if key != "kind"}
     if node["kind"] == "box":

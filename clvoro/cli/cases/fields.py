@@ -26,9 +26,9 @@ def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
     node : mapping
         A tree that `schema.size` has passed.
     folder : Path
-        Where the files that it names are looked for.
+        Folder of the files that it names.
     domain : Domain
-        What a raster covers if it does not say so itself.
+        Default extent of a raster.
     """
     from ... import sizing
 
@@ -91,7 +91,7 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         surface = sizing.Surface.read(locate(folder, node["file"]), **_given(node, "join"))
         if node.get("closed", False):
             surface.require_closed()
-            if "join" not in node:  # corners a hair apart let their triangles cross by a hair
+            if "join" not in node:  # nearly coincident corners would make triangles intersect
                 surface.check()
         return surface
     if kind == "boundary":

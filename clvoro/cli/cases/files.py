@@ -1,4 +1,4 @@
-"""Where the files that a case names are."""
+"""Paths of the files that a case names."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import re
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-"""Where the built-in cases and their files lie."""
+"""Folder of the built-in cases and their files."""
 WRITTEN = re.compile(
     r"(mesh|history)(-.*)?\.(vtu|npz|csv|foam|nc|vtk|ply|obj)|case\.toml|report\.html|frames\.csv|frames|pictures|constant"
 )
-"""Names of what a run writes into its folder."""
+"""Names of the files that a run writes into its folder."""
 
 
 def locate(folder: Path, name: str) -> Path:
-    """Return the path of a file that a case names: beside the case, else a built-in case's own."""
+    """Return the path of a file that a case names: beside the case, otherwise among the built-in ones."""
     path, own = folder / name, FOLDER / name
     alone = Path(name).name == name
     return own if alone and own.is_file() and not path.exists() else path

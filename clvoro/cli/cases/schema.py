@@ -1,4 +1,4 @@
-"""What a case file may contain."""
+"""The tables and keys of a case file."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def size(value: object, place: str) -> dict[str, Any]:
     return _SIZE(value, place)
 
 
-# What an array in a file covers, and how.
+# Extent and layout of an array in a file.
 _COVERED: dict[str, Check] = {
     "lower": vector(2, 3),
     "upper": vector(2, 3),
@@ -259,7 +259,7 @@ _HOMES = {
 
 
 def _home(name: object, place: str) -> str:
-    """Say where in a case a key belongs that is not known at `place`, if that is one table, or which kinds have it."""
+    """Return a hint for an unknown key at `place`: the table or the kinds that have this key."""
     kinds = [kind for kind, t in _SIZE.tables.items() if name in (*t.required, *t.optional)]
     if kinds and re.search(r" size\b", place):
         return f" (it is for kind = {' or '.join(map(repr, kinds))})"
@@ -278,7 +278,7 @@ def run(value: object, place: str) -> dict[str, Any]:
 
 
 def _told_home(table: Table, value: object, place: str) -> dict[str, Any]:
-    """Check `value`; errors say of a key in the wrong table in which one it is known."""
+    """Check `value`; errors about a key in the wrong table name the right one."""
     try:
         return table(value, place)
     except UnknownKeyError as error:

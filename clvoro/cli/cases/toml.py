@@ -16,9 +16,9 @@ except ModuleNotFoundError:  # Python 3.10
 __all__ = ["read", "write"]
 
 LONGEST = 1 << 21
-"""Bytes of a case file; larger polygons and arrays have files of their own."""
-_DEEPEST = 16  # parts of a key, for each of which and all before it tables are made
-# Comments and texts, which end somewhere even if no quote is there, are gone over at once: nothing is looked at twice.
+"""Most bytes of a case file; large polygons and arrays are in other files."""
+_DEEPEST = 16  # most parts of a dotted key, as each part makes a table
+# Skips comments and strings, also unterminated ones, in one pass of linear time.
 _PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]+|\\.)*"?|'[^'\n]*'?)"""
 _DOT = rf"[ \t]*\.[ \t]*{_PART}"
 _TOKENS = re.compile(
@@ -52,7 +52,7 @@ def write(table: Mapping[str, object], header: Sequence[str] = ()) -> str:
     Raises
     ------
     TypeError
-        For a value that TOML has no form for.
+        For a value that TOML cannot represent.
     """
     lines = [f"# {line}".rstrip() for line in header]
     lines += [""] * bool(lines)
