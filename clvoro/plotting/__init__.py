@@ -9,12 +9,14 @@ except ModuleNotFoundError as error:
         "pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'"
     ) from error
 
+from .boundary import plot_boundaries
 from .cells import plot_cells, plot_size
 from .curves import plot_displacements, plot_history
 from .page import write_report
 from .solids import plot_cutaway, plot_distributions, plot_mesh, plot_slice, plot_slices
 
 __all__ = [
+    "plot_boundaries",
     "plot_cells",
     "plot_cutaway",
     "plot_displacements",

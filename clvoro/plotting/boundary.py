@@ -1,19 +1,75 @@
-"""The boundary of polygonal domains in pictures: its line, and clipping to the domain."""
+"""Boundaries of domains in pictures: the outline, clipping to the domain, and named boundaries."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
+from ..errors import InputError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
-from .style import frame_domain
+from .style import METHOD_COLORS, WIDTH, frame_domain, interactive_figure, single_height, styled
 
 _LINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8, "facecolor": "none", "joinstyle": "round"}
 _MARGIN = 0.01  # of the longer side, around a whole domain
+_DASHES = ("-", "--", ":", "-.")  # for more names than colors
+
+
+def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) -> Any:
+    """Draw the boundary of a 2D domain with one color for each name, before or over a mesh.
+
+    Parameters
+    ----------
+    domain : Box or Polygon
+    ax : matplotlib axes, optional
+        Drawn into; a new figure by default.
+    numbers : bool
+        Write the number of each edge or side at its middle.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        For a 3D domain.
+    """
+    if domain.dim != 2:
+        raise InputError(f"plot_boundaries draws in two dimensions, and {domain} has three")
+    with styled():
+        if ax is None:
+            height = single_height(domain.lower, domain.upper, legend=True)
+            ax = interactive_figure(WIDTH, height).add_subplot()
+            frame_part(ax, domain, domain.lower, domain.upper)
+        for k, name in enumerate(domain.boundary_names):
+            walls = np.flatnonzero(domain.boundary_index == k)
+            if isinstance(domain, Polygon):  # edges without length cannot be drawn
+                walls = walls[domain.oriented.places[walls] >= 0]
+            segments = [np.concatenate(domain.boundary(wall).items()[:2]) for wall in walls]
+            color = METHOD_COLORS[k % len(METHOD_COLORS)]
+            style = _DASHES[k // len(METHOD_COLORS) % len(_DASHES)]
+            lines = LineCollection(
+                segments,
+                colors=color,
+                linestyles=style,
+                linewidths=2,
+                label=name,
+                zorder=3,
+                clip_on=False,
+            )
+            ax.add_collection(lines, autolim=False)
+            for wall, segment in zip(walls, segments, strict=True) if numbers else ():
+                ax.annotate(
+                    str(wall), segment.mean(axis=0), color=color, zorder=4, ha="center", va="center",
+                    bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+                )  # fmt: skip
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, frameon=False)
+    return ax.figure
 
 
 def outline_path(domain: Polygon) -> Path:

@@ -203,6 +203,29 @@ def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
     ]
 
 
+def test_plots_show_the_names(meshed) -> None:
+    pytest.importorskip("matplotlib")
+    from clvoro.plotting import plot_boundaries
+
+    _, edges, result = meshed
+    domain = result.diagram.domain
+    figure = plot_boundaries(domain, numbers=True)
+    lines = {c.get_label(): c for c in figure.axes[0].collections}
+    assert list(lines) == list(domain.boundary_names)
+    for name, drawn in lines.items():
+        shape = shapely.union_all([edges[k] for k in domain.boundaries.select("test", name)])
+        assert shapely.union_all(shapely.linestrings(drawn.get_segments())).equals(shape)
+    texts = figure.axes[0].texts
+    assert {t.get_text() for t in texts} == set(map(str, range(12)))
+    for text in texts:
+        assert edges[int(text.get_text())].distance(shapely.Point(text.xy)) < 1e-14
+    assert len({tuple(c.get_color()[0]) for c in lines.values()}) == len(lines)
+    over = result.plot("volume")
+    assert plot_boundaries(clvoro.Box((0, 0), (1, 1)), over.axes[0]) is over
+    with pytest.raises(InputError, match="two dimensions"):
+        plot_boundaries(clvoro.Box((0, 0, 0), (1, 1, 1)))
+
+
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
 
 
