@@ -47,14 +47,14 @@ if TYPE_CHECKING:
 class Adapter:
     """Adapts Voronoi meshes on one device.
 
-    Kernels are built when they are first needed, and kept; so is memory. One adapter does one thing at a time: calls
-    from other threads wait. Processes that are forked once OpenCL is at work cannot use it (`DeviceError`): have them
-    spawned.
+    An adapter builds kernels when it first needs them, and keeps them and its device memory. Calls from several threads
+    wait for each other. A process that was forked after the first use of OpenCL cannot use it (`DeviceError`); spawn
+    processes instead.
 
     Parameters
     ----------
     ctx : pyopencl.Context, optional
-        Any context; with None, `clvoro.create_context()`.
+        Any context; by default that of `clvoro.create_context()`.
     dtype : "float64" or "float32"
         Precision on the device.
 
@@ -71,9 +71,9 @@ class Adapter:
     Raises
     ------
     DeviceError
-        If there is no working device, or it has no double precision and `dtype` is "float64".
+        If no device works, or it has no double precision and `dtype` is "float64".
     InputError, InputTypeError
-        If `dtype` is another one, or `ctx` no context.
+        If `dtype` is another type, or `ctx` is not a context.
 
     Examples
     --------
@@ -118,17 +118,17 @@ class Adapter:
 
     def __reduce__(self) -> NoReturn:
         raise InputTypeError(
-            "an Adapter belongs to its device and process, and is neither copied nor pickled; make another one where "
-            "it is needed, as by clvoro.Adapter(adapter.ctx, adapter.dtype)"
+            "an Adapter belongs to its device and process, and cannot be copied or pickled; create another one where "
+            "it is needed: clvoro.Adapter(adapter.ctx, adapter.dtype)"
         )
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """One call at a time: the stages' buffers are shared. Other threads wait; a callback must not call back."""
+        """Exclude other threads, as calls share buffers; reject calls from a callback."""
         check_process()
         if self._owner == threading.get_ident():
             raise InputError(
-                "the adapter is at work: a callback may not use it; expected another Adapter for it"
+                "the adapter is running: a callback may not use it; create another Adapter for the callback"
             )
         with self._busy:
             self._owner = threading.get_ident()
@@ -144,9 +144,9 @@ class Adapter:
 
     @contextmanager
     def watched(self, queue: cl.CommandQueue, watch: Callable[[np.void], None]) -> Iterator[None]:
-        """Work on `queue`, and show each new row of a history to `watch` before the caller's callback (see `profile`).
+        """Use `queue`, and call `watch` with each new row of a history before the caller's callback (see `profile`).
 
-        Another queue than the adapter's own comes with buffers of its own.
+        A queue other than the adapter's own has buffers of its own.
         """
         with self._alone():
             kept = self.queue, self._stages, self._watch
@@ -161,7 +161,7 @@ class Adapter:
     def _shown(
         self, callback: Callable[[np.void], object] | None, notice: BuildNotice | None
     ) -> Callable[[np.void], object] | None:
-        """Return what to call with each row."""
+        """Return the function that a run calls with each row."""
         watches = [watch for watch in (notice and notice.clear, self._watch) if watch is not None]
         if not watches:
             return callback
@@ -184,7 +184,7 @@ class Adapter:
         key = domain.dim, kind.periodic, kind.polygonal
         stages = self._stages.get(key)
         if stages is None or stages.engine.domain_kind != kind:
-            # Those of the last periods are dropped: their programs are kept elsewhere, and serve these.
+            # Stages of other periods are dropped. The programs are cached elsewhere and serve these, too.
             engine = Engine(self.ctx, self.queue, domain.dim, self.dtype, kind)
             stages = self._stages[key] = Stages(engine)
         return stages
@@ -330,7 +330,8 @@ class Adapter:
         """
         start, given = _generators(points)
         merged = Options(
-            method=method, start=start, effort=effort, seed=seed, max_steps=max_steps, n_cells=n_cells, layers=layers,
+            method=method, start=start, effort=effort, seed=seed, max_steps=max_steps, n_cells=n_cells,
+            layers=layers,  # type: ignore[arg-type]
             **special(options),
         )  # fmt: skip
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
@@ -396,8 +397,9 @@ class Adapter:
         """
         start, given = _generators(points)
         merged = Options(
-            method=method, start=start, n_cells=n_cells, layers=layers, **special(options)
-        )
+            method=method, start=start, n_cells=n_cells, **special(options),
+            layers=layers,  # type: ignore[arg-type]
+        )  # fmt: skip
         with self._alone():
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)

@@ -66,7 +66,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
     """
     if np.ma.is_masked(value):
         raise InputError(
-            f"{name} has {np.ma.count_masked(value)} masked numbers, expected all to be there; pass "
+            f"{name} has {np.ma.count_masked(value)} masked numbers, expected none; pass "
             "numpy.ma.compress_rows(array)"
         )
     expected = f"expected an array of real numbers of shape (n, {d}), one row per point"
@@ -137,8 +137,8 @@ def check_callable(name: str, value: Callable[..., object], argument: str, hint:
     except TypeError:
         kind = "class " if isinstance(value, type) else ""
         raise InputTypeError(
-            f"{name} is the {kind}{getattr(value, '__name__', type(value).__name__)}{signature}, expected what takes "
-            f"one argument, {argument}; {hint}"
+            f"{name} is the {kind}{getattr(value, '__name__', type(value).__name__)}{signature}, expected a callable "
+            f"of one argument, {argument}; {hint}"
         ) from None
 
 

@@ -23,7 +23,7 @@ EffortName = Literal["fast", "default", "best"]
 Start = Literal["density", "uniform"]
 METHODS, EFFORTS, STARTS = get_args(MethodName), get_args(EffortName), get_args(Start)
 _MULTILEVEL = ("adaptive", "exact")
-_MOST_STEPS = 10**6  # of a run: its plan, which names each, and its history are lists
+_MOST_STEPS = 10**6  # plan and history are lists with one entry per step
 
 _USERS = {
     "effort": _MULTILEVEL,
@@ -216,13 +216,13 @@ class Options:
     max_steps: int | None = None
     n_cells: int | None = None
     error_target: float | None = None
-    layers: Layers | Sequence[Layers] = ()
+    layers: Sequence[Layers] = ()
 
     def __post_init__(self) -> None:
         check_choice("method", self.method, METHODS)
         check_choice("points", self.start, STARTS)
         check_choice("effort", self.effort, EFFORTS)
-        layers = self.layers
+        layers: object = self.layers  # the caller may give one Layers
         if not isinstance(layers, Layers | Sequence):
             hint = f"; write clvoro.Layers({layers!r})" if isinstance(layers, Real) else ""
             raise InputTypeError(

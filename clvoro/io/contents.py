@@ -86,6 +86,8 @@ def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
         if not isinstance(name, str) or not _WORD.fullmatch(name) or name in OWN:
             why = "which is clvoro's own" if name in OWN else "no word of ASCII letters and digits"
             raise InputError(f"cell_data has the name {name!r:.60}, {why}; choose another name")
+        if np.ma.is_masked(values):
+            raise InputError(f"cell_data[{name!r}] has masked numbers, expected none; fill them")
         array = np.asarray(values)
         if array.dtype.kind not in "fiub":
             raise InputTypeError(

@@ -24,7 +24,7 @@ class _Variable:
 
     dimensions: tuple[str, ...]
     values: np.ndarray
-    attributes: Mapping[str, str | np.generic]
+    attributes: Mapping[str, str | np.generic | np.ndarray]
     counts: np.ndarray | None = None
     missing: int = 0
 
@@ -64,7 +64,7 @@ class NetCDF:
         name: str,
         dimensions: tuple[str, ...],
         values: np.ndarray,
-        **attributes: str | np.generic,
+        **attributes: str | np.generic | np.ndarray,
     ) -> None:
         """Add a variable of integers or real numbers.
 

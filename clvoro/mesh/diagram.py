@@ -42,49 +42,51 @@ class Diagram:
     The graph is stored by cells: the row of a cell lists its faces, each with the neighbor behind it. A face between
     two cells is in the rows of both (two half-faces). `faces` has each face once.
 
-    In a polygonal domain a cell is the part of its generator's Voronoi region (all that is nearer to it than to the
-    others, as the crow flies) that lies in the domain and is connected to the generator there. Parts of the region that
-    the boundary cuts off go to the cell beside them with which they share the longest face, and stay with their
-    generator if there is none. A cell need not be convex, may go around holes and then has several loops of faces, and
-    may have several faces in common with one neighbor, which its row then names as often.
+    In a polygonal domain a cell is the part of its generator's Voronoi region that lies in the domain and is connected
+    to the generator there. Parts of the region that the boundary cuts off belong to the adjacent cell with which they
+    share the longest face, or to their generator if there is no such cell. A cell need not be convex. It may surround
+    holes, and then has several loops of faces. It may share several faces with one neighbor, which its row then lists
+    several times.
 
     Attributes
     ----------
     domain : Box or Polygon
-    points : (n, d) float
-        Generators.
-    volumes : (n,) float
-        Areas in 2D.
-    centroids : (n, d) float
+    points : (n, d) float64
+        Generators, in the domain's unit of length.
+    volumes : (n,) float64
+        Volumes of the cells; areas in 2D.
+    centroids : (n, d) float64
+        Centroids of the cells.
     neighbor_starts : (n + 1,) int32
-        Row i of the graph is ``neighbors[neighbor_starts[i]:neighbor_starts[i + 1]]``.
+        The row of cell i is ``neighbors[neighbor_starts[i]:neighbor_starts[i + 1]]``, and likewise in all arrays with m
+        entries, one per half-face.
     neighbors : (m,) int32
-        A generator's index, or ``-1 - k`` for wall k of the domain: in a box wall 2 a is the lower side of axis a,
-        wall 2 a + 1 the upper one; in a polygon wall k is the edge from vertex k on, as the caller gave them. Its name
-        is ``domain.boundary_names[domain.boundary_index[k]]``. In 2D in counter-clockwise order around the cell, in a
-        polygon loop by loop, clockwise around holes.
+        Cell behind each half-face, or ``-1 - k`` for wall k of the domain. In a box wall 2 a is the lower side of axis
+        a, and wall 2 a + 1 the upper one. In a polygon wall k is the edge that begins in vertex k, as the caller gave
+        them. Its name is ``domain.boundary_names[domain.boundary_index[k]]``. In 2D the order is counter-clockwise
+        around the cell; in a polygon loop by loop, clockwise around holes.
     shifts : (m, d) int8
-        In a periodic box: face k of cell i lies towards the image of its neighbor j at
-        ``points[j] + shifts[k] * domain.extent``. Zeros in other domains, and towards walls.
-    face_measures : (m,) float
-        Lengths in 2D, areas in 3D.
-    face_centroids : (m, d) float
-    vertices : (v, d) float
-        Each Voronoi vertex once. In a periodic box cells are not cut at the seams: their faces and corners lie around
-        their generators, partly outside of the box. A vertex is there once for each of its images that is a corner of
-        a cell: cells on both sides of a seam have vertices of their own.
+        In a periodic box the neighbor j behind half-face k is the image of generator j at
+        ``points[j] + shifts[k] * domain.extent``. Zeros in other domains, and on walls.
+    face_measures : (m,) float64
+        Areas of the faces; lengths in 2D.
+    face_centroids : (m, d) float64
+        Centroids of the faces.
+    vertices : (v, d) float64
+        Voronoi vertices, each once. In a periodic box cells are not cut at the seams: their faces and corners lie
+        around their generators, partly outside of the box. Each image of a vertex that is a corner of a cell is a
+        vertex of its own.
     cell_vertex_starts : (n + 1,) int32, 2D only
-    cell_vertices : (m,) int32, 2D only
-        Polygon corners, counter-clockwise; face k of a cell runs from its corner k to its corner k + 1. In a
-        polygonal domain a cell of several loops has them joined to one by bridges there and back: it has more corners
-        than faces, and `face_vertices` tells which are whose.
+    cell_vertices : (c,) int32, 2D only
+        Corners of cell i, ``cell_vertices[cell_vertex_starts[i]:cell_vertex_starts[i + 1]]``, counter-clockwise. In a
+        box face k of a cell runs from its corner k to its corner k + 1. In a polygonal domain several loops of a cell
+        are joined by bridges there and back, so that it has more corners than faces.
     face_vertex_starts : (m + 1,) int32, in 3D and in polygonal domains
     face_vertices : (k,) int32, in 3D and in polygonal domains
-        Corners of face f of the graph, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``.
-        In 3D counter-clockwise as seen from outside of the cell to whose row the face belongs; the other cell has
-        them in the opposite order. Empty where the face is as narrow as its vertices round. In a polygonal domain the
-        two ends, the cell on the left on the way from the first to the second.
-
+        Corners of half-face f, ``face_vertices[face_vertex_starts[f]:face_vertex_starts[f + 1]]``. In 3D the order is
+        counter-clockwise as seen from outside of the cell; the opposite half-face has the opposite order. Empty where a
+        face is as narrow as round-off. In a polygonal domain the two ends, with the cell on the left of the way from
+        the first to the second.
 
     Raises
     ------
@@ -269,9 +271,8 @@ class Diagram:
     def triangles(self) -> np.ndarray:
         """Return the dual triangulation in the plane: triples of generators whose cells meet in a vertex.
 
-        They are the Delaunay triangles whose circumcenter lies in the domain (those of others, between cells that meet
-        only beyond a wall, are not there). Where more than three cells meet, as in a square lattice, their generators'
-        polygon is cut into triangles.
+        They are the Delaunay triangles whose circumcenter lies in the domain. Where more than three cells meet, as in a
+        square lattice, the polygon of their generators is divided into triangles.
 
         Returns
         -------
@@ -281,7 +282,7 @@ class Diagram:
         Raises
         ------
         InputError
-            In 3D, and in periodic boxes, where a triangle's corners may be images.
+            In 3D, and in periodic boxes, where corners of triangles may be images.
         """
         from .delaunay import dual_triangles
 
@@ -297,12 +298,12 @@ class Diagram:
         return measure_mesh(self)
 
     def check(self) -> Report:
-        """Verify the diagram on the host: graph, faces, volumes, and that it is the Voronoi diagram of its generators.
+        """Verify the diagram on the host: graph, faces, volumes, and the Voronoi property.
 
         Returns
         -------
         Report
-            True if nothing is wrong; ``print`` it, or call its ``demand()`` to have an error raised.
+            True if every property holds. ``print`` it, or call its ``demand()``, which raises an error otherwise.
         """
         from .check import check_diagram
 
@@ -317,12 +318,12 @@ class Diagram:
         limited: bool = True,
         adapter: Adapter | None = None,
     ) -> np.ndarray:
-        """Carry cell data over to another mesh of the same domain, conservatively.
+        """Transfer cell data to another mesh of the same domain, conservatively.
 
-        A new cell gets the mean over its parts, each of which it has in common with one old cell. With `order` 1 an
-        old cell has its value everywhere; with 2 it has a linear function about its centroid, whose slope fits the
-        neighbors' values by least squares, limited as by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the
-        cell beyond the values of cell and neighbors.
+        A new cell gets the mean over its intersections with the old cells. With `order` 1 a value is constant in an old
+        cell. With `order` 2 it is a linear function about the centroid. Its slope fits the values of the neighbors by
+        least squares, and is limited by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the cell does the
+        function exceed the values of cell and neighbors.
 
         Parameters
         ----------
@@ -332,8 +333,8 @@ class Diagram:
             The new mesh.
         order : 1 or 2
         limited : bool
-            With False slopes are as they are: linear functions stay exact (to rounding) at walls and extrema too,
-            wherever a cell has d neighbors in different directions, and values may leave the bounds of the old ones.
+            Whether slopes are limited. Without limits linear functions are exact up to round-off, at walls and extrema,
+            too, where a cell has d neighbors in different directions, but new values may exceed the old ones.
         adapter : Adapter, optional
             The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
             has it. Between meshes of a polygonal domain, whose cells need not be convex, the host does it.
@@ -341,17 +342,16 @@ class Diagram:
         Returns
         -------
         (n_new,) or (n_new, k) float64
-            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values, and every new
-            value lies between the least and the largest old one nearby (unless `limited` is False). Rounding leaves
-            the mass off by little; that is made up for in proportion to the room up to those bounds. Between float32
-            meshes, whose volumes are rounded, bounds take precedence: the mass of a constant is off as the sums of
-            volumes are.
+            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values. Every new value
+            lies between the least and the largest old value nearby (unless `limited` is False). A correction in
+            proportion to the distance from these bounds compensates the round-off of the mass. Between float32 meshes
+            the bounds take precedence: the mass of a constant differs as the sums of the volumes do.
 
         Raises
         ------
         InputError, InputTypeError
-            If the meshes have different domains or a periodic one in 3D, `values` has another shape or is not finite (a
-            mean with a NaN is none), or `order` is neither 1 nor 2.
+            If the meshes have different domains or a periodic one in 3D, `values` has another shape or is not finite,
+            or `order` is neither 1 nor 2.
         ClvoroError
             If one of the meshes is not the Voronoi diagram of its points.
         """

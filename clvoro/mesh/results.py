@@ -47,19 +47,19 @@ HISTORY_DTYPE = np.dtype(
         ("seconds", "f8"),  # wall time since the run began
     ]
 )
-"""One row per step of a run, and one more if cells or the sizes asked for have changed after the last."""
+"""Columns of the history: one row per step, and one more if cells or target sizes have changed after the last step."""
 
 
 @dataclass(frozen=True, eq=False)
 class Displacements(Sealed):
-    """The two halves of one step, before they are combined: the paper's Figure 6.
+    """The two displacements of one step, before they are combined: the paper's Figure 6.
 
     Attributes
     ----------
-    points : (n, d) float
+    points : (n, d) float64
         Generators before the step.
-    lloyd, poisson : (n, d) float
-        Displacement towards the centroids, and the metric correction; lengths in the domain's unit.
+    lloyd, poisson : (n, d) float64
+        Displacement to the centroids, and the metric correction, in the domain's unit of length.
     """
 
     points: np.ndarray
@@ -69,39 +69,41 @@ class Displacements(Sealed):
 
 @dataclass(frozen=True, eq=False)
 class Result(Sealed):
-    """A finished (or interrupted) run. Its arrays are read-only; take a `copy()` to change one.
+    """The mesh of a run, with its sizes, errors, quality and history.
+
+    Arrays are read-only; take a ``copy()`` to change one.
 
     Attributes
     ----------
-    points : (n, d) float
-        Generators: `diagram.points`, in the order of `origin`.
+    points : (n, d) float64
+        Generators: `diagram.points`, in the domain's unit of length.
     diagram : Diagram
-    target_size : (n,) float
+        Cells, faces and vertices.
+    target_size : (n,) float64
         Target size h at the generators, in the domain's unit of length.
-    size_error : (n,) float
-        Signed metric error e, the paper's (3.1).
-    quality : (n,) float
-        Cell quality, the paper's (4.1), 1 for a regular polygon; in 3D the isoperimetric quotient 36 pi V^2 / S^3. In a
-        polygonal domain it is that of the polygon in which faces on the boundary are one straight side as long as they
-        turn by no more than 30 degrees in sum; holes within a cell are no sides.
+    size_error : (n,) float64
+        Signed metric error e, the paper's (3.1): positive where a cell is too large.
+    quality : (n,) float64
+        Cell quality: in 2D the paper's (4.1), 1 for a regular polygon; in 3D the isoperimetric quotient
+        36 pi V^2 / S^3. In a polygonal domain faces on the boundary count as one straight side while they turn by at
+        most 30 degrees in sum, and holes within a cell are not sides.
     history : structured array of `HISTORY_DTYPE`
-        One row per step: ``history["mean_error"]``, ...; the last one tells of this mesh. One more follows where a run
-        is stopped before all is done (on a coarser level, before sizes are scaled to `n_cells`, or amid a step).
+        One row per step: ``history["mean_error"]``, ... The last row describes this mesh. It is an additional one if
+        the run was stopped on a coarser level, before sizes were scaled to `n_cells`, or within a step.
     converged : bool
-        Whether the run ended by itself: at its tolerance, or with its plan.
+        Whether the run ended by itself: at its tolerance, or at the end of its plan.
     stop_reason : str
-        Why it ended, for people.
+        Why the run ended.
     initial, final : Displacements or None
-        Lloyd and Poisson displacements of the first and of the last step; where a run may end after any step (methods
-        that repeat one kind, a callback that stops it), those of the step that would come next are the last.
+        Lloyd and Poisson displacements of the first and of the last step. If the last step is not known beforehand
+        (methods that repeat one kind of step, a callback that stops the run), `final` is those of the next step.
     size_factor : float
         With `n_cells` of methods "adaptive" and "exact", `target_size` is the size field times this common factor;
         else 1.
     settings : dict
-        What is needed to repeat the run: of the options those that its method uses.
+        The options that the method uses, to repeat the run.
     origin : (n,) int32 or None
-        Index, in the points that the run began with, of the generator that each row continues; -1 where it was
-        inserted. Rows stand in this order, inserted ones last. What is not listed was deleted.
+        Index of each generator in the points with which the run began; -1 for inserted generators, which come last.
     """
 
     points: np.ndarray
@@ -133,7 +135,7 @@ class Result(Sealed):
         limited: bool = True,
         adapter: Adapter | None = None,
     ) -> np.ndarray:
-        """Carry cell data (n,) or (n, k) over to another mesh of the same domain; see `Diagram.transfer`."""
+        """Transfer cell data (n,) or (n, k) to another mesh of the same domain; see `Diagram.transfer`."""
         return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
 
     def save(

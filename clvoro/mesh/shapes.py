@@ -17,7 +17,7 @@ def cell_shapes(diagram: Diagram) -> np.ndarray:
     """Return each cell of a diagram in 2D as a shapely geometry, (n,); see `Diagram.to_shapely`."""
     ends, following = face_ends(diagram), next_faces(diagram)
     owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
-    # Loops are kept one after the other, and end where they lead back to their first face.
+    # One loop follows the other; each ends where the next face is its first one.
     begins = np.concatenate([[True], following[:-1] != np.arange(1, len(following))])
     loop = np.cumsum(begins) - 1
     sizes = np.bincount(loop)
@@ -41,13 +41,13 @@ def cell_shapes(diagram: Diagram) -> np.ndarray:
     for i in np.unique(of[several]):
         cells[i] = _joined(rings[several[of[several] == i]])
     cells[[cell is None for cell in cells]] = shapely.Polygon()
-    bad = ~shapely.is_valid(cells)  # outlines that cross themselves by a rounding, or touch
+    bad = ~shapely.is_valid(cells)  # outlines that touch or cross themselves within round-off
     cells[bad] = [_areas(shapely.make_valid(cell)) for cell in cells[bad]]
     return cells
 
 
 def _joined(rings: np.ndarray) -> Any:
-    """Return what lies on the left of all `rings`."""
+    """Return the region on the left of all `rings`."""
     outer = shapely.is_ccw(rings)
     parts = [_areas(shapely.make_valid(part)) for part in np.asarray(shapely.polygons(rings))]
     whole = shapely.union_all([p for p, o in zip(parts, outer, strict=True) if o])
@@ -57,6 +57,6 @@ def _joined(rings: np.ndarray) -> Any:
 
 
 def _areas(shape: Any) -> Any:
-    """Return what of a shape has an area."""
+    """Return the parts of a shape that have an area."""
     flat = [p for p in shapely.get_parts(shape) if p.geom_type in ("Polygon", "MultiPolygon")]
     return shapely.union_all(flat) if flat else shapely.Polygon()

@@ -48,7 +48,7 @@ def cut_cells(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Sectio
         by = step * domain.extent
         part = _cut(diagram, normal, point - by)
         if any(domain.periodic):
-            part = _inside(part, domain.lower - by, domain.upper - by)
+            part = _inside(part, np.subtract(domain.lower, by), np.subtract(domain.upper, by))
         parts.append((part, by))
     if len(parts) == 1:
         return parts[0][0]

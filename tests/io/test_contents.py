@@ -105,6 +105,7 @@ def test_own_data_in_other_formats(diagram, result, tmp_path):
         ({1: [1]}, InputError, "has the name 1"),
         ({"p": [1, 2]}, InputError, r"shape \(2,\), expected \(1,\) or \(1, k\)"),
         ({"p": [[[1]]]}, InputError, r"shape \(1, 1, 1\)"),
+        ({"p": np.ma.masked_equal([1], 1)}, InputError, "masked numbers"),
         ({"p": ["a"]}, InputTypeError, "expected real numbers"),
         ({"p": [1j]}, InputTypeError, "dtype complex128"),
         ([1], InputTypeError, "expected a mapping"),
