@@ -46,8 +46,8 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.sampling.start import count_cells
 from clvoro.opencl.engine import Engine
-from clvoro.remapping.remap import transfer_values
-from clvoro.remapping.transfer import transfer_needed
+from clvoro.remapping.cell_data import transfer_values
+from clvoro.remapping.device_transfer import transfer_bytes
 
 STEEP = {
     "jump": (SQUARE, "x < 0.5 ? 1.0 : 19.0"),
@@ -200,7 +200,7 @@ def transferred(options: Any, n: int) -> dict[str, Any]:
         transfer_values(old, values, new, 2, adapter=adapter)
     double = adapter.queue.device.double_fp_config
     engine = Engine(adapter.ctx, adapter.queue, 2, np.dtype("float64" if double else "float32"))
-    told = transfer_needed(engine, *sizes, 1, 2)
+    told = transfer_bytes(engine, *sizes, 1, 2)
     held = ledger.peak / told
     return {
         "cells": n,

@@ -1,11 +1,11 @@
-/* A piece: the part of a cell that half-spaces leave of it, whatever side of them the cell's generator is on.
-   Coordinates are relative to that generator. A vector is a REAL4, of which DIM numbers count.
+/* A piece is the intersection of a Voronoi cell with half-spaces { y : y.normal <= level }. The cell's generator may
+   lie outside them. Coordinates are relative to that generator. A vector is a REAL4 with DIM components in use.
 
-   piece_t                  the convex polygon or polyhedron
-   build_piece              the cell of generator i, from its row of a graph
-   cut_piece                keep what has y.normal <= level
-   measure_piece            volume and centroid
-   EACH_FACE(piece, f)      its faces, with face_label(piece, f) */
+   piece_t                  a convex polygon or polyhedron
+   build_piece              make the cell of generator i from its row of the neighbor graph
+   cut_piece                intersect with one half-space
+   measure_piece            compute volume and centroid
+   EACH_FACE(piece, f)      loop over the faces; face_label(piece, f) is the label of one */
 #include "opencl/real.h"
 #if DIM == 2
 #include "tessellation/polygon.h"
@@ -13,13 +13,13 @@
 #include "tessellation/clip.h"
 #endif
 
-#define PIECE_WHOLE 0  /* nothing was cut off */
-#define PIECE_CUT 1    /* something was */
+#define PIECE_WHOLE 0  /* the half-space contains the piece */
+#define PIECE_CUT 1    /* a part was cut off */
 #define PIECE_EMPTY 2  /* nothing is left */
-#define PIECE_FULL 3   /* there are too many faces */
-#define PIECE_BROKEN 4 /* rounding leaves no polyhedron */
+#define PIECE_FULL 3   /* the piece has more faces than its arrays hold */
+#define PIECE_BROKEN 4 /* round-off leaves no valid polyhedron */
 
-#define NO_LABEL -1 /* of a face of the cell itself */
+#define NO_LABEL -1 /* the label of a face of the cell itself */
 
 inline REAL4 load_vector(global const REAL *points, int i)
 {
@@ -30,7 +30,7 @@ inline REAL4 load_vector(global const REAL *points, int i)
 #endif
 }
 
-inline REAL product(REAL4 a, REAL4 b)
+inline REAL dot_vectors(REAL4 a, REAL4 b)
 {
 #if DIM == 2
     return a.s0 * b.s0 + a.s1 * b.s1;
@@ -44,7 +44,7 @@ inline REAL product(REAL4 a, REAL4 b)
 /* Face k runs counter-clockwise from corner k to corner k + 1. */
 typedef struct {
     int n;
-    REAL reach2; /* largest squared distance of a corner of the cell from its generator */
+    REAL reach2; /* largest squared distance from the generator to a corner of the cell */
     REAL x[CELL_CAPACITY], y[CELL_CAPACITY];
     int labels[CELL_CAPACITY];
 } piece_t;
@@ -98,7 +98,8 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
     return PIECE_WHOLE;
 }
 
-/* Keep what has y.normal <= level, but for a strip of `depth`. The new face gets the label. */
+/* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
+ */
 inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
     const int n = piece->n;
@@ -142,7 +143,7 @@ inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int l
     return PIECE_CUT;
 }
 
-/* By triangles that share a corner: small pieces of large cells are measured as well as others. */
+/* Sum over triangles that share corner 0, so that small pieces far from the generator keep their accuracy. */
 inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
@@ -195,8 +196,9 @@ inline int build_piece(piece_t *piece, int i, global const int *starts, global c
     return PIECE_WHOLE;
 }
 
-/* Keep what has y.normal <= level, but for a strip of `depth`. The new face gets the label. Unlike clip_polyhedron this
-   takes any plane, and new vertices by interpolation only: the edges are no longer than the cell. */
+/* Keep y.normal <= level. Vertices beyond the plane by no more than `depth` count as inside. The new face gets `label`.
+   Unlike `clip_polyhedron` this takes any plane. New vertices are interpolated along edges, which is accurate since no
+   edge is longer than the cell. */
 inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int label)
 {
     const REAL *x = X(piece), *y = Y(piece), *z = Z(piece);
@@ -226,7 +228,7 @@ inline int cut_piece(piece_t *piece, REAL4 normal, REAL level, REAL depth, int l
     return PIECE_CUT;
 }
 
-/* By tetrahedra that share a vertex: small pieces of large cells are measured as well as others. */
+/* Sum over tetrahedra that share vertex 0, so that small pieces far from the generator keep their accuracy. */
 inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
 {
     const REAL4 o = corner_of(piece, 0);
@@ -243,7 +245,7 @@ inline REAL measure_piece(const piece_t *piece, REAL4 *centroid)
         REAL4 b = corner_of(piece, v) - o;
         for (v = vertex_after(piece, v, f); v != start[f]; v = vertex_after(piece, v, f)) {
             const REAL4 c = corner_of(piece, v) - o;
-            const REAL triple = product(a, cross_product(b, c));
+            const REAL triple = dot_vectors(a, cross_product(b, c));
             sum += triple;
             first += triple * (a + b + c);
             b = c;

@@ -2,20 +2,39 @@
 #include "tessellation/bins.h"
 #include "remapping/piece.h"
 
-/* What became of a cell. */
+/* Outcomes of a cell. */
 #define DONE 0
-#define LIST_FULL 1   /* it meets more old cells than the list holds */
-#define PIECE_LARGE 2 /* more faces than a piece holds */
-#define FAILED 3
+#define LIST_FULL 1   /* the cell overlaps more old cells than its list holds */
+#define PIECE_LARGE 2 /* a piece has more faces than its arrays hold */
+#define FAILED 3      /* the graph is not that of a Voronoi diagram */
 
-/* The old cells that a new cell is known to meet: a queue, and a hash table with open addressing, of twice its capacity
-   (a power of two), that says which are in it. */
+/* A neighbor graph. Row i lists the neighbors of generator i; -1 - wall stands for a wall. */
+typedef struct {
+    global const REAL *points;
+    global const int *starts, *neighbors;
+} graph_t;
+
+#define GRAPH_ARGS global const REAL *points, global const int *starts, global const int *neighbors
+#define OLD_GRAPH_ARGS global const REAL *old_points, global const int *old_starts, global const int *old_neighbors
+
+/* Cell data of the old mesh, `width` columns.
+
+   values (n, width)        means q_j over the cells
+   least, most (n, width)   bounds of the data inside a cell
+   centroids (n, DIM)       c_j - x_j
+   slopes (n, width, DIM)   g_j; not read unless with_slopes */
+#define CELL_DATA_ARGS                                                                                                 \
+    const int width, global const REAL *values, global const REAL *least, global const REAL *most,                     \
+        global const REAL *centroids, const int with_slopes, global const REAL *slopes
+
+/* The old cells found so far for one new cell: a queue, and a hash table with open addressing and 2 * capacity slots (a
+   power of two) that holds the same indices. */
 typedef struct {
     int n, capacity;
     global int *queue, *table;
 } visited_t;
 
-/* Add j, unless it is there already; false if there is no room. */
+/* Add j unless it is listed already. Returns false if the queue is full. */
 inline bool visit(visited_t *seen, int j)
 {
     const int mask = 2 * seen->capacity - 1;
@@ -32,12 +51,11 @@ inline bool visit(visited_t *seen, int j)
     return true;
 }
 
-/* The generator nearest to x, of those with the given graph: from one in x's bin (or near it, where that is empty) from
-   neighbor to neighbor as long as one is nearer. Nothing can end that early: whoever is not in a generator's cell is
-   nearer to one of its neighbors. */
-inline int nearest_generator(global const REAL *x, int n, global const int *items, global const int2 *bins,
-                             global const FRAME *grid_frames, global const int4 *grid_shapes, global const int *starts,
-                             global const int *neighbors, global const REAL *points)
+/* The generator of `graph` nearest to x. Start at a generator in the bin of x, or near it, and move to a nearer
+   neighbor until there is none. A point outside a generator's cell is nearer to one of its neighbors, so the walk
+   cannot stop early. */
+inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, global const int *items,
+                             global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
 {
     int bin = bin_in_grid(x, grid_frames[0], grid_shapes[0]);
     while (bins[bin].s1 != bins[bin + 1].s1) {
@@ -46,16 +64,16 @@ inline int nearest_generator(global const REAL *x, int n, global const int *item
     }
     const REAL4 here = load_vector(x, 0);
     int j = items[min(bins[bin].s0, n - 1)], best = j;
-    REAL4 d = load_vector(points, j) - here;
-    REAL best2 = product(d, d);
+    REAL4 d = load_vector(graph->points, j) - here;
+    REAL best2 = dot_vectors(d, d);
     do {
         j = best;
-        for (int k = starts[j]; k < starts[j + 1]; ++k) {
-            const int q = neighbors[k];
+        for (int k = graph->starts[j]; k < graph->starts[j + 1]; ++k) {
+            const int q = graph->neighbors[k];
             if (q < 0)
                 continue;
-            d = load_vector(points, q) - here;
-            const REAL d2 = product(d, d);
+            d = load_vector(graph->points, q) - here;
+            const REAL d2 = dot_vectors(d, d);
             if (d2 < best2) {
                 best2 = d2;
                 best = q;
@@ -65,24 +83,23 @@ inline int nearest_generator(global const REAL *x, int n, global const int *item
     return j;
 }
 
-/* Leave of a piece, relative to x, what lies in old cell j: { y : |y - x_j| <= |y - x_k| for its neighbors k }. The
-   plane between two cells is computed in one way for both, so that the two get complements. One of PIECE_*. */
-inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, global const int *starts,
-                       global const int *neighbors, global const REAL *points)
+/* Intersect a piece, relative to x, with old cell j: { y : |y - x_j| <= |y - x_k| for all neighbors k }. Both cells of
+   a face compute its plane by the same operations, so that their pieces are complementary. Returns PIECE_*. */
+inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, const graph_t *graph)
 {
     int what = PIECE_WHOLE;
-    const REAL4 xj = load_vector(points, j);
-    for (int k = starts[j]; k < starts[j + 1]; ++k) {
-        const int q = neighbors[k];
+    const REAL4 xj = load_vector(graph->points, j);
+    for (int k = graph->starts[j]; k < graph->starts[j + 1]; ++k) {
+        const int q = graph->neighbors[k];
         if (q < 0)
             continue;
-        const REAL4 xq = load_vector(points, q);
+        const REAL4 xq = load_vector(graph->points, q);
         const REAL4 low = j < q ? xj : xq, high = j < q ? xq : xj;
         const REAL4 a = low - x, b = high - x;
         REAL4 normal = high - low;
-        REAL level = product(normal, a + b) / 2;
-        const REAL noise = 4 * REAL_EPS * sqrt(product(normal, normal));
-        const REAL depth = noise * (reach + sqrt(fmax(product(a, a), product(b, b))));
+        REAL level = dot_vectors(normal, a + b) / 2;
+        const REAL noise = 4 * REAL_EPS * sqrt(dot_vectors(normal, normal));
+        const REAL depth = noise * (reach + sqrt(fmax(dot_vectors(a, a), dot_vectors(b, b))));
         if (j > q) {
             normal = -normal;
             level = -level;
@@ -95,28 +112,22 @@ inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, global const 
     return what;
 }
 
-/* Per new cell i = todo[first + p]: the mean of what is given in the old cells j,
+/* Per new cell i = todo[first + p]: the mean of the old data,
 
        q_i = sum_j |V_i and V_j| (q_j + g_j . (c_ij - c_j)) / sum_j |V_i and V_j|,
 
-   with the centroid c_ij of the piece V_i and V_j. The pieces are found by flooding: from the old cell that holds x_i
-   over the faces that the pieces have in common with each other.
+   over the old cells j, with the centroid c_ij of the intersection of V_i and V_j. The old cells are found by flooding:
+   first the one that contains x_i, then the neighbors across each face of an intersection.
 
-   values, least, most (n_old, width)  of the old cells: q_j, and bounds of what is in them
-   slopes (n_old, width, DIM)          g_j; with_slopes = 0: none
-   centroids (n_old, DIM)              c_j - x_j
-   means, low, high (n_new, width)     q_i, and the bounds of what it is made of
-   volumes, found (n_new)              of the cell, of its pieces together
-   queues, tables                      (capacity), (2 capacity) for each work-item */
-kernel void transfer(const int size, const int first, global const int *todo, const int capacity, global int *queues,
-                     global int *tables, global const REAL *points, global const int *starts,
-                     global const int *neighbors, const int n_old, global const REAL *old_points,
-                     global const int *old_starts, global const int *old_neighbors, global const int *items,
-                     global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
-                     const REAL4 box_lower, const REAL4 box_upper, const int width, global const REAL *values,
-                     global const REAL *least, global const REAL *most, const int with_slopes,
-                     global const REAL *slopes, global const REAL *centroids, global REAL *means, global REAL *low,
-                     global REAL *high, global REAL *volumes, global REAL *found, global int *status)
+   means, low, high (n_new, width)   q_i, and bounds of the old data in the cell
+   volumes, covered (n_new,)         volume of the cell, sum of the volumes of its intersections
+   queues, tables                    capacity and 2 * capacity entries for each work-item */
+kernel void transfer_cell_data(const int size, const int first, global const int *todo, const int capacity,
+                               global int *queues, global int *tables, GRAPH_ARGS, const int n_old, OLD_GRAPH_ARGS,
+                               global const int *items, global const int2 *bins, global const FRAME *grid_frames,
+                               global const int4 *grid_shapes, const REAL4 box_lower, const REAL4 box_upper,
+                               CELL_DATA_ARGS, global REAL *means, global REAL *low, global REAL *high,
+                               global REAL *volumes, global REAL *covered, global int *status)
 {
     WORK_ITEM(p);
     const int i = todo[first + p];
@@ -133,8 +144,8 @@ kernel void transfer(const int size, const int first, global const int *todo, co
     REAL4 centroid;
     volumes[i] = measure_piece(&whole, &centroid);
     const REAL reach = sqrt(whole.reach2);
-    visit(&seen, nearest_generator(points + (size_t)DIM * i, n_old, items, bins, grid_frames, grid_shapes, old_starts,
-                                   old_neighbors, old_points));
+    const graph_t old = {old_points, old_starts, old_neighbors};
+    visit(&seen, nearest_generator(points + (size_t)DIM * i, &old, n_old, items, bins, grid_frames, grid_shapes));
     for (int c = 0; c < width; ++c) {
         means[(size_t)i * width + c] = 0;
         low[(size_t)i * width + c] = REAL_MAX;
@@ -144,14 +155,14 @@ kernel void transfer(const int size, const int first, global const int *todo, co
     for (int k = 0; k < seen.n; ++k) {
         const int j = seen.queue[k];
         piece = whole;
-        what = cut_by_cell(&piece, x, reach, j, old_starts, old_neighbors, old_points);
+        what = cut_by_cell(&piece, x, reach, j, &old);
         if (what == PIECE_FULL || what == PIECE_BROKEN) {
             status[i] = what == PIECE_FULL ? PIECE_LARGE : FAILED;
             return;
         }
         bool room = true;
         if (what == PIECE_EMPTY) {
-            /* Rounding may have the search for the first cell end beside it. */
+            /* Round-off may let the search for the first cell stop at a neighbor of it. */
             for (int q = old_starts[j]; sum == 0 && q < old_starts[j + 1]; ++q)
                 room = room && (old_neighbors[q] < 0 || visit(&seen, old_neighbors[q]));
         } else {
@@ -176,15 +187,15 @@ kernel void transfer(const int size, const int first, global const int *todo, co
             return;
         }
     }
-    found[i] = sum;
+    covered[i] = sum;
     for (int c = 0; c < width; ++c)
         means[(size_t)i * width + c] /= sum;
     status[i] = sum > 0 ? DONE : FAILED;
 }
 
-/* Solve M g = b, M symmetric and not negative, in place of M and b: by elimination, the largest pivot first. False,
-   with b as it was, if M is singular but for rounding. */
-inline bool eliminate(REAL m[DIM][DIM], REAL *b)
+/* Solve M g = b for a symmetric positive semidefinite M by elimination with the largest pivot first. Overwrites M, and
+   b with g. Returns false and leaves b unchanged if M is singular to round-off. */
+inline bool solve_by_elimination(REAL m[DIM][DIM], REAL *b)
 {
     int order[DIM];
     REAL x[DIM], scale = 0;
@@ -222,9 +233,9 @@ inline bool eliminate(REAL m[DIM][DIM], REAL *b)
     return true;
 }
 
-/* Solve the normal equations M g = b in place of b. A direction that the neighbors say nothing about, as in the corner
-   of a box with one neighbor, gets no slope: the least solution, to the root of rounding. */
-inline void solve_normal(REAL m[DIM][DIM], REAL *b)
+/* Solve the normal equations M g = b; overwrite b with g. If M is singular, as for a cell in a corner of the box with
+   one neighbor, return the solution of least norm, accurate to the square root of the machine epsilon. */
+inline void solve_normal_equations(REAL m[DIM][DIM], REAL *b)
 {
     REAL copy[DIM][DIM], trace = 0;
     for (int a = 0; a < DIM; ++a) {
@@ -232,27 +243,26 @@ inline void solve_normal(REAL m[DIM][DIM], REAL *b)
         for (int c = 0; c < DIM; ++c)
             copy[a][c] = m[a][c];
     }
-    if (eliminate(copy, b))
+    if (solve_by_elimination(copy, b))
         return;
     for (int a = 0; a < DIM; ++a)
         for (int c = 0; c < DIM; ++c)
             copy[a][c] = m[a][c] + (a == c ? sqrt(REAL_EPS) * trace : 0);
-    if (!(trace > 0) || !eliminate(copy, b))
+    if (!(trace > 0) || !solve_by_elimination(copy, b))
         for (int a = 0; a < DIM; ++a)
             b[a] = 0;
 }
 
-/* Per old cell j and component c: the slope g_j that fits its neighbors k best,
+/* Per cell j, for each column c: the slope g_j of the least-squares fit to the neighbors k,
 
        min over g of sum_k w_k (q_k - q_j - g . (c_k - c_j))^2,   w_k = 1 / |c_k - c_j|^2,
 
-   and least, most: the bounds of the values of j and its neighbors. With `limited`, g_j is multiplied by the largest
-   factor <= 1 with which the linear function stays between those at all corners v of the cell (T. J. Barth and
-   D. C. Jespersen, The design and application of upwind schemes on unstructured meshes, AIAA 89-0366, 1989):
+   and least, most: the extremes of q over j and its neighbors. With `limited`, g_j is multiplied by the largest factor
+   <= 1 that keeps the linear function within these bounds at all corners v of the cell (T. J. Barth and D. C.
+   Jespersen, The design and application of upwind schemes on unstructured meshes, AIAA 89-0366, 1989):
 
-       min over v of (most - q_j) / (g . (v - c_j)) or (least - q_j) / (g . (v - c_j)), by the sign of what divides. */
-kernel void fit_slopes(const int size, const int width, global const REAL *points, global const int *starts,
-                       global const int *neighbors, const REAL4 box_lower, const REAL4 box_upper,
+       min over v of (most - q_j) / r if r > 0, (least - q_j) / r if r < 0,   r = g . (v - c_j). */
+kernel void fit_slopes(const int size, const int width, GRAPH_ARGS, const REAL4 box_lower, const REAL4 box_upper,
                        global const REAL *centroids, global const REAL *values, const int limited, global REAL *slopes,
                        global REAL *least, global REAL *most, global int *status)
 {
@@ -278,7 +288,7 @@ kernel void fit_slopes(const int size, const int width, global const REAL *point
             const REAL there = values[(size_t)q * width + c];
             const REAL4 d4 = (load_vector(points, q) - x) + (load_vector(centroids, q) - cj);
             const REAL d[3] = {d4.s0, d4.s1, d4.s2};
-            const REAL weight = 1 / product(d4, d4);
+            const REAL weight = 1 / dot_vectors(d4, d4);
             bottom = fmin(bottom, there);
             top = fmax(top, there);
             for (int a = 0; a < DIM; ++a) {
@@ -287,7 +297,7 @@ kernel void fit_slopes(const int size, const int width, global const REAL *point
                     m[a][b] += weight * d[a] * d[b];
             }
         }
-        solve_normal(m, g);
+        solve_normal_equations(m, g);
         REAL factor = 1;
         for (int v = 0; limited && v < corner_count(&cell); ++v) {
             const REAL4 off = corner_of(&cell, v) - cj;

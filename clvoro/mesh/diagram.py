@@ -355,7 +355,7 @@ class Diagram:
         ClvoroError
             If one of the meshes is not the Voronoi diagram of its points.
         """
-        from ..remapping.remap import transfer_values
+        from ..remapping.cell_data import transfer_values
 
         return transfer_values(self, values, onto, order, limited, adapter)
 

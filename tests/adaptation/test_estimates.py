@@ -36,9 +36,9 @@ from clvoro.cli import command as cli
 from clvoro.cli import jobs
 from clvoro.errors import MemoryLimitError, SizeErrorWarning
 from clvoro.opencl.engine import Engine
-from clvoro.remapping import remap
-from clvoro.remapping.remap import transfer_values
-from clvoro.remapping.transfer import transfer_needed
+from clvoro.remapping import cell_data
+from clvoro.remapping.cell_data import transfer_values
+from clvoro.remapping.device_transfer import transfer_bytes
 from clvoro.solvers import poisson
 
 BENCH = Path(__file__).parents[2] / "bench"
@@ -411,8 +411,8 @@ def test_transfers_hold_what_is_told(bench, ctx, monkeypatch, dim, old, new, ord
     with bench.counted_buffers(ledger):
         transfer_values(meshes[0], values, meshes[1], order, adapter=adapter)
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype("float64"))
-    assert 0.9 <= ledger.peak / transfer_needed(engine, *sizes, 1, order) <= 1.1
-    monkeypatch.setattr(remap, "transfer_needed", lambda *_: 1e18)
+    assert 0.9 <= ledger.peak / transfer_bytes(engine, *sizes, 1, order) <= 1.1
+    monkeypatch.setattr(cell_data, "transfer_bytes", lambda *_: 1e18)
     with pytest.raises(MemoryLimitError, match=f"1 columns from {old} cells to {new}.*GiB"):
         transfer_values(meshes[0], values, meshes[1], order, adapter=adapter)
 

@@ -693,7 +693,7 @@ def test_transfer_between_domains_is_refused(pair, ctx) -> None:
 
 
 def test_slopes_are_those_of_the_device(ctx) -> None:
-    from clvoro.remapping.overlap import fit_slopes
+    from clvoro.remapping.host_transfer import fit_slopes
 
     # In a box, described as a polygon.
     box, points = clvoro.Box((0, 0), (1, 1)), np.random.default_rng(9).random((80, 2))

@@ -1,4 +1,4 @@
-"""Cell data from mesh to mesh: against plain clipping, and what must hold on any mesh."""
+"""Transfer of cell data: comparison with plain clipping, and properties that hold on any mesh."""
 
 import math
 
@@ -25,7 +25,7 @@ def adapter(ctx):
 
 @pytest.fixture(scope="module")
 def mesh(adapter):
-    """A function that makes a diagram of n random generators."""
+    """Return a function that makes a diagram of n random generators."""
     made = {}
 
     def make(dim, n, seed):
@@ -39,7 +39,7 @@ def mesh(adapter):
 
 
 def lattice(adapter, dim, side):
-    """A diagram of equal boxes."""
+    """Return a diagram whose cells are equal boxes."""
     box = BOXES[dim]
     axes = [
         low + (high - low) * (np.arange(side) + 0.5) / side
@@ -56,7 +56,7 @@ def mass_defect(old, new, values, carried):
 
 
 def half_spaces(diagram, i):
-    """Rows (a, b) with a.y + b <= 0 for all y of cell i, walls included."""
+    """Return rows (a, b) of the half-spaces a.y + b <= 0 of cell i, walls included."""
     x, box = diagram.points, diagram.domain
     others = np.delete(x, i, axis=0)
     normals = others - x[i]
@@ -81,7 +81,7 @@ def clip_polygon(corners, plane):
 
 
 def flat_part(box, planes):
-    """Area and centroid of the part of a 2D box within half-planes."""
+    """Return area and centroid of the intersection of a 2D box with half-planes."""
     (x0, y0), (x1, y1) = box.lower, box.upper
     corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     for plane in planes:
@@ -94,7 +94,7 @@ def flat_part(box, planes):
 
 
 def solid_part(planes):
-    """Volume and centroid of what lies within half-spaces, by Qhull from an inner point."""
+    """Return volume and centroid of the intersection of half-spaces, computed by Qhull from an inner point."""
     from scipy.optimize import linprog
 
     ones = np.ones(len(planes))
@@ -114,7 +114,7 @@ def solid_part(planes):
 
 
 def overlaps(old, new):
-    """Volumes and first moments of all pairs, (n_new, n_old) and (n_new, n_old, d)."""
+    """Return volumes (n_new, n_old) and first moments (n_new, n_old, d) of all intersections."""
     dim = old.domain.dim
     volumes = np.zeros((len(new), len(old)))
     moments = np.zeros((len(new), len(old), dim))
@@ -129,7 +129,7 @@ def overlaps(old, new):
 
 
 def slopes(diagram, q):
-    """Least-squares slopes, and the extremes of a cell and its neighbors, cell by cell."""
+    """Return least-squares slopes, and the extremes over each cell and its neighbors."""
     found = np.zeros_like(diagram.centroids)
     least, most = q.copy(), q.copy()
     for i, c in enumerate(diagram.centroids):
@@ -143,7 +143,7 @@ def slopes(diagram, q):
 
 
 def corners(diagram, i):
-    """The corners of a cell."""
+    """Return the corners of a cell."""
     if diagram.domain.dim == 2:
         a, b = diagram.cell_vertex_starts[i : i + 2]
         return diagram.vertices[diagram.cell_vertices[a:b]]
@@ -161,7 +161,7 @@ def test_matches_plain_clipping(mesh, adapter, dim, way):
     q = np.random.default_rng(311).normal(size=23)
     volumes, moments = overlaps(old, new)
     if dim == 3:
-        # Qhull leaves out what it takes for flat.
+        # Qhull drops intersections that it takes for flat.
         assert volumes.sum() == pytest.approx(old.domain.measure, rel=1e-6)
     expected = volumes @ q
     if way != "first":
@@ -176,7 +176,7 @@ def test_matches_plain_clipping(mesh, adapter, dim, way):
     expected /= volumes.sum(axis=1)
     order = 1 if way == "first" else 2
     got = old.transfer(q, new, order, limited=way != "second", adapter=adapter)
-    # 3D: inner points of parts thinner than 1e-7 are not looked for.
+    # In 3D the reference drops intersections thinner than 1e-7.
     np.testing.assert_allclose(got, expected, atol=1e-12 if dim == 2 else 1e-5)
 
 
@@ -191,7 +191,7 @@ def test_mass_bounds_and_constants(mesh, adapter, dim, order, counts):
     )
     got = old.transfer(q, new, order, adapter=adapter)
     assert got.shape == (counts[1], 3)
-    # Sums of a thousand products round to 1e-14 or so.
+    # The round-off of a sum of a thousand products is about 1e-14.
     assert mass_defect(old, new, q, got) < 1e-13
     assert (got >= q.min(axis=0)).all()
     assert (got <= q.max(axis=0)).all()
@@ -203,7 +203,7 @@ def test_linear_functions_are_exact_without_limiter(mesh, adapter, dim):
     old, new = mesh(dim, 500, 2203), mesh(dim, 700, 6101)
     slope = np.array([0.7, -1.3, 2.1])[:dim]
     got = old.transfer(2 + old.centroids @ slope, new, 2, limited=False, adapter=adapter)
-    # Slopes round by eps * value over the distance of neighbors.
+    # The round-off of a slope is eps * value / distance of neighbors.
     np.testing.assert_allclose(got, 2 + new.centroids @ slope, rtol=0, atol=1e-11)
 
 
@@ -212,8 +212,8 @@ def test_linear_functions_are_exact_without_limiter(mesh, adapter, dim):
     [(0.2, 0.3), (0.7, 0.6)],
     [(0.1, 0.2, 0.3), (0.5, 0.9, 0.4), (0.8, 0.3, 0.9)],
 ])  # fmt: skip
-def test_too_few_neighbors_give_the_least_slope(adapter, points):
-    """Corner cells with one neighbor, and cells in a row: no slope across."""
+def test_too_few_neighbors_give_slopes_of_least_norm(adapter, points):
+    """A corner cell with one neighbor, or cells in a row, do not determine all slopes."""
     dim = len(points[0])
     box = Box((0,) * dim, (1,) * dim)
     old = adapter.diagram(box, points)
@@ -222,7 +222,7 @@ def test_too_few_neighbors_give_the_least_slope(adapter, points):
     got = old.transfer(q, new, 2, limited=False, adapter=adapter)
     g, _, _ = slopes(old, q)
     owner = ((new.points[:, None] - old.points) ** 2).sum(axis=2).argmin(axis=1)
-    # New cells that lie within one old cell, seen from their corners.
+    # New cells whose corners all lie in one old cell.
     whole = [
         i
         for i in range(len(new))
@@ -232,11 +232,11 @@ def test_too_few_neighbors_give_the_least_slope(adapter, points):
     ]
     assert len(whole) > 50
     expected = q[owner] + ((new.centroids - old.centroids[owner]) * g[owner]).sum(axis=1)
-    # Singular systems are solved to the root of eps.
+    # Singular systems are solved to sqrt(eps).
     np.testing.assert_allclose(got[whole], expected[whole], rtol=0, atol=1e-6)
 
 
-def test_limiter_leaves_linear_functions_inside_of_good_meshes(adapter):
+def test_limiter_keeps_linear_functions_in_the_interior_of_good_meshes(adapter):
     box = Box((0, 0), (1, 1))
     old = adapter.run(box, 0.06, seed=93, effort="fast").diagram
     new = adapter.run(box, 0.05, seed=57, effort="fast").diagram
@@ -244,7 +244,7 @@ def test_limiter_leaves_linear_functions_inside_of_good_meshes(adapter):
     got = old.transfer(linear, new, 2, adapter=adapter)
     exact = 1 + new.centroids @ [2.0, -0.6]
     inner = (np.abs(new.centroids - 0.5) < 0.3).all(axis=1)
-    # Corners of a good cell lie within the hull of the neighbors' centroids; those of the worst just beyond.
+    # Corners of most cells lie within the hull of the neighbors' centroids, where the limiter changes nothing.
     assert np.mean(np.abs(got - exact)[inner] < 1e-12) > 0.8
     assert np.abs(got - exact)[inner].mean() < 0.05 * 0.06 * math.hypot(2, 0.6)
 
@@ -255,7 +255,7 @@ def test_same_mesh_is_the_identity(mesh, adapter, dim, order):
     old = mesh(dim, 700, 1327)
     q = np.random.default_rng(7).normal(size=700)
     got = old.transfer(q, old, order, adapter=adapter)
-    # Slivers of rounding's width: eps times the surface over the volume of the smallest cell.
+    # Intersections as thin as round-off: eps times surface over volume of the smallest cell.
     np.testing.assert_allclose(got, q, rtol=0, atol=1e-12)
 
 
@@ -264,7 +264,7 @@ def test_same_mesh_is_the_identity(mesh, adapter, dim, order):
     "sides", [(6, 6, 0.0), (6, 12, 0.0), (12, 6, 0.0), (6, 9, 0.0), (6, 6, 0.5)]
 )
 def test_lattices(adapter, dim, sides):
-    """Faces upon faces, corners upon corners, generators upon corners."""
+    """Faces coincide with faces, corners with corners, generators with corners."""
     coarse, fine, shift = sides
     old = lattice(adapter, dim, coarse)
     new = lattice(adapter, dim, fine)
@@ -277,7 +277,7 @@ def test_lattices(adapter, dim, sides):
     q = np.random.default_rng(67).normal(size=len(old))
     got = old.transfer(q, new, adapter=adapter)
     assert mass_defect(old, new, q, got) < 1e-13
-    # Along each axis what intervals have in common; the product of that is the share of cubes.
+    # The volume of an intersection of two boxes is the product of the overlaps along the axes.
     old_ends = np.linspace(0, 1, coarse + 1)
     new_ends = np.linspace(0, 1, fine + 1)
     if shift:
@@ -292,8 +292,8 @@ def test_lattices(adapter, dim, sides):
 
 
 @DIMS
-def test_refined_mesh_gives_back_what_it_got(mesh, adapter, dim):
-    """Onto a mesh that holds the old generators and many more, and back: means of means, mass and bounds kept."""
+def test_transfer_to_refined_mesh_and_back(mesh, adapter, dim):
+    """The finer mesh contains the old generators; mass and bounds are kept both ways."""
     old = mesh(dim, 150, 3037)
     rng = np.random.default_rng(45)
     near = old.points.repeat(20, axis=0)
@@ -305,14 +305,14 @@ def test_refined_mesh_gives_back_what_it_got(mesh, adapter, dim):
     back = new.transfer(there, old, adapter=adapter)
     assert mass_defect(old, new, q, there) < 1e-13
     assert mass_defect(old, old, q, back) < 1e-13
-    # Generators that were kept lie well inside of their old cells.
+    # The cells of the old generators in the new mesh lie within their old cells.
     assert np.abs(there[:150] - q).max() < 1e-12
     assert np.abs(back - q).mean() < np.abs(q).mean()
 
 
 @DIMS
-def test_sizes_of_a_million_to_one(adapter, dim):
-    """A cluster of 1e-6 of the box in one mesh: cells that meet thousands, and that lie deep within one."""
+def test_size_ratio_of_a_million(adapter, dim):
+    """One mesh has a cluster of 1e-6 of the box: a cell overlaps thousands, or lies within one."""
     box = BOXES[dim]
     rng = np.random.default_rng(191)
     wide = box.lower + box.extent * rng.random((60, dim))
@@ -330,7 +330,7 @@ def test_sizes_of_a_million_to_one(adapter, dim):
         np.testing.assert_allclose(linear, new.centroids[:, 0], rtol=0, atol=1e-9)
 
 
-def test_lists_grow_where_a_cell_meets_many(mesh, adapter):
+def test_lists_grow_for_a_cell_with_many_overlaps(mesh, adapter):
     old, new = mesh(2, 20_000, 401), mesh(2, 3, 83)
     got = old.transfer(old.centroids[:, 0], new, 2, limited=False, adapter=adapter)
     np.testing.assert_allclose(got, new.centroids[:, 0], rtol=0, atol=1e-11)
@@ -338,7 +338,7 @@ def test_lists_grow_where_a_cell_meets_many(mesh, adapter):
 
 @DIMS
 def test_cells_of_many_faces(adapter, dim):
-    """A ring or a sphere of generators around one: the cell in the middle has 90 faces."""
+    """A ring or a sphere of generators around one gives the middle cell 90 faces."""
     box = Box((0,) * dim, (1,) * dim)
     turns = 2 * np.pi * np.arange(90)
     height = (2 * np.arange(90) + 1) / 90 - 1 if dim == 3 else np.zeros(90)
@@ -350,19 +350,21 @@ def test_cells_of_many_faces(adapter, dim):
     assert np.diff(old.neighbor_starts).max() == 90
     got = old.transfer(old.centroids[:, 1], new, 2, limited=False, adapter=adapter)
     np.testing.assert_allclose(got, new.centroids[:, 1], rtol=0, atol=1e-11)
-    # All of it within one old cell, of which nothing else needs room.
+    # The new cell lies within one old cell, whose pieces need the room for its 90 faces.
     wide = adapter.diagram(
         box, np.array([0.5] * dim) + np.array([[-0.49], [-0.41]]) * np.eye(dim)[0]
     )
     again = clvoro.Adapter(adapter.ctx)
     got = wide.transfer(wide.centroids[:, 0], new, 2, limited=False, adapter=again)
-    # Singular systems are solved to the root of eps.
+    # Singular systems are solved to sqrt(eps).
     np.testing.assert_allclose(got, new.centroids[:, 0], rtol=0, atol=1e-7)
 
 
-def test_faces_that_are_the_same_but_for_what_rounds(adapter):
-    """Two prisms on each other: where the other mesh has their common face about as much higher as its corners round,
-    some of the corners are beyond it and others between them are not."""
+def test_faces_that_differ_by_round_off(adapter):
+    """Move the common face of two prisms by about the round-off of its corners.
+
+    Some corners are then beyond the new face while others between them are not.
+    """
     angle = 2 * np.pi * np.arange(40) / 40
     ring = 0.5 + 0.3 * np.column_stack([np.cos(angle), np.sin(angle)])
     layer = np.column_stack([np.vstack([[0.5, 0.5], ring]), np.full(41, 0.25)])
@@ -387,7 +389,7 @@ def test_order_of_convergence(adapter, order):
         error = old.transfer(f(old.centroids), new, order, adapter=adapter) - f(new.centroids)
         errors.append(new.volumes @ np.abs(error))
     rate = math.log(errors[0] / errors[1]) / math.log(4)
-    # Limited at walls, the second order loses a little.
+    # The limiter at walls costs some of the second order.
     assert rate > (0.9 if order == 1 else 1.7)
 
 
@@ -413,17 +415,17 @@ def test_results_in_single_precision(ctx, dim):
 
 @DIMS
 def test_device_without_double_precision(mesh, ctx, monkeypatch, dim):
-    from clvoro.remapping import remap
+    from clvoro.remapping import cell_data
 
     real = np.dtype(np.float32)
-    engine = remap.Engine
-    monkeypatch.setattr(remap, "Engine", lambda c, queue, d, _: engine(c, queue, d, real))
+    engine = cell_data.Engine
+    monkeypatch.setattr(cell_data, "Engine", lambda c, queue, d, _: engine(c, queue, d, real))
     old, new = mesh(dim, 200, 17), mesh(dim, 250, 18)
     q = np.random.default_rng(3).normal(size=200)
     got = old.transfer(q, new, 1, adapter=clvoro.Adapter(ctx))
     monkeypatch.undo()
     assert mass_defect(old, new, q, got) < 1e-13
-    # Single precision over a cell's width; small cells feel it most.
+    # Single precision over the width of a cell; small cells have the largest error.
     np.testing.assert_allclose(got, old.transfer(q, new), rtol=0, atol=3e-4)
 
 
@@ -441,7 +443,7 @@ def test_large_and_small_numbers(mesh, adapter):
 @settings(max_examples=25)
 @given(data=st.data(), dim=st.sampled_from([2, 3]), order=st.sampled_from([1, 2]))
 def test_any_mesh(adapter, data, dim, order):
-    """Generators on a coarse raster: cocircular, collinear, on walls, few."""
+    """Generators on a coarse grid are cocircular, collinear, on walls, and few."""
     box = Box((0,) * dim, (1,) * dim)
     place = st.tuples(*[st.integers(0, 8)] * dim)
     meshes = [
@@ -488,7 +490,7 @@ def test_other_bad_input(mesh, adapter):
 
 
 @DIMS
-def test_cells_of_generators_that_coincide_are_refused(mesh, adapter, dim):
+def test_coincident_generators_are_rejected(mesh, adapter, dim):
     old, new = mesh(dim, 60, 1), mesh(dim, 50, 2)
     points = new.points.copy()
     beside = new.neighbors[slice(*new.neighbor_starts[7:9])]
@@ -501,7 +503,7 @@ def test_cells_of_generators_that_coincide_are_refused(mesh, adapter, dim):
         )
 
 
-def test_what_is_no_voronoi_diagram_is_refused(mesh, adapter):
+def test_graphs_of_no_voronoi_diagram_are_rejected(mesh, adapter):
     old, new = mesh(2, 60, 1), mesh(2, 50, 2)
     names = ("volumes", "centroids", "neighbor_starts", "neighbors")
     arrays = {name: getattr(old, name) for name in names}

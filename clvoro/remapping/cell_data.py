@@ -1,4 +1,4 @@
-"""Cell data from one mesh to another, conservatively: what `Result.transfer` does."""
+"""Conservative transfer of cell data from one mesh to another: the entry that `Result.transfer` calls."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ..mesh.results import Result
 from ..opencl.devices import create_context
 from ..opencl.engine import Engine
 from ..tessellation.bins import Bins
-from .overlap import transfer_on_host
-from .transfer import Content, Graph, Transfer, transfer_needed
+from .device_transfer import CellData, CellGraph, ConservativeTransfer, transfer_bytes
+from .host_transfer import transfer_on_host
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
 
-DEFECT = 1e-3
-"""Share of a cell by which its parts may differ from it, beside single precision: else a part is missing."""
+COVER_TOLERANCE = 1e-3
+"""Largest accepted difference between a cell's volume and that of its intersections, as a share of the cell."""
 
 
 def transfer_values(
@@ -37,7 +37,7 @@ def transfer_values(
     limited: bool = True,
     adapter: Adapter | None = None,
 ) -> np.ndarray:
-    """Carry `values` of the cells of `old` over to those of `new`; see `Result.transfer`."""
+    """Transfer `values` of the cells of `old` to the cells of `new`; see `Result.transfer`."""
     source, target = _diagram("self", old), _diagram("onto", new)
     if source.domain != target.domain:
         raise InputError(
@@ -47,8 +47,8 @@ def transfer_values(
     on_host = isinstance(source.domain, Polygon) or any(source.domain.periodic)
     if on_host and source.domain.dim == 3:
         raise InputError(
-            f"the meshes are of {source.domain}, and values are not carried over in periodic boxes in 3D yet, expected "
-            "a domain with walls"
+            f"the meshes are of {source.domain}; expected a domain with walls, since transfer in 3D periodic boxes is "
+            "not supported"
         )
     if isinstance(order, bool) or order not in (1, 2):
         raise InputError(f"order is {order!r}, expected 1 or 2")
@@ -56,18 +56,20 @@ def transfer_values(
     columns = np.ascontiguousarray(given.reshape(len(source), -1), np.float64)
     if columns.shape[1] == 0:
         return np.zeros((len(target), 0))
-    # Numbers around 1, by powers of two: nothing is rounded, and no product leaves the range.
+    # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
     scale = np.exp2(np.ceil(np.log2(np.maximum(np.abs(columns).max(axis=0), 1e-300))))
     task = source, target, columns / scale, order, bool(limited)
     if on_host:
-        means, low, high = _transferred_on_host(*task)
+        means, low, high = _transfer_on_host(*task)
     else:
         with adapter._alone() if adapter is not None else nullcontext():
             ctx = _default_context() if adapter is None else adapter.ctx
-            means, low, high = _transferred(ctx, *task)
+            means, low, high = _transfer_on_device(ctx, *task)
     bounded = order == 1 or bool(limited)
-    kept = _keep_mass(columns / scale, source.volumes, means, target.volumes, low, high, bounded)
-    return (kept * scale).reshape(len(target), *given.shape[1:])
+    conserved = _conserve_mass(
+        columns / scale, source.volumes, means, target.volumes, low, high, bounded
+    )
+    return (conserved * scale).reshape(len(target), *given.shape[1:])
 
 
 def _diagram(name: str, mesh: object) -> Diagram:
@@ -87,12 +89,12 @@ def _checked(values: ArrayLike, n: int) -> np.ndarray:
         array = np.asarray(values)
     except ValueError as error:
         raise InputError(
-            f"values is no array ({error}), expected shape ({n},) or ({n}, k)"
+            f"values cannot be converted to an array ({error}), expected shape ({n},) or ({n}, k)"
         ) from error
     if array.dtype.kind not in "fiub":
         raise InputTypeError(
-            f"values has dtype {array.dtype}, expected real numbers; of complex ones pass real and imaginary part as "
-            "two columns"
+            f"values has dtype {array.dtype}, expected real numbers; pass the real and the imaginary part of complex "
+            "numbers as two columns"
         )
     if array.ndim not in (1, 2) or array.shape[0] != n:
         transposed = array.ndim == 2 and array.shape[1] == n
@@ -101,15 +103,15 @@ def _checked(values: ArrayLike, n: int) -> np.ndarray:
             + (
                 "pass values.T"
                 if transposed
-                else "pass the values of the mesh whose transfer() this is"
+                else "call transfer() of the mesh that the values belong to"
             )
         )
     array = array.astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(array.reshape(n, -1)).all(axis=1))
     if bad.size:
         raise InputError(
-            f"values[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} rows are not); fill "
-            "them first: a mean with one is none"
+            f"values[{bad[0]}] is {array[bad[0]]}, expected finite numbers ({bad.size} of {n} rows are not): "
+            "replace them first"
         )
     return array
 
@@ -120,7 +122,7 @@ def _default_context() -> cl.Context:
     return create_context()
 
 
-def _transferred(
+def _transfer_on_device(
     ctx: cl.Context,
     source: Diagram,
     target: Diagram,
@@ -128,61 +130,61 @@ def _transferred(
     order: int,
     limited: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return means over the new cells and their bounds, (n, width) float64 each."""
+    """Return means over the new cells and bounds of the old data in them, (n, width) float64 each."""
     queue = cl.CommandQueue(ctx)
-    # Whatever the meshes were made in: parts of cells are differences.
+    # Double precision where the device has it, whatever the precision of the meshes: intersections lose digits.
     real = np.dtype(np.float64 if queue.device.double_fp_config else np.float32)
     engine, box = Engine(ctx, queue, source.domain.dim, real), source.domain
     before, after = ((len(mesh), len(mesh.neighbors)) for mesh in (source, target))
-    needed = transfer_needed(engine, before, after, columns.shape[1], order)
+    needed = transfer_bytes(engine, before, after, columns.shape[1], order)
     device = queue.device
     if needed > available_memory(device):
         raise MemoryLimitError(
-            f"carrying {columns.shape[1]} columns from {len(source)} cells to {len(target)} needs "
-            f"{in_bytes(needed)} on the device; {device.name.strip()} has {in_bytes(available_memory(device))}. Carry "
+            f"the transfer of {columns.shape[1]} columns from {len(source)} cells to {len(target)} needs "
+            f"{in_bytes(needed)} on the device, {device.name.strip()} has {in_bytes(available_memory(device))}: pass "
             "fewer columns at a time, or use another device"
         )
-    bins, stage = Bins(engine), Transfer(engine)
+    bins, stage = Bins(engine), ConservativeTransfer(engine)
     old, new = _upload(engine, source), _upload(engine, target)
     sequence = bins.build(box, new.points, new.n).items[: new.n].copy()
     binned = bins.build(box, old.points, old.n)
     values = engine.upload(columns)
     centroids = engine.upload((source.centroids - source.points) / box.frame[1])
     if order == 2:
-        content = stage.fit_slopes(box, old, values, centroids, limited)
+        data = stage.fit_slopes(box, old, values, centroids, limited)
     else:
-        content = Content(values, values, values, centroids)
-    got = stage.transfer(box, old, binned, content, new, sequence)
-    _demand_whole(got.found, got.volumes, box.dim)
+        data = CellData(values, values, values, centroids)
+    got = stage.transfer(box, old, binned, data, new, sequence)
+    _require_cover(got.covered, got.volumes, box.dim)
     return got.means.astype(float), got.low.astype(float), got.high.astype(float)
 
 
-def _transferred_on_host(
+def _transfer_on_host(
     source: Diagram, target: Diagram, columns: np.ndarray, order: int, limited: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `_transferred` does, in a polygonal domain."""
-    means, low, high, found = transfer_on_host(source, target, columns, order, limited)
+    """Do what `_transfer_on_device` does, for polygons and 2D periodic boxes."""
+    means, low, high, covered = transfer_on_host(source, target, columns, order, limited)
     unit = source.domain.frame[1] ** 2
-    _demand_whole(found / unit, target.volumes / unit, 2)
+    _require_cover(covered / unit, target.volumes / unit, 2)
     return means, low, high
 
 
-def _demand_whole(found: np.ndarray, volumes: np.ndarray, dim: int) -> None:
-    """Raise ClvoroError unless the parts of each cell, `found` together, are all of it; in the device's unit."""
+def _require_cover(covered: np.ndarray, volumes: np.ndarray, dim: int) -> None:
+    """Raise ClvoroError unless the intersections of each cell fill it. Volumes are normalized."""
     slack = 64 * np.finfo(np.float32).eps * volumes ** (1 - 1 / dim)
-    defect = np.abs(found - volumes) - DEFECT * volumes - slack
+    defect = np.abs(covered - volumes) - COVER_TOLERANCE * volumes - slack
     worst = int(defect.argmax())
     if not defect[worst] <= 0:
         raise ClvoroError(
-            f"the parts of new cell {worst} have {found[worst] / volumes[worst]:.6g} of its volume, expected "
-            "1: one of the meshes is not the Voronoi diagram of its points; ask their diagram.check()"
+            f"the intersections of new cell {worst} with old cells fill {covered[worst] / volumes[worst]:.6g} of it, "
+            "expected 1: one of the meshes is not the Voronoi diagram of its points; call diagram.check() on both"
         )
 
 
-def _upload(engine: Engine, diagram: Diagram) -> Graph:
-    """Return a diagram on the device."""
+def _upload(engine: Engine, diagram: Diagram) -> CellGraph:
+    """Copy the graph of a diagram to the device."""
     origin, scale = diagram.domain.frame
-    return Graph(
+    return CellGraph(
         len(diagram),
         engine.upload((diagram.points - origin) / scale),
         engine.upload(diagram.neighbor_starts, np.int32),
@@ -190,7 +192,7 @@ def _upload(engine: Engine, diagram: Diagram) -> Graph:
     )
 
 
-def _keep_mass(
+def _conserve_mass(
     columns: np.ndarray,
     old_volumes: np.ndarray,
     means: np.ndarray,
@@ -199,15 +201,15 @@ def _keep_mass(
     high: np.ndarray,
     bounded: bool,
 ) -> np.ndarray:
-    """Return `means` (n, width) with the mass of `columns` under the volumes that the diagrams report.
+    """Correct `means` (n, width) so that their mass is that of `columns`, with the volumes of the diagrams.
 
-    The parts of a cell sum to its volume up to rounding, those of an old cell too, so that the mass is off by rounding.
-    What is missing goes to all cells in proportion to V times the room that they have up to the bound of what they are
-    made of; what is too much, down to it. No bound is broken by that, and where all is constant, nothing changes.
+    The intersections of a cell sum to its volume to round-off, so the mass is wrong by round-off. Each cell takes a
+    share of the missing mass in proportion to V times the distance of its mean from the upper bound of its data; a
+    surplus likewise with the lower bound. No mean leaves its bounds, and constant data stays constant.
     """
-    # Within the bounds already, but for rounding.
+    # The means exceed the bounds by round-off at most.
     q = np.clip(means, low, high) if bounded else means.copy()
-    # Twice, as the first time rounds, too.
+    # Twice: the second pass corrects the round-off of the first.
     for _ in range(2):
         for c in range(q.shape[1]):
             missing = _sum(old_volumes, columns[:, c]) - _sum(volumes, q[:, c])
@@ -222,5 +224,5 @@ def _keep_mass(
 
 
 def _sum(volumes: np.ndarray, values: np.ndarray) -> float:
-    """Return the sum of products, in extended precision where the machine has it."""
+    """Sum the products, in extended precision where the platform has it."""
     return np.sum(np.multiply(volumes, values, dtype=np.longdouble))
