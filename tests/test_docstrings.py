@@ -1,4 +1,4 @@
-"""What users of the public names are told: every one has a docstring, and its examples are right."""
+"""Public names have docstrings, and the examples in them are right."""
 
 import doctest
 import inspect

@@ -246,7 +246,7 @@ def test_nothing_is_defined_in_vain():
     assert len(defined) > 300, "the patterns find nothing any more"
     vain = {name for name in defined if counts[name] <= defined[name] + asked[name]}
     # But for those that are put together, as by CLVORO_JOIN(NAME_, REAL), and of three kinds
-    # the one that is told by being none of the others.
+    # the one that is neither of the others.
     together = re.compile("(?<=_)(double|float|int)$")
     vain -= {name for name in vain if together.search(name) and counts[together.sub("", name)]}
     assert vain == {"SIZE_ROUND"}

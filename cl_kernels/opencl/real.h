@@ -5,7 +5,7 @@
 #ifndef REAL
 #error "build with -DREAL=double or -DREAL=float"
 #endif
-/* Geometry relies on each operation being rounded as written; contraction is asked for by fma() only. */
+/* Geometry relies on each operation being rounded as written; only fma() contracts. */
 #pragma OPENCL FP_CONTRACT OFF
 
 /* Intel's CPU compiler runs several work-items as the lanes of one vector, and then gets private arrays in loops that

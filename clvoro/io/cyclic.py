@@ -74,7 +74,7 @@ class CyclicPair:
     def align(
         self, points: np.ndarray, starts: np.ndarray, corners: np.ndarray, first: int
     ) -> np.ndarray:
-        """Return the corners of all faces, where each lower face begins with the image of the upper one's first corner.
+        """Return the corners of all faces; a lower face begins with the image of the upper face's first corner.
 
         Parameters
         ----------

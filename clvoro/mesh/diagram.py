@@ -130,7 +130,7 @@ class Diagram:
 
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in Diagram._NAMES:
-            # A copy under construction has no arrays yet, and is asked for private names.
+            # A copy under construction has no arrays yet; `copy` looks for private names.
             there = "" if name.startswith("_") else f"; it has {', '.join(self._there())}"
             raise AttributeError(f"a Diagram has no {name!r}{there}", name=name, obj=self)
         if name == "shifts" and name not in self._arrays:

@@ -18,7 +18,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 _QUICK = "_fast" in inspect.signature(cla.Array.__init__).parameters
-"""Whether PyOpenCL's constructor can be told that its arguments are sound; not a part of its public interface."""
+"""Whether PyOpenCL's constructor has a flag that skips the checks of its arguments; it is not public."""
 _PATTERN = 64
 """Bytes that a device is given at most to fill memory with: the more at once, the faster."""
 _ZEROS = np.zeros(_PATTERN, np.uint8)
@@ -34,7 +34,7 @@ class DeviceArray(cla.Array):
     def mark(self) -> int:
         """A number that no other array has, or ever had, but views that begin where this one does.
 
-        By it a kernel's arguments are told from its last ones, whose memory may long be another's.
+        It distinguishes the arguments of a kernel from its last ones, whose memory another array may own by now.
         """
         return next(_marks)
 

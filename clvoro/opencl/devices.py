@@ -54,7 +54,7 @@ class DeviceInfo:
     reason : str
         Why it does not work; empty if it does.
     default : bool
-        Whether `create_context` picks it when nothing is asked for.
+        Whether `create_context()` picks it.
     """
 
     index: str
@@ -98,7 +98,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     """Return a context on the best working device.
 
     The order is: `device`, the environment variable `PYOPENCL_CTX`, a GPU, PoCL, any other CPU.
-    The simulator Oclgrind is taken only if asked for by name or index.
+    The simulator Oclgrind is taken only by its name or index.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     Raises
     ------
     DeviceError
-        If nothing that was asked for works; the message says what was found and what to install.
+        If no device that fits works; the message says what was found and what to install.
     InputTypeError
         If `device` is of another type.
     """
@@ -220,7 +220,7 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
     if any(d.kind in ("cpu", "-") and not d.works for d in devices):
         lines.append(f"{_runtimes.cache_remedy()}.")
     if any(d.default for d in devices):
-        lines.append("* is used when nothing is asked for.")
+        lines.append("* is the default.")
     elif os.environ.get("PYOPENCL_CTX"):
         lines.append(f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} chooses no working device.")
     else:
@@ -241,7 +241,7 @@ def require_fp64(where: cl.Context | cl.Device, dtype: DTypeLike = np.float64) -
     device = getattr(where, "devices", [where])[0]  # a context, or the device itself
     if not has_fp64(device):
         raise DeviceError(
-            f"dtype='float64' was asked for, but the device {device.name.strip()} has no double "
+            f"dtype is 'float64', but the device {device.name.strip()} has no double "
             "precision; use dtype='float32', or another device (`clvoro devices` lists them)"
         )
 

@@ -175,7 +175,7 @@ class Room:
         array = self._arrays.get(name)
         if array is None or len(array) < size:
             room = max(size + int(self._spare * size), 1)
-            # The old one is let go of first.
+            # Free the old one first.
             array = None
             self._arrays.pop(name, None)
             self._parts.pop(name, None)

@@ -47,7 +47,7 @@ def make_diagram(points):
             "neighbors": np.concatenate([cell.neighbors for cell in cells]).astype(np.int32),
             "face_measures": np.linalg.norm(nexts - corners, axis=1),
             "face_centroids": (nexts + corners) / 2,
-            "vertices": lambda: corners[first],  # fetched when asked for, as from a device
+            "vertices": lambda: corners[first],  # read when first used, as from a device
             "cell_vertex_starts": starts,
             "cell_vertices": ids.ravel().astype(np.int32),
         },

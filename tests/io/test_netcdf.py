@@ -234,7 +234,7 @@ def test_as_xarray_reads_it(room, tmp_path):
                     assert np.array_equal(found[name].values, values)
 
 
-@pytest.mark.filterwarnings("ignore:Projected")  # of areas on a sphere, which are not asked for
+@pytest.mark.filterwarnings("ignore:Projected")  # of areas on a sphere, which the test does not use
 def test_as_uxarray_reads_it(result, tmp_path):
     uxarray = pytest.importorskip("uxarray")
     result.save(tmp_path / "mesh.nc")

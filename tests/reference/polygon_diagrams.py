@@ -203,7 +203,7 @@ def _adopt(pieces, faces, close, small) -> None:
 
 
 def faults(diagram, real: str = "float64") -> list[str]:
-    """What is wrong with a diagram of a polygonal domain, as far as it can be told without a reference."""
+    """Return the faults of a diagram of a polygonal domain that can be found without a reference."""
     d, domain = diagram, diagram.domain
     eps = float(np.finfo(real).eps)
     size, n = float(domain.extent.max()), len(d.points)

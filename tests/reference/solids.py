@@ -76,7 +76,7 @@ def solid_diagram(lower, upper, points, shortest=1e-9):
             "neighbors": np.array([j for j, _ in faces], np.int32),
             "face_measures": measures,
             "face_centroids": middles,
-            "vertices": lambda: vertices[used],  # fetched when asked for, as from a device
+            "vertices": lambda: vertices[used],  # read when first used, as from a device
             "face_vertex_starts": np.cumsum([0] + [len(loop) for _, loop in faces]).astype(
                 np.int32
             ),

@@ -27,7 +27,7 @@ extern const kernel_t kernels[];
 
 static __thread size_t item_local, item_group;
 static size_t group_size, groups;
-static pthread_barrier_t meeting;
+static pthread_barrier_t group_barrier;
 
 size_t get_local_id(unsigned axis)
 {
@@ -63,7 +63,7 @@ void barrier(unsigned flags)
 {
     (void)flags;
     if (group_size > 1)
-        pthread_barrier_wait(&meeting);
+        pthread_barrier_wait(&group_barrier);
 }
 
 typedef struct {
@@ -86,7 +86,7 @@ static void run_group(size_t group, void (*launch)(uint64_t *), uint64_t *args, 
     item_t *items = malloc(group_size * sizeof *items);
     pthread_t *threads = malloc(group_size * sizeof *threads);
     if (at_once)
-        pthread_barrier_init(&meeting, NULL, group_size);
+        pthread_barrier_init(&group_barrier, NULL, group_size);
     for (size_t k = 0; k < group_size; ++k) {
         const size_t i = FORWARDS ? k : group_size - 1 - k;
         items[i] = (item_t){i, group, launch, args};
@@ -98,7 +98,7 @@ static void run_group(size_t group, void (*launch)(uint64_t *), uint64_t *args, 
     for (size_t i = 0; at_once && i < group_size; ++i)
         pthread_join(threads[i], NULL);
     if (at_once)
-        pthread_barrier_destroy(&meeting);
+        pthread_barrier_destroy(&group_barrier);
     free(threads);
     free(items);
 }

@@ -88,8 +88,8 @@ def test_processes_find_the_same_bits(ctx, alone):
     program += "from tests.robustness import test_concurrency as t\n"
     program += "a = clvoro.Adapter()\nprint(a.queue.device.max_compute_units)\n"
     program += "for k in (0, 3, 1): print(t.run(a, t.WORK[k]))"
-    # Another seed of Python's hashes: no order of a set may matter. Nor may how many cores there are, of which PoCL
-    # takes as many as it is told.
+    # Another seed of Python's hashes: no order of a set may matter. Nor may the number of cores,
+    # which a variable sets for PoCL.
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=Path(__file__).parents[2], text=True, check=True,
         capture_output=True, env={**os.environ, "PYTHONHASHSEED": "12345", "POCL_MAX_PTHREAD_COUNT": "1"},
@@ -130,7 +130,7 @@ def run_large(name):
 def test_one_core_finds_the_bits_of_two(ctx, name):
     """With `python -m pytest -m slow -k cores tests/robustness/test_concurrency.py`, some seconds each."""
     if ctx.devices[0].platform.name != "Portable Computing Language":
-        pytest.skip("no other is told how many cores to take")
+        pytest.skip("only PoCL has a variable for the number of cores")
     program = "import sys; sys.path.insert(0, '.'); from tests import conftest\n"
     program += "from tests.robustness import test_concurrency as t\n"
     program += "print(*t.run_large(sys.argv[1]))"

@@ -168,7 +168,7 @@ def simulate(name, *options):
 
 @pytest.fixture(scope="module")
 def simulator(request):
-    """The simulator, at work on all that is asked for: the traps first, then the rest in the order of the tests."""
+    """The simulator with all selected work: the traps first, then the rest in the order of the tests."""
     plugins = request.config.pluginmanager
     reporter, capture = map(plugins.getplugin, ("terminalreporter", "capturemanager"))
 

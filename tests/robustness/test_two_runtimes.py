@@ -32,8 +32,8 @@ def agreement(monkeypatch):
     if not BENCH.is_dir():
         pytest.skip("the tests lie outside a source tree")
     monkeypatch.syspath_prepend(str(BENCH))
-    yield importlib.import_module("agreement")
-    for name in ("agreement", "_common"):
+    yield importlib.import_module("two_devices")
+    for name in ("two_devices", "_common"):
         sys.modules.pop(name, None)
 
 

@@ -133,8 +133,8 @@ def test_gaps_of_random_polygons(seed: int) -> None:
     x = inner(domain, 300)
     size = sizing.FeatureSize(domain, 4, slope=0.3, h_min=0.02, h_max=0.5, curvature=0)
     h = size(x)
-    # The sample is 1/120 of an edge apart, so are the ends of its chords off; those that just face each other,
-    # or just do not, may be told apart otherwise: ten degrees either way.
+    # The sample is 1/120 of an edge apart, so are the ends of its chords off; edges that just face each other,
+    # or just do not, may be classified otherwise: ten degrees either way.
     step = (
         np.hypot(
             *(domain.oriented.vertices[domain.oriented.next_vertex] - domain.oriented.vertices).T

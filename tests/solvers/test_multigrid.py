@@ -460,7 +460,7 @@ def test_few_cells(make, n):
 
 @pytest.mark.parametrize("fault", ["indefinite", "negative", "not finite", "useless"])
 def test_jacobi_continues_after_a_failure(make, monkeypatch, fault):
-    """A preconditioner that is none costs its iterations, and no exception."""
+    """A failed preconditioner costs its iterations, and raises no exception."""
     apply, calls = Multigrid.apply, [0]
 
     def faulty(self, r, u, spare):

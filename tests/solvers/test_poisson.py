@@ -121,7 +121,7 @@ def test_large_tolerances_use_single_precision(make, preconditioner, start):
     off = abs(A - full) - 2.0**-24 * abs(full)
     off.setdiag(0)
     assert off.max() <= 0
-    # A smooth right side: potentials are large, and rounding them to float32 would cost the digits asked for.
+    # A smooth right side: potentials are large, and rounding them to float32 would cost digits within the tolerance.
     b = np.cos(np.pi * graph[0][:, 0]) + 0.1 * np.random.default_rng(917).standard_normal(n)
     b -= b.mean()
     phi = engine.upload(0.999 * direct(full, b)) if start == "near" else engine.zeros(n)

@@ -14,7 +14,7 @@ from tests.reference import patch
 def test_who_is_left_by_a_cell_that_is_clipped_again_is_doubted(ctx, again):
     """A row that names too many: the one who is no neighbor may have been found to fit, by the row as it was.
 
-    The row from before is told of who leaves it elsewhere, when all cells of a round have been clipped.
+    When all cells of a round have been clipped, the old row learns which generators leave it elsewhere.
     """
     engine, n, i = patch.make_engine(ctx), 40, 17
     points = patch.relaxed_points(n, 2501)

@@ -102,16 +102,16 @@ def borders_on_lost_faces(d: Diagram, g: Rebuilt, cells: np.ndarray) -> np.ndarr
 
 
 def _check_factor(check: Check, result: Result) -> None:
-    """Check the factor on the sizes: there is one only where a count of cells was asked for."""
-    factor, asked = result.size_factor, result.settings.get("n_cells")
-    known = "n_cells" in result.settings and asked is None
+    """Check the factor of the sizes, which is 1 without `n_cells`."""
+    factor, n_cells = result.size_factor, result.settings.get("n_cells")
+    known = "n_cells" in result.settings and n_cells is None
     number = isinstance(factor, int | float) and np.isfinite(factor) and factor > 0
     check.note(
         "size factor", [not number or (known and factor != 1)],
-        lambda _: f"size_factor is {factor!r:.40}, expected " + ("1: no count was asked for" if known else "> 0"),
+        lambda _: f"size_factor is {factor!r:.40}, expected " + ("1, as there is no n_cells" if known else "> 0"),
     )  # fmt: skip
-    told = result.settings.get("size_factor", factor)
+    recorded = result.settings.get("size_factor", factor)
     check.note(
-        "size factor", [told != factor],
-        lambda _: f"size_factor is {factor!r:.40}, {told!r:.40} in the settings",
+        "size factor", [recorded != factor],
+        lambda _: f"size_factor is {factor!r:.40}, {recorded!r:.40} in the settings",
     )  # fmt: skip

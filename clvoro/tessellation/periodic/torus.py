@@ -93,7 +93,7 @@ class Torus:
         Raises
         ------
         InputError
-            If generators are too close to each other to be told apart.
+            If generators coincide up to round-off.
         FewCellsError
         """
         stages, margins, dim = self.stages, self.margins, self.domain.dim

@@ -30,7 +30,7 @@ def fetch_diagram(
     copy: bool = True,
     unfolded: Unfolded | None = None,
 ) -> Diagram:
-    """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are fetched when asked for.
+    """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
     Without `copy`, nobody may use the buffers of `t` any more. `unfolded` is what `t` was folded from, in a periodic
     box.

@@ -80,7 +80,7 @@ def test_what_is_split_off_is_apart(ctx, name):
 
 
 def reorganized(engine, domain, t, total):
-    """What the population becomes when the count is to change by `total`, by cells that are as small as asked for."""
+    """Return the population after the count has changed by `total`, where cells have their target size."""
     one = engine.upload(np.ones(t.n))
     rows = Population(
         t.points, engine.upload(np.arange(t.n), np.int32), engine.zeros((t.n, 2)),

@@ -597,7 +597,7 @@ def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("periodic", [(True, True), (True, False)])
 @pytest.mark.parametrize("order", [1, 2])
 def test_values_are_carried_over_the_seams(adapter, periodic, order):
-    """Conservatively and within bounds; a smooth periodic function to the order asked for."""
+    """Conservatively and within bounds; a smooth periodic function to the given order."""
     box = clvoro.Box((0.5, -1.0), (2.5, 0.0), periodic=periodic)
     # Between float32 meshes volumes are rounded, and their sums with them.
     tight = 1e-12 if adapter.dtype == np.float64 else 1e-5
