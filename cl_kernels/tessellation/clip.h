@@ -1,16 +1,17 @@
-/* The clip of a polyhedron by the half-space nearer to its generator than to a neighbor. A clip takes out the
-   triangles of the vertices beyond the bisector, which form a disc, and joins the rim of the disc to the new face. Only
-   that structure, never a coordinate, says what is adjacent: Euler's formula holds whatever is rounded. */
+/* Clipping a polyhedron by the bisector with a neighbor. In the dual triangulation the vertices beyond the bisector are
+   triangles that form a disc. Clipping removes the disc and joins its rim to the new face. Adjacency follows from this
+   structure alone, never from coordinates: Euler's formula holds whatever the round-off. */
 #include "tessellation/clip_tolerance.h"
 #include "tessellation/polyhedron.h"
 
 #define CLIP_MISSED 0    /* the bisector does not cut the cell */
-#define CLIP_CUT 1       /* it does */
-#define CLIP_FULL 2      /* it does, and there are too many faces */
-#define CLIP_COLLAPSED 3 /* rounding leaves nothing, or much on the wrong side */
-#define CLIP_COINCIDE 4  /* another generator is at the place of the cell's own */
+#define CLIP_CUT 1       /* it cuts */
+#define CLIP_FULL 2      /* it cuts, and there are too many faces */
+#define CLIP_COLLAPSED 3 /* round-off leaves nothing, or much on the wrong side */
+#define CLIP_COINCIDE 4  /* another generator coincides with that of the cell */
 
-/* Largest square of the distance of generators that are near each other, as a share of that to the cell's own. */
+/* Generators are near each other if the square of their distance is at most this share of that to the generator of the
+   cell. */
 #define NEAR_EACH_OTHER R(1e-3)
 
 inline REAL4 cross_product(REAL4 a, REAL4 b)
@@ -19,8 +20,8 @@ inline REAL4 cross_product(REAL4 a, REAL4 b)
                    difference_of_products(a.s0, b.s1, a.s1, b.s0), 0);
 }
 
-/* The bisector with generator q instead of which that between p and q may be taken: where these two are near each other
-   beside their distance from the cell's own, the planes of both are nearly parallel, and their difference is not. */
+/* The plane for generator q, or instead the bisector of p and q: if these are near each other and far from the cell,
+   their planes are nearly parallel, but the difference of the planes is accurate. */
 inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const REAL *points)
 {
     if (label_p < 0 || label_q < 0)
@@ -34,7 +35,7 @@ inline REAL4 better_row(REAL4 q, REAL4 p, int label_q, int label_p, global const
     return (REAL4)(w.s0, w.s1, w.s2, w.s0 * p.s0 + w.s1 * p.s1 + w.s2 * p.s2 + w2 / 2);
 }
 
-/* The point in which three planes meet, from the planes alone. */
+/* The intersection of three planes. */
 inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const REAL *points)
 {
     const REAL4 p = cell->planes[a];
@@ -48,15 +49,15 @@ inline REAL4 meeting_point(const cell_t *cell, int a, int b, int c, global const
     return (qr * p.s3 + rp * q.s3 + pq * r.s3) * inverse;
 }
 
-/* Make what lies beyond one disc: grown from the farthest vertex by a triangle at a time, the farthest first, and where
-   that does not reach all that lies farther beyond than `doubt`, through the nearest that do not. The distances of
-   vertices that do not belong where round-off has put them are changed. False if something stays out of reach, such as
-   the wrong end of a slit, which is not cut off. */
+/* Make the vertices beyond the bisector one disc. It grows from the farthest vertex by one triangle at a time, the
+   farthest first. If it does not reach all vertices farther beyond than `doubt`, it grows through the nearest other
+   vertices. The distances of vertices that change sides are corrected. False if a vertex stays out of reach, such as
+   the wrong end of a slit, which is not removed. */
 inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
 {
     REAL *s = (REAL *)cell->beyond;
-    bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* of the disc: vertices, faces */
-    int added = 0, left = 0;                         /* left: vertices certainly beyond, and not in the disc yet */
+    bool inside[VERTEX_CAPACITY], on[FACE_CAPACITY]; /* whether a vertex, a face belongs to the disc */
+    int added = 0, left = 0;                         /* left: vertices surely beyond that are not in the disc */
     for (int v = 0; v < cell->n; ++v) {
         inside[v] = false;
         added = s[v] > s[added] ? v : added;
@@ -91,14 +92,14 @@ inline bool keep_disc(cell_t *cell, REAL depth, REAL doubt)
     return left == 0;
 }
 
-/* The edges over which a bisector leaves the cell. */
+/* The edges of the cell that a bisector cuts. */
 typedef struct {
     int gone;                                                  /* vertices beyond the bisector */
     int n;                                                     /* edges */
-    ulong dead[FACE_WORDS];                                    /* faces all of which is beyond */
-    INDEX vertices[VERTEX_CAPACITY + 1];                       /* those beyond, ascending */
+    ulong dead[FACE_WORDS];                                    /* faces entirely beyond */
+    INDEX vertices[VERTEX_CAPACITY + 1];                       /* vertices beyond, ascending */
     INDEX before[FACE_CAPACITY + 4], after[FACE_CAPACITY + 4]; /* faces of an edge, along the rim */
-    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];       /* its ends, kept and not */
+    INDEX in[FACE_CAPACITY + 4], out[FACE_CAPACITY + 4];       /* its ends, kept and removed */
 } rim_t;
 
 /* Find the rim; false if it is not one simple cycle. */
@@ -154,7 +155,7 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
         faces += (int)popcount(around[w]);
         dead += (int)popcount(rim->dead[w]);
     }
-    /* Simple cycles, and Euler's formula for a disc: enough up to six triangles. More may be a ring and a disc. */
+    /* Simple cycles and Euler's formula prove a disc of up to six triangles. More may be a ring and a disc. */
     if (faces != n || n != gone + 2 - 2 * dead)
         return false;
     if (gone > 6) {
@@ -172,7 +173,7 @@ inline bool find_rim(const cell_t *cell, REAL depth, rim_t *rim)
     return true;
 }
 
-/* Take out the faces that lie within the rim, and put one in their place; FACE_CAPACITY if there is no room. */
+/* Remove the faces inside the rim and add the new face; FACE_CAPACITY if there is no room. */
 inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
 {
     for (int w = 0; w < FACE_WORDS; ++w)
@@ -185,7 +186,7 @@ inline int replace_faces(cell_t *cell, const rim_t *rim, int label)
     return face;
 }
 
-/* New vertices, where the plane meets the edges of the rim, by interpolation. */
+/* New vertices: intersections of the plane with the edges of the rim, by interpolation. */
 inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, REAL *nz)
 {
     const REAL *x = X(cell), *y = Y(cell), *z = Z(cell), *s = (const REAL *)cell->beyond;
@@ -200,8 +201,8 @@ inline void cut_edges(const cell_t *cell, const rim_t *rim, REAL *nx, REAL *ny, 
     }
 }
 
-/* Join the rim to the new face by the new vertices. They take the places of those that are gone, then go behind the
-   last; places left over are filled from the end. */
+/* Join the rim to the new face by the new vertices. They replace the removed vertices, and then follow the last one;
+   remaining gaps are filled from the end. */
 inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, const REAL *ny, const REAL *nz)
 {
     REAL *x = X(cell), *y = Y(cell), *z = Z(cell);
@@ -228,13 +229,13 @@ inline void close_rim(cell_t *cell, const rim_t *rim, int face, const REAL *nx, 
     }
 }
 
-/* With -DCLIP_SHARPLY=1 less is cut off, too: where all neighbors that are seen are known to have a face. */
+/* -DCLIP_SHARPLY=1: smaller parts are cut, too, as all given neighbors are known to have a face. */
 #ifndef CLIP_SHARPLY
 #define CLIP_SHARPLY 0
 #endif
 
-/* Cut off what is nearer to the neighbor at x + d: the points y with y.d > d.d / 2; one of CLIP_*. With `seen_before`
-   the neighbor may be a face of the cell already. */
+/* Clip the cell by the bisector with the neighbor at x + d: remove the points y with y.d > d.d / 2; returns CLIP_*.
+   With `seen_before` the cell may already have a face with this neighbor. */
 inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_before, global const REAL *points)
 {
     const REAL level = d2 / 2;
@@ -248,7 +249,7 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
     const REAL4 far4 = far.lo > far.hi ? far.lo : far.hi;
     const REAL2 far2 = far4.lo > far4.hi ? far4.lo : far4.hi;
     const REAL farthest = far2.s0 > far2.s1 ? far2.s0 : far2.s1;
-    /* Most bisectors miss the cell: no square root for these. */
+    /* Most bisectors miss the cell: avoid the square root. */
     if (!(farthest > (CLIP_SHARPLY ? 0 : 4 * REAL_EPS * d2)))
         return CLIP_MISSED;
     const REAL distance = sqrt(d2), depth = CLIP_SHARPLY ? 0 : distance * noise_length(distance);
@@ -273,8 +274,8 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
         return CLIP_FULL;
     cell->planes[face] = (REAL4)(d.s0, d.s1, d.s2, level);
 
-    /* Interpolation rounds by eps of the edge's length; where that may be much beside the distance of the generators
-       (while the cell is not closed yet, or near-duplicates), planes are intersected instead. */
+    /* Interpolation has an error of eps times the length of the edge. If this is large compared with the distance of
+       the generators (an open cell, or near-duplicates), the planes are intersected instead. */
     REAL nx[VERTEX_CAPACITY], ny[VERTEX_CAPACITY], nz[VERTEX_CAPACITY];
     cut_edges(cell, &rim, nx, ny, nz);
     if (cell->reach2 > 16 * d2) {
@@ -283,7 +284,7 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
         for (int k = 0; k < rim.n; ++k) {
             const int in = rim.in[k], out = rim.out[k];
             const REAL4 v = meeting_point(cell, rim.before[k], rim.after[k], face, points);
-            /* But for planes that are nearly parallel to the edge: there only interpolation stays on it. */
+            /* But not if the plane is nearly parallel to the edge: only interpolation stays on the edge. */
             const REAL slack = 1 + reach / (s[out] - s[in]);
             const REAL off = fabs(v.s0 - nx[k]) + fabs(v.s1 - ny[k]) + fabs(v.s2 - nz[k]);
             const REAL edge = fabs(x[out] - x[in]) + fabs(y[out] - y[in]) + fabs(z[out] - z[in]);
@@ -299,7 +300,7 @@ inline int clip_polyhedron(cell_t *cell, REAL4 d, REAL d2, int label, bool seen_
     return CLIP_CUT;
 }
 
-/* Clip by the generators in row i of a graph; one of CLIP_*, or CLIP_COINCIDE. */
+/* Clip by the generators in row i of a graph; returns CLIP_*. */
 inline int clip_polyhedron_by_row(cell_t *cell, int i, REAL4 x, global const int *starts, global const int *neighbors,
                                   global const REAL *points)
 {

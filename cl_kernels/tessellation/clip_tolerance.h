@@ -1,8 +1,8 @@
 #include "opencl/real.h"
 
-/* How deep beyond the bisector with the neighbor at x + d, times |d|, a vertex must lie to be cut off: deeper than
-   what rounds in the vertex, and than what rounded in the positions of generators in the unit box, unless generators
-   are so near each other that they must differ by less. Cells of a lattice are thus not shredded. */
+/* Least distance of a removed vertex beyond the bisector with the neighbor at x + d, times |d|. It exceeds the
+   round-off of the vertex and that of positions in the unit box, unless the generators are nearer than that. So the
+   cells of a lattice are not cut into slivers. */
 #if IS_DOUBLE
 #define FINEST R(4e-11)
 #else

@@ -3,7 +3,7 @@
 #include "tessellation/periodic/halo.h"
 #include "tessellation/search.h"
 
-/* Share of a cell's volume that may differ about its faces without notice. */
+/* Share of the volume of a cell by which its faces may differ from those of neighbors. */
 #define EVEN_SHARE R(1e-3)
 
 inline REAL distance_between(global const REAL *points, int i, int j)
@@ -30,7 +30,7 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
 }
 
 #ifdef SEAMS
-/* Look at the balls around the vertices of the cell of generator i. */
+/* Test the balls around the vertices of the cell of generator i. */
 inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *seams)
 {
     const REAL x[3] = {place.s0, place.s1, place.s2};
@@ -45,19 +45,19 @@ inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *
 }
 #endif
 
-/* Per place p in bin order: the cell of generator i = items[p], its faces and its measures.
+/* Per item p in bin order: the cell of generator i = items[p], its faces and its measures.
 
    V_i = { y in the box : |y - x_i| <= |y - x_j| for all j } (the paper's 2.1), by clipping the box with one bisector
    after the other. A generator farther than twice the farthest vertex cannot cut, so the search widens until the
-   cube of bins that it has seen covers that ball. Its radius is left in reach[p], which begins as a guess of it. With
-   `warm` the neighbors of an earlier, similar diagram are clipped first, and the search only has to confirm them. Only
-   the first `rows` generators get cells; of those in a periodic box the balls around their vertices are looked at.
+   searched cube of bins covers that ball. reach[p] is the first guess of the radius, and then the radius. With `warm`
+   the cell is first clipped by the neighbors of an earlier, similar diagram, and the search only has to confirm them.
+   Only the first `rows` generators get cells; in a periodic box the balls around their vertices are tested.
 
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
    S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
 
-   row_places, row_counts (n,)   where in the arrays of faces the cell's are, and how many; cells come in no particular
-                                 order, the next kernels bring them into it
+   row_places, row_counts (n,)   first entry of the cell in the arrays of faces, and number of its faces; the cells are
+                                 in any order, later kernels sort them
    labels, measures, centroids   of the faces
    volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
 kernel void clip_polyhedra(const int size, const int rows, global const REAL *binned, global const int *items,
@@ -78,7 +78,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     cell_t cell;
     start_polyhedron(&cell, x, box_lower, box_upper);
     int flag = 0;
-    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* from 0, where bins are too small for it, it would never widen */
+    REAL w = fmax(reach[p], FLT_MIN), inner = -1; /* a radius of 0 would never widen */
     if (warm) {
         flag = flag_of(clip_polyhedron_by_row(&cell, i, x, old_starts, old_neighbors, points));
         w = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
@@ -86,7 +86,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     while (flag == 0) {
         flag = clip_polyhedron_by_bins(&cell, x, p, w, inner, warm, &in);
         const REAL need = 2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS);
-        if (!(need > w)) /* ends with a NaN, too */
+        if (!(need > w)) /* a NaN ends the loop, too */
             break;
         inner = w;
         w = need < 4 * w ? need : 2 * w;
@@ -149,7 +149,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         square += normal.s3 * face_square;
         mixed += normal.s3 * face_mixed;
         const int label = cell.labels[f];
-        /* Faces below rounding are none; smaller ones than a neighbor is sure to see, too, are doubtful. */
+        /* Faces below round-off are dropped. Faces so small that a neighbor might drop them are doubtful. */
         const REAL across2 = label >= 0 ? d2 : cell.reach2;
         const bool small = !(area > sqrt(REAL_EPS) * across2);
         if (small || !(area > slim * reach_length)) {
@@ -180,7 +180,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     row_counts[i] = count;
     if (doubtful || narrow)
         atomic_or(report, (doubtful ? FLAG_DOUBT : 0) | (narrow ? FLAG_NARROW : 0));
-    /* In a box as thin as rounding all faces are below it. */
+    /* In a box as thin as round-off all faces are below it. */
     if (count < 4 || !(volume > 0 && lost <= share * volume))
         atomic_or(report, FLAG_COLLAPSED);
     else if (lost > EVEN_SHARE * volume)

@@ -8,7 +8,7 @@
 #ifndef FACE_CAPACITY
 #error "build with -DFACE_CAPACITY=faces that a cell may have while it is clipped, a multiple of 64"
 #endif
-/* Loops that are short as a rule: vectors of them cost more than they save. */
+/* Usually short loops: vectorization would not pay. */
 #ifdef __clang__
 #define SHORT_LOOP _Pragma("clang loop vectorize(disable) interleave(disable) unroll(disable)")
 #else
@@ -16,7 +16,7 @@
 #endif
 
 #define REAL8 CLVORO_JOIN(REAL, 8)
-#define VERTEX_CAPACITY (2 * FACE_CAPACITY) /* 2 F - 4, in whole vectors */
+#define VERTEX_CAPACITY (2 * FACE_CAPACITY) /* 2 F - 4, rounded up to whole vectors */
 #if VERTEX_CAPACITY <= 256
 #define INDEX uchar
 #define INDEX4 uchar4
@@ -57,12 +57,12 @@ inline int next_face(const ulong *set, int f)
     return FACE_CAPACITY;
 }
 
-/* Arrays of vertices are filled up to whole vectors by zeros: the generator itself, which no bisector cuts off. */
+/* Arrays of vertices are padded to whole vectors by zeros: the generator itself, which no bisector cuts off. */
 typedef struct {
     int n;                   /* vertices */
-    bool torn;               /* has a clip left something that it should have cut off? See clip.h */
+    bool torn;               /* whether a clip kept something that it should have removed; see clip.h */
     REAL reach2;             /* largest squared distance of a vertex from the generator */
-    ulong alive[FACE_WORDS]; /* set of the faces that there are */
+    ulong alive[FACE_WORDS]; /* set of the existing faces */
     REAL8 x[VERTEX_CAPACITY / 8], y[VERTEX_CAPACITY / 8], z[VERTEX_CAPACITY / 8];
     REAL8 beyond[VERTEX_CAPACITY / 8];       /* signed distances from a bisector, times |d| */
     INDEX4 faces[VERTEX_CAPACITY];           /* of a vertex, counter-clockwise */
@@ -75,7 +75,7 @@ typedef struct {
 #define Y(cell) ((REAL *)(cell)->y)
 #define Z(cell) ((REAL *)(cell)->z)
 
-/* Note vertex v as the one between its faces. */
+/* Record vertex v between its faces. */
 inline void link_vertex(cell_t *cell, int v)
 {
     const INDEX4 f = cell->faces[v];
@@ -97,7 +97,7 @@ inline void find_reach(cell_t *cell)
     cell->reach2 = half2.s0 > half2.s1 ? half2.s0 : half2.s1;
 }
 
-/* The whole box around generator x. Face w is wall w. */
+/* Start with the whole box around generator x. Face w is wall w. */
 inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
 {
     cell->n = 8;
@@ -112,7 +112,7 @@ inline void start_polyhedron(cell_t *cell, REAL4 x, REAL4 lower, REAL4 upper)
         cell->x[b] = cell->y[b] = cell->z[b] = 0;
     for (int v = 0; v < 8; ++v) {
         const int fx = v & 1, fy = 2 + ((v >> 1) & 1), fz = 4 + (v >> 2);
-        /* Counter-clockwise where an even number of walls are lower ones. */
+        /* Counter-clockwise for an even number of lower walls. */
         const bool turned = ((v & 1) + ((v >> 1) & 1) + (v >> 2)) % 2 == 0;
         cell->faces[v] = turned ? (INDEX4)(fx, fz, fy, 0) : (INDEX4)(fx, fy, fz, 0);
         link_vertex(cell, v);

@@ -1,4 +1,4 @@
-"""The tessellation in 3D: cells cut by neighbors and walls, faces, moments (`polyhedra.cl`; `walks.cl` on CPUs)."""
+"""Cells in 3D: each clipped by its neighbors and walls; faces and moments (`polyhedra.cl`; `walks.cl` on CPUs)."""
 
 from __future__ import annotations
 
@@ -34,32 +34,33 @@ from .periodic.halo import seam_defines
 HARMLESS = DOUBT | NARROW | UNEVEN
 """Flags of a diagram that is not rejected."""
 FACE_CAPACITY = 64
-"""Faces that a cell may have while it is clipped; doubled for those cells that have more."""
+"""Most faces of a cell while it is clipped. It is doubled for cells with more."""
 MOST_FACES = 512
+"""Largest capacity."""
 FACES_PER_CELL = 16.5
-"""Room for faces at first: random cells have 15.54 of them on average; walls add some."""
+"""First guess of the half-faces per cell. Random cells have 15.54 on average; walls add some."""
 STRETCH = 128
-"""Generators whose cells a CPU's work-item makes, eight at a time (`walks.cl`)."""
+"""Number of generators whose cells one work-item of a CPU builds, eight at a time (`walks.cl`)."""
 CUBE = 8
-"""Bins each way of the cubes through which it goes from one to the next."""
+"""Number of bins along each axis of the cubes that order these generators."""
 FIRST_REACH = 2.0
-"""How far it looks for neighbors at first, in units of the spacing that the bins know."""
+"""First search radius of `walks.cl`, in units of the local spacing of the bins."""
 
 
 @dataclass(frozen=True)
 class _CutCells:
-    """Cells as they are cut, each by itself, on the device; see `clip_polyhedra` in `polyhedra.cl`.
+    """Cells clipped independently of each other, on the device; see `clip_polyhedra` in `polyhedra.cl`.
 
     Attributes
     ----------
     places, counts : (n,) int32
-        Where the faces of each begin in the arrays of faces, and how many they are.
+        First entry of each cell in the arrays of faces, and number of its faces.
     labels, measures, centroids
-        Of `m` faces.
+        Arrays of `m` half-faces.
     cells : dict
         Volumes, offsets and covariances.
     doubtful : bool
-        Rounding might let a neighbor see a face otherwise.
+        With round-off two cells might disagree about a face.
     """
 
     places: cla.Array
@@ -75,7 +76,8 @@ class _CutCells:
 class Polyhedra:
     """Tessellate a box in 3D.
 
-    Buffers are reused: of a `Tessellation` the next call leaves nothing, but its graph as long as the new one is made.
+    Buffers are reused: each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new
+    one is complete.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -102,7 +104,7 @@ class Polyhedra:
         return self._programs[capacity]
 
     def _reserve_cells(self, n: int) -> None:
-        """Make room for `n` cells."""
+        """Allocate the arrays per cell for `n` cells."""
         if n <= self._capacity:
             return
         engine = self.engine
@@ -116,22 +118,22 @@ class Polyhedra:
         self._capacity = n
 
     def _take_faces(self, m: int) -> tuple[cla.Array, cla.Array, cla.Array]:
-        """Return labels, measures and centroids of `m` faces of a diagram at work, in no order yet."""
+        """Return arrays for labels, measures and centroids of `m` half-faces, in any order."""
         if m >= 2**31 // 3:
             raise MemoryLimitError(
-                f"the cells have {m:.3g} faces, expected fewer than {2**31 // 3:.3g}, which 32-bit "
-                "indices can tell apart; use fewer cells, or perturb generators that lie on a "
+                f"the cells have {m:.3g} faces, expected fewer than {2**31 // 3:.3g}, the limit "
+                "of 32-bit indices; use fewer cells, or perturb generators that lie on a "
                 "common sphere"
             )
         engine, self._room = self.engine, m
         return engine.scratch(m, np.int32), engine.scratch(m), engine.scratch((m, 3))
 
     def _faces(self, m: int) -> dict[str, cla.Array]:
-        """Return room for the `m` faces of a diagram."""
+        """Return arrays for the `m` half-faces of a diagram."""
         engine, faces = self.engine, self._of_faces
         if not faces or len(faces["neighbors"]) < m:
             faces.clear()
-            m += m // 32  # their number changes a little from step to step
+            m += m // 32  # their number changes a little between steps
             faces["neighbors"] = engine.empty(m, np.int32)
             faces["face_measures"] = engine.empty(m)
             faces["face_centroids"] = engine.empty((m, 3))
@@ -140,7 +142,7 @@ class Polyhedra:
     def restore(
         self, points: cla.Array, saved: Mapping[str, np.ndarray], spare: int
     ) -> Tessellation:
-        """Return the diagram of `points` (n, 3) that was `saved`, as it was: with room for so many more faces."""
+        """Return the `saved` diagram of `points` (n, 3), with room for `spare` more half-faces."""
         n, m = len(points), len(saved["neighbors"]) + spare
         self._reserve_cells(n)
         cells = {
@@ -168,12 +170,12 @@ class Polyhedra:
         previous : Tessellation, optional
             A diagram of the same generators at earlier positions: clipping starts from its neighbors.
         exact : bool
-            Refuse generators so close together that cells differ by more than `EXACT_SHARE` of their volumes about
-            their common faces. Without it only by more than `ROUGH_SHARE`.
+            Reject generators so close together that two cells differ about their common face by more than `EXACT_SHARE`
+            of a cell; otherwise by more than `ROUGH_SHARE`.
         rows : int, optional
-            Generators whose cells are wanted, the first ones; the faces of these towards others are not compared.
+            Number of cells to build, those of the first generators. Their faces with other cells are not matched.
         seams : tuple, optional
-            What balls around the vertices of cells are held against, in a periodic box, and only there: SEAM_ARGS
+            In a periodic box the SEAM_ARGS of kernels, which test the balls around vertices
             (tessellation/periodic/halo.h).
 
         Raises
@@ -198,7 +200,7 @@ class Polyhedra:
         return t
 
     def _begin_anew(self, binned: BinnedPoints, first: cla.Array, n: int) -> None:
-        """Have the radii from before: the last bits depend on them, and should not on what has been tried."""
+        """Restore the search radii, so that the last bits of the result do not depend on earlier attempts."""
         cl.enqueue_copy(
             self.engine.queue, buffer_of(binned.reach), buffer_of(first), byte_count=4 * n
         )
@@ -215,9 +217,9 @@ class Polyhedra:
         share: np.floating,
         seams: tuple[object, ...],
     ) -> _CutCells | None:
-        """Cut the first `rows` cells, again with more room for as long as any needs it; None if one collapses.
+        """Clip the first `rows` cells; repeat with larger capacities if needed. None if a cell collapses.
 
-        `first` (n,) float32 is what `binned.reach` has been to begin with.
+        `first` (n,) float32 is a copy of the original `binned.reach`.
         """
         engine = self.engine
         most = round(FACES_PER_CELL * rows + 6 * rows ** (2 / 3)) + 64
@@ -251,35 +253,35 @@ class Polyhedra:
             engine.run_each(
                 self._kernels(capacity).clip_polyhedra, n, np.int32(rows), binned.points, binned.items,
                 *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *seams,
-                # Private arrays of a whole group lie on the stack of a CPU's thread.
+                # On a CPU the private arrays of a whole group lie on the stack of one thread.
                 group=1 if again else None,
             )  # fmt: skip
             flags, m = (int(v) for v in self._report.get())
             if flags & ~(FULL | HARMLESS):
                 return None
             if m > self._room:
-                # All anew: what did not fit was not kept.
+                # Repeat all: faces beyond the capacity were lost.
                 self._begin_anew(binned, first, n)
                 faces = self._take_faces(m + m // 32 + 64)
                 capacity, again = FACE_CAPACITY, False
                 self._report.set(np.zeros(2, np.int32))
             elif flags & FULL:
-                # Those cells alone, with more room.
+                # Clip only the cells with too many faces, with a larger capacity.
                 capacity, again = 2 * capacity, True
                 if capacity > MOST_FACES:
                     raise ClvoroError(
-                        f"a cell has more than {MOST_FACES} faces; so many generators on a common sphere "
-                        "are not supported: remove or perturb some"
+                        f"a cell has more than {MOST_FACES} faces, expected fewer; remove or perturb generators "
+                        "that lie on a common sphere"
                     )
                 self._report.set(np.array([flags & HARMLESS, m], np.int32))
             else:
                 return _CutCells(places, counts, *faces, cells, m, bool(flags & DOUBT))
 
     def _match(self, cut: _CutCells, points: cla.Array, share: np.floating) -> Tessellation | None:
-        """Keep the faces that both cells see, and bring them into the order of rows; None if they differ by much."""
+        """Keep the faces that both cells have, and sort them by rows. None if cells differ by too much."""
         engine, k, m = self.engine, self._kernels(FACE_CAPACITY), cut.m
         rows, cells, doubt = len(cut.counts), cut.cells, np.int32(cut.doubtful)
-        # The previous graph stays until all is done.
+        # The previous graph stays valid until the end.
         starts, neighbors = engine.scratch(rows + 1, np.int32), engine.scratch(m, np.int32)
         kept = engine.scratch(m, np.uint8)
         engine.run_each(
@@ -303,7 +305,7 @@ class Polyhedra:
         )  # fmt: skip
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:
-        """Return the places of the first `rows` generators, so that those which follow each other are near."""
+        """Return the items of the first `rows` generators in an order that keeps neighbors close."""
         engine, k = self.engine, self._walks
         cubes = math.prod(-(-side // CUBE) for side in binned.sides)
         starts, order = engine.scratch(cubes + 1, np.int32), engine.scratch(rows, np.int32)
