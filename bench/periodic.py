@@ -26,7 +26,7 @@ import numpy as np
 from _common import Report, counts, heading, make_adapter, parser
 
 import clvoro
-from clvoro.adaptation.forecast import images_expected
+from clvoro.adaptation.forecast import expected_images
 from clvoro.adaptation.sampling.start import density_tree
 from clvoro.sizing import Expression
 from clvoro.tessellation.tessellator import Tessellator
@@ -104,7 +104,7 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
         one += int(inside.sum()) if any(step) else 0
     return {
         "dim": dim, "cells": n, "images": images.count / n - 1, "one margin": one / n,
-        "expected": images_expected(box, size, n, density_tree(size, box)),
+        "expected": expected_images(box, size, n, density_tree(size, box)),
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ float32 over h, at the smallest size and as a mean over the cells. "more" is wha
 error, "scatter" the range of the error in float64 over the starts. The script returns 1 if "more" exceeds 1e-3 and the
 scatter without a warning before the run.
 `--noise` moves the generators of uniform meshes at random by a small distance, and prints the change of the error over
-that distance: `clvoro.adaptation.precision.ADDED`.
+that distance: `clvoro.adaptation.diagnostics.ROUND_OFF_ERROR`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from _common import (
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.precision import MOST_ADDED
+from clvoro.adaptation.diagnostics import MAX_ROUND_OFF_ERROR
 from clvoro.adaptation.sampling.start import count_cells
 from clvoro.errors import PrecisionWarning
 
@@ -80,7 +80,7 @@ def measure(options: Namespace, name: str, n: int, effort: str) -> dict[str, Any
         record["least"], record["mean"] = spacing / float(h.min()), float((spacing / h).mean())
     record["more"] = record["float32_mean_error"] - record["float64_mean_error"]
     record["scatter"] = record["float64_mean_error_range"]
-    record["fits"] = record["more"] <= max(MOST_ADDED, record["scatter"])
+    record["fits"] = record["more"] <= max(MAX_ROUND_OFF_ERROR, record["scatter"])
     return record
 
 

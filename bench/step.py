@@ -43,9 +43,9 @@ from _common import (
 
 import clvoro
 from clvoro.adaptation.methods import Method, ProjectedMethod, WeightedMethod
-from clvoro.adaptation.schedule import Step, plan_adaptive
+from clvoro.adaptation.schedule import Step, adaptive_schedule
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import Mesh
+from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.profile import Profile, profiled_queue
 from clvoro.sizing import Sizing
@@ -58,10 +58,12 @@ WARM_UP = 4
 
 def kinds() -> dict[str, Callable[[], Method]]:
     """Return what makes a method anew, for the kinds of steps that a default run takes on its finest level."""
-    steps = [a.method for a in plan_adaptive(2, "default", 1, exact=False) if isinstance(a, Step)]
+    steps = [
+        a.method for a in adaptive_schedule(2, "default", 1, exact=False) if isinstance(a, Step)
+    ]
     projected = {m.descent: m for m in steps if isinstance(m, ProjectedMethod)}
     coupled = [m for m in steps if isinstance(m, WeightedMethod)]
-    last = {"weighted": coupled[-1], "glide": projected["lloyd"], "polish": projected["shape"]}
+    last = {"weighted": coupled[-1], "glide": projected["lloyd"], "polish": projected["quality"]}
     return {name: partial(replace, method) for name, method in last.items()}
 
 
@@ -75,7 +77,7 @@ NEEDS = {
     "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
     "metric.compare_neighbors": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
     "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
-    "quality_descent.descend_shape": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
+    "quality_descent.descend_quality": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
     "poisson.assemble_laplacian": (2 + 1, 6 + 1 + 6 + 12, 3 * 20),
     "volume_projection.assemble_projection": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),
@@ -123,16 +125,18 @@ def peak_operations(adapter: clvoro.Adapter) -> float:
     return items * 4096 * 8 * 8 * 2 / best
 
 
-def fresh_mesh(adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarray, n: int) -> Mesh:
+def fresh_mesh(
+    adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarray, n: int
+) -> MeshState:
     engine = Engine(adapter.ctx, queue, 2, adapter.dtype)
     field = test_field("F2") * (CELLS_OF_F2 / n) ** 0.5
     origin, scale = BOX.frame
     unsorted = engine.upload((points - origin) / scale)
-    return Mesh(Stages(engine), BOX, Sizing(engine, BOX, field), unsorted)
+    return MeshState.create(Stages(engine), BOX, Sizing(engine, BOX, field), unsorted)
 
 
 def take_steps(
-    mesh: Mesh, method: Method, repeat: int, clock: Callable[[], float]
+    mesh: MeshState, method: Method, repeat: int, clock: Callable[[], float]
 ) -> tuple[dict[str, list[float]], int]:
     """Seconds of the parts of `repeat` steps, by `clock`, and the iterations of their solves."""
     queue = mesh.engine.queue
@@ -158,7 +162,7 @@ def take_steps(
 
     def finish() -> None:
         mesh.update()
-        mesh.assess()
+        mesh.read_summaries()
 
     tessellator.tessellate = tessellate  # type: ignore[method-assign]
     try:

@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from .adaptation.diagnostics import warn_of_errors
-from .adaptation.estimates import check_memory, memory_needed
+from .adaptation.estimates import check_memory, estimate_memory
 from .adaptation.loop import INTERRUPTED
 from .adaptation.options import (
     Checkpoint,
@@ -25,7 +25,7 @@ from .adaptation.options import (
     special,
 )
 from .adaptation.preparation import Preparation
-from .adaptation.run import carry_out
+from .adaptation.run import run_adaptation
 from .adaptation.stages import Stages
 from .arguments import Naming, check_callable, check_choice, check_points
 from .errors import DeviceError, InputError, InputTypeError, Interrupted, MemoryLimitError
@@ -226,7 +226,7 @@ class Adapter:
         stages = self._stages_for(domain)
         host = check_points(points, domain)
         n, engine = len(host), stages.engine
-        check_memory(engine, n, memory_needed(engine, n, domain, run=False))
+        check_memory(engine, n, estimate_memory(engine, n, domain, run=False))
         binned = stages.bins.build(domain, engine.upload(domain.place(host, self.dtype)), n)
         labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
         with Naming(host, domain, self.dtype):
@@ -343,7 +343,7 @@ class Adapter:
             stages = self._stages_for(domain)
             host = None if given is None else check_points(given, domain)
             with noticed_builds(stages.engine, self.on_build) as notice:
-                result = carry_out(
+                result = run_adaptation(
                     stages,
                     domain,
                     size,

@@ -1,18 +1,16 @@
+/* The size field as a density of generators, rho = h^-d: weights of the cells, grad log h, weighted centroids. One
+   work-item per generator unless a kernel says otherwise. */
 #include "geometry/domain.h"
 #include "opencl/blocks.h"
 #include "opencl/reduce.h"
 #include "opencl/row_entries.h"
 
-/* The size field as a density of generators, rho = h^-d, and what follows from it. */
+/* density = rho = h^-d, weight = V rho (the number of generators that the cell should have), log_ratio = r = log(V rho)
+   = log(V / h^d) = d log(L / h).
 
-/* Per generator i:
-   density  rho = h^-d
-   weight   V rho, the number of generators that the cell should hold
-   excess   r = log(V / h^d) = d log(L / h): the cell is too large by this share of its volume
-
-   Four generators per work-item, as their logarithms come at the price of one on a CPU. */
+   One work-item per four generators, because four logarithms cost as much as one on a CPU. */
 kernel void evaluate_density(const int size, global const REAL *volumes, global const REAL *h, global REAL *density,
-                             global REAL *weight, global REAL *excess, global REAL *log_h)
+                             global REAL *weight, global REAL *log_ratio, global REAL *log_h)
 {
     const int begin = 4 * get_global_id(0);
     if (begin >= size)
@@ -22,7 +20,7 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
         const REAL4 rho = 1 / (DIM == 2 ? target * target : target * target * target), v = volume * rho;
         vstore4(rho, 0, density + begin);
         vstore4(v, 0, weight + begin);
-        vstore4(log(v), 0, excess + begin);
+        vstore4(log(v), 0, log_ratio + begin);
         vstore4(log(target), 0, log_h + begin);
         return;
     }
@@ -31,17 +29,20 @@ kernel void evaluate_density(const int size, global const REAL *volumes, global 
         const REAL rho = 1 / (DIM == 2 ? target * target : target * target * target);
         density[i] = rho;
         weight[i] = volumes[i] * rho;
-        excess[i] = log(volumes[i] * rho);
+        log_ratio[i] = log(volumes[i] * rho);
         log_h[i] = log(target);
     }
 }
 
-/* Displacement to a cell's centroid weighted by h^-(d + 2) (the paper's 2.4; the density whose centroidal diagrams have
-   cells of size h). With rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell, g = grad log h, that is
-   c + Cov (-(d + 2) g), Cov the cell's covariance: no quadrature. Measured, quadrature of h inside the cells gains
-   nothing. */
-inline void weight_offset(const int i, const REAL *gradient, global const REAL *offsets, global const REAL *covariances,
-                          global REAL *lloyd)
+/* Displacement to the centroid weighted by h^-(d + 2), the paper's (2.4): centroidal diagrams of this density have
+   cells of size h.
+
+       c + Cov (-(d + 2) g),   g = grad log h, Cov the covariance of the cell
+
+   This is exact for rho = rho_i exp(-(d + 2) g.(y - x_i)) to first order in the cell. Measured, quadrature of h inside
+   the cells is not better. */
+inline void weighted_offset(const int i, const REAL *gradient, global const REAL *offsets,
+                            global const REAL *covariances, global REAL *lloyd)
 {
     REAL g[DIM];
     EACH_AXIS(a)
@@ -58,9 +59,8 @@ inline void weight_offset(const int i, const REAL *gradient, global const REAL *
 #endif
 }
 
-/* Per generator i: grad log h by least squares over the neighbors, weighted by 1 / distance^2, and the displacement to
-   the weighted centroid. One evaluation of h per generator serves all that needs its gradient, and the fit averages
-   over kinks of h at the scale of the cells. */
+/* gradient = grad log h by least squares over the neighbors, weighted by 1 / distance^2; lloyd = displacement to the
+   weighted centroid. One evaluation of h per generator is enough, and the fit averages kinks of h over a cell. */
 kernel void fit_gradient(const int size, global const int *starts, global const int *neighbors,
                          global const REAL *points, global const REAL *log_h, global const REAL *offsets,
                          global const REAL *covariances, global REAL *gradient, global REAL *lloyd PERIOD_ARGS)
@@ -84,7 +84,7 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
             d[a] = nearest_images(PICK(REAL, points, j, DIM, a) - points[DIM * i + a], PERIOD(a));
             d2 += d[a] * d[a];
         }
-        /* What does not count is at no distance. */
+        /* Walls have distance 1 and no difference. */
         const MANY(REAL) weight = 1 / CHOOSE(REAL, counts, d2, 1), rise = PICK(REAL, log_h, j, 1, 0) - log_h[i];
         EACH_AXIS(p)
         {
@@ -102,8 +102,8 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
         if (q >= p)
             m[p][q] = m[q][p] = SUM(REAL, sums[p][q]);
     }
-    /* Too few or collinear neighbors leave the gradient undetermined: take none. Divided by infinity, as PoCL 6 with
-       LLVM 18 dies of a branch here. */
+    /* The gradient is 0 if neighbors are too few or collinear. Division by infinity, because PoCL 6 with LLVM 18
+       crashes on a branch here. */
     const REAL trace = m[0][0] + m[1][1] + (DIM == 3 ? m[DIM - 1][DIM - 1] : 0);
     const REAL least = sqrt(REAL_EPS);
 #if DIM == 2
@@ -129,17 +129,16 @@ kernel void fit_gradient(const int size, global const int *starts, global const 
 #endif
     EACH_AXIS(a)
     gradient[DIM * i + a] = g[a];
-    weight_offset(i, g, offsets, covariances, lloyd);
+    weighted_offset(i, g, offsets, covariances, lloyd);
 }
 
-/* Block-wise, two launches: r -= mean r, weighted by V rho. A wrong count of generators shows as the mean: strain
-   cannot mend it, insertion and deletion can. partial: the groups' sums of V rho r, then those of V rho. */
-kernel void sum_excess(const int size, global const REAL *weight, global const REAL *excess, global REAL *partial)
+/* partial = per work-group, sum of V rho r, then sum of V rho. One block of generators per work-group. */
+kernel void sum_log_ratio(const int size, global const REAL *weight, global const REAL *log_ratio, global REAL *partial)
 {
     local REAL scratch[GROUP_SIZE];
     Sum weighed = SUM_ZERO, total = SUM_ZERO;
     for (BLOCK_LOOP(i, size)) {
-        sum_add(&weighed, weight[i] * excess[i]);
+        sum_add(&weighed, weight[i] * log_ratio[i]);
         sum_add(&total, weight[i]);
     }
     const REAL sums[2] = {group_sum(weighed.value, scratch), group_sum(total.value, scratch)};
@@ -149,10 +148,12 @@ kernel void sum_excess(const int size, global const REAL *weight, global const R
     }
 }
 
-kernel void remove_mean(const int size, global const REAL *partial, global REAL *excess)
+/* r -= mean r, weighted by V rho. A wrong number of generators changes the mean; motion cannot correct it, insertion
+   and deletion can. */
+kernel void subtract_mean_log_ratio(const int size, global const REAL *partial, global REAL *log_ratio)
 {
     local REAL scratch[GROUP_SIZE];
     const REAL mean = total_sum(partial, scratch) / total_sum(partial + get_num_groups(0), scratch);
     for (BLOCK_LOOP(i, size))
-        excess[i] -= mean;
+        log_ratio[i] -= mean;
 }

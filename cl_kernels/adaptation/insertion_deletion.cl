@@ -1,12 +1,11 @@
-#include "adaptation/apart.h"
+/* Insertion and deletion of generators, the paper's 2.3.1. One work-item per generator.
+
+   A hexagonal mesh that follows a size field must contain dislocations: pairs of a 5-sided and a 7-sided cell (charges
+   -1 and +1). A dislocation under strain climbs: under tension across its axis the 7-sided cell is split, under
+   compression the 5-sided one is deleted. A dislocation at a wall can end there. The same changes correct the number of
+   generators. Sites that change in the same call are several rings of cells apart. */
+#include "adaptation/separation.h"
 #include "adaptation/site_selection.h"
-
-/* Insertion and deletion of generators: the paper's 2.3.1, where the lattice (in 2D) and the count ask for it.
-
-   A mesh of hexagons that follows a size field must carry dislocations, pairs of a 5-sided and a 7-sided cell (charge
-   -1 and +1). One that sits under strain climbs: stretched across its axis the 7-sided cell is split, compressed the
-   5-sided one goes. One that has come to a wall ends there. The same moves carry the count of generators to what the
-   size field asks for. Sites act at the same time only if they are several rings of cells apart. */
 
 #if DIM == 2
 #define REGULAR_FACES 6
@@ -25,9 +24,9 @@ inline REAL2 difference(global const REAL *points, int from, int to PERIOD_ARGS)
 
 #define LATTICE_2 R(1.1547005383792515) /* (neighbor distance / h)^2 of a regular hexagonal mesh: 2 / sqrt 3 */
 
-/* Per generator i: kinds[i] = (charge, walls), charge = its number of sides less that of a perfect lattice: 6 inside, 5
-   at a wall, 4 in a corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an
-   unstrained lattice, in single precision: it is compared with thresholds. Only six-sided inner cells have weight. */
+/* kinds[i] = (charge, walls), charge = number of sides minus that of a perfect lattice: 6 inside, 5 at a wall, 4 in a
+   corner. strain[i] = (xx, xy, yy, weight) of S = mean_j 2 d d^T / (a^2 h_i h_j), the identity in an unstrained
+   lattice, in single precision. Only six-sided inner cells have weight. */
 kernel void measure_strain(const int size, global const int *starts, global const int *neighbors,
                            global const REAL *points, global const REAL *h, global int2 *kinds,
                            global float4 *strain OUTLINE_ARGS PERIOD_ARGS)
@@ -46,8 +45,8 @@ kernel void measure_strain(const int size, global const int *starts, global cons
         s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(d.s0 * d.s0, d.s0 * d.s1, d.s1 * d.s1, 0);
     }
 #ifdef POLYGON
-    /* Half a neighbor more or less is none. A cell between two boundaries, or at a sharp corner, is as one in a
-       corner. */
+    /* Half a neighbor more or less is no charge. A cell between two boundaries, or at a sharp corner, counts as one in
+       a corner. */
     const REAL charge = n - walls - outlines[i].s1;
     kinds[i] = (int2)((int)(charge > 0 ? ceil(charge - R(0.5)) : floor(charge + R(0.5))),
                       walls == 0 ? 0 : (outlines[i].s1 < R(3.2) ? 2 : 1));
@@ -58,7 +57,7 @@ kernel void measure_strain(const int size, global const int *starts, global cons
     strain[i] = (float4)(s.s0, s.s1, s.s2, walls == 0 && n == 6);
 }
 
-/* Per generator i: the weighted mean of the strain over itself and its neighbors, and the sum of the weights. */
+/* mean[i] = weighted mean of the strain over i and its neighbors, and the sum of the weights. */
 kernel void average_strain(const int size, global const int *starts, global const int *neighbors,
                            global const float4 *strain, global float4 *mean)
 {
@@ -77,10 +76,9 @@ kernel void average_strain(const int size, global const int *starts, global cons
     mean[i] = (float4)(weight > 0 ? sum.s012 / weight : (float3)(1, 0, 1), weight);
 }
 
-/* Per cell i of negative charge: the pull s = b.S.b - t.S.t on its pair with the neighbor of positive charge where |s|
-   is largest, t from i to the neighbor, b across. Pairs with both cells at walls are left alone; those with one, if
-   wanted, come first: they can go altogether. So do those of a cell with a charge of 2, the worst cells that there
-   are. */
+/* pull[i] = b.S.b - t.S.t for a cell i of negative charge and the neighbor of positive charge where |pull| is largest;
+   t points to the neighbor, b across. Pairs with both cells at walls are left out. Pairs with one cell at a wall (with
+   `at_walls`), and cells with a charge of 2, get the strongest keys. */
 kernel void score_pairs(const int size, global const int *starts, global const int *neighbors,
                         global const REAL *points, global const int2 *kinds, global const float4 *strain,
                         const int at_walls, global int *partners, global REAL *pull, global ulong *keys PERIOD_ARGS)
@@ -103,7 +101,7 @@ kernel void score_pairs(const int size, global const int *starts, global const i
             const REAL across = s.s0 * d.s1 * d.s1 - 2 * s.s1 * d.s0 * d.s1 + s.s2 * d.s0 * d.s0;
             const REAL value = (across - along) / dot(d, d);
             const bool first = one_wall || kind.s0 < -1 || kinds[j].s0 > 1;
-            const REAL value_rank = fabs(value) + (first ? R(WALL_THETA) : R(0));
+            const REAL value_rank = fabs(value) + (first ? R(WALL_STRAIN) : R(0));
             if (partner < 0 || value_rank > rank) {
                 best = value;
                 rank = value_rank;
@@ -115,52 +113,53 @@ kernel void score_pairs(const int size, global const int *starts, global const i
     keys[i] = partner < 0 ? 0 : site_key(rank, i);
 }
 
-/* What a pair does to the count of generators, 1 if it is split, -1 if it is deleted. Thresholds give way as the count
-   needs: shift m of 0..SHIFTS-1 lies at (m - SHIFTS / 2) * SHIFT_STEP. A pair with one cell at a wall ends there,
-   unless the strain is much against it: a wall cell of charge -1 goes, one of charge +1 is split along the wall. An
-   inner cell of four sides always goes, one of eight is always split. */
-inline int pair_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
+/* Change of the number of generators by a pair: 1 if it is split, -1 if it is deleted. Thresholds are shifted to
+   correct the number: shift m of 0..SHIFTS-1 is (m - SHIFTS / 2) SHIFT_STEP. A pair with one cell at a wall ends there,
+   unless the strain is strong: a wall cell of charge -1 is deleted, one of charge +1 is split along the wall. An inner
+   cell of four sides is always deleted, one of eight always split. */
+inline int count_change(REAL pull, int2 minus, int2 plus, REAL theta, REAL shift)
 {
     if (minus.s0 < -1 && minus.s1 == 0)
         return -1;
     if (plus.s0 > 1 && plus.s1 == 0)
         return 1;
     if (minus.s1 > 0)
-        return pull < R(WALL_THETA) ? -1 : 0;
+        return pull < R(WALL_STRAIN) ? -1 : 0;
     if (plus.s1 > 0)
-        return pull > -R(WALL_THETA) ? 1 : 0;
+        return pull > -R(WALL_STRAIN) ? 1 : 0;
     if (pull > theta - shift)
         return 1;
     return -pull > theta + shift ? -1 : 0;
 }
 
-/* Per chosen pair: tally[m] += what shift m would add to the count of generators. Integer sums: any order will do. */
-kernel void tally_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
-                        global const int *partners, const REAL theta, global int *tally)
+/* tally[m] += change of the number of generators with shift m. Integer sums do not depend on the order. */
+kernel void count_pair_changes(const int size, global const ulong *chosen, global const REAL *pull,
+                               global const int2 *kinds, global const int *partners, const REAL theta,
+                               global int *tally)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
         return;
     for (int m = 0; m < SHIFTS; ++m) {
         const REAL shift = (m - SHIFTS / 2) * R(SHIFT_STEP);
-        const int change = pair_change(pull[i], kinds[i], kinds[partners[i]], theta, shift);
+        const int change = count_change(pull[i], kinds[i], kinds[partners[i]], theta, shift);
         if (change)
             atomic_add(tally + m, change);
     }
 }
 
-/* Per chosen pair: split it at its cell of charge +1, into two generators across the pair, or delete that of charge -1.
-   `busy` marks the sites that act. */
+/* Per chosen pair: split its cell of charge +1 into two generators across the pair, or delete that of charge -1. `busy`
+   marks the sites that change. */
 kernel void mark_pairs(const int size, global const ulong *chosen, global const REAL *pull, global const int2 *kinds,
                        global const int *partners, const REAL theta, const REAL shift, global const REAL *points,
-                       global const REAL *reach, global int *kept, global REAL2 *shifts, global int *born,
+                       global const REAL *local_length, global int *kept, global REAL2 *shifts, global int *born,
                        global REAL2 *births, global ulong *busy PERIOD_ARGS)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
         return;
     const int j = partners[i];
-    const int change = pair_change(pull[i], kinds[i], kinds[j], theta, shift);
+    const int change = count_change(pull[i], kinds[i], kinds[j], theta, shift);
     if (change == 0)
         return;
     busy[i] = 1;
@@ -171,12 +170,12 @@ kernel void mark_pairs(const int size, global const ulong *chosen, global const 
     const REAL2 d = difference(points, i, j PERIODS);
     const REAL2 across = (REAL2)(-d.s1, d.s0) / sqrt(dot(d, d));
     born[j] = 1;
-    shifts[j] = R(SPLIT_DISTANCE) * reach[j] * across;
+    shifts[j] = R(SPLIT_DISTANCE) * local_length[j] * across;
     births[j] = -shifts[j];
 }
 
-/* Per six-sided cell i among six-sided cells: the anisotropy of the strain, the difference of its eigenvalues, as a
-   site where a pair may be made. */
+/* Sites of nucleation: six-sided cells among six-sided cells with an anisotropy of the strain, the difference of its
+   eigenvalues, above `threshold`. */
 kernel void score_strain(const int size, global const int *starts, global const int *neighbors,
                          global const int2 *kinds, global const float4 *strain, const REAL threshold,
                          global ulong *keys)
@@ -190,8 +189,8 @@ kernel void score_strain(const int size, global const int *starts, global const 
     keys[i] = clean && anisotropy > threshold ? site_key(anisotropy, i) : 0;
 }
 
-/* Per chosen site, by its rank in turn: a new generator in the middle of its longest edge, or itself and its nearest
-   neighbor merged. */
+/* Per chosen site, alternating by rank: insert a generator at the midpoint of its longest edge, or merge it with its
+   nearest neighbor. */
 kernel void mark_nuclei(const int size, global const ulong *chosen, global const int *ranks, global const int *starts,
                         global const int *neighbors, global const REAL *points, global int *kept, global REAL2 *shifts,
                         global int *born, global REAL2 *births, global ulong *busy PERIOD_ARGS)
@@ -223,26 +222,26 @@ kernel void mark_nuclei(const int size, global const ulong *chosen, global const
 
 #endif
 
-/* Per generator i: the excess of its cell, in the sense of `sign`, as a site to split (sign > 0) or to delete. Cells of
-   few faces go, those of many are split, if their excess is alike. Above 4 all are alike. A cell without neighbors
-   stays: it is the last of its piece of the domain. */
-kernel void score_excess(const int size, global const int *starts, global const int *neighbors,
-                         global const REAL *excess, const REAL sign, global ulong *keys)
+/* Sites to split (sign > 0) or to delete (sign < 0): cells that are too large or too small for h. Cells of many faces
+   are preferred for splitting, cells of few faces for deletion. Magnitudes are limited to 4. A cell without neighbors,
+   the last one of a piece of the domain, is never deleted. */
+kernel void score_log_ratio(const int size, global const int *starts, global const int *neighbors,
+                            global const REAL *log_ratio, const REAL sign, global ulong *keys)
 {
     WORK_ITEM(i);
-    bool alone = sign < 0;
-    for (int k = starts[i]; k < starts[i + 1] && alone; ++k)
-        alone = neighbors[k] < 0;
-    if (alone) {
+    bool isolated = sign < 0;
+    for (int k = starts[i]; k < starts[i + 1] && isolated; ++k)
+        isolated = neighbors[k] < 0;
+    if (isolated) {
         keys[i] = 0;
         return;
     }
     const REAL faces = starts[i + 1] - starts[i];
-    const REAL magnitude = 2 + sign * (excess[i] + FACE_WEIGHT * (faces - REGULAR_FACES));
+    const REAL magnitude = 2 + sign * (log_ratio[i] + FACE_WEIGHT * (faces - REGULAR_FACES));
     keys[i] = magnitude > 0 ? site_key(fmin(magnitude, R(4)), i) : 0;
 }
 
-/* The direction in which a cell is longest, of length 1, from its second moments. */
+/* Unit vector along the longest axis of a cell, from its second moments. */
 #if DIM == 2
 inline void longest_axis(global const REAL *moments, REAL *axis)
 {
@@ -253,8 +252,7 @@ inline void longest_axis(global const REAL *moments, REAL *axis)
 #else
 inline void longest_axis(global const REAL *moments, REAL *axis)
 {
-    /* Powers of the matrix, from the coordinate axis along which it is longest; a nearly round cell has no axis that
-       matters. */
+    /* Power iteration from the longest coordinate axis. The axis of a nearly round cell does not matter. */
     const REAL xx = moments[0], xy = moments[1], xz = moments[2], yy = moments[3], yz = moments[4], zz = moments[5];
     REAL3 v = (REAL3)(xx >= yy && xx >= zz, yy > xx && yy >= zz, zz > xx && zz > yy);
     for (int k = 0; k < 12; ++k) {
@@ -282,10 +280,10 @@ inline void split_cell(int i, global const REAL *offsets, global const REAL *cov
     }
 }
 
-/* Per chosen site: split the cell, or delete it. */
-kernel void mark_excess(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
-                        global const REAL *covariances, global const REAL *volumes, global int *kept,
-                        global REAL *shifts, global int *born, global REAL *births)
+/* Per chosen site: split the cell (sign > 0) or delete it. */
+kernel void mark_split_delete(const int size, global const ulong *chosen, const REAL sign, global const REAL *offsets,
+                              global const REAL *covariances, global const REAL *volumes, global int *kept,
+                              global REAL *shifts, global int *born, global REAL *births)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -297,25 +295,25 @@ kernel void mark_excess(const int size, global const ulong *chosen, const REAL s
 }
 
 #if DIM == 2
-/* Per inner cell i: 1 - Q, where it is above `flaw`, as a site to mend. Cells of four sides or eight come first,
-   whatever their Q: with their neighbors they are a generator too many or too few. */
-kernel void score_flaws(const int size, global const int *starts, global const int *neighbors,
-                        global const REAL *quality, const REAL flaw, global ulong *keys)
+/* Sites to repair: inner cells with 1 - Q above `deficit`. Cells of at most four or at least eight sides come first,
+   whatever their Q: they have a generator too many or too few around them. */
+kernel void score_bad_cells(const int size, global const int *starts, global const int *neighbors,
+                            global const REAL *quality, const REAL deficit, global ulong *keys)
 {
     WORK_ITEM(i);
     const int n = starts[i + 1] - starts[i];
     const bool odd = n < 5 || n > 7;
     const REAL own = 1 - quality[i];
-    bool site = odd || own > flaw;
+    bool site = odd || own > deficit;
     for (int k = starts[i]; k < starts[i + 1] && site; ++k)
         site = neighbors[k] >= 0;
     keys[i] = site ? site_key(odd + own, i) : 0;
 }
 
 /* Per chosen site: split a cell of at least `split_from` sides, delete any other. */
-kernel void mark_flaws(const int size, global const ulong *chosen, global const int *starts, const int split_from,
-                       global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
-                       global int *kept, global REAL *shifts, global int *born, global REAL *births)
+kernel void mark_bad_cells(const int size, global const ulong *chosen, global const int *starts, const int split_from,
+                           global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
+                           global int *kept, global REAL *shifts, global int *born, global REAL *births)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
@@ -327,14 +325,14 @@ kernel void mark_flaws(const int size, global const ulong *chosen, global const 
 }
 #endif
 
-/* Per generator i: its row, or rows, in the new order. place and birth_place are the prefix sums of kept and born. New
-   generators go behind all kept rows, with new labels. */
+/* Write generator i, if it is kept, and its new generator, if there is one, to the new arrays. place and birth_place
+   are the prefix sums of kept and born. New generators follow all kept ones and get new labels. */
 kernel void apply_changes(const int size, global const int *place, global const int *birth_place, const int next_label,
                           const int fixed, DOMAIN_ARGS, global const REAL *points, global const int *labels,
-                          global const REAL *velocity, global const ulong *signatures, global const REAL *ever,
+                          global const REAL *velocity, global const ulong *signatures, global const REAL *ever_changed,
                           global const REAL *shifts, global const REAL *births, global REAL *new_points,
                           global int *new_labels, global REAL *new_velocity, global ulong *new_signatures,
-                          global REAL *new_ever, global const int *starts, global const int *neighbors,
+                          global REAL *new_ever_changed, global const int *starts, global const int *neighbors,
                           global const FACE *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
@@ -354,8 +352,9 @@ kernel void apply_changes(const int size, global const int *place, global const 
         keep_inside(x, child, DOMAIN);
 #ifdef POLYGON
     if (born && kept)
-        moved &= !take_apart(x, y, child, (REAL2)(births[2 * i] - shifts[2 * i], births[2 * i + 1] - shifts[2 * i + 1]),
-                             fixed, neighbors, face_centroids, starts[i], starts[i + 1], tangents, DOMAIN);
+        moved &=
+            !separate_child(x, y, child, (REAL2)(births[2 * i] - shifts[2 * i], births[2 * i + 1] - shifts[2 * i + 1]),
+                            fixed, neighbors, face_centroids, starts[i], starts[i + 1], tangents, DOMAIN);
 #endif
     if (kept) {
         const int p = place[i];
@@ -366,7 +365,7 @@ kernel void apply_changes(const int size, global const int *place, global const 
         }
         new_labels[p] = labels[i];
         new_signatures[p] = signatures[i];
-        new_ever[p] = ever[i];
+        new_ever_changed[p] = ever_changed[i];
     }
     if (born) {
         const int q = place[size] + birth_place[i];
@@ -377,6 +376,6 @@ kernel void apply_changes(const int size, global const int *place, global const 
         }
         new_labels[q] = next_label + birth_place[i];
         new_signatures[q] = 0;
-        new_ever[q] = 1;
+        new_ever_changed[q] = 1;
     }
 }

@@ -1,17 +1,17 @@
 #include "tessellation/clipped/outline.h"
 #include "tessellation/roundness.h"
 
-/* Per generator i: metric error and quality of its cell.
+/* Error, quality, energy and local length of the cell of generator i, one work-item per generator.
 
-   error    e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
-   reach    min(L, h): the length that limits a generator's motion, also where the target has only just grown or shrunk
-   energy   integral of |y - x_i|^2 over the cell            (the paper's 2.3)
-   quality  2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1; trimmed cells come with theirs)
-            3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
+   error         e = (L - h) / min(L, h), L = V^(1/d)             (the paper's 3.1)
+   local_length  min(L, h), the unit of bounds of the motion
+   energy        integral of |y - x_i|^2 over the cell            (the paper's 2.3)
+   quality       2D: Q = 4 A n tan(pi / n) / P^2                  (the paper's 4.1; trimmed cells have their own)
+                 3D: Q = 36 pi V^2 / S^3, the isoperimetric quotient */
 kernel void evaluate_metric(const int size, global const REAL *volumes, global const int *starts,
                             global const FACE *face_measures, global const REAL *offsets,
                             global const REAL *covariances, global const REAL *h, global REAL *error,
-                            global REAL *quality, global REAL *energy, global REAL *reach OUTLINE_ARGS)
+                            global REAL *quality, global REAL *energy, global REAL *local_length OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     const REAL volume = volumes[i];
@@ -40,12 +40,12 @@ kernel void evaluate_metric(const int size, global const REAL *volumes, global c
     }
     energy[i] = volume * square;
     const REAL target = h[i];
-    reach[i] = fmin(length, target);
+    local_length[i] = fmin(length, target);
     error[i] = (length - target) / fmin(length, target);
 }
 
-/* A well-mixed word per neighbor; their sum does not depend on the order of the faces. */
-inline ulong mixed(ulong v)
+/* A hash of a neighbor. The sum of hashes does not depend on the order of the faces. */
+inline ulong hash64(ulong v)
 {
     v += 0x9e3779b97f4a7c15UL;
     v = (v ^ (v >> 30)) * 0xbf58476d1ce4e5b9UL;
@@ -53,34 +53,35 @@ inline ulong mixed(ulong v)
     return v ^ (v >> 31);
 }
 
-/* Per generator i: has its set of neighbors changed since the signature was taken? signatures[i] is renewed, and
-   ever[i] remembers. Walls count as neighbors. labels name generators for good, whatever their present index. */
+/* changed[i] = 1 if the set of neighbors differs from that of the last call, by its hash in signatures[i];
+   ever_changed[i] = 1 if it has ever differed. One work-item per generator. Walls are neighbors. labels are permanent.
+ */
 kernel void compare_neighbors(const int size, global const int *starts, global const int *neighbors,
                               global const int *labels, const int first, global ulong *signatures, global REAL *changed,
-                              global REAL *ever)
+                              global REAL *ever_changed)
 {
     WORK_ITEM(i);
     ulong signature = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbors[k];
-        signature += mixed(j < 0 ? (ulong)(long)j : (ulong)labels[j]);
+        signature += hash64(j < 0 ? (ulong)(long)j : (ulong)labels[j]);
     }
     const int differs = !first && signature != signatures[i];
     signatures[i] = signature;
     changed[i] = differs;
-    ever[i] = first ? 0 : fmax(ever[i], (REAL)differs);
+    ever_changed[i] = first ? 0 : fmax(ever_changed[i], (REAL)differs);
 }
 
-/* Per generator i that does not move, labels[i] < fixed: the size that its cell has is the right one. */
-kernel void hold_sizes(const int size, global const int *labels, const int fixed, global const REAL *volumes,
-                       global REAL *h)
+/* h[i] = L_i for fixed generators, labels[i] < fixed: their size is right. One work-item per generator. */
+kernel void set_fixed_sizes(const int size, global const int *labels, const int fixed, global const REAL *volumes,
+                            global REAL *h)
 {
     WORK_ITEM(i);
     if (labels[i] < fixed)
         h[i] = DIM == 2 ? sqrt(volumes[i]) : cbrt(volumes[i]);
 }
 
-/* Per generator i: h times a factor: the size on a coarser level. */
+/* h *= factor. One work-item per generator. */
 kernel void scale_sizes(const int size, const REAL factor, global REAL *h)
 {
     WORK_ITEM(i);

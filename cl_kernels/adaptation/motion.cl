@@ -1,12 +1,15 @@
+/* Motion of generators. One work-item per generator. */
 #include "geometry/domain.h"
 
-/* Per generator i: u = -grad phi (the paper's 3.3). The solver's potential is psi = -phi, from -div grad psi = e, so
-   that u = grad psi, with grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i), which is exact for linear
-   psi in a closed cell; walls carry no flux. */
-kernel void follow_potential(const int size, global const int *starts, global const int *neighbors,
-                             global const FACE *face_measures, global const FACE *face_centroids,
-                             global const REAL *volumes, global const REAL *points, global const REAL *psi,
-                             global REAL *u PERIOD_ARGS)
+/* u = -grad phi, the paper's (3.3). The solver's potential is psi = -phi, from -div grad psi = e:
+
+       u = grad psi = 1 / V_i sum_j l_ij / d_ij (psi_j - psi_i) (m_ij - x_i)
+
+   It is exact for linear psi in a cell without walls; walls have no flux. */
+kernel void compute_potential_gradient(const int size, global const int *starts, global const int *neighbors,
+                                       global const FACE *face_measures, global const FACE *face_centroids,
+                                       global const REAL *volumes, global const REAL *points, global const REAL *psi,
+                                       global REAL *u PERIOD_ARGS)
 {
     WORK_ITEM(i);
     REAL sum[DIM] = {0};
@@ -28,10 +31,10 @@ kernel void follow_potential(const int size, global const int *starts, global co
     u[DIM * i + a] = sum[a] / volumes[i];
 }
 
-/* Per generator i: correction = alpha u with one alpha for all, alpha = min(limit, k / max_i(|u_i| / h_i)) (the paper's
-   3.5); summaries[4 slot + 3] is that maximum. */
-kernel void relax_globally(const int size, global const REAL *summaries, const int slot, const REAL limit, const REAL k,
-                           global REAL *u, global REAL *speed)
+/* u = alpha u with alpha = min(limit, k / max_i(|u_i| / h_i)), the paper's (3.5). summaries[4 slot + 3] is the maximum.
+ */
+kernel void relax_correction(const int size, global const REAL *summaries, const int slot, const REAL limit,
+                             const REAL k, global REAL *u, global REAL *speed)
 {
     WORK_ITEM(i);
     const REAL fastest = summaries[4 * slot + 3];
@@ -41,8 +44,8 @@ kernel void relax_globally(const int size, global const REAL *summaries, const i
     speed[i] *= alpha;
 }
 
-/* Per generator i: length of a displacement over h. Both displacements of a step in one launch took PoCL twice as long
-   as in two: it no longer found vectors. */
+/* speed = |u| / h. One launch for both displacements of a step takes PoCL twice as long as two, because it does not
+   vectorize. */
 kernel void measure_displacement(const int size, global const REAL *u, global const REAL *h, global REAL *speed)
 {
     WORK_ITEM(i);
@@ -52,8 +55,8 @@ kernel void measure_displacement(const int size, global const REAL *u, global co
     speed[i] = sqrt(u2) / h[i];
 }
 
-/* Per generator i: x += a lloyd + b correction, clipped to clip * h_i (clip = 0: not clipped), and kept in the
-   domain. velocity is the displacement that came of it. */
+/* x += a lloyd + b correction, the paper's (3.4), clipped to clip h_i (clip = 0: not clipped), and kept in the domain.
+   velocity = the displacement after that. */
 kernel void move_generators(const int size, global const REAL *lloyd, const REAL a, global const REAL *correction,
                             const REAL b, global const REAL *h, const REAL clip, DOMAIN_ARGS, global REAL *points,
                             global REAL *velocity)
@@ -73,7 +76,7 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
         x[c] = points[DIM * i + c];
         y[c] = x[c] + scale * d[c];
     }
-    /* Generators that stay where they are may stand outside of the part of the domain that is left to the others. */
+    /* Fixed generators may be outside of the part of the domain in which the others move. */
     if (d2 > 0)
         reflect_inside(x, y, DOMAIN);
     EACH_AXIS(c)
@@ -83,8 +86,9 @@ kernel void move_generators(const int size, global const REAL *lloyd, const REAL
     }
 }
 
-/* Per generator i that does not move, labels[i] < fixed: no displacement. */
-kernel void hold_generators(const int size, global const int *labels, const int fixed, global REAL *displacement)
+/* displacement = 0 for fixed generators, labels[i] < fixed. */
+kernel void zero_fixed_displacements(const int size, global const int *labels, const int fixed,
+                                     global REAL *displacement)
 {
     WORK_ITEM(i);
     if (labels[i] < fixed)
@@ -92,7 +96,7 @@ kernel void hold_generators(const int size, global const int *labels, const int 
     displacement[DIM * i + a] = 0;
 }
 
-/* Per generator i: lloyd = factor * lloyd + share * velocity. */
+/* lloyd = factor lloyd + share velocity. */
 kernel void add_momentum(const int size, const REAL factor, global const REAL *velocity, const REAL share,
                          global REAL *lloyd)
 {

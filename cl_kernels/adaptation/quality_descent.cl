@@ -1,25 +1,23 @@
+/* Gradient of the cell quality by the generators, in 2D. From the paper's (4.1), up to a constant per number of faces,
+
+     E = sum_c omega_c (2 log P_c - log A_c),   dE/dx_i = sum over the vertices and faces of cell i,
+
+   with omega >= 1 larger for bad cells. A cell pulls its vertices along its faces with the tension 2 omega / P, and
+   pushes its faces outwards with the pressure omega / A. */
 #include "geometry/domain.h"
 #include "tessellation/clipped/outline.h"
 
-/* The gradient of cell quality by the generators, in 2D. By the paper's (4.1), up to a constant for each number of
-   faces,
-
-     E = sum_c omega_c (2 log P_c - log A_c),   dE/dx_i = sum over the corners and faces of cell i,
-
-   omega >= 1 weighs bad cells more. A cell pulls at its corners along its faces with the tension 2 omega / P and pushes
-   its faces outwards with the pressure omega / A. */
-
-/* Per generator i: tension and pressure of its cell; omega = 1 + emphasis * -log Q. Four generators per work-item, as
-   their logarithms come at the price of one on a CPU. */
-kernel void load_cells(const int size, global const int *starts, global const FACE *face_measures,
-                       global const REAL *volumes, global const REAL *quality, const REAL emphasis,
-                       global REAL *tension, global REAL *pressure)
+/* tension = 2 omega / P, pressure = omega / A, omega = 1 - bad_cell_weight log Q. One work-item per four generators,
+   because four logarithms cost as much as one on a CPU. */
+kernel void compute_tension_pressure(const int size, global const int *starts, global const FACE *face_measures,
+                                     global const REAL *volumes, global const REAL *quality, const REAL bad_cell_weight,
+                                     global REAL *tension, global REAL *pressure)
 {
     const int begin = 4 * get_global_id(0), count = min(4, size - begin);
     REAL q[4] = {1, 1, 1, 1};
     for (int c = 0; c < count; ++c)
         q[c] = fmax(quality[begin + c], R(1e-6));
-    const REAL4 omegas = 1 - emphasis * log((REAL4)(q[0], q[1], q[2], q[3]));
+    const REAL4 omegas = 1 - bad_cell_weight * log((REAL4)(q[0], q[1], q[2], q[3]));
     const REAL omega[4] = {omegas.s0, omegas.s1, omegas.s2, omegas.s3};
     for (int c = 0; c < count; ++c) {
         const int i = begin + c;
@@ -31,17 +29,17 @@ kernel void load_cells(const int size, global const int *starts, global const FA
     }
 }
 
-/* A face of a cell, as seen from its generator at x. */
+/* A face of the cell of the generator at x. */
 typedef struct {
     int label;
     REAL2 away;    /* to the neighbor; 0 for a wall */
     REAL2 tangent; /* unit vector along the face, counter-clockwise */
     REAL inverse;  /* 1 / distance of the neighbor */
-    REAL tension;  /* the neighbor's */
+    REAL tension;  /* of the neighbor */
 } Face;
 
-inline Face look_at_face(int label, REAL2 x, global const REAL *points,
-                         global const REAL *tension OUTLINE_ARGS PERIOD_ARGS)
+inline Face read_face(int label, REAL2 x, global const REAL *points,
+                      global const REAL *tension OUTLINE_ARGS PERIOD_ARGS)
 {
     Face f;
     f.label = label;
@@ -64,42 +62,43 @@ inline Face look_at_face(int label, REAL2 x, global const REAL *points,
     return f;
 }
 
-/* Does face k end at the corner r of its cell? */
+/* Whether face k ends at the vertex r of its cell. */
 inline bool ends_at(REAL2 r, int k, REAL2 tangent, global const FACE *face_measures, global const FACE *face_centroids)
 {
     const REAL2 end = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]) + face_measures[k] / 2 * tangent;
     return !(dot(end - r, end - r) > R(1e-6) * dot(r, r));
 }
 
-/* Per generator i: lloyd = -rate h^2 dE/dx_i, at most `longest` h.
+/* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator.
 
-   The corner v between the faces to j and q obeys (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it moves
-   along the wall. Its pull is the sum of its faces' tensions along them, each that of the two cells beside the face. */
-kernel void descend_shape(const int size, global const int *starts, global const int *neighbors,
-                          global const FACE *face_measures, global const FACE *face_centroids,
-                          global const REAL *points, global const REAL *tension, global const REAL *pressure,
-                          global const REAL *h, const REAL rate, const REAL longest,
-                          global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
+   The vertex v between the faces to j and q moves by (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it
+   moves along the wall. The force on it is the sum of the tensions of its faces, along them, each of the two cells at
+   the face. */
+kernel void descend_quality(const int size, global const int *starts, global const int *neighbors,
+                            global const FACE *face_measures, global const FACE *face_centroids,
+                            global const REAL *points, global const REAL *tension, global const REAL *pressure,
+                            global const REAL *h, const REAL rate, const REAL max_displacement,
+                            global REAL *lloyd OUTLINE_ARGS PERIOD_ARGS)
 {
     WORK_ITEM(i);
     const REAL2 x = (REAL2)(points[2 * i], points[2 * i + 1]);
     const int begin = starts[i], end = starts[i + 1];
     const REAL wi = tension[i];
     REAL2 g = 0;
-    Face before = look_at_face(neighbors[end - 1], x, points, tension OUTLINE PERIODS);
+    Face before = read_face(neighbors[end - 1], x, points, tension OUTLINE PERIODS);
     for (int k = begin; k < end; ++k) {
-        const Face face = look_at_face(neighbors[k], x, points, tension OUTLINE PERIODS);
+        const Face face = read_face(neighbors[k], x, points, tension OUTLINE PERIODS);
         const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
         const REAL2 r = m - face_measures[k] / 2 * face.tangent; /* corner k */
         REAL s = 0;
         bool apart = false;
 #ifdef POLYGON
-        /* A cell may have several loops, the first face of which follows their last one; where no face ends, the cell
-           goes on in a piece that has come to it. */
+        /* A cell may have several loops. The first face of a loop follows its last one. Where no face ends, the cell
+           continues in a piece that was added to it. */
         const int last = k == begin ? end - 1 : k - 1;
         apart = !ends_at(r, last, before.tangent, face_measures, face_centroids);
         for (int other = begin; other < end && apart; ++other) {
-            const Face ending = look_at_face(neighbors[other], x, points, tension OUTLINE PERIODS);
+            const Face ending = read_face(neighbors[other], x, points, tension OUTLINE PERIODS);
             if (ends_at(r, other, ending.tangent, face_measures, face_centroids)) {
                 before = ending;
                 apart = false;
@@ -132,9 +131,9 @@ kernel void descend_shape(const int size, global const int *starts, global const
     }
     REAL2 u = -rate * h[i] * h[i] * g;
     const REAL length = sqrt(dot(u, u));
-    if (length > longest * h[i])
-        u *= longest * h[i] / length;
-    /* A corner of no angle has no gradient. */
+    if (length > max_displacement * h[i])
+        u *= max_displacement * h[i] / length;
+    /* A degenerate vertex has no gradient. */
     if (!(length < REAL_MAX))
         u = 0;
     lloyd[2 * i] = u.s0;

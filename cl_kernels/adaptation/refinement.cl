@@ -1,25 +1,24 @@
-#include "adaptation/apart.h"
+/* Refinement from a mesh for 2h to one for h: a new generator at the midpoint of every Delaunay edge, which turns a
+   regular lattice into one of half the spacing. Edges across very short faces are left out. Each cell at a wall also
+   gets one new generator between its generator and the wall, or behind its generator if that is almost on the wall. One
+   work-item per generator. */
+#include "adaptation/separation.h"
 
-/* From a mesh for 2h to one for h: a new generator at the middle of every Delaunay edge, which carries a regular
-   lattice over to one twice as fine. Edges across faces of no length are left out. The wall is not a neighbor, so that
-   cells along it would be left alone: each gets one new generator between its generator and the wall, or beyond its
-   generator if that all but stands on the wall, where between them is no room. */
-
-/* A pair is counted once, by its lower index. */
-inline bool has_middle(int i, int j, REAL measure, REAL volume)
+/* Whether the edge from i to j gets a new generator. Each edge is counted at its lower index. */
+inline bool has_midpoint(int i, int j, REAL measure, REAL volume)
 {
     const REAL length = DIM == 2 ? sqrt(volume) : cbrt(volume);
     return j > i && measure > SHORT_FACE * (DIM == 2 ? length : length * length);
 }
 
-/* Generators that do not move, labels less than `fixed`, have the number that they are to have. */
+/* Whether an end of the edge is fixed (label below `fixed`): such edges get no new generators. */
 inline bool is_fixed(int i, int j, global const int *labels, int fixed)
 {
     return fixed > 0 && (labels[i] < fixed || (j >= 0 && labels[j] < fixed));
 }
 
 #ifdef POLYGON
-/* A cell at the boundary brings one, before its longest edge there: of two equally long, the first. */
+/* Whether face k is the longest boundary edge of its cell (the first of equal ones), which gets the new generator. */
 inline bool is_wall_side(int k, int begin, int end, global const int *neighbors, global const FACE *face_measures,
                          REAL volume)
 {
@@ -33,11 +32,10 @@ inline bool is_wall_side(int k, int begin, int end, global const int *neighbors,
 #define is_wall_side(k, begin, end, neighbors, face_measures, volume) (neighbors[k] < 0)
 #endif
 
-/* How far cell i reaches from a wall with the normal n, inwards, at the distance `gap` from its generator, up to
-   `most`: in a strip that is far thinner than h, generators beyond it are there that it has brought on coarser levels.
- */
-inline REAL room_inwards(int i, REAL most, REAL gap, const REAL *n, global const int *starts,
-                         global const int *neighbors, global const REAL *points PERIOD_ARGS)
+/* Depth of cell i from a wall with the inward normal n, at most `most`; gap = distance of its generator from the wall.
+   In a strip much thinner than h there are already generators from coarser levels. */
+inline REAL free_depth(int i, REAL most, REAL gap, const REAL *n, global const int *starts, global const int *neighbors,
+                       global const REAL *points PERIOD_ARGS)
 {
     REAL room = most;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
@@ -56,7 +54,7 @@ inline REAL room_inwards(int i, REAL most, REAL gap, const REAL *n, global const
     return room;
 }
 
-/* Per generator i: how many new generators it brings. */
+/* counts[i] = number of new generators at cell i. */
 kernel void count_new_generators(const int size, global const int *starts, global const int *neighbors,
                                  global const FACE *face_measures, global const REAL *volumes, global const int *labels,
                                  const int fixed, global int *counts)
@@ -68,23 +66,24 @@ kernel void count_new_generators(const int size, global const int *starts, globa
         if (is_fixed(i, j, labels, fixed))
             continue;
         count += j < 0 ? is_wall_side(k, starts[i], starts[i + 1], neighbors, face_measures, volumes[i])
-                       : has_middle(i, j, face_measures[k], volumes[i]);
+                       : has_midpoint(i, j, face_measures[k], volumes[i]);
     }
     counts[i] = count;
 }
 
-/* Per generator i: write itself to row i of `finer` and its new generators behind row n. firsts are the prefix sums of
-   the counts; h is the size on the new level. */
-kernel void place_children(const int size, global const int *starts, global const int *neighbors,
-                           global const FACE *face_measures, global const REAL *volumes, global const REAL *points,
-                           global const int *labels, const int fixed, global const REAL *h, const int n, DOMAIN_ARGS,
-                           global const int *firsts, global REAL *finer, global const FACE *face_centroids OUTLINE_ARGS)
+/* Row i of `finer` = generator i; rows from n + child_starts[i] on = its new generators. child_starts are the prefix
+   sums of the counts; h is the size on the new level. */
+kernel void place_new_generators(const int size, global const int *starts, global const int *neighbors,
+                                 global const FACE *face_measures, global const REAL *volumes,
+                                 global const REAL *points, global const int *labels, const int fixed,
+                                 global const REAL *h, const int n, DOMAIN_ARGS, global const int *child_starts,
+                                 global REAL *finer, global const FACE *face_centroids OUTLINE_ARGS)
 {
     WORK_ITEM(i);
     BOX_CORNERS(lower, upper);
     for (int a = 0; a < DIM; ++a)
         finer[DIM * i + a] = points[DIM * i + a];
-    global REAL *child = finer + DIM * (n + firsts[i]);
+    global REAL *child = finer + DIM * (n + child_starts[i]);
     for (int k = starts[i]; k < starts[i + 1]; ++k) {
         const int j = neighbors[k];
         if (is_fixed(i, j, labels, fixed))
@@ -96,11 +95,11 @@ kernel void place_children(const int size, global const int *starts, global cons
             const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]), t = BOUNDARY_TANGENT(j);
             const REAL gap = m.s0 * t.s1 - m.s1 * t.s0;
             const REAL normal[2] = {-t.s1, t.s0};
-            const REAL room = room_inwards(i, h[i] / 2, gap, normal, starts, neighbors, points PERIODS);
+            const REAL room = free_depth(i, h[i] / 2, gap, normal, starts, neighbors, points PERIODS);
             const REAL way = gap > h[i] / 8 ? fmin(gap / 2, h[i] / 4) : room / 2;
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {x[0] + m.s0 - way * t.s1, x[1] + m.s1 + way * t.s0};
-            keep_apart(x, y, h[i] / 16, place_at_face(x, m, j, way, fixed, tangents, DOMAIN), DOMAIN);
+            keep_separate(x, y, h[i] / 16, place_at_face(x, m, j, way, fixed, tangents, DOMAIN), DOMAIN);
             child[0] = y[0];
             child[1] = y[1];
 #else
@@ -111,30 +110,30 @@ kernel void place_children(const int size, global const int *starts, global cons
                 child[a] = points[DIM * i + a];
                 normal[a] = a != axis ? 0 : wall % 2 ? -1 : 1;
             }
-            /* In a box that is thinner than the cell, too: short of what comes from its other wall; in the cell. */
+            /* In a box thinner than the cell: inside the cell, and not beyond the middle of the box. */
             const REAL gap = fabs(points[DIM * i + axis] - level);
             const REAL most = fmin(h[i], (upper[axis] - lower[axis]) / 2);
-            const REAL room = room_inwards(i, most, gap, normal, starts, neighbors, points PERIODS);
+            const REAL room = free_depth(i, most, gap, normal, starts, neighbors, points PERIODS);
             const REAL way = gap > most / 8 || room < 3 * gap ? fmin(gap / 2, h[i] / 4) : room / 2;
             child[axis] = level + (wall % 2 ? -way : way);
 #endif
-        } else if (has_middle(i, j, face_measures[k], volumes[i])) {
+        } else if (has_midpoint(i, j, face_measures[k], volumes[i])) {
             for (int a = 0; a < DIM; ++a)
                 child[a] = PLACED(a, points[DIM * i + a] + DIFFERENCE(a, points[DIM * i + a], points[DIM * j + a]) / 2);
 #ifdef POLYGON
-            /* Around a corner of the boundary the middle of the common face is in sight of both; where cells meet on
-               both sides of an obstacle, each face but the longest (of two equally long, the first) brings its own. */
-            bool met = false;
-            for (int m = starts[i]; m < starts[i + 1] && !met; ++m)
-                met = neighbors[m] == j && m != k &&
-                      (face_measures[m] > face_measures[k] || (face_measures[m] == face_measures[k] && m < k));
+            /* Around a corner of the boundary the midpoint of the common face is visible from both generators. Of
+               several common faces, all but the longest one (the first of equal ones) get their own new generator. */
+            bool several = false;
+            for (int m = starts[i]; m < starts[i + 1] && !several; ++m)
+                several = neighbors[m] == j && m != k &&
+                          (face_measures[m] > face_measures[k] || (face_measures[m] == face_measures[k] && m < k));
             const REAL x[2] = {points[2 * i], points[2 * i + 1]};
             REAL y[2] = {child[0], child[1]};
-            if (met || exit_parameter(x, y, DOMAIN) <= 1) {
+            if (several || exit_parameter(x, y, DOMAIN) <= 1) {
                 const REAL2 m = (REAL2)(face_centroids[2 * k], face_centroids[2 * k + 1]);
                 y[0] = x[0] + m.s0;
                 y[1] = x[1] + m.s1;
-                keep_apart(x, y, h[i] / 16, place_at_face(x, m, j, 0, fixed, tangents, DOMAIN), DOMAIN);
+                keep_separate(x, y, h[i] / 16, place_at_face(x, m, j, 0, fixed, tangents, DOMAIN), DOMAIN);
             }
             child[0] = y[0];
             child[1] = y[1];

@@ -1,14 +1,14 @@
-/* Sites where generators are inserted or deleted, one key per generator: those are chosen that act in the same sweep,
-   the strongest first, several rings of cells apart. */
+/* Selection of sites where generators are inserted or deleted. Each generator has a key. The strongest sites that are
+   several rings of cells apart are chosen. One work-item per generator. */
 #include "opencl/real.h"
 
-/* A word that orders sites by magnitude, ties by index; 0 is no site. */
+/* A key that orders sites by magnitude, then by index. 0 is not a site. */
 inline ulong site_key(REAL magnitude, int i)
 {
     return ((ulong)as_uint((float)magnitude) << 32) | (uint)(0x7fffffff - i);
 }
 
-/* Per generator i: the largest key in itself and its neighbors. */
+/* spread[i] = largest key of i and its neighbors. */
 kernel void spread_keys(const int size, global const int *starts, global const int *neighbors, global const ulong *keys,
                         global ulong *spread)
 {
@@ -20,8 +20,7 @@ kernel void spread_keys(const int size, global const int *starts, global const i
     spread[i] = key;
 }
 
-/* Per generator i: a site whose key is the largest for rings around is chosen; `chosen` collects over several
-   rounds. */
+/* A site is chosen if its key is the largest in the rings around it. `chosen` collects several rounds. */
 kernel void choose_sites(const int size, global const ulong *keys, global const ulong *spread, global ulong *chosen,
                          global ulong *latest)
 {
@@ -33,7 +32,7 @@ kernel void choose_sites(const int size, global const ulong *keys, global const 
         chosen[i] = mine;
 }
 
-/* Per generator i: a site near a chosen one (spread[i] != 0) is out. */
+/* Remove sites near a chosen one, spread[i] != 0. */
 kernel void drop_sites(const int size, global const ulong *spread, global ulong *keys)
 {
     WORK_ITEM(i);
@@ -41,10 +40,9 @@ kernel void drop_sites(const int size, global const ulong *spread, global ulong 
         keys[i] = 0;
 }
 
-/* Per generator i: no site where it does not move (labels less than `fixed`) or, with `around`, one of its
-   neighbors. */
-kernel void exempt_fixed(const int size, global const int *starts, global const int *neighbors,
-                         global const int *labels, const int fixed, const int around, global ulong *keys)
+/* Remove sites at fixed generators (labels below `fixed`) and, with `around`, at their neighbors. */
+kernel void drop_fixed_sites(const int size, global const int *starts, global const int *neighbors,
+                             global const int *labels, const int fixed, const int around, global ulong *keys)
 {
     WORK_ITEM(i);
     bool near = labels[i] < fixed;
@@ -54,7 +52,7 @@ kernel void exempt_fixed(const int size, global const int *starts, global const 
         keys[i] = 0;
 }
 
-/* Per chosen site: count it in the histogram of the keys from `low` on, HISTOGRAM bins of `width`. */
+/* Histogram of the keys of chosen sites from `low` on, HISTOGRAM bins of `width`. */
 kernel void count_sites(const int size, global const ulong *chosen, const ulong low, const ulong width,
                         global int *histogram)
 {
@@ -64,7 +62,7 @@ kernel void count_sites(const int size, global const ulong *chosen, const ulong 
         atomic_inc(histogram + (key - low) / width);
 }
 
-/* Per chosen site: drop it if its key is below `least`. */
+/* Remove chosen sites with keys below `least`. */
 kernel void limit_sites(const int size, const ulong least, global ulong *chosen)
 {
     WORK_ITEM(i);
@@ -72,7 +70,7 @@ kernel void limit_sites(const int size, const ulong least, global ulong *chosen)
         chosen[i] = 0;
 }
 
-/* Per generator i: is it a chosen site? For ranks by prefix sums. */
+/* flags[i] = 1 for chosen sites, for ranks by prefix sums. */
 kernel void flag_sites(const int size, global const ulong *chosen, global int *flags)
 {
     WORK_ITEM(i);

@@ -1,15 +1,13 @@
-"""Checkpoints: a run's whole state in one file, from which it goes on to the same end, bit for bit.
+"""Checkpoints: the whole state of a run in one file, from which it continues with the same bits.
 
-What a step leaves for the next one is saved as it is: generators in the device's order, their diagram (the next one is
-repaired from it), sizes, velocities, the solvers' starts, the multigrid's coarse levels (which last for several steps),
-and the few numbers that the host keeps. What is computed anew from these (the size field, the plan) is compared with
-what the file says, so that a run does not go on from another's state.
+The file has everything that a step passes to the next one: generators in the order of the device, their diagram (the
+next one is updated from it), sizes, velocities, starts of the solvers, coarse levels of the multigrid, and the numbers
+on the host. The size field and the schedule are computed again and compared with the file.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 import time
@@ -23,6 +21,7 @@ from ..arguments import check_path, warn
 from ..errors import CheckpointWarning, InputError, OutputError
 from ..mesh.results import Displacements
 from ..tessellation.cells import Cells
+from .fingerprint import schedule_digest
 from .schedule import Action, Step
 from .stages import Stages
 
@@ -30,34 +29,29 @@ if TYPE_CHECKING:
     from .loop import Loop
 
 FORMAT, VERSION = "clvoro-checkpoint", 7
-MESH = ("points", "labels", "velocity", "signatures", "ever", "h", "potential")
+MESH = ("points", "labels", "velocity", "signatures", "ever_changed", "h", "potential")
 PER_FACE = ("neighbors", "face_measures", "face_centroids")
 DIAGRAM = (
     "starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances",
 )  # fmt: skip
 
 
-def fingerprint(plan: list[Action]) -> str:
-    """Return a hash of a plan that has not begun."""
-    return hashlib.sha256(repr(plan).encode()).hexdigest()
-
-
 class Checkpointer:
-    """Writes a run's state to `path` every `every` seconds, at most once between two actions of its plan.
+    """Writes the state of a run to `path` every `every` seconds, at most once between two actions.
 
     Parameters
     ----------
     path : str or path
     every : float
-        Seconds from one to the next; 0: after each action.
-    made_by : dict
-        Of `describe`.
-    plan : list of Action
+        Seconds between two checkpoints; 0 writes one after each action.
+    fingerprint : dict
+        See `run_fingerprint`.
+    schedule : list of Action
         Before it begins.
     """
 
     def __init__(
-        self, path: str | PathLike[str], every: float, made_by: dict, plan: list[Action]
+        self, path: str | PathLike[str], every: float, fingerprint: dict, schedule: list[Action]
     ) -> None:
         from ..io import check_writable
 
@@ -65,15 +59,15 @@ class Checkpointer:
         if os.path.isdir(path) or not path:
             raise InputError(f"checkpoint is {path!r}, a folder, expected the name of a file")
         check_writable(path)
-        _check_own(path)
-        self.path, self.every, self.made_by = Path(path), every, made_by
-        self.plan = fingerprint(plan)
+        _check_overwrite(path)
+        self.path, self.every, self.fingerprint = Path(path), every, fingerprint
+        self.schedule = schedule_digest(schedule)
         self._last = time.monotonic()
 
     def offer(self, loop: Loop, stop: bool) -> None:
-        """Write a checkpoint if it is time, or if the run stops here.
+        """Write a checkpoint if it is due, or if the run stops.
 
-        One that cannot be written, as the disk is full, costs neither the run nor the one from before.
+        If it cannot be written, because the disk is full for instance, the run continues and the last one stays.
         """
         if not stop and time.monotonic() - self._last < self.every:
             return
@@ -81,13 +75,13 @@ class Checkpointer:
             self.write(loop)
         except OutputError as error:
             warn(
-                f"{error}. The run goes on without this checkpoint; the one before is as it was",
+                f"{error}. The run continues without this checkpoint; the last one is unchanged",
                 CheckpointWarning,
             )
         self._last = time.monotonic()
 
     def write(self, loop: Loop) -> None:
-        """Write the state of `loop`, which is between two actions; what was at `path` is replaced when all is written.
+        """Write the state of `loop` between two actions. The file is replaced when the new one is complete.
 
         Raises
         ------
@@ -110,7 +104,7 @@ class Checkpointer:
             arrays[f"multigrid.{name}"] = array
         torus = mesh.tessellator.torus
         if torus is not None:
-            # Within what images are taken: in 3D, sums of a cell depend on it in their last bits.
+            # The depth of the halo: in 3D the last bits of a cell depend on it.
             arrays["seam.needed"] = torus.margins.needed.get()
         for part in ("initial", "final"):
             if getattr(loop, part) is not None:
@@ -120,34 +114,34 @@ class Checkpointer:
         state = {
             "position": loop.position, "level": loop.level, "n_start": loop.n_start,
             "steps": loop.steps, "next_label": mesh.next_label, "spare": len(t.neighbors) - m,
-            "coarsening": float(mesh.coarsening).hex(),
+            "size_factor": float(mesh.size_factor).hex(),
             "elapsed": time.perf_counter() - loop.began,
-            "methods": [state_of(method) for method in methods_of(loop.plan)],
+            "methods": [state_of(method) for method in methods_of(loop.schedule)],
             "capacities": capacities_of(mesh.stages), "levels": loop.levels,
             "seam_cells": 0 if torus is None else torus.margins.cells,
         }  # fmt: skip
-        about = {"made_by": self.made_by, "plan": self.plan, "state": state}
+        about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
         arrays["about"] = np.array(json.dumps(about))
         write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)
 
 
-def _check_own(path: str) -> None:
-    """Refuse to replace a file that is no checkpoint, unless it is empty."""
+def _check_overwrite(path: str) -> None:
+    """Raise InputError if the file exists, is not empty and not a checkpoint."""
     from ..io.arrays import is_kind
 
     if os.path.exists(path) and os.path.getsize(path) and not is_kind(path, FORMAT):
         raise InputError(
-            f"checkpoint is {path!r}, a file that is there and is no checkpoint; choose another name, or remove it"
+            f"checkpoint is {path!r}, an existing file that is not a checkpoint; choose another name, or remove it"
         )
 
 
-def methods_of(plan: list[Action]) -> list[Any]:
-    """Return the methods of a plan, each once, in the order in which they first come."""
-    return list({id(a.method): a.method for a in plan if isinstance(a, Step)}.values())
+def methods_of(schedule: list[Action]) -> list[Any]:
+    """Return the methods of a schedule, each once, in the order of their first step."""
+    return list({id(a.method): a.method for a in schedule if isinstance(a, Step)}.values())
 
 
 def state_of(method: Any) -> dict[str, float | int]:
-    """Return what a method keeps from step to step: the numbers of those that are not frozen."""
+    """Return the state of a method between two steps: its numbers, if it is not frozen."""
     if type(method).__dataclass_params__.frozen:
         return {}
     values = {field.name: getattr(method, field.name) for field in dataclasses.fields(method)}
@@ -155,6 +149,6 @@ def state_of(method: Any) -> dict[str, float | int]:
 
 
 def capacities_of(stages: Stages) -> list[int]:
-    """Return the room for faces that the cells' kernels were built with: whether a repair finds it too small."""
+    """Return the capacities for faces that the kernels of the cells were built with."""
     cells = stages.cells
     return [cells.cell_capacity, cells.row_capacity] if isinstance(cells, Cells) else []

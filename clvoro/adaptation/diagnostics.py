@@ -1,4 +1,4 @@
-"""Warnings for plausible input mistakes: units and positions that differ, and sizes that cells cannot follow."""
+"""Warnings for plausible input mistakes: before a run for its input and precision, after it for its errors."""
 
 from __future__ import annotations
 
@@ -8,30 +8,38 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arguments import warn
-from ..errors import MismatchWarning, SizeErrorWarning
+from ..errors import InputError, MismatchWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.box import Domain
 from ..mesh.results import Result
+from ..sizing import Sizing
 from ..sizing.field import Field
 
 COARSER, FINER = 2.0, 1e-3
-"""Ratios of the size of layers to the size field beside them from which on there is a mistake."""
+"""Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
 SAMPLE = 64
-"""Number of places along a layer that are compared."""
+"""Points along a layer where the sizes are compared."""
 MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
-"""Bounds of |e| above which a finished mesh causes a warning. For fields that cells can follow the mean is at most
-0.02, the largest 0.3; where sizes jump 1 : 2 from one cell to the next, the largest is 1."""
+"""Limits of |e|. For size fields of moderate growth the mean is at most 0.02 and the largest value at most 0.3; where h
+jumps 1 : 2 between two cells, the largest value is 1."""
 STEEP = 1.25
-"""Ratio of the sizes of adjacent cells from which on the change of sizes causes the error."""
+"""Ratio of the sizes of adjacent cells above which the growth of h is the reason of an error."""
+ROUND_OFF_ERROR = 0.1
+"""Mean |e| because of round-off, over the ratio of the spacing of positions to h. Random changes of up to half a
+spacing cost 0.095 (0.07 in 3D) times this ratio (`bench/precision.py --noise`)."""
+MAX_ROUND_OFF_ERROR = 1e-3
+"""Mean |e| because of round-off above which a run warns."""
+MAX_SPACING = 1 / 16
+"""Spacing of positions over the smallest h above which a run warns: random starts have pairs much closer than h."""
 
 
 def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -> None:
-    """Warn of each part of the input that hardly fits `domain`, and of layers that hardly fit `field`.
+    """Warn of parts of the input that do not match `domain`, and of layers that do not match `field`.
 
     Parameters
     ----------
     field : Field
-        The field as the caller gave it, without the bounds of layers.
+        The field of the caller, without the limits beside layers.
 
     Warns
     -----
@@ -45,10 +53,10 @@ def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -
 
 
 def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
-    """Return warnings if the cells of `layer` have quite another size than `field` has there.
+    """Return warnings if the cells of `layer` have a very different size than `field` there.
 
-    Layers have flat cells, so that finer ones are right. But a width along the wall that is a default may be far too
-    small.
+    Layers are usually finer than the field across the wall. But their width along the wall, if it is not given, can be
+    far too small.
     """
     feet, normals = columns_of(domain, layer)
     some = slice(None, None, -(-len(feet) // SAMPLE))
@@ -64,14 +72,14 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
             return [f"{what}: sizes jump there; {remedy}"]
         if row == layer.count - 1 and layer.spacing is None and layer.width < FINER * h:
             return [
-                f"{what}: their width is the last layer's height, as no spacing is given; are layers and size field in "
-                "the same unit? Otherwise give spacing, the width along the wall"
+                f"{what}: their width is the last layer's height, because no spacing is given; do layers and size "
+                "field have the same unit? Otherwise give spacing, the width along the wall"
             ]
     return []
 
 
 def warn_of_errors(result: Result) -> None:
-    """Warn if the mesh of a run whose plan is completed does not meet its size field, and say where it does so least.
+    """Warn if a converged mesh does not have the sizes of its field, and name the worst cell.
 
     Warns
     -----
@@ -104,3 +112,54 @@ def warn_of_errors(result: Result) -> None:
         f"{made:.3g} where the size field is {wanted:.3g}; {why}",
         SizeErrorWarning,
     )
+
+
+def check_precision(
+    sizing: Sizing, domain: Domain, points: np.ndarray, factor: float = 1.0
+) -> float:
+    """Raise or warn if the device's precision does not resolve the sizes of `sizing` times `factor`.
+
+    Positions in the domain's frame are rounded to multiples of 2^-24 (in single precision).
+
+    Parameters
+    ----------
+    points : (n, d) float64
+        Generators, or a sample of them on a coarser level, with the density of the cells.
+
+    Returns
+    -------
+    float
+        The mean over `points` of the spacing of positions over h.
+
+    Raises
+    ------
+    InputError
+        If h is less than the spacing of positions at one of `points`.
+
+    Warns
+    -----
+    PrecisionWarning
+        If round-off costs more than `MAX_ROUND_OFF_ERROR`, or the spacing is more than `MAX_SPACING` times h.
+    """
+    real = sizing.real
+    spacing = float(np.finfo(real).eps) / 2 * domain.frame[1]
+    h = sizing(points) * factor
+    remedy = "use dtype='float64', a smaller domain or larger sizes"
+    if real == np.float64:
+        remedy = "use a smaller domain or larger sizes"
+    least = int(np.argmin(h))
+    if h[least] < spacing:
+        where = ", ".join(f"{c:.6g}" for c in points[least])
+        raise InputError(
+            f"the size field is {h[least]:.3g} at ({where}), but positions in {real} are "
+            f"{spacing:.3g} apart in this domain: generators would coincide; {remedy}"
+        )
+    mean = float((spacing / h).mean())
+    if ROUND_OFF_ERROR * mean > MAX_ROUND_OFF_ERROR or spacing > MAX_SPACING * h[least]:
+        warn(
+            f"positions in {real} are {spacing:.3g} apart in this domain, which is {mean:.2g} of the sizes on average "
+            f"and {spacing / h[least]:.2g} of the smallest: round-off alone costs a mean error of "
+            f"{ROUND_OFF_ERROR * mean:.2g}, and generators may coincide; {remedy}",
+            PrecisionWarning,
+        )
+    return mean

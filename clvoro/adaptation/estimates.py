@@ -1,6 +1,8 @@
-"""What a run takes on the device, known before it begins."""
+"""Estimates of the device memory that a run needs."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
@@ -13,143 +15,163 @@ from ..opencl.host_memory import host_memory
 from ..opencl.primitives import scan_width
 from ..solvers.poisson import max_jacobi_iterations
 from ..tessellation.periodic.halo import block_count
-from .forecast import IMAGE_REACH, shore_expected
+from .forecast import IMAGE_REACH, expected_boundary_cells
 
-MOST_CELLS = 100_000_000
-"""Cells that 32-bit indices into the rows of neighbors allow for."""
+MAX_CELLS = 100_000_000
+"""Limit of the 32-bit indices into rows of neighbors."""
 PEAK = {2: (21, 73), 3: (151, 102)}
-"""Reals and 32-bit integers per cell at the peak of a run by dimension, over all stages' buffers (bench/memory.py)."""
+"""Reals and 32-bit integers per cell at the peak of a run by dimension, of all stages (bench/memory.py)."""
 TRIMMED_PEAK = (62, 75)
-"""The same where a polygon's boundary trims the cells, and faces are in full precision."""
-SHORE_PEAK, EDGE_PEAK = (100, 187), (22, 20)
-"""What comes to that for each cell at the boundary, with the sentinels beyond it, and for each of its edges."""
-OUTPUT = {2: {8: 340, 4: 220}, 3: {8: 3600, 4: 4000}}
-"""Bytes per cell while the finished diagram is read, corners, loops and all, by dimension and size of a real.
-
-In 3D single precision takes more: views of faces have to be brought together where double precision agrees at once."""
-TRIMMED_OUTPUT, SHORE_OUTPUT, EDGE_OUTPUT = {8: 535, 4: 330}, {8: 1200, 4: 780}, {8: 65, 4: 38}
-"""The same of polygons: per cell, and what comes to it as above."""
-DIAGRAM = {2: {8: 700, 4: 440}, 3: {8: 4700, 4: 4600}}
-"""The same of one diagram, until it is made and read: of random generators, of which stages keep what they have."""
-TRIMMED_DIAGRAM, SHORE_DIAGRAM, EDGE_DIAGRAM = {8: 1110, 4: 735}, {8: 750, 4: 530}, {8: 260, 4: 170}
-"""The same of polygons, likewise; there are no sentinels."""
+"""The same in polygons, where the boundary trims cells and faces are in full precision."""
+BOUNDARY_PEAK, EDGE_PEAK = (100, 187), (22, 20)
+"""The same in addition per cell at the boundary, with its ghost generators, and per edge of the boundary."""
+OUTPUT = {2: {8: 340, 4: 220}, 3: {8: 3600, 4: 2850}}
+"""Bytes per cell while the final diagram is read, with vertices, by dimension and size of a real."""
+TRIMMED_OUTPUT, BOUNDARY_OUTPUT, EDGE_OUTPUT = {8: 535, 4: 330}, {8: 1200, 4: 780}, {8: 65, 4: 38}
+"""The same in polygons: per cell, and in addition per cell at the boundary and per edge."""
+DIAGRAM = {2: {8: 700, 4: 440}, 3: {8: 4700, 4: 3400}}
+"""Bytes per cell of one diagram of random generators, until it is computed and read."""
+TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM = (
+    {8: 1110, 4: 735},
+    {8: 750, 4: 530},
+    {8: 260, 4: 170},
+)
+"""The same in polygons, without ghost generators."""
 FOLDED = {2: (9, 57), 3: (40, 25)}
-"""What comes to the peak of a run in a periodic box, where graphs are folded: per cell, but not per image."""
+"""Reals and integers per cell (not per image) in addition in periodic boxes."""
 FOLDED_DIAGRAM = {2: {8: 360, 4: 340}, 3: {8: 2000, 4: 1900}}
-"""What comes to one diagram, likewise, in bytes by dimension and size of a real."""
+"""Bytes per cell in addition for one diagram in periodic boxes."""
 PARTIAL_SUMS, SCANS, ARRAYS = 80, 8, 64
-"""What there is whatever the number of cells: reals to each work-group of sums, scans, and arrays in the workspace, of
-each of which up to a unit is left."""
+"""Independent of the number of cells: reals per work-group for sums, scans, and arrays in the workspace, each of which
+wastes up to one unit."""
 FEW = 6000
-"""Cells from which on linear solves are by multigrid, whose iterations are few: there is room to record each one."""
+"""Cells from which on linear solves use multigrid, so that the record of iterations stays short."""
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What a run of n cells needs besides its cells.
+
+    Attributes
+    ----------
+    images : float, optional
+        Ghost images per generator in periodic boxes (`expected_images`); by default those of equal cells.
+    surplus : float
+        Temporary additional cells, per cell (`expected_surplus`).
+    field_bytes : float
+        Memory of the size field.
+    boundary : float, optional
+        Cells at the boundary of a polygon (`expected_boundary_cells`); by default those of equal cells.
+    """
+
+    images: float | None = None
+    surplus: float = 0.0
+    field_bytes: float = 0.0
+    boundary: float | None = None
 
 
 def fixed_bytes(engine: Engine, n: float) -> float:
-    """Return the bytes of a run that do not grow with its number of cells, `n`, or hardly."""
+    """Return the bytes of a run that hardly depend on its number of cells `n`."""
     real = engine.real.itemsize
     records = 8 * real * max_jacobi_iterations(int(min(n, FEW)))
-    return records + PARTIAL_SUMS * engine.groups * real + spare_bytes(engine)
+    return records + PARTIAL_SUMS * engine.groups * real + workspace_bytes(engine)
 
 
-def spare_bytes(engine: Engine) -> float:
-    """Return the part of these bytes that one diagram takes, too."""
+def workspace_bytes(engine: Engine) -> float:
+    """Return the part of these bytes that one diagram needs, too."""
     unit = max(64, engine.queue.device.mem_base_addr_align // 8)
     periodic = engine.domain_kind.periodic
-    margins = 3 * 4 * block_count(engine.dim) if periodic else 0
-    return ARRAYS * unit + SCANS * 4 * scan_width(engine) + margins
+    halo = 3 * 4 * block_count(engine.dim) if periodic else 0
+    return ARRAYS * unit + SCANS * 4 * scan_width(engine) + halo
 
 
-def memory_needed(
+def estimate_memory(
     engine: Engine,
     n: float,
     domain: Domain | None = None,
-    images: float | None = None,
-    surplus: float = 0.0,
-    held: float = 0.0,
-    shore: float | None = None,
+    extras: Extras | None = None,
     *,
     run: bool = True,
 ) -> float:
-    """Return the bytes that a run of `n` cells, or reading its diagram, takes on the device at most.
+    """Return the largest device memory of a run of `n` cells, or of reading its diagram, in bytes.
 
-    Without `run`, those that `Adapter.diagram` takes.
-
-    `images` per generator are what periodic boxes take (`images_expected`), `shore` are the cells at the boundary of a
-    polygon (`shore_expected`); None: as of cells that are all alike. `surplus` are generators per one that is asked for
-    (`surplus_expected`), `held` bytes that are there in any case.
+    Without `run`, return that of `Adapter.diagram`.
     """
-    n *= 1 + surplus
-    cells, folded, edges = n, 0.0, 0
+    extras = Extras() if extras is None else extras
+    n *= 1 + extras.surplus
+    cells, folded, boundary, edges = n, 0.0, 0.0, 0
     if domain is not None and any(domain.periodic):
-        if images is None:
-            deep = IMAGE_REACH[domain.dim] * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
-            seams = [2 * min(deep / length, 1.0) for length in domain.extent[list(domain.periodic)]]
-            images = float(np.prod(1 + np.array(seams))) - 1
+        images = _images_of_equal_cells(domain, n) if extras.images is None else extras.images
         cells, folded = n * (1 + images), n
     trimmed = isinstance(domain, Polygon)
     if isinstance(domain, Polygon):
-        edges = len(domain.oriented.vertices)
-        if shore is None:
+        edges, boundary = len(domain.oriented.vertices), extras.boundary
+        if boundary is None:
             spacing = (domain.measure / max(n, 1.0)) ** 0.5
-            shore = shore_expected(domain, lambda p: np.full(len(p), spacing))
-        shore = min(shore, n)
+            boundary = expected_boundary_cells(domain, lambda p: np.full(len(p), spacing))
+        boundary = min(boundary, n)
 
     d, real = engine.dim, engine.real.itemsize
-    at = n, shore or 0.0, edges
 
     def bytes_of(figures: tuple[int, int]) -> int:
         return figures[0] * real + figures[1] * 4
 
-    def together(*figures: float) -> float:
-        return sum(f * count for f, count in zip(figures, at, strict=True))
+    def in_polygon(per_cell: float, per_boundary_cell: float, per_edge: float) -> float:
+        return per_cell * n + per_boundary_cell * boundary + per_edge * edges
 
     if not run:
-        per_cell = (TRIMMED_DIAGRAM, SHORE_DIAGRAM, EDGE_DIAGRAM)
-        made = together(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[d][real]
-        return made + folded * FOLDED_DIAGRAM[d][real] + held + spare_bytes(engine)
+        per_cell = (TRIMMED_DIAGRAM, BOUNDARY_DIAGRAM, EDGE_DIAGRAM)
+        made = in_polygon(*(f[real] for f in per_cell)) if trimmed else cells * DIAGRAM[d][real]
+        return (
+            made + folded * FOLDED_DIAGRAM[d][real] + extras.field_bytes + workspace_bytes(engine)
+        )
     if trimmed:
-        peak = together(*(bytes_of(f) for f in (TRIMMED_PEAK, SHORE_PEAK, EDGE_PEAK)))
-        output = together(*(f[real] for f in (TRIMMED_OUTPUT, SHORE_OUTPUT, EDGE_OUTPUT)))
+        peak = in_polygon(*map(bytes_of, (TRIMMED_PEAK, BOUNDARY_PEAK, EDGE_PEAK)))
+        output = in_polygon(*(f[real] for f in (TRIMMED_OUTPUT, BOUNDARY_OUTPUT, EDGE_OUTPUT)))
     else:
         peak = cells * bytes_of(PEAK[d]) + folded * bytes_of(FOLDED[d])
         output = cells * OUTPUT[d][real]
-    return max(peak + fixed_bytes(engine, n), output) + held
+    return max(peak + fixed_bytes(engine, n), output) + extras.field_bytes
+
+
+def _images_of_equal_cells(domain: Domain, n: float) -> float:
+    """Return the ghost images per generator of `n` equal cells in a periodic box."""
+    depth = IMAGE_REACH[domain.dim] * (domain.measure / max(n, 1.0)) ** (1 / domain.dim)
+    shares = [2 * min(depth / length, 1.0) for length in domain.extent[list(domain.periodic)]]
+    return float(np.prod(1 + np.array(shares))) - 1
 
 
 def in_bytes(amount: float) -> str:
-    """Return a number of bytes as people read it: 258 KiB, 1.47 GiB."""
+    """Return a number of bytes as text: 258 KiB, 1.47 GiB."""
     power = 0 if amount < 2**10 else 1 if amount < 2**20 else 2 if amount < 2**30 else 3
     return f"{amount / 2 ** (10 * power):.3g} {('bytes', 'KiB', 'MiB', 'GiB')[power]}"
 
 
 def available_memory(device: cl.Device) -> float:
-    """Return the bytes that `device` has; of a CPU, no more than this process may take."""
+    """Return the memory of `device` in bytes; for a CPU at most the limit of this process."""
     own = device.global_mem_size
     return min(own, host_memory()) if device.type & cl.device_type.CPU else own
 
 
 def check_memory(engine: Engine, n: float, needed: float) -> float:
-    """Return `needed`, the bytes that a mesh of `n` cells takes (`memory_needed`), if there are as many.
-
-    Nothing has been allocated yet.
+    """Return `needed`, the bytes for `n` cells (see `estimate_memory`), if the device has them.
 
     Raises
     ------
     MemoryLimitError
-        Saying how many cells were asked for, how much memory they need and how much there is.
+        If it has not. The message has the number of cells and both sizes.
     """
     available = available_memory(engine.queue.device)
-    if n > MOST_CELLS:
+    if n > MAX_CELLS:
         raise MemoryLimitError(
-            f"the run asks for {n:.3g} cells, expected at most {MOST_CELLS:.3g}, which the device's 32-bit "
-            f"indices can tell apart (and they would need {in_bytes(needed)} of "
-            f"{in_bytes(available)}). Are h and the domain in the same unit of length? Otherwise use a larger "
-            "size or n_cells"
+            f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "
+            f"{in_bytes(needed)} of {in_bytes(available)}). Do h and the domain have the same unit of length? "
+            "Otherwise use a larger size or n_cells"
         )
     if needed > available:
         raise MemoryLimitError(
-            f"the size field asks for {n:.3g} cells, which need {in_bytes(needed)} on the device; "
-            f"{engine.queue.device.name.strip()} has {in_bytes(available)}. Are h and the domain in the same "
+            f"the size field requires {n:.3g} cells, which need {in_bytes(needed)} on the device; "
+            f"{engine.queue.device.name.strip()} has {in_bytes(available)}. Do h and the domain have the same "
             "unit of length? Otherwise use a larger size, n_cells, dtype='float32' or another device"
         )
     return needed

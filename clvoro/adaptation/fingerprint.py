@@ -1,9 +1,10 @@
-"""What makes a run, as plain values: by them a checkpoint knows its own run from others."""
+"""Fingerprints: plain values that identify a run, its domain and its schedule, for checkpoints."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,13 @@ from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
 
 
-def describe(
+def run_fingerprint(
     domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None
-) -> dict:
-    """Return what makes a run, as plain values: a checkpoint of other ones is refused."""
+) -> dict[str, Any]:
+    """Return plain values that identify a run. A checkpoint of another run is rejected."""
     start = None if points is None else hashlib.sha256(np.ascontiguousarray(points).tobytes())
     return {
-        "domain": identity(domain),
+        "domain": domain_fingerprint(domain),
         "dtype": dtype.name,
         "points": None if start is None else start.hexdigest(),
         **options,
@@ -26,8 +27,8 @@ def describe(
     }
 
 
-def identity(domain: Domain) -> dict[str, Any]:
-    """Return what tells `domain` from others, and what the arrays of a file have to fit."""
+def domain_fingerprint(domain: Domain) -> dict[str, Any]:
+    """Return plain values that identify `domain` and determine the shapes of a file's arrays."""
     described = json.dumps(domain.describe(), sort_keys=True)
     return {
         "kind": type(domain).__name__,
@@ -39,9 +40,14 @@ def identity(domain: Domain) -> dict[str, Any]:
     }
 
 
-def named(identity: Any) -> str:
-    """Return a domain as errors call it, by its `identity` or what a file has in its place."""
-    if not isinstance(identity, dict):
-        return repr(identity)
-    told = {key: value for key, value in identity.items() if key not in ("kind", "digest")}
-    return f"{identity.get('kind')}({told}, {identity.get('digest')!s:.8}...)"
+def domain_name(fingerprint: Any) -> str:
+    """Return a domain as it appears in errors, from its fingerprint or from any other value in its place."""
+    if not isinstance(fingerprint, dict):
+        return repr(fingerprint)
+    shown = {key: value for key, value in fingerprint.items() if key not in ("kind", "digest")}
+    return f"{fingerprint.get('kind')}({shown}, {fingerprint.get('digest')!s:.8}...)"
+
+
+def schedule_digest(schedule: Sequence[object]) -> str:
+    """Return a hash of a schedule that has not begun."""
+    return hashlib.sha256(repr(schedule).encode()).hexdigest()

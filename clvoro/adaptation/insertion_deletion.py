@@ -1,4 +1,7 @@
-"""Insertion and deletion of generators: dislocations climb, the count meets the field (`population.cl`)."""
+"""Insertion and deletion of generators, the paper's 2.3.1 (`insertion_deletion.cl`).
+
+In 2D dislocations climb and relieve strain; in 2D and 3D the number of generators follows the size field.
+"""
 
 from __future__ import annotations
 
@@ -14,41 +17,83 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Room, Scan
 from ..tessellation.device_diagram import Tessellation
 
-THETA = 0.06
-"""Strain across a pair of a 5-sided and a 7-sided cell at which it climbs."""
-WALL_THETA = 0.3
-"""Strain that keeps a pair from ending at the wall beside it."""
+CLIMB_STRAIN = 0.06
+"""Strain across a dislocation (a 5-sided and a 7-sided cell) above which it climbs."""
+WALL_STRAIN = 0.3
+"""Strain that keeps a dislocation from ending at the wall beside it."""
 NUCLEATION_STRAIN = 0.22
-"""Anisotropy of the lattice above which a pair may be made."""
-PAIR_RINGS, NUCLEUS_RINGS, EXCESS_RINGS = 4, 6, 3
-"""Rings of cells between sites that act in the same sweep: their displacements should not meet."""
+"""Anisotropy of the lattice above which a pair of dislocations may be nucleated."""
+PAIR_RINGS, NUCLEUS_RINGS, LOG_RATIO_RINGS = 4, 6, 3
+"""Rings of cells between sites that change in the same call, so that their displacements do not interact."""
 ROUNDS = 3
-"""Rounds of choosing sites; each takes the strongest that are left."""
+"""Rounds of choosing sites. Each takes the strongest of the remaining sites."""
 SHIFTS, SHIFT_STEP = 51, 0.01
-HISTOGRAM = 128  # a power of two: its bins are divided evenly down to single keys
+"""Shifts of the threshold that are tried to bring the number of generators closest to the required one."""
+HISTOGRAM = 128  # a power of two, so that bins are divided evenly down to single keys
 SPLIT_DISTANCE = 0.3
-"""Half the distance over h at which the two halves of a split cell start."""
-LARGEST_CHANGE = 0.05
-"""Share of the generators that one call may insert or delete to correct the count."""
-MENDED_SHARE = 1e-3
-"""Share of the cells that are mended at a time."""
+"""Half the initial distance over h of the two halves of a split cell."""
+MAX_CHANGE = 0.05
+"""Share of the generators that one call may insert or delete to correct their number."""
+REPAIRED_SHARE = 1e-3
+"""Share of the cells that one call may repair."""
 
 
 @dataclass(frozen=True)
-class Population:
-    """Generators, on the device: points and velocity (n, d), labels, signatures and ever (n,)."""
+class Generators:
+    """Generators on the device: points and velocity (n, d), labels, signatures and ever_changed (n,)."""
 
     points: cla.Array
     labels: cla.Array
     velocity: cla.Array
     signatures: cla.Array
-    ever: cla.Array
-    inserted: int = 0
-    deleted: int = 0
+    ever_changed: cla.Array
+
+    def __len__(self) -> int:
+        return len(self.labels)
 
 
-class PopulationControl:
-    """Decide where generators are inserted and deleted, and do it: for the lattice (in 2D) and for the count."""
+@dataclass(frozen=True)
+class Outcome:
+    """Generators after insertions and deletions, and the numbers of both."""
+
+    generators: Generators
+    inserted: int
+    deleted: int
+
+
+@dataclass(frozen=True)
+class CellSizes:
+    """Sizes of the cells, (n,) real on the device: h, min(L, h) and log(V / h^d)."""
+
+    h: cla.Array
+    local_length: cla.Array
+    log_ratio: cla.Array
+
+
+@dataclass(frozen=True)
+class Change:
+    """The change of a set of generators.
+
+    Attributes
+    ----------
+    missing : float
+        Generators to insert, by the size field or a fixed number; negative: to delete.
+    nuclei : int
+        Pairs of dislocations to nucleate.
+    climb : bool
+        In 2D, let dislocations climb. Otherwise only the number is corrected, exactly.
+    climb_strain : float
+        Strain above which a dislocation climbs. Above `CLIMB_STRAIN`, dislocations at walls do not change.
+    """
+
+    missing: float
+    nuclei: int = 0
+    climb: bool = True
+    climb_strain: float = CLIMB_STRAIN
+
+
+class InsertionDeletion:
+    """Choose where generators are inserted and deleted, and do it."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -57,7 +102,7 @@ class PopulationControl:
         self._kernels = engine.kernels(
             "adaptation/insertion_deletion",
             {
-                "WALL_THETA": WALL_THETA,
+                "WALL_STRAIN": WALL_STRAIN,
                 "SHIFTS": SHIFTS,
                 "SHIFT_STEP": SHIFT_STEP,
                 "SPLIT_DISTANCE": SPLIT_DISTANCE,
@@ -66,130 +111,114 @@ class PopulationControl:
         )
 
     def clear(self) -> None:
-        """Let go of all buffers."""
+        """Free all buffers."""
         self._room.clear()
 
-    def reorganize(
+    def insert_delete(
         self,
         domain: Domain,
         t: Tessellation,
-        h: cla.Array,
-        reach: cla.Array,
-        excess: cla.Array,
-        rows: Population,
-        missing: float,
+        sizes: CellSizes,
+        generators: Generators,
         next_label: int,
-        nuclei: int = 0,
-        climb: bool = True,
-        theta: float = THETA,
+        change: Change,
         fixed: int = 0,
-    ) -> Population | None:
-        """Make pairs (`nuclei` of each kind), let pairs climb, and bring the count to what the field asks for.
+    ) -> Outcome | None:
+        """Nucleate dislocations, let them climb, and correct the number of generators.
 
         Parameters
         ----------
-        h, excess : (n,) real
-        reach : (n,) real
-            Length by which a generator may be moved: the lesser of h and L.
-        rows : Population
-            The present generators.
-        missing : float
-            How many generators the size field, or the count that is held, asks for beside those that there are;
-            negative: too many.
+        generators : Generators
+            The present ones.
         next_label : int
-            First label for the new ones.
-        nuclei : int
-        climb : bool
-            2D only. Without it only the count is corrected, to the last generator.
-        theta : float
-            Strain from which on a pair climbs; above `THETA`, pairs at walls are left alone.
+            First label of new generators.
         fixed : int
-            Generators of smaller labels stay where they are, and what is done beside them is for the count alone.
+            Generators with labels below `fixed` do not change, and next to them only the number is corrected.
 
         Returns
         -------
-        Population or None
-            None if nothing is to change.
+        Outcome or None
+            None if nothing changes.
         """
         n = t.n
-        # Less than 0.7 of a generator is left to strain; a large change is made in several calls.
-        need = math.trunc(missing + math.copysign(0.3, missing))
-        most = max(4, int(LARGEST_CHANGE * n))
+        # Less than 0.7 of a generator is left to strain. A large change takes several calls.
+        need = math.trunc(change.missing + math.copysign(0.3, change.missing))
+        most = max(4, int(MAX_CHANGE * n))
         need = max(-most, min(most, need))
         marks = _Marks.clean(self._room, n, self.engine.dim)
-        self._labels, self._fixed = rows.labels, fixed
-        if climb:
-            kinds, strain_1, strain_2 = self._measure(t, h)
-            if nuclei:
-                self._nucleate(t, kinds, strain_1, marks, nuclei)
-            gained = self._climb(t, reach, kinds, strain_2, marks, need, theta, nuclei > 0)
-            # Memory is scarce here, where generators are there twice in the end.
+        self._labels, self._fixed = generators.labels, fixed
+        if change.climb:
+            kinds, strain_1, strain_2 = self._measure(t, sizes.h)
+            if change.nuclei:
+                self._nucleate(t, kinds, strain_1, marks, change.nuclei)
+            gained = self._climb(t, sizes.local_length, kinds, strain_2, marks, need, change)
+            # Free memory, because the generators will exist twice.
             del kinds, strain_1, strain_2
             self._room.clear("kinds", "strain", "partners", "pull")
             rest = need - gained
             if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
-                self._split_or_delete(t, excess, marks, rest)
+                self._split_or_delete(t, sizes.log_ratio, marks, rest)
         elif need:
-            self._split_or_delete(t, excess, marks, need)
+            self._split_or_delete(t, sizes.log_ratio, marks, need)
         self._room.clear("keys", "spread", "chosen", "latest", "ranks")
-        return self._apply(domain, t, rows, marks, next_label)
+        return self._apply(domain, t, generators, marks, next_label)
 
-    def mend(
+    def repair_cells(
         self,
         domain: Domain,
         t: Tessellation,
         quality: cla.Array,
-        rows: Population,
+        generators: Generators,
         next_label: int,
-        flaw: float,
+        deficit: float,
         split: bool = False,
         fixed: int = 0,
-        share: float = MENDED_SHARE,
-    ) -> Population | None:
+        share: float = REPAIRED_SHARE,
+    ) -> Outcome | None:
         """Delete or split the worst inner cells of a mesh in 2D.
 
-        A cell that is far worse than the others sits where the lattice's defects have come to lie badly. One generator
-        less, or more, shakes them into another arrangement there, which most often is a better one.
+        A very bad cell is where lattice defects are stuck in a poor arrangement. One generator less, or more, leads to
+        another arrangement, which is usually better.
 
         Parameters
         ----------
         quality : (n,) real
-        rows, next_label, fixed
-            As for `reorganize`.
-        flaw : float
-            1 - Q above which a cell is mended.
+        generators, next_label, fixed
+            As for `insert_delete`.
+        deficit : float
+            1 - Q above which a cell is repaired.
         split : bool
-            Split cells of six sides; else they are deleted. Those of more are split, those of fewer deleted.
+            Split six-sided cells; otherwise delete them. Cells of more sides are split, cells of fewer deleted.
         share : float
-            Of the cells, at most so many are mended: a mesh so small that it is less than one stays as it is.
+            Largest share of the cells to repair. A mesh for which that is less than one cell does not change.
 
         Returns
         -------
-        Population or None
-            None if nothing is to change.
+        Outcome or None
+            None if nothing changes.
         """
         engine, k, n = self.engine, self._kernels, t.n
         most = int(share * n)
         if most == 0:
             return None
         marks = _Marks.clean(self._room, n, engine.dim)
-        self._labels, self._fixed = rows.labels, fixed
+        self._labels, self._fixed = generators.labels, fixed
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
-            k.score_flaws, n, t.starts, t.neighbors, quality, engine.real.type(flaw), keys
+            k.score_bad_cells, n, t.starts, t.neighbors, quality, engine.real.type(deficit), keys
         )
-        self._exempt(t, keys, around=True)
+        self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(chosen, n, most)
         engine.run_each(
-            k.mark_flaws, n, chosen, t.starts, np.int32(6 if split else 7), t.offsets,
+            k.mark_bad_cells, n, chosen, t.starts, np.int32(6 if split else 7), t.offsets,
             t.covariances, t.volumes, *marks.arrays,
         )  # fmt: skip
         self._room.clear("keys", "spread", "chosen", "latest")
-        return self._apply(domain, t, rows, marks, next_label)
+        return self._apply(domain, t, generators, marks, next_label)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
-        """Return charge and walls (n, 2), and the strain averaged over one ring and over two (n, 4)."""
+        """Return charge and number of walls (n, 2), and the strain averaged over one and over two rings (n, 4)."""
         engine, k, n = self.engine, self._kernels, t.n
         kinds = self._room("kinds", size=2 * n, dtype=np.int32)
         raw, once = (self._room("strain", turn, size=4 * n, dtype=np.float32) for turn in range(2))
@@ -204,14 +233,14 @@ class PopulationControl:
     def _nucleate(
         self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int
     ) -> None:
-        """Mark at most `nuclei` insertions and as many mergers where the clean lattice is strained most."""
+        """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
             k.score_strain, n, t.starts, t.neighbors, kinds, strain,
             engine.real.type(NUCLEATION_STRAIN), keys,
         )  # fmt: skip
-        self._exempt(t, keys, around=True)
+        self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
         self._limit(chosen, n, 2 * nuclei)
         ranks = self._room("ranks", size=n + 1, dtype=np.int32)
@@ -225,66 +254,66 @@ class PopulationControl:
     def _climb(
         self,
         t: Tessellation,
-        reach: cla.Array,
+        local_length: cla.Array,
         kinds: cla.Array,
         strain: cla.Array,
         marks: _Marks,
         need: int,
-        theta: float,
-        nucleated: bool,
+        change: Change,
     ) -> int:
-        """Mark the pairs that climb, with thresholds shifted to bring the count nearest to `need`; return the gain.
+        """Mark the dislocations that climb and return the change of the number of generators.
 
-        Not near those that have been `nucleated`.
+        The threshold is shifted so that the change is closest to `need`. Nucleated pairs and their neighborhood do not
+        climb.
         """
         engine, k, n = self.engine, self._kernels, t.n
-        real = engine.real.type
+        real, strain_limit = engine.real.type, engine.real.type(change.climb_strain)
         partners = self._room("partners", size=n, dtype=np.int32)
         pull = self._room("pull", size=n)
         keys = self._room("keys", size=n, dtype=np.uint64)
         engine.run_each(
             k.score_pairs, n, t.starts, t.neighbors, t.points, kinds, strain,
-            np.int32(theta <= THETA), partners, pull, keys, *engine.period_args,
+            np.int32(change.climb_strain <= CLIMB_STRAIN), partners, pull, keys, *engine.period_args,
         )  # fmt: skip
-        self._exempt(t, keys, around=True)
-        if nucleated:
+        self._drop_fixed(t, keys, neighbors=True)
+        if change.nuclei:
             engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
-        engine.run_each(k.tally_pairs, n, chosen, pull, kinds, partners, real(theta), tally)
+        engine.run_each(k.count_pair_changes, n, chosen, pull, kinds, partners, strain_limit, tally)
         changes = tally.get()
-        # The shift of the threshold whose change is nearest to the need, the least among equals.
+        # The shift whose change is closest to the need; the smallest of equal ones.
         shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
         engine.run_each(
-            k.mark_pairs, n, chosen, pull, kinds, partners, real(theta), real(shifts[best]),
-            t.points, reach, *marks.arrays, marks.busy, *engine.period_args,
+            k.mark_pairs, n, chosen, pull, kinds, partners, strain_limit, real(shifts[best]),
+            t.points, local_length, *marks.arrays, marks.busy, *engine.period_args,
         )  # fmt: skip
         return int(changes[best])
 
     def _split_or_delete(
-        self, t: Tessellation, excess: cla.Array, marks: _Marks, rest: int
+        self, t: Tessellation, log_ratio: cla.Array, marks: _Marks, rest: int
     ) -> None:
-        """Mark about `rest` cells to be split, or -rest to be deleted: those that are most too large or too small."""
+        """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
         engine, k, n = self.engine, self._kernels, t.n
         sign = engine.real.type(math.copysign(1, rest))
         keys = self._room("keys", size=n, dtype=np.uint64)
-        engine.run_each(k.score_excess, n, t.starts, t.neighbors, excess, sign, keys)
-        self._exempt(t, keys, around=False)
-        engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, EXCESS_RINGS), keys)
-        chosen = self._choose(t, keys, EXCESS_RINGS)
+        engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, keys)
+        self._drop_fixed(t, keys, neighbors=False)
+        engine.run_each(k.drop_sites, n, self._spread(t, marks.busy, LOG_RATIO_RINGS), keys)
+        chosen = self._choose(t, keys, LOG_RATIO_RINGS)
         self._limit(chosen, n, rest if rest > 0 else min(-rest, n - 1))
         engine.run_each(
-            k.mark_excess, n, chosen, sign, t.offsets, t.covariances, t.volumes, *marks.arrays
+            k.mark_split_delete, n, chosen, sign, t.offsets, t.covariances, t.volumes, *marks.arrays
         )
 
-    def _exempt(self, t: Tessellation, keys: cla.Array, around: bool) -> None:
-        """Strike out sites at generators that stay where they are, or beside them."""
+    def _drop_fixed(self, t: Tessellation, keys: cla.Array, neighbors: bool) -> None:
+        """Remove sites at fixed generators and, with `neighbors`, next to them."""
         if self._fixed:
             self.engine.run_each(
-                self._kernels.exempt_fixed, t.n, t.starts, t.neighbors, self._labels,
-                np.int32(self._fixed), np.int32(around), keys,
+                self._kernels.drop_fixed_sites, t.n, t.starts, t.neighbors, self._labels,
+                np.int32(self._fixed), np.int32(neighbors), keys,
             )  # fmt: skip
 
     def _spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
@@ -297,7 +326,7 @@ class PopulationControl:
         return source
 
     def _choose(self, t: Tessellation, keys: cla.Array, rings: int) -> cla.Array:
-        """Return the keys of sites that are `rings` rings apart, the strongest first; `keys` is used up."""
+        """Return the keys of the strongest sites that are `rings` rings apart. `keys` is overwritten."""
         engine, k, n = self.engine, self._kernels, t.n
         chosen = self._room.zeros("chosen", size=n, dtype=np.uint64)
         latest = self._room("latest", size=n, dtype=np.uint64)
@@ -309,7 +338,7 @@ class PopulationControl:
         return chosen
 
     def _limit(self, chosen: cla.Array, n: int, most: int) -> None:
-        """Keep the `most` strongest of the sites; keys are distinct, so that no two tie."""
+        """Keep the `most` strongest sites. Keys are distinct."""
         engine, k = self.engine, self._kernels
         low, span = 0, 2**64
         while True:
@@ -323,14 +352,19 @@ class PopulationControl:
             most -= int(from_top[whole - 1]) if whole else 0
             if whole == bins or most == 0:
                 break
-            # Look closer at the bin in which the count is passed.
+            # Divide the bin in which the number is exceeded.
             low, span = least - width, width
         engine.run_each(k.limit_sites, n, np.uint64(min(least, 2**64 - 1)), chosen)
 
     def _apply(
-        self, domain: Domain, t: Tessellation, rows: Population, marks: _Marks, next_label: int
-    ) -> Population | None:
-        """Carry out what is marked."""
+        self,
+        domain: Domain,
+        t: Tessellation,
+        generators: Generators,
+        marks: _Marks,
+        next_label: int,
+    ) -> Outcome | None:
+        """Carry out the marked changes."""
         engine, n = self.engine, t.n
         self._scan.exclusive(marks.kept, marks.kept, n)
         self._scan.exclusive(marks.born, marks.born, n)
@@ -338,23 +372,23 @@ class PopulationControl:
         m = n - deleted + inserted
         if m == 0 or (deleted == 0 and inserted == 0):
             return None
-        new = Population(
+        new = Generators(
             engine.empty((m, engine.dim)), engine.empty(m, np.int32), engine.empty((m, engine.dim)),
-            engine.empty(m, np.uint64), engine.empty(m), inserted, deleted,
+            engine.empty(m, np.uint64), engine.empty(m),
         )  # fmt: skip
         engine.run_each(
             self._kernels.apply_changes, n, marks.kept, marks.born, np.int32(next_label), np.int32(self._fixed),
-            *domain.device_args(engine), t.points, rows.labels, rows.velocity,
-            rows.signatures, rows.ever, marks.shifts, marks.births, new.points, new.labels,
-            new.velocity, new.signatures, new.ever, t.starts, t.neighbors, t.face_centroids,
+            *domain.device_args(engine), t.points, generators.labels, generators.velocity,
+            generators.signatures, generators.ever_changed, marks.shifts, marks.births, new.points, new.labels,
+            new.velocity, new.signatures, new.ever_changed, t.starts, t.neighbors, t.face_centroids,
             *t.outlines,
         )  # fmt: skip
-        return new
+        return Outcome(new, inserted, deleted)
 
 
 @dataclass(frozen=True)
 class _Marks:
-    """What is to change: see population.cl."""
+    """Changes of each generator: see insertion_deletion.cl."""
 
     kept: cla.Array
     shifts: cla.Array

@@ -1,10 +1,11 @@
-"""The loop of the paper's Figure 1: displace, move, tessellate anew, record, until the plan is done."""
+"""The loop of the paper's Figure 1: displace, move, tessellate, record, until the schedule ends."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,20 +15,69 @@ from ..mesh.results import HISTORY_DTYPE, Displacements, Result
 from ..opencl.primitives import Summary
 from ..solvers.conjugate_gradient import Solution
 from .checkpoint import Checkpointer
-from .schedule import MOST_SURPLUS, Action, Mend, Refine, Reorganize, Rest, Settle, Step, work_of
-from .state import Mesh
+from .methods import Method
+from .schedule import (
+    MOST_SURPLUS,
+    Action,
+    CorrectCount,
+    InsertDelete,
+    Refine,
+    RepairCells,
+    ResetMomentum,
+    Step,
+    work_of,
+)
+from .state import MeshState
 
 SAMPLING_GAIN = 0.36
-"""Error in counting by sizes at generators over that on the next coarser level: measured on a kinked field."""
+"""Ratio of the errors of two levels in counting cells by sizes at the generators, measured on a field with a kink."""
 WINDOW = 10
-"""Steps over which error and quality are watched for progress."""
-LESS, MOST_SWINGS = 0.9, 2
-"""Where a count comes to be too large after it has been too small, or the other way round, it has at most this share of
-the cells missing that it has had at best; the second time that it has not, it is left at that. Counts of smooth fields
-swing once on their way."""
+"""Steps over which error and quality are averaged to detect stagnation."""
+LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
+"""Corrections of the number of cells end at the second change of sign of the missing cells without a reduction to this
+share of the smallest number so far. For smooth fields the sign changes at most once."""
 INTERRUPTED = "interrupted"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
-"""Why runs end that have converged."""
+"""Reasons of converged runs."""
+
+
+@dataclass
+class Progress:
+    """How far a run has come.
+
+    Attributes
+    ----------
+    level : int
+        The present level; 0 is the finest.
+    n_start : int
+        Number of generators at the start.
+    labeled : int
+        Number of labels when the last row of the history was added.
+    position : int
+        Number of actions done.
+    steps : int
+        Number of steps done.
+    rows : list of (1,) array
+        The history.
+    initial, final : Displacements or None
+        Of the first and of the last step. If the last step is not known in advance, they are evaluated again at the
+        end.
+    last : Method or None
+        Method of the last step.
+    elapsed : float
+        Seconds.
+    """
+
+    level: int
+    n_start: int
+    labeled: int
+    position: int = 0
+    steps: int = 0
+    rows: list[np.ndarray] = field(default_factory=list)
+    initial: Displacements | None = None
+    final: Displacements | None = None
+    last: Method | None = None
+    elapsed: float = 0.0
 
 
 class Loop:
@@ -35,111 +85,110 @@ class Loop:
 
     Parameters
     ----------
-    mesh : Mesh
-        On the coarsest level.
-    plan : list of Action
+    mesh : MeshState
+        Mesh of the coarsest level.
+    schedule : list of Action
     levels : int
-        Coarser levels that the plan begins with.
+        Number of coarser levels.
     max_steps : int or None
     tol : float or None
-        Share by which error or quality must improve over a window of steps; 0 takes all steps. None: the run has
-        converged where the plan ends.
+        Share by which error or quality must improve over a window of steps; 0 takes all steps. With None the run has
+        converged when the schedule ends.
     callback : callable or None
-        Takes the new row of the history; the run stops if it returns True.
+        Called with each new row of the history; the run stops if it returns True.
+    checkpoint : Checkpointer, optional
+    progress : Progress, optional
+        That of a saved run; by default the run starts. Its fields are attributes of the loop.
 
     Attributes
     ----------
-    position : int
-        Actions of the plan that are done; a checkpoint sets it, and what follows.
-    begun, steps : int
-        Steps that have begun, and that are done.
-    rows : list of (1,) array
-        Of the history.
-    labeled : int
-        Labels that had been given when the last row was added.
-    checkpoint : Checkpointer or None
+    begun : int
+        Number of steps begun.
     """
 
     def __init__(
         self,
-        mesh: Mesh,
-        plan: list[Action],
+        mesh: MeshState,
+        schedule: list[Action],
         levels: int,
         max_steps: int | None,
         tol: float | None,
         callback: Callable[[np.void], object] | None,
+        checkpoint: Checkpointer | None = None,
+        progress: Progress | None = None,
     ) -> None:
-        self.mesh, self.plan, self.level, self.levels = mesh, plan, levels, levels
-        self.n_start = mesh.n
+        p = Progress(levels, mesh.n, mesh.next_label) if progress is None else progress
+        self.mesh, self.schedule, self.levels, self.checkpoint = mesh, schedule, levels, checkpoint
+        self.level, self.position, self.begun, self.steps = p.level, p.position, p.steps, p.steps
+        self.n_start, self.labeled, self.rows = p.n_start, p.labeled, p.rows
+        self.initial, self.final, self.last = p.initial, p.final, p.last
+        self.began = time.perf_counter() - p.elapsed
         self.max_steps, self.tol, self.callback = max_steps, tol, callback
-        self.rows: list[np.ndarray] = []
-        self.begun, self.steps = 0, 0
-        self.labeled = mesh.next_label
         self.solution: Solution | None = None
-        self.initial: Displacements | None = None
-        # Of a plan's last step; where no plan tells which that will be, they are evaluated once more in the end.
-        self.final: Displacements | None = None
-        steps = [position for position, action in enumerate(plan) if isinstance(action, Step)]
+        steps = [position for position, action in enumerate(schedule) if isinstance(action, Step)]
         self.last_step = steps[-1] if steps and tol is None else None
-        self.began = time.perf_counter()
-        self.position = 0
-        self.checkpoint: Checkpointer | None = None
 
-    def run(self, n_cells: int | None, asked: float, settings: dict[str, Any]) -> Result:
-        """Carry out the plan.
+    def run(self, n_cells: int | None, required: float, settings: dict[str, Any]) -> Result:
+        """Carry out the schedule.
 
-        `asked` is the integral of h^-d on the finest level. `n_cells` holds the finest level's count, and a common
-        factor on the size field follows; with None the size field decides.
+        Parameters
+        ----------
+        n_cells : int or None
+            Number of cells of the finest level, for which the size field is scaled; None keeps the size field.
+        required : float
+            Integral of h^-d on the finest level.
+        settings : dict
+            Settings for the result.
         """
-        self.n_cells, self.asked = n_cells, asked
+        self.n_cells, self.required = n_cells, required
         try:
             stop = not self.rows and self.record(0.0)
             if stop and self.checkpoint is not None:
                 self.checkpoint.offer(self, stop)
-            done = work_of(self.plan, self.levels, self.mesh.engine.dim, asked)
-            ahead = list(zip(self.plan, [*done[1:], 1.0], strict=False))
+            done = work_of(self.schedule, self.levels, self.mesh.engine.dim, required)
+            ahead = list(zip(self.schedule, [*done[1:], 1.0], strict=False))
             for action, progress in ahead[self.position :]:
-                # Also where a run that goes on had been stopped just when it would have ended.
-                reason = self.why_ended(stop)
+                # A resumed run may have been stopped when it was about to end.
+                reason = self.end_reason(stop)
                 if reason:
                     break
                 if isinstance(action, Step):
                     self.step(action)
                     stop = self.record(progress)
-                elif isinstance(action, Reorganize):
-                    self.reorganize(action)
-                elif isinstance(action, Mend):
-                    self.mend(action)
-                elif isinstance(action, Settle):
-                    self.settle(action.share, action.ahead)
+                elif isinstance(action, InsertDelete):
+                    self.insert_delete(action)
+                elif isinstance(action, RepairCells):
+                    self.repair_cells(action)
+                elif isinstance(action, CorrectCount):
+                    self.correct_count(action.share, action.ahead)
                 elif isinstance(action, Refine):
                     self.refine()
-                elif isinstance(action, Rest):
+                elif isinstance(action, ResetMomentum):
                     self.mesh.velocity.fill(0)
                 self.position += 1
                 if self.checkpoint is not None:
                     self.checkpoint.offer(self, stop)
             else:
-                reason = self.why_ended(stop, over=True)
+                reason = self.end_reason(stop, over=True)
         except KeyboardInterrupt:
             reason = INTERRUPTED
             self.mesh.update()
-        # Whatever stopped the run, the mesh has the size and the count that were asked for.
+        # The result always has the required sizes and number of cells.
         while self.level > 0:
             self.refine()
-        self.settle()
-        if not self.told():
+        self.correct_count()
+        if not self.is_recorded():
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         return self.result(reason in (COMPLETED, STALLED), reason, settings)
 
     @property
-    def held(self) -> int | None:
-        """The count that the present level has to have; None: what the size field asks for."""
+    def fixed_count(self) -> int | None:
+        """Fixed number of cells of the present level; None if the size field determines it."""
         return self.n_cells if self.level == 0 else None
 
     def step(self, action: Step) -> None:
-        """Displace and move all generators, and tessellate anew."""
+        """Displace and move all generators, and tessellate them."""
         self.begun = self.steps + 1
         with self.mesh.engine.workspace.frame():
             self.solution = action.method.displace(self.mesh)
@@ -148,101 +197,108 @@ class Loop:
             if self.position == self.last_step:
                 self.final = self.displacements()
             action.method.move(self.mesh)
-        # The row that follows tells of bad sizes, too, unless they are scaled before.
-        self.mesh.update(check=self.held is not None)
-        if self.held is not None:
-            self.mesh.match_size()
+        # The next row of the history checks the sizes, too, unless they are scaled before.
+        self.mesh.update(check=self.fixed_count is not None)
+        if self.fixed_count is not None:
+            self.mesh.normalize_sizes()
         self.last = action.method
         self.steps += 1
 
-    def reorganize(self, action: Reorganize) -> None:
+    def insert_delete(self, action: InsertDelete) -> None:
         """Insert and delete generators."""
         if action.least and abs(self.missing()) <= action.least * self.mesh.n:
             return
-        # What the solver holds is of no use for other generators, and the largest of what is not needed here.
+        # The solver cannot reuse its large buffers for other generators.
         self.mesh.stages.clear("poisson")
         nuclei = round(action.nuclei * self.mesh.n)
-        most = math.inf if self.held is not None else self.most()
-        self.mesh.reorganize(nuclei, self.held, theta=action.theta, most=most)
+        max_cells = math.inf if self.fixed_count is not None else self.max_cells()
+        self.mesh.insert_delete(
+            nuclei, self.fixed_count, climb_strain=action.climb_strain, most=max_cells
+        )
 
-    def mend(self, action: Mend) -> None:
+    def repair_cells(self, action: RepairCells) -> None:
         """Delete or split the worst cells."""
         self.mesh.stages.clear("poisson")
-        self.mesh.mend(action.flaw, action.split)
+        self.mesh.repair_cells(action.deficit, action.split)
 
     def missing(self) -> float:
-        """Cells that are missing: to the count that is held, or to what the size field asks for."""
-        if self.held is not None:
-            return float(self.held - self.mesh.n)
-        return min(self.mesh.missing(), self.most() - self.mesh.n)
+        """Return the number of missing cells, by the fixed number or by the size field."""
+        if self.fixed_count is not None:
+            return float(self.fixed_count - self.mesh.n)
+        return min(self.mesh.missing_cells(), self.max_cells() - self.mesh.n)
 
-    def most(self) -> float:
-        """Cells of this level, at most, where no count is held.
+    def max_cells(self) -> float:
+        """Return the largest number of cells of this level, if there is no fixed number.
 
-        A size counts where a generator is: one beside a jump owns a part of what is to be coarse, and asks for others
-        there, which ask for more. Where cells can follow their sizes, they ask for little more than the integral.
+        Sizes are evaluated at the generators. A small cell beside a jump of h covers a part of the coarse side and
+        requires more cells there, which require more in turn. Where h is smooth the number is close to the integral.
         """
         factor = 2.0 ** (self.mesh.engine.dim * self.level)
-        return self.mesh.fixed + (1 + MOST_SURPLUS) * self.asked / factor
+        return self.mesh.fixed + (1 + MOST_SURPLUS) * self.required / factor
 
-    def missing_ahead(self) -> float:
-        """Cells that are missing for refinement to make the count of the next finer level.
+    def missing_for_next_level(self) -> float:
+        """Return how many cells are missing so that refinement gives the number of the next finer level.
 
-        What a level asks for, the sum of V rho, differs from the integral since h is sampled at the generators; the
-        difference is less by `SAMPLING_GAIN` on the next level. Refinement makes less than 2^d times as many cells, as
-        those at walls have fewer neighbors; their share halves with each level.
+        The sum of V rho differs from the integral, because h is sampled at the generators; on the next level the
+        difference is smaller by `SAMPLING_GAIN`. Refinement gives less than 2^d times as many cells, because cells at
+        walls have fewer neighbors; their share halves with each level.
         """
         mesh = self.mesh
         factor = 2.0**mesh.engine.dim
-        # What this level would ask for with exact sampling.
-        exact = self.asked / factor**self.level
-        bias = min((mesh.n + mesh.missing()) / exact - 1, MOST_SURPLUS)
+        # The number of this level by the integral.
+        exact = self.required / factor**self.level
+        bias = min((mesh.n + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
         lack = factor * mesh.n / mesh.refined_count() - 1
         wanted = exact * (1 + SAMPLING_GAIN * bias)
         for level in range(self.level):
             wanted *= 1 + lack / 2**level
         return wanted - mesh.n
 
-    def settle(self, share: float = 0.0, ahead: bool = False) -> None:
-        """Bring the count to within `share` of what the size field asks for; without it, to the one that is held.
+    def correct_count(self, share: float = 0.0, ahead: bool = False) -> None:
+        """Correct the number of cells.
 
-        `ahead`: to what makes the next level's count.
+        Parameters
+        ----------
+        share : float
+            Tolerance relative to the number that the size field requires. With 0 only a fixed number is corrected.
+        ahead : bool
+            Correct towards the number from which refinement gives that of the next level.
         """
-        least, before, swings = math.inf, 0.0, 0
+        least, before, oscillations = math.inf, 0.0, 0
         while True:
-            if share == 0 and self.held is None:
+            if share == 0 and self.fixed_count is None:
                 break
-            missing = self.missing_ahead() if ahead else self.missing()
+            missing = self.missing_for_next_level() if ahead else self.missing()
             if abs(missing) <= share * self.mesh.n:
                 break
-            # Each one that comes beside a jump of sizes changes what they all ask for: the count may swing for ever.
-            # In one direction it ends by itself, however few come or go at a time.
-            if abs(missing) < LESS * least:
-                least, swings = abs(missing), 0
+            # At jumps of h each new cell changes the required number, so that it can oscillate without end. Changes
+            # of one sign end by themselves.
+            if abs(missing) < LEAST_PROGRESS * least:
+                least, oscillations = abs(missing), 0
             elif missing * before < 0:
-                swings += 1
+                oscillations += 1
             before = missing
-            if swings == MOST_SWINGS:
+            if oscillations == MAX_OSCILLATIONS:
                 break
-            target = self.mesh.n + round(missing) if ahead else self.held
-            most = math.inf if target is not None else self.most()
-            inserted, deleted = self.mesh.reorganize(0, target, climb=False, most=most)
+            target = self.mesh.n + round(missing) if ahead else self.fixed_count
+            max_cells = math.inf if target is not None else self.max_cells()
+            inserted, deleted = self.mesh.insert_delete(0, target, climb=False, most=max_cells)
             if inserted == deleted:
                 break
-        if self.held is not None:
-            self.mesh.match_size()
+        if self.fixed_count is not None:
+            self.mesh.normalize_sizes()
 
     def refine(self) -> None:
-        """Go to the next finer level."""
-        # The finer level needs another solver, and memory.
+        """Refine to the next finer level."""
+        # The finer level needs another solver and more memory.
         self.mesh.stages.clear("poisson")
         self.mesh.engine.workspace.clear()
         finer = self.mesh.refine()
-        # Together: an interruption between them would refine once too often.
+        # One assignment: after an interruption between two, the mesh would be refined once too often.
         self.mesh, self.level = finer, self.level - 1
 
     def record(self, progress: float) -> bool:
-        """Append a row to the history; True if the callback wants to stop."""
+        """Append a row to the history; return True if the callback stops the run."""
         self.add_row(progress)
         if self.callback is None:
             return False
@@ -255,26 +311,26 @@ class Loop:
                 f"None to go on ({error})"
             ) from error
 
-    def told(self) -> bool:
-        """Tell whether the last row is of the mesh as it is: not amid a step, of these generators, with their sizes."""
+    def is_recorded(self) -> bool:
+        """Tell whether the last row of the history describes the present mesh."""
         if not self.rows:
             return False
         row, mesh = self.rows[-1][0], self.mesh
         same = (row["step"], row["level"], row["cells"]) == (self.begun, self.level, mesh.n)
-        # Before the first step sizes are not yet scaled to the count that is held.
-        scaled = self.held is None or self.steps > 0
+        # Before the first step the sizes are not scaled to a fixed number.
+        scaled = self.fixed_count is None or self.steps > 0
         return bool(same and scaled and self.labeled == mesh.next_label)
 
     def add_row(self, progress: float) -> None:
         """Append a row to the history."""
         mesh = self.mesh
-        s, n, labeled = mesh.assess(), mesh.n, mesh.next_label
+        s, n, labeled = mesh.read_summaries(), mesh.n, mesh.next_label
         row = np.zeros(1, HISTORY_DTYPE)
         row["step"], row["level"], row["cells"] = self.steps, self.level, n
         row["progress"] = progress
-        self.describe(row, s)
-        row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever"].sum / n
-        # Generators get a label each when they are inserted.
+        self.write_quality(row, s)
+        row["changed"], row["ever_changed"] = round(s["changed"].sum), s["ever_changed"].sum / n
+        # Each inserted generator gets a new label.
         row["inserted"] = labeled - self.labeled
         before = self.rows[-1]["cells"] if self.rows else self.n_start
         row["deleted"] = before + row["inserted"] - n
@@ -282,19 +338,19 @@ class Loop:
             row["lloyd"], row["poisson"] = s["lloyd"].sum / n, s["correction"].sum / n
             row["iterations"], row["residual"] = self.solution.iterations, self.solution.residual
         row["seconds"] = time.perf_counter() - self.began
-        # Together, without a call in between: an interruption there would tell of some insertions twice.
+        # Without a call in between: after an interruption there, insertions would be counted twice.
         self.rows += [row]
         self.labeled = labeled
 
-    def describe(self, row: np.ndarray, s: dict[str, Summary]) -> None:
-        """Write to `row` how good the mesh is, by its summaries `s`."""
+    def write_quality(self, row: np.ndarray, s: dict[str, Summary]) -> None:
+        """Write errors, qualities and energy to `row`, from the summaries `s`."""
         mesh, n = self.mesh, self.mesh.n
         row["mean_error"], row["max_error"] = s["error"].magnitude / n, s["error"].peak
         row["mean_quality"], row["min_quality"] = s["quality"].sum / n, s["quality"].least
         row["energy"] = s["energy"].sum * mesh.domain.frame[1] ** (mesh.engine.dim + 2)
 
-    def why_ended(self, stop: bool, over: bool = False) -> str:
-        """Return why nothing more is done; "" if there is something: `over` says that the plan has no more."""
+    def end_reason(self, stop: bool, over: bool = False) -> str:
+        """Return why the run ends, or "" if it continues. `over`: the schedule has ended."""
         if stop:
             return "stopped by the callback"
         if self.stalled():
@@ -305,7 +361,7 @@ class Loop:
         return "max_steps reached" if over or used_up else ""
 
     def stalled(self) -> bool:
-        """Tell whether neither mean error nor mean quality has improved by `tol` over the last steps."""
+        """Tell whether both mean error and mean quality have improved by less than `tol` over the last steps."""
         if not self.tol or len(self.rows) <= 2 * WINDOW:
             return False
         history = np.concatenate(self.rows[-2 * WINDOW :])
@@ -315,48 +371,49 @@ class Loop:
         return bool(max(better_error, better_quality) < self.tol)
 
     def displacements(self) -> Displacements:
-        """Fetch the two halves of the step."""
+        """Return the two displacements of the step, on the host."""
         mesh, (origin, scale) = self.mesh, self.mesh.domain.frame
         return Displacements(
-            mesh.values(mesh.points, scale) + origin,
-            mesh.values(mesh.lloyd, scale),
-            mesh.values(mesh.correction, scale),
+            mesh.to_host(mesh.points, scale) + origin,
+            mesh.to_host(mesh.lloyd, scale),
+            mesh.to_host(mesh.correction, scale),
         )
 
     def result(self, converged: bool, reason: str, settings: dict[str, Any]) -> Result:
-        """Fetch what the run has come to.
+        """Return the result of the run.
 
         Raises
         ------
         InputError
-            If rounding has made cells of generators near each other wrong.
+            If cells of nearly coincident generators are wrong because of round-off.
         """
         mesh, final = self.mesh, self.final
         if self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
-            # No step was known to be the last, or generators have been inserted or deleted since.
+            # The last step was not known in advance, or generators have changed since.
+            assert self.last is not None
             with mesh.engine.workspace.frame():
                 self.last.displace(mesh)
                 final = self.displacements()
-        if mesh.complete():
-            # Faces of no more than rounding may have come and gone, and with them sides of cells.
-            self.describe(self.rows[-1], mesh.assess())
+        if mesh.finalize():
+            # Faces shorter than round-off may have changed, and with them the quality.
+            self.write_quality(self.rows[-1], mesh.read_summaries())
         labels = np.sort(mesh.labels.get())
-        size = mesh.values(mesh.h, mesh.domain.frame[1])
-        error, quality = mesh.values(mesh.error), mesh.values(mesh.quality)
-        diagram = mesh.finish()
+        size = mesh.to_host(mesh.h, mesh.domain.frame[1])
+        error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
+        diagram = mesh.fetch_diagram()
         return Result(
             points=diagram.points,
             diagram=diagram,
             target_size=size,
             size_error=error,
             quality=quality,
-            # With the type it need not be found out from all of them.
+            # A given type is faster.
             history=np.concatenate(self.rows, dtype=HISTORY_DTYPE),
             converged=converged,
             stop_reason=reason,
             initial=self.initial,
             final=final,
-            size_factor=mesh.coarsening,
+            size_factor=mesh.size_factor,
             settings=settings,
             origin=np.where(labels < self.n_start, labels, -1).astype(np.int32),
         )

@@ -1,4 +1,4 @@
-"""How good a diagram is: metric error, quality, and whose neighbors changed (`metric.cl`)."""
+"""Metric error (the paper's 3.1), quality (4.1) and changes of neighbors (`metric.cl`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..tessellation.device_diagram import Tessellation
 
 
 class Metric:
-    """Evaluate cells against their target size."""
+    """The kernels of `metric.cl`."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -24,14 +24,14 @@ class Metric:
         error: cla.Array,
         quality: cla.Array,
         energy: cla.Array,
-        reach: cla.Array,
+        local_length: cla.Array,
     ) -> None:
-        """Write the paper's (3.1), signed, its (4.1), each cell's part of its (2.3), and min(L, h); all (n,)."""
+        """Write the signed error (3.1), the quality (4.1), the energy (2.3) of each cell, and min(L, h); all (n,)."""
         exact = t.face_measures.dtype == self.engine.real
         kernels = self._exact if exact else self._kernels
         self.engine.run_each(
             kernels.evaluate_metric, t.n, t.volumes, t.starts, t.face_measures, t.offsets,
-            t.covariances, h, error, quality, energy, reach, *t.outlines,
+            t.covariances, h, error, quality, energy, local_length, *t.outlines,
         )  # fmt: skip
 
     def compare_neighbors(
@@ -41,20 +41,24 @@ class Metric:
         first: bool,
         signatures: cla.Array,
         changed: cla.Array,
-        ever: cla.Array,
+        ever_changed: cla.Array,
     ) -> None:
-        """Write 1 to `changed` (n,) and `ever` (n,) where the set of neighbors differs from the last call's.
+        """Write 1 to `changed` (n,) and `ever_changed` (n,) where the set of neighbors differs from the last call.
 
-        `signatures` (n,) uint64 carries what is compared; `first` only records it.
+        `signatures` (n,) uint64 are the hashes to compare; with `first` they are only set.
         """
         self.engine.run_each(
             self._kernels.compare_neighbors, t.n, t.starts, t.neighbors, labels, np.int32(first),
-            signatures, changed, ever,
+            signatures, changed, ever_changed,
         )  # fmt: skip
 
-    def hold_sizes(self, labels: cla.Array, fixed: int, volumes: cla.Array, h: cla.Array) -> None:
-        """Write the size that they have to `h` (n,) of cells whose label is less than `fixed`."""
-        self.engine.run_each(self._kernels.hold_sizes, len(h), labels, np.int32(fixed), volumes, h)
+    def set_fixed_sizes(
+        self, labels: cla.Array, fixed: int, volumes: cla.Array, h: cla.Array
+    ) -> None:
+        """Set `h` (n,) to the present size of cells whose label is below `fixed`."""
+        self.engine.run_each(
+            self._kernels.set_fixed_sizes, len(h), labels, np.int32(fixed), volumes, h
+        )
 
     def scale_sizes(self, factor: float, h: cla.Array) -> None:
         """Multiply `h` (n,) by `factor`."""

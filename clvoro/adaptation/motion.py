@@ -1,4 +1,4 @@
-"""Moving generators: the correction's displacement, and the move itself (`motion.cl`)."""
+"""Motion of generators: the gradient of the potential, relaxation, and the move itself (`motion.cl`)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ..tessellation.device_diagram import Tessellation
 
 
 class Motion:
-    """The kernels of `motion.cl`, one method each."""
+    """The kernels of `motion.cl`."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("adaptation/motion")
 
-    def follow_potential(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
+    def compute_potential_gradient(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
         """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d)."""
         self.engine.run_each(
-            self._kernels.follow_potential, t.n, t.starts, t.neighbors, t.face_measures,
+            self._kernels.compute_potential_gradient, t.n, t.starts, t.neighbors, t.face_measures,
             t.face_centroids, t.volumes, t.points, psi, u, *self.engine.period_args,
         )  # fmt: skip
 
-    def relax_globally(
+    def relax_correction(
         self,
         summaries: Summaries,
         name: str,
@@ -36,12 +36,12 @@ class Motion:
     ) -> None:
         """Scale `u` and `speed` by alpha = min(limit, k / max(speed)), the paper's (3.5).
 
-        The summary `name` of the speeds has been collected.
+        The summary `name` of `speed` must have been collected.
         """
         real = self.engine.real.type
         n = speed.shape[0]
         self.engine.run_each(
-            self._kernels.relax_globally, n, summaries.values, np.int32(summaries.slots[name]),
+            self._kernels.relax_correction, n, summaries.values, np.int32(summaries.slots[name]),
             real(limit), real(k), u, speed,
         )  # fmt: skip
 
@@ -65,7 +65,7 @@ class Motion:
         velocity: cla.Array,
         clip: float = 0.0,
     ) -> None:
-        """Move `points` (n, d) by a lloyd + b correction, at most clip h (0: no bound), within `domain`.
+        """Move `points` (n, d) by a lloyd + b correction, at most by clip h (0: no bound), inside `domain`.
 
         `velocity` (n, d) becomes the displacement.
         """
@@ -75,10 +75,16 @@ class Motion:
             real(clip), *domain.device_args(self.engine), points, velocity,
         )  # fmt: skip
 
-    def hold_generators(self, labels: cla.Array, fixed: int, displacement: cla.Array) -> None:
-        """Set `displacement` (n, d) to 0 for generators whose label is less than `fixed`."""
+    def zero_fixed_displacements(
+        self, labels: cla.Array, fixed: int, displacement: cla.Array
+    ) -> None:
+        """Set `displacement` (n, d) to 0 for generators whose label is below `fixed`."""
         self.engine.run_each(
-            self._kernels.hold_generators, len(labels), labels, np.int32(fixed), displacement
+            self._kernels.zero_fixed_displacements,
+            len(labels),
+            labels,
+            np.int32(fixed),
+            displacement,
         )
 
     def add_momentum(

@@ -1,4 +1,4 @@
-"""What a run begins with: its size field and number of cells, generators, mesh and plan."""
+"""Preparation of a run: size field, number of cells and levels, memory, initial generators, and schedule."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from ..geometry.box import Domain
 from ..geometry.geojson import may_be_degrees
 from ..geometry.polygon import Polygon
 from ..sizing import Sizing, as_field
+from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
-from .diagnostics import warn_of_mismatches
-from .estimates import check_memory, memory_needed
-from .forecast import images_expected, shore_expected, surplus_expected
+from .diagnostics import check_precision, warn_of_mismatches
+from .estimates import Extras, check_memory, estimate_memory
+from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import Relaxation, make_method
 from .options import Options
-from .precision import check_precision
 from .sampling.quadrature import DensityTree
 from .sampling.start import density_tree, sample_density, sample_uniform
-from .schedule import Action, auto_levels, is_near, plan_adaptive, plan_steps
+from .schedule import Action, adaptive_schedule, auto_levels, is_near, repeated_schedule
 from .stages import Stages
-from .state import Mesh
+from .state import MeshState, Setup
 
 GRADIENT_STEP = 0.2
-"""Step over h in which the exact projection sees the gradient of the size field."""
+"""Step over h of the differences for the gradient of the size field in exact projections."""
 STEPS = 100
-"""Steps of a method that repeats one kind of step, unless the caller says otherwise."""
+"""Default number of steps of a method that repeats one kind of step."""
 
 
 class Preparation:
-    """From options to a mesh and a plan.
+    """From options to a mesh and a schedule.
 
     Parameters
     ----------
@@ -41,26 +41,26 @@ class Preparation:
     domain : Domain
     size : number, callable or clvoro.sizing field
     points : (n, d) array, optional
-        The caller's generators, checked.
+        Generators of the caller, checked.
     options : Options
-    most_levels : int, optional
-        Most coarser levels, where their number is left to this.
+    max_levels : int, optional
+        Largest automatic number of coarser levels.
 
     Attributes
     ----------
     rows : (m, d) ndarray
-        Generators of layers, which stay where they are.
+        Generators of layers, which do not move.
     free : Domain
-        What the layers leave.
+        The domain without the layers.
     sizing : Sizing
     target : int
         Cells of the finest level.
     factor : float
-        On the size field, so that it asks for `target` cells.
+        Factor on the size field that gives `target` cells.
     levels : int
-        Coarser levels that a plan begins with.
+        Number of coarser levels.
     memory : float
-        Bytes that the run takes on the device, or reading its diagram, as far as can be told.
+        Estimated device memory of the run, or of reading its diagram, in bytes.
 
     Raises
     ------
@@ -74,76 +74,99 @@ class Preparation:
         size: object,
         points: np.ndarray | None,
         options: Options,
-        most_levels: int | None = None,
+        max_levels: int | None = None,
     ) -> None:
         self.stages, self.domain, self.points, self.options = stages, domain, points, options
-        n_cells, d = options.n_cells, domain.dim
-        given = points is not None and not options.multilevel
-        if points is not None and given and n_cells not in (None, len(points)):
+        n_cells = options.n_cells
+        # The other methods keep the number of given points.
+        fixed_count = points is not None and not options.multilevel
+        if points is not None and fixed_count and n_cells not in (None, len(points)):
             raise InputError(
                 f"n_cells is {n_cells}, but {len(points)} points are given, and method {options.method!r} "
                 "keeps their number; leave n_cells out, or use method='adaptive'"
             )
-        self.rows, self.free = np.empty((0, d)), domain
+        self.rows, self.free = np.empty((0, domain.dim)), domain
         field = given_field = as_field(size)
         if options.layers:
-            self._check_memory(count_rows(domain, options.layers))
-            self.rows, self.free = (
-                place_layers(domain, options.layers),
-                free_domain(domain, options.layers),
-            )
-            if n_cells is not None and n_cells < len(self.rows) + self.free.n_pieces:
-                raise InputError(
-                    f"n_cells is {n_cells}, of which layers take {len(self.rows)}, expected at least "
-                    f"{len(self.rows) + self.free.n_pieces}; leave n_cells out, or make the layers' cells wider"
-                )
-            field = limit_beside_layers(given_field, domain, options.layers)
+            field = self._place_layers(given_field)
         self.sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
         self._tree: DensityTree | None = None
-        if points is not None and given:
-            asked = float(len(points))
+        if points is not None and fixed_count:
+            required = float(len(points))
         else:
             self._tree = density_tree(self.sizing, self.free)
-            asked = self._tree.integral + len(self.rows)
+            required = self._tree.integral + len(self.rows)
         warn_of_mismatches(given_field, domain, options.layers)
-        self.target = n_cells if n_cells is not None else max(1, round(asked))
-        if n_cells is None and asked < 0.5:
-            message = (
-                f"the size field asks for {asked:.2g} cells in a domain of {domain.measure:.6g}, so that there will be "
-                "one, too small; are h and the domain in the same unit of length?"
-            )
-            if isinstance(domain, Polygon) and may_be_degrees(domain.lower, domain.upper):
-                message += (
-                    " (Coordinates that are longitudes and latitudes have to be projected first.)"
-                )
-            warn(message, CoarseSizeWarning)
-        most, images = max(self.target, 0 if points is None else len(points)), None
+        self.target = n_cells if n_cells is not None else max(1, round(required))
+        if n_cells is None and required < 0.5:
+            self._warn_of_coarse_size(required)
         scaled = options.multilevel and n_cells is not None
-        self.factor = (asked / self.target) ** (1 / d) if scaled else 1.0
+        self.factor = (required / self.target) ** (1 / domain.dim) if scaled else 1.0
         self.levels = 0
         if options.multilevel:
             self.levels = self._count_levels()
-            if options.levels == "auto" and most_levels is not None:
-                self.levels = min(self.levels, most_levels)
-        surplus, shore = 0.0, None
-        if options.multilevel and self._tree is not None:
-            # A coarser level has steeper sizes, and hands its generators on to the next; in the plane, where there is
-            # none, as many come on the finest.
-            reach = self.factor * (2 if self.levels or d == 2 else 1)
-            surplus = surplus_expected(domain, self.sizing, self._tree, reach)
-        if any(domain.periodic) and self._tree is not None:
-            free = most * self._tree.integral / asked
-            images = images_expected(domain, self.sizing, free, self._tree)
-        held = self.sizing.device_bytes + self.sizing.bytes_for(most)
-        self._check_memory(most, images, held=held, shore=0.0)
-        if isinstance(domain, Polygon) and not given:
-            shore = shore_expected(domain, lambda p: (asked / most) ** 0.5 * self.sizing(p))
-        needed = self._check_memory(most, images, surplus, held, shore)
-        # Of few cells, what has been done so far may take more than the run.
-        self.memory = max(needed, float(self.sizing.peak_bytes))
+            if options.levels == "auto" and max_levels is not None:
+                self.levels = min(self.levels, max_levels)
+        self.memory = self._estimate_memory(required, fixed_count)
+
+    @property
+    def setup(self) -> Setup:
+        """What all levels have in common."""
+        return Setup(self.stages, self.domain, self.sizing, self.free, len(self.rows))
+
+    def _place_layers(self, field: Field) -> Field:
+        """Place the generators of the layers, and return the size field limited beside them."""
+        domain, layers, n_cells = self.domain, self.options.layers, self.options.n_cells
+        self._check_memory(count_rows(domain, layers))
+        self.rows, self.free = place_layers(domain, layers), free_domain(domain, layers)
+        least = len(self.rows) + self.free.n_pieces
+        if n_cells is not None and n_cells < least:
+            raise InputError(
+                f"n_cells is {n_cells}, but layers have {len(self.rows)} cells, expected at least {least}; leave "
+                "n_cells out, or make the cells of the layers wider"
+            )
+        return limit_beside_layers(field, domain, layers)
+
+    def _warn_of_coarse_size(self, required: float) -> None:
+        domain = self.domain
+        message = (
+            f"the size field requires {required:.2g} cells in a domain of {domain.measure:.6g}, so that the mesh has "
+            "one cell, which is too small; do h and the domain have the same unit of length?"
+        )
+        if isinstance(domain, Polygon) and may_be_degrees(domain.lower, domain.upper):
+            message += " (Coordinates that are longitudes and latitudes must be projected first.)"
+        warn(message, CoarseSizeWarning)
+
+    def _estimate_memory(self, required: float, fixed_count: bool) -> float:
+        """Return the bytes that the run needs on the device.
+
+        Raises
+        ------
+        MemoryLimitError
+        """
+        domain, sizing, tree = self.domain, self.sizing, self._tree
+        most = max(self.target, 0 if self.points is None else len(self.points))
+        surplus, images, boundary = 0.0, None, None
+        if self.options.multilevel and tree is not None:
+            # Coarser levels have steeper sizes and pass their cells on to the next level. In 2D without coarser levels
+            # as many additional cells appear on the finest one.
+            reach = self.factor * (2 if self.levels or domain.dim == 2 else 1)
+            surplus = expected_surplus(domain, sizing, tree, reach)
+        if any(domain.periodic) and tree is not None:
+            free = most * tree.integral / required
+            images = expected_images(domain, sizing, free, tree)
+        field_bytes = sizing.device_bytes + sizing.bytes_for(most)
+        self._check_memory(most, Extras(images, 0.0, field_bytes, 0.0))
+        if isinstance(domain, Polygon) and not fixed_count:
+            boundary = expected_boundary_cells(
+                domain, lambda p: (required / most) ** 0.5 * sizing(p)
+            )
+        needed = self._check_memory(most, Extras(images, surplus, field_bytes, boundary))
+        # For few cells, the preparation may have taken more than the run.
+        return max(needed, float(sizing.peak_bytes))
 
     def _count_levels(self) -> int:
-        """Return the number of coarser levels that lead to the cells, from the caller's points or from a sample."""
+        """Return the number of coarser levels, from the points of the caller or from a random sample."""
         d, levels, points = self.domain.dim, self.options.levels, self.points
         if levels == "auto":
             if points is None:
@@ -160,26 +183,19 @@ class Preparation:
         self._check_memory(begun)
         return count
 
-    def _check_memory(
-        self,
-        n: float,
-        images: float | None = None,
-        surplus: float = 0.0,
-        held: float = 0.0,
-        shore: float | None = None,
-    ) -> float:
-        """Return the bytes that a run of `n` cells takes, if there are as many."""
+    def _check_memory(self, n: float, extras: Extras | None = None) -> float:
+        """Return the bytes that a run of `n` cells needs; raise if the device has less."""
         engine = self.stages.engine
-        needed = memory_needed(engine, n, self.domain, images, surplus, held, shore)
+        needed = estimate_memory(engine, n, self.domain, extras)
         return check_memory(engine, n, needed)
 
     def generators(self) -> np.ndarray:
-        """Return the first ones, (n, d): the caller's or a random sample of the coarsest level, after those of layers.
+        """Return the initial generators (n, d): those of layers, then those of the caller or a random sample.
 
         Warns
         -----
         PrecisionWarning
-            If their positions cannot tell sizes as small as those asked for.
+            If positions do not resolve the sizes.
         """
         options, real = self.options, self.stages.engine.real
         host = self.points
@@ -197,42 +213,40 @@ class Preparation:
             host = np.concatenate([self.rows, apart_from(host, self.rows, self.free)])
         return host
 
-    def mesh(self) -> Mesh:
-        """Return the mesh of the first generators."""
+    def mesh(self) -> MeshState:
+        """Return the mesh of the initial generators."""
         host, real = self.generators(), self.stages.engine.real
         with Naming(host, self.domain, real):
-            return Mesh(
-                self.stages,
-                self.domain,
-                self.sizing,
-                self.stages.engine.upload(self.domain.place(host, real)),
-                coarsening=self.factor * 2.0**self.levels,
-                free=self.free,
-                fixed=len(self.rows),
-            )
+            points = self.stages.engine.upload(self.domain.place(host, real))
+            start = {
+                "points": points,
+                "labels": self.stages.engine.upload(np.arange(len(points)), np.int32),
+            }
+            del points
+            return MeshState(self.setup, self.factor * 2.0**self.levels, start)
 
     @property
-    def may_be_near(self) -> bool:
-        """Whether the caller's points may be a mesh that only needs correction."""
+    def may_need_correction_only(self) -> bool:
+        """Whether the points of the caller may be a mesh that only needs a correction."""
         return self.points is not None and self.options.multilevel and self.levels == 0
 
-    def plan(self, mesh: Mesh | None) -> list[Action]:
-        """Return what is to be done. `mesh` (of `mesh`, as it begins) is looked at only if it `may_be_near`."""
+    def schedule(self, mesh: MeshState | None) -> list[Action]:
+        """Return the schedule. The initial `mesh` is only used if it `may_need_correction_only`."""
         options = self.options
         if not options.multilevel:
             relaxation = Relaxation(options.alpha, options.k)
             steps = STEPS if options.max_steps is None else options.max_steps
-            return plan_steps(make_method(options.method, relaxation), steps)
-        near = self.may_be_near and mesh is not None and self._is_near(mesh)
-        return plan_adaptive(
+            return repeated_schedule(make_method(options.method, relaxation), steps)
+        near = self.may_need_correction_only and mesh is not None and self._is_near(mesh)
+        return adaptive_schedule(
             self.domain.dim, options.effort, self.levels, options.method == "exact", options.error_target,
             warm=self.points is not None, near=near,
         )  # fmt: skip
 
-    def _is_near(self, mesh: Mesh) -> bool:
+    def _is_near(self, mesh: MeshState) -> bool:
         n, n_cells = mesh.n, self.options.n_cells
-        missing = mesh.missing() if n_cells is None else float(n_cells - n)
-        s = mesh.assess()
+        missing = mesh.missing_cells() if n_cells is None else float(n_cells - n)
+        s = mesh.read_summaries()
         return is_near(
             self.domain.dim, self.options.effort, n, missing, s["error"].magnitude / n, s["quality"].sum / n
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Descent of cell quality itself (`shape.cl`), for the last steps, where Lloyd's centroids no longer help."""
+"""Gradient descent of the cell quality in 2D, for the last steps of a run (`quality_descent.cl`)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 
 
-class Shape:
-    """The kernels of `shape.cl`."""
+class QualityDescent:
+    """The kernels of `quality_descent.cl`."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -23,29 +23,31 @@ class Shape:
         quality: cla.Array,
         lloyd: cla.Array,
         *,
-        emphasis: float = 5.0,
+        bad_cell_weight: float = 5.0,
         rate: float = 0.1,
-        longest: float = 0.2,
+        max_displacement: float = 0.2,
     ) -> None:
-        """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 2), in the place of Lloyd's.
+        """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 2), in place of the displacement to the centroid.
 
         Parameters
         ----------
         h, quality : (n,) real
-        emphasis : float
-            Weight of bad cells: omega = 1 + emphasis (-log Q).
-        longest : float
-            Bound of the displacement over h.
+        bad_cell_weight : float
+            Factor in the weight omega = 1 - bad_cell_weight log Q of a cell.
+        rate : float
+            Step length.
+        max_displacement : float
+            Largest displacement over h.
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
             tension, pressure = engine.scratch(t.n), engine.scratch(t.n)
             engine.run(
-                k.load_cells, -(-t.n // 4), np.int32(t.n), t.starts, t.face_measures, t.volumes,
-                quality, real(emphasis), tension, pressure,
+                k.compute_tension_pressure, -(-t.n // 4), np.int32(t.n), t.starts, t.face_measures, t.volumes,
+                quality, real(bad_cell_weight), tension, pressure,
             )  # fmt: skip
             engine.run_each(
-                k.descend_shape, t.n, t.starts, t.neighbors, t.face_measures, t.face_centroids,
-                t.points, tension, pressure, h, real(rate), real(longest), lloyd, *t.outlines,
+                k.descend_quality, t.n, t.starts, t.neighbors, t.face_measures, t.face_centroids,
+                t.points, tension, pressure, h, real(rate), real(max_displacement), lloyd, *t.outlines,
                 *engine.period_args,
             )  # fmt: skip

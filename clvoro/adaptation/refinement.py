@@ -1,4 +1,4 @@
-"""Coarse to fine: a mesh for 2h becomes one for h by the middles of its Delaunay edges (`refinement.cl`)."""
+"""Refinement from a mesh for 2h to one for h: new generators at the midpoints of Delaunay edges (`refinement.cl`)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ..opencl.primitives import Scan
 from ..tessellation.device_diagram import Tessellation
 
 SHORT_FACE = 0.02
-"""Share of a cell's length (squared in 3D) under which a face is an accident that deserves no new generator."""
-CLOSE, MOST_LOOKED_AT = 256, 5000
-"""Roundings of positions within which new generators of polygons count as the same; how many may be looked at on the
-host for that: cells of larger meshes are smaller than that could happen to."""
+"""Share of a cell's length (squared in 3D) below which a face brings no new generator."""
+COINCIDENT, MAX_CHECKED = 256, 5000
+"""Distance in ulps below which new generators in polygons count as coincident, and the number of generators up to which
+this is checked, on the host. It only happens with cells larger than the edges of the boundary."""
 
 
 class Refinement:
@@ -35,7 +35,7 @@ class Refinement:
         labels: cla.Array | None = None,
         fixed: int = 0,
     ) -> cla.Array:
-        """Return about 2^d times as many generators, (n', d): those of `t` first, then the new ones.
+        """Return about 2^d times as many generators, (n', d): those of `t`, then the new ones.
 
         Parameters
         ----------
@@ -43,40 +43,42 @@ class Refinement:
             Size on the new level, at the generators of `t`.
         labels : (n,) int32, optional
         fixed : int
-            Generators of smaller labels, and edges that end in them, bring no new ones.
+            Generators with labels below `fixed`, and edges that end in them, bring no new ones.
         """
         engine, k, n = self.engine, self._kernels, t.n
-        still = t.starts if labels is None else labels, np.int32(fixed)
-        firsts = self._children(t, *still)
-        finer = engine.empty((n + int(firsts[n].get()), engine.dim))
+        fixed_args = t.starts if labels is None else labels, np.int32(fixed)
+        starts = self._child_starts(t, *fixed_args)
+        finer = engine.empty((n + int(starts[n].get()), engine.dim))
         engine.run_each(
-            k.place_children, n, t.starts, t.neighbors, t.face_measures, t.volumes, t.points, *still, h,
-            np.int32(n), *domain.device_args(engine), firsts, finer,
+            k.place_new_generators, n, t.starts, t.neighbors, t.face_measures, t.volumes, t.points, *fixed_args, h,
+            np.int32(n), *domain.device_args(engine), starts, finer,
             t.face_centroids, *t.outlines,
         )  # fmt: skip
-        # Where cells are much larger than what their boundary is made of, several may bring one at the same corner.
-        if isinstance(domain, Polygon) and len(finer) <= MOST_LOOKED_AT:
-            return self._apart(finer, n)
+        # Several cells that are much larger than the edges of the boundary can bring one at the same corner.
+        if isinstance(domain, Polygon) and len(finer) <= MAX_CHECKED:
+            return self._without_coincident(finer, n)
         return finer
 
-    def _apart(self, finer: cla.Array, n: int) -> cla.Array:
-        """Return the generators without new ones, from row `n` on, that all but coincide with others."""
+    def _without_coincident(self, finer: cla.Array, n: int) -> cla.Array:
+        """Return the generators without new ones (from row `n` on) that coincide with others."""
         host = finer.get()
-        pairs = KDTree(host).query_pairs(CLOSE * np.finfo(host.dtype).eps, output_type="ndarray")
+        pairs = KDTree(host).query_pairs(
+            COINCIDENT * np.finfo(host.dtype).eps, output_type="ndarray"
+        )
         close = np.unique(pairs.max(axis=1))
         close = close[close >= n]
         return self.engine.upload(np.delete(host, close, axis=0)) if len(close) else finer
 
     def count(self, t: Tessellation) -> int:
-        """Return how many generators `refine` would make of `t`."""
-        return t.n + int(self._children(t, t.starts, np.int32(0))[t.n].get())
+        """Return the number of generators after `refine`."""
+        return t.n + int(self._child_starts(t, t.starts, np.int32(0))[t.n].get())
 
-    def _children(self, t: Tessellation, labels: cla.Array, fixed: np.int32) -> cla.Array:
-        """Return the prefix sums (n + 1,) int32 of how many new generators each one brings."""
-        firsts = self.engine.empty(t.n + 1, np.int32)
+    def _child_starts(self, t: Tessellation, labels: cla.Array, fixed: np.int32) -> cla.Array:
+        """Return the prefix sums (n + 1,) int32 of the numbers of new generators."""
+        starts = self.engine.empty(t.n + 1, np.int32)
         self.engine.run_each(
             self._kernels.count_new_generators, t.n, t.starts, t.neighbors, t.face_measures, t.volumes,
-            labels, fixed, firsts,
+            labels, fixed, starts,
         )  # fmt: skip
-        self._scan.exclusive(firsts, firsts, t.n)
-        return firsts
+        self._scan.exclusive(starts, starts, t.n)
+        return starts

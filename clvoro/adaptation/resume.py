@@ -1,10 +1,9 @@
-"""Checkpoints that are read: found sound in themselves and of the same run, and turned into its mesh and loop again."""
+"""Read checkpoints, check that they are valid and of the same run, and restore mesh and progress from them."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -22,19 +21,18 @@ from .checkpoint import (
     MESH,
     VERSION,
     capacities_of,
-    fingerprint,
     methods_of,
     state_of,
 )
-from .fingerprint import named
+from .fingerprint import domain_name, schedule_digest
+from .insertion_deletion import Generators
+from .loop import Progress
 from .schedule import Action, Step
 from .stages import Stages
-from .state import SUMMARIES, Mesh
+from .state import SUMMARIES, MeshState, Setup
 
 if TYPE_CHECKING:
     from ..geometry.box import Domain
-    from ..sizing import Sizing
-    from .loop import Loop
 
 _COUNTS = (
     "position",
@@ -48,7 +46,7 @@ _COUNTS = (
 
 
 class Saved:
-    """A checkpoint that has been read and found sound in itself.
+    """A checkpoint that has been read and is valid in itself.
 
     Parameters
     ----------
@@ -57,7 +55,7 @@ class Saved:
     Raises
     ------
     InputError
-        If the file is missing, damaged, cut off or no checkpoint; names the file and what is wrong.
+        If the file is missing, damaged, truncated or not a checkpoint.
     """
 
     def __init__(self, path: str | PathLike[str]) -> None:
@@ -68,25 +66,25 @@ class Saved:
         version = self.arrays["version"].item()
         if version != VERSION:
             raise InputError(
-                f"cannot resume from {self.name}: it is a checkpoint of version {version}, expected {VERSION}, as this "
-                "version of clvoro writes; begin anew without resume"
+                f"cannot resume from {self.name}: it is a checkpoint of version {version}, expected {VERSION}, that of "
+                "this version of clvoro; start again without resume"
             )
         try:
             about = json.loads(self.arrays["about"].item())
-            self.made_by, self.plan = dict(about["made_by"]), str(about["plan"])
+            self.fingerprint, self.schedule = dict(about["fingerprint"]), str(about["schedule"])
             self.state = state = dict(about["state"])
             if any(type(state[name]) is not int or state[name] < 0 for name in _COUNTS):
                 raise ValueError("counts")
-            self.coarsening = float.fromhex(state["coarsening"])
+            self.size_factor = float.fromhex(state["size_factor"])
             self.elapsed = float(state["elapsed"])
             self.levels = int(state["levels"])
-            if not (0 < self.coarsening < np.inf and 0 <= self.elapsed < np.inf):
-                raise ValueError("coarsening")
+            if not (0 < self.size_factor < np.inf and 0 <= self.elapsed < np.inf):
+                raise ValueError("size_factor")
             if not self.levels >= 0:
                 raise ValueError("levels")
-            domain = self.made_by["domain"]
+            domain = self.fingerprint["domain"]
             d = len(domain["lower"])
-            self._check(d, int(domain["walls"]), np.dtype(self.made_by["dtype"]))
+            self._check(d, int(domain["walls"]), np.dtype(self.fingerprint["dtype"]))
             if any(domain["periodic"]):
                 self._check_seams(d)
         except (
@@ -102,7 +100,7 @@ class Saved:
             ) from error
 
     def _check(self, d: int, walls: int, real: np.dtype) -> None:
-        """Check all that the device would otherwise index by, or divide by, unseen."""
+        """Check everything that the device uses as an index or divides by."""
         a = self.arrays
         n, m = len(a["mesh.points"]), len(a["diagram.neighbors"])
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
@@ -135,72 +133,71 @@ class Saved:
             raise ValueError("points")
         if not ((h > 0).all() and np.isfinite(h).all()):
             raise ValueError("sizes")
-        # Room that was made for the most cells that the run had is kept when there are fewer.
+        # Capacities for the largest number of cells so far are kept when there are fewer.
         cells = max(n, self.state["n_start"], int(a["history"]["cells"].max()))
         if self.state["spare"] > 64 * cells + 64:
             raise ValueError("spare")
 
     def _check_seams(self, d: int) -> None:
-        """Check what a periodic box of `d` dimensions has beside."""
+        """Check the arrays of a periodic box of `d` dimensions."""
         needed = self.arrays["seam.needed"]
         if needed.shape != (block_count(d),) or needed.dtype != np.float32:
             raise ValueError("seam.needed")
         if not (np.isfinite(needed).all() and needed.min() >= 0):
             raise ValueError("seam.needed")
 
-    def fit(self, made_by: dict) -> None:
-        """Refuse a checkpoint of another domain or of other settings, naming the first that differs.
+    def check_fingerprint(self, fingerprint: dict) -> None:
+        """Compare the checkpoint with the `fingerprint` of this run.
 
         Raises
         ------
         InputError
+            If the domain or a setting differs; the message has the first one.
         """
-        made_by = json.loads(json.dumps(made_by))
-        for name in {**self.made_by, **made_by}:
-            was, now = self.made_by.get(name), made_by.get(name)
+        fingerprint = json.loads(json.dumps(fingerprint))
+        for name in {**self.fingerprint, **fingerprint}:
+            was, now = self.fingerprint.get(name), fingerprint.get(name)
             if was == now:
                 continue
             if name == "points":
                 was, now = ("none" if v is None else f"others ({v:.8}...)" for v in (was, now))
             if name == "domain":
-                was, now = (named(v) for v in (was, now))
+                was, now = (domain_name(v) for v in (was, now))
             raise InputError(
-                f"cannot resume from {self.name}: it is of a run with {name} = {was}, and this one has {name} = "
-                f"{now}; give the settings of that run, or begin anew without resume"
+                f"cannot resume from {self.name}: it is from a run with {name} = {was}, but this run has {name} = "
+                f"{now}; use the settings of that run, or start again without resume"
             )
 
     def restore(
         self,
-        stages: Stages,
-        domain: Domain,
-        sizing: Sizing,
-        plan: list[Action],
-        free: Domain | None = None,
-        fixed: int = 0,
-    ) -> Mesh:
-        """Return the mesh as the run left it, for a loop over `plan`.
+        setup: Setup,
+        schedule: list[Action],
+    ) -> MeshState:
+        """Return the mesh of the saved run, for a loop over `schedule`.
 
         Raises
         ------
         InputError
-            If plan or size field are others than those of the run that was saved.
+            If schedule or size field differ from those of the saved run.
         """
+        stages, domain, sizing = setup.stages, setup.domain, setup.sizing
         state, engine, a = self.state, stages.engine, self.arrays
-        if self.plan != fingerprint(plan) or state["position"] > len(plan):
+        if self.schedule != schedule_digest(schedule) or state["position"] > len(schedule):
             raise InputError(
-                f"cannot resume from {self.name}: its plan is another, as of another version of clvoro; begin anew"
+                f"cannot resume from {self.name}: its schedule differs, as with another version of clvoro; start again"
             )
         _set_capacities(stages, state["capacities"])
         arrays = {name: engine.upload(a[f"mesh.{name}"], a[f"mesh.{name}"].dtype) for name in MESH}
-        points, n = arrays["points"], len(arrays["points"])
+        h, potential = arrays.pop("h"), arrays.pop("potential")
+        generators = Generators(**arrays)
+        points, n = generators.points, len(generators)
         sizes = engine.empty(n)
         sizing.evaluate(points, n, sizes)
-        moving = a["mesh.labels"] >= fixed
-        self._compare_sizes(sizes.get().astype(float) * self.coarsening, domain, moving)
+        moving = a["mesh.labels"] >= setup.fixed
+        self._compare_sizes(sizes.get().astype(float) * self.size_factor, domain, moving)
         del sizes
-        if "multipliers" in a:
-            arrays["multipliers"] = engine.upload(a["multipliers"], np.float32)
-        mesh = Mesh.saved(stages, domain, sizing, arrays, self.coarsening, free, fixed)
+        multipliers = engine.upload(a["multipliers"], np.float32) if "multipliers" in a else None
+        mesh = MeshState.restore(setup, self.size_factor, generators, h, potential, multipliers)
         faces = a["diagram.face_measures"].dtype
         if not isinstance(domain, Polygon) and faces != engine.face:
             raise InputError(f"cannot resume from {self.name}: it is damaged (faces are {faces})")
@@ -211,7 +208,7 @@ class Saved:
         if torus is not None:
             torus.margins.needed.set(a["seam.needed"])
             torus.margins.cells = state["seam_cells"]
-        mesh._evaluate_metric()
+        mesh.evaluate_metric()
         mesh.summaries.values.set(a["summaries"])
         levels = {
             k.removeprefix("multigrid."): v for k, v in a.items() if k.startswith("multigrid.")
@@ -233,30 +230,36 @@ class Saved:
             origin, scale = domain.frame
             place = self.arrays["mesh.points"][worst] * scale + origin
             raise InputError(
-                f"cannot resume from {self.name}: its size field is another; at {place} the run's size was "
-                f"{saved[worst] * scale / self.coarsening:.6g}, this field's is "
-                f"{now[worst] * scale / self.coarsening:.6g}. Give the field of that run, or begin anew"
+                f"cannot resume from {self.name}: its size field differs; at {place} the size of that run was "
+                f"{saved[worst] * scale / self.size_factor:.6g}, this field's is "
+                f"{now[worst] * scale / self.size_factor:.6g}. Use the field of that run, or start again"
             )
 
-    def set(self, loop: Loop) -> None:
-        """Set a loop, which has the mesh from `restore`, to where the run was."""
-        state = self.state
-        for name in ("position", "level", "n_start", "steps"):
-            setattr(loop, name, state[name])
-        loop.begun = loop.steps
-        loop.labeled = loop.n_start + int(self.arrays["history"]["inserted"].sum())
-        for method, values in zip(methods_of(loop.plan), state["methods"], strict=True):
+    def progress(self, schedule: list[Action]) -> Progress:
+        """Return how far the saved run had come, and set the state of the methods in `schedule`."""
+        state, history = self.state, self.arrays["history"]
+        for method, values in zip(methods_of(schedule), state["methods"], strict=True):
             for name in state_of(method):
                 setattr(method, name, values[name])
-        loop.rows = [row.reshape(1) for row in self.arrays["history"]]
-        steps = [action for action in loop.plan[: loop.position] if isinstance(action, Step)]
-        if steps:
-            loop.last = steps[-1].method
-        for part in ("initial", "final"):
-            saved = [self.arrays.get(f"{part}.{f.name}") for f in dataclasses.fields(Displacements)]
-            if all(array is not None for array in saved):
-                setattr(loop, part, Displacements(*saved))  # type: ignore[arg-type]
-        loop.began = time.perf_counter() - self.elapsed
+        steps = [action for action in schedule[: state["position"]] if isinstance(action, Step)]
+        return Progress(
+            level=state["level"],
+            n_start=state["n_start"],
+            labeled=state["n_start"] + int(history["inserted"].sum()),
+            position=state["position"],
+            steps=state["steps"],
+            rows=[row.reshape(1) for row in history],
+            initial=self._displacements("initial"),
+            final=self._displacements("final"),
+            last=steps[-1].method if steps else None,
+            elapsed=self.elapsed,
+        )
+
+    def _displacements(self, part: str) -> Displacements | None:
+        saved = [self.arrays.get(f"{part}.{f.name}") for f in dataclasses.fields(Displacements)]
+        if any(array is None for array in saved):
+            return None
+        return Displacements(*saved)  # type: ignore[arg-type]
 
 
 def _set_capacities(stages: Stages, capacities: object) -> None:

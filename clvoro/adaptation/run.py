@@ -1,4 +1,4 @@
-"""A run: prepared, begun anew or where it was saved, carried out."""
+"""A run: preparation, start or restart, loop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..geometry.box import Domain
 from ..mesh.results import Result
 from ..tessellation.periodic.torus import FewCellsError
 from .checkpoint import Checkpointer
-from .fingerprint import describe
+from .fingerprint import run_fingerprint
 from .loop import Loop
 from .options import Checkpoint, Options, uses
 from .preparation import Preparation
@@ -19,7 +19,7 @@ from .resume import Saved
 from .stages import Stages
 
 
-def carry_out(
+def run_adaptation(
     stages: Stages,
     domain: Domain,
     size: object,
@@ -29,26 +29,27 @@ def carry_out(
     callback: Callable[[np.void], object] | None,
     on_memory: Callable[[float], object] | None,
 ) -> Result:
-    """Return the result of a run, which has fewer coarse levels where a periodic box has too few cells around it.
+    """Return the result of a run.
 
+    If a periodic box has too few cells around it on the coarsest level, the run starts again with fewer levels.
     `on_memory` is called once with the bytes that the run needs on the device, before it begins; `callback` with each
     row of the history. Raises and warns as `Adapter.run` does.
     """
     source = files.source
     saved = None if source is None else Saved(source)
-    made_by = {}
+    fingerprint = {}
     if saved is not None or files.path is not None:
-        made_by = describe(domain, vars(options), stages.engine.real, points)
+        fingerprint = run_fingerprint(domain, vars(options), stages.engine.real, points)
     if saved is not None:
-        saved.fit(made_by)
-    most = None if saved is None else saved.levels
+        saved.check_fingerprint(fingerprint)
+    max_levels = None if saved is None else saved.levels
     while True:
-        prepared = Preparation(stages, domain, size, points, options, most)
+        prepared = Preparation(stages, domain, size, points, options, max_levels)
         if on_memory is not None:
             on_memory(prepared.memory)
             on_memory = None
         try:
-            loop = _begin(prepared, made_by, saved, files, callback)
+            loop = _start(prepared, fingerprint, saved, files, callback)
             return loop.run(
                 options.n_cells if options.multilevel else None,
                 float(prepared.target),
@@ -57,46 +58,41 @@ def carry_out(
         except FewCellsError:
             if options.levels != "auto" or prepared.levels == 0:
                 raise
-            most = prepared.levels - 1
+            max_levels = prepared.levels - 1
 
 
-def _begin(
+def _start(
     prepared: Preparation,
-    made_by: dict,
+    fingerprint: dict[str, Any],
     saved: Saved | None,
     files: Checkpoint,
     callback: Callable[[np.void], object] | None,
 ) -> Loop:
-    """Return the loop at its beginning, or where it was when it was saved."""
-    options, mesh = prepared.options, None
-    if saved is None or prepared.may_be_near:
+    """Return the loop at its beginning, or where it was saved."""
+    options, mesh, progress = prepared.options, None, None
+    if saved is None or prepared.may_need_correction_only:
         mesh = prepared.mesh()
-    plan = prepared.plan(mesh)
+    schedule = prepared.schedule(mesh)
     writer = None
     if files.path is not None:
-        writer = Checkpointer(files.path, files.every, made_by, plan)
+        writer = Checkpointer(files.path, files.every, fingerprint, schedule)
     if saved is not None:
-        mesh = None  # and with it the room that the one from there takes
-        mesh = saved.restore(
-            prepared.stages, prepared.domain, prepared.sizing, plan, prepared.free, len(prepared.rows)
-        )  # fmt: skip
+        mesh = None  # free its memory
+        mesh = saved.restore(prepared.setup, schedule)
+        progress = saved.progress(schedule)
     assert mesh is not None
     tol = None if options.multilevel else options.tol
-    loop = Loop(mesh, plan, prepared.levels, options.max_steps, tol, callback)
-    loop.checkpoint = writer
-    if saved is not None:
-        saved.set(loop)
-    return loop
+    return Loop(mesh, schedule, prepared.levels, options.max_steps, tol, callback, writer, progress)
 
 
 def _settings(prepared: Preparation) -> dict[str, Any]:
-    """Return what the result says of how it was made: what was asked for, as far as it matters to the method."""
+    """Return the settings for the result: those that the method uses."""
     options = prepared.options
-    told = {
+    settings = {
         **vars(options),
         "start": options.start if prepared.points is None else "points",
         "levels": prepared.levels,
         "dtype": prepared.stages.engine.real.name,
         "layers": [repr(layer) for layer in options.layers],
     }
-    return {name: value for name, value in told.items() if uses(options.method, name)}
+    return {name: value for name, value in settings.items() if uses(options.method, name)}

@@ -1,28 +1,29 @@
-"""Plans: in which order a run takes its steps, from the coarsest level to the finest.
+"""Schedules: the order of the steps of a run, from the coarsest level to the finest.
 
-    density start ─► couple ─► [ reorganize ─► glide ] x sweeps
-        ─► refine ─► couple ─► [...] ... ─► settle ─► polish (─► project)
+    density start ─► couple ─► [ insert/delete ─► glide ] x sweeps
+        ─► refine ─► couple ─► [...] ... ─► correct count ─► polish (─► project)
 
-*couple*      weighted Lloyd and Poisson: from any start to nearly the right sizes
-*reorganize*  insert and delete generators: dislocations climb, the count meets the field
-*glide*       weighted Lloyd with momentum, softly projected: defects move and annihilate
-*settle*      where a count was asked for: exactly that many
-*polish*      descent of cell quality, projected; the penalty is steered to the error that is aimed at; now and then the
-              worst cells are deleted or split, where the descent has nowhere to go
-*project*     the same with next to no penalty: every cell the size that was asked for
+*couple*         weighted Lloyd and Poisson: from any start to approximately the target sizes
+*insert/delete*  dislocations climb, and the number of cells follows the field
+*glide*          weighted Lloyd with momentum and a soft projection: lattice defects move and annihilate
+*correct count*  to a fixed number of cells, if there is one
+*polish*         projected descent of the cell quality; the penalty is controlled to reach the error target; some of the
+                 worst cells are deleted or split
+*project*        the same with a very small penalty: all cells get their target size
 
-In 3D there is no lattice whose defects could climb, and a mesh that has been coupled long enough loses next to no
-quality in the projection:
+In 3D there is no lattice with dislocations, and a mesh that has been coupled long enough hardly loses quality in the
+projection:
 
-    density start ─► [ couple ─► settle ahead ] x 2 ─► refine ─► ... ─► couple ─► settle ─► couple ─► glide (─► project)
+    density start ─► [ couple ─► correct count ahead ] x 2 ─► refine ─► ...
+        ─► couple ─► correct count ─► couple ─► glide (─► project)
 
-*settle ahead*  the count at which refinement makes the one that the next level wants
+*correct count ahead*  to the number from which refinement gives that of the next level
 
-From a mesh that is near its size field already, as after the field has moved by a few cells:
+From a mesh that is close to its size field, for instance after the field has moved by a few cells:
 
-    stride ─► settle ─► stride ─► correct ─► settle ─► polish (in 3D: glide) (─► project)
+    stride ─► correct count ─► stride ─► correct ─► correct count ─► polish (in 3D: glide) (─► project)
 
-*stride*   weighted Lloyd and Poisson, by as much as two cells at once: the potential's displacement is smooth
+*stride*   weighted Lloyd and Poisson, by up to two cells at once, because the potential's displacement is smooth
 *correct*  one step of the projection alone
 """
 
@@ -32,58 +33,58 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from .insertion_deletion import THETA
+from .insertion_deletion import CLIMB_STRAIN
 from .methods import Method, ProjectedMethod, WeightedMethod
 
 COARSEST = {2: 1400, 3: 1500}
-"""Cells of the coarsest level, roughly, by dimension.
+"""Approximate number of cells of the coarsest level by dimension.
 
-A step on fewer costs hardly less (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) from 23,000 to 100,000
-cells, half as many, and a level more, make a mesh no better.
+A step on fewer cells is hardly cheaper (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) with 23,000 to
+100,000 cells, half as many cells and one more level give no better mesh.
 """
 STEP_CELLS = 3000
-"""Cells on which a step works as long as its launches take the host."""
+"""Cells for which a step takes as long as its launches."""
 
 
 @dataclass(frozen=True)
-class Mend:
-    """Delete or split the worst cells: those with 1 - Q above `flaw`; see `PopulationControl.mend`."""
+class RepairCells:
+    """Delete or split the worst cells, with 1 - Q above `deficit`; see `InsertionDeletion.repair_cells`."""
 
-    flaw: float
+    deficit: float
     split: bool = False
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much work a run takes.
+    """Amount of work of a run.
 
     Attributes
     ----------
     start, couple, couple_finest : int
-        Coupled steps on the coarsest level, on those between, and on the finest.
+        Coupled steps on the coarsest level, on the levels between, and on the finest.
     sweeps : tuple of int
-        Sweeps (reorganize, then glide) on the finest level, on the next coarser one, ...; the last holds for all above.
+        Sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last number
+        holds for all coarser levels.
     glide : int
-        Steps in a sweep.
-    first : int
-        Sweeps on the coarsest level, at most, where there are others.
+        Steps of a sweep.
     polish : int
-        Steps of polishing, at the end.
-    aim : float
+        Steps of polishing.
+    error_target : float
         Mean |log(L / h)| that polishing aims at.
     relaxation, momentum : float
-        Of the gliding.
-    eps : float
-        Penalty with which polishing begins.
+        Parameters of gliding.
+    penalty : float
+        Initial penalty of polishing.
     nuclei : float
-        Share of the cells where pairs may be made, every third sweep.
-    emphasis, lenience, bound : float
-        Of the polishing: weight of bad cells; -log Q from which on a cell may be off its size for its shape; and
-        excess, over the mean that is aimed at, from which on it may not.
-    mends : tuple of (int, Mend)
-        Of the worst cells, each before that step of polishing; the last ones leave steps to get into shape.
-    flaw : float
-        1 - mean Q up to which a mesh is as good as this effort makes it, in 2D, walls apart.
+        Share of the cells where dislocations may be nucleated, in every third sweep.
+    first : int
+        Largest number of sweeps on the coarsest of several levels.
+    bad_cell_weight, quality_scale, log_ratio_scale : float
+        Parameters of polishing: see `ProjectedMethod`. The last one is relative to the error target.
+    repairs : tuple of (int, RepairCells)
+        Repairs of the worst cells, each before this step of polishing. Some steps follow the last one.
+    deficit : float
+        1 - mean Q of meshes of this effort in 2D, without walls.
     """
 
     start: int
@@ -92,124 +93,138 @@ class Effort:
     sweeps: tuple[int, ...]
     glide: int
     polish: int
-    aim: float
+    error_target: float
     relaxation: float = 1.3
     momentum: float = 0.7
-    eps: float = 0.3
+    penalty: float = 0.3
     nuclei: float = 0.0
     first: int = 99
-    emphasis: float = 20.0
-    lenience: float = 0.03
-    bound: float = 12.0
-    mends: tuple[tuple[int, Mend], ...] = ()
-    flaw: float = 0.012
+    bad_cell_weight: float = 20.0
+    quality_scale: float = 0.03
+    log_ratio_scale: float = 12.0
+    repairs: tuple[tuple[int, RepairCells], ...] = ()
+    deficit: float = 0.012
 
 
 EFFORTS = {
-    "fast": Effort(8, 2, 3, (0, 1, 4, 8), glide=6, first=4, polish=5, aim=0.0035, relaxation=1.0, flaw=0.022),
+    "fast": Effort(
+        8, 2, 3, (0, 1, 4, 8), glide=6, first=4, polish=5, error_target=0.0035, relaxation=1.0,
+        deficit=0.022,
+    ),
     "default": Effort(
-        30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, aim=0.0025, lenience=0.02,
-        bound=11.0, mends=((5, Mend(0.06)), (9, Mend(0.06)), (13, Mend(0.07))),
+        30, 5, 3, (4, 18, 20, 20), glide=7, polish=21, error_target=0.0025, quality_scale=0.02,
+        log_ratio_scale=11.0,
+        repairs=((5, RepairCells(0.06)), (9, RepairCells(0.06)), (13, RepairCells(0.07))),
     ),
     "best": Effort(
-        60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, aim=0.0039, relaxation=1.5, momentum=0.8,
-        eps=0.7, nuclei=0.0018, emphasis=80.0, lenience=0.02, bound=16.0,
-        mends=((30, Mend(0.037)), (50, Mend(0.037, split=True)), (70, Mend(0.037)), (80, Mend(0.037))),
-        flaw=0.006,
+        60, 5, 10, (100, 40, 30, 30), glide=7, polish=90, error_target=0.0039, relaxation=1.5, momentum=0.8,
+        penalty=0.7, nuclei=0.0018, bad_cell_weight=80.0, quality_scale=0.02, log_ratio_scale=16.0,
+        repairs=(
+            (30, RepairCells(0.037)), (50, RepairCells(0.037, split=True)), (70, RepairCells(0.037)),
+            (80, RepairCells(0.037)),
+        ),
+        deficit=0.006,
     ),
 }  # fmt: skip
 
 EFFORTS_3D = {
-    "fast": Effort(30, 4, 2, (), glide=4, polish=0, aim=0.004, relaxation=1.5, momentum=0.7),
-    "default": Effort(40, 8, 2, (), glide=8, polish=0, aim=0.0025, relaxation=1.5, momentum=0.8),
-    "best": Effort(80, 30, 3, (), glide=60, polish=0, aim=0.003, relaxation=1.5, momentum=0.8),
+    "fast": Effort(
+        30, 4, 2, (), glide=4, polish=0, error_target=0.004, relaxation=1.5, momentum=0.7
+    ),
+    "default": Effort(
+        40, 8, 2, (), glide=8, polish=0, error_target=0.0025, relaxation=1.5, momentum=0.8
+    ),
+    "best": Effort(
+        80, 30, 3, (), glide=60, polish=0, error_target=0.003, relaxation=1.5, momentum=0.8
+    ),
 }
-"""The same in 3D. `couple` steps follow each of three counts on a coarser level, `couple_finest` each of two."""
+"""The same in 3D. On a coarser level `couple` steps follow each of three numbers of cells, on the finest
+`couple_finest` each of two."""
 
-SINGLE_AIM = 0.0017
-"""Mean |log(L / h)| that polishing aims at most at, where there is one level only."""
-SINGLE_LENIENCE = 0.15
-"""-log Q from which on a cell may be off its size for its shape, there, at least. Measured on F1 (600 cells), thirty
-starts: the largest error is 0.010 (median; of twenty others in three more than 0.02, 0.030 at most) in the place of
-0.013 (0.031), for 0.01 of the least Q."""
+SINGLE_LEVEL_ERROR_TARGET = 0.0017
+"""Largest error target with one level."""
+SINGLE_LEVEL_QUALITY_SCALE = 0.15
+"""Smallest quality scale with one level. Measured on F1 (600 cells), thirty starts: the median of the largest error is
+0.010 instead of 0.013 (in three of twenty other starts above 0.02, at most 0.030), for 0.01 of the smallest Q."""
 MOST_SURPLUS = 0.4
-"""Cells that a run takes at most, over the integral of h^-d, as a share of that. Steep slopes ask for up to 0.35 more
-for a while, and for 0.15 in the end; jumps for any number, and meshes are no better for it."""
+"""Largest number of cells over the integral of h^-d, as a share of it. Steep slopes require up to 0.35 more for a
+while, and 0.15 at the end. Jumps would require any number, without a better mesh."""
 COUNT_SHARE = 0.03
-"""Share of the generators by which the count may be off before the climb takes care of it."""
+"""Share of the cells by which their number may differ before dislocations climb."""
 COUNT_LEAST = 1e-3
-"""The same while polishing: a cell that comes late has few steps left to get its shape."""
+"""The same while polishing, because few steps are left for a new cell to improve."""
 COUNT_EXACTLY = 1e-6
-"""Share by which the count may be off after cells have been mended, where sizes are to be exact: more are deleted than
-split, and measured on F2 two generators too few cost a mean error of 3e-5. Others keep their better shapes."""
-COUNT_THETA = 0.3
-"""Strain for pairs to climb while polishing: only the count makes them."""
+"""The same after cells have been repaired, if sizes are to be exact. More cells are deleted than split; measured on F2,
+two missing cells cost a mean error of 3e-5. Otherwise the better quality is kept."""
+COUNT_CLIMB_STRAIN = 0.3
+"""Strain above which dislocations climb while polishing: only the number of cells makes them climb."""
 START_TOLERANCE, COUPLE_TOLERANCE = 3e-2, 0.2
-"""Relative residuals of Poisson solves in 2D where there are coarser levels: on the coarsest, and after refinement. The
-next step sees the rest: measured on F2 and F3, three starts each, with 11,000 to 300,000 cells, a tenth of the one and
-half of the other change neither sizes nor shapes (0.4 in the place of 0.2 does)."""
+"""Relative residuals of Poisson solves in 2D with several levels: on the coarsest level, and after refinement. Measured
+on F2 and F3, three starts each, 11,000 to 300,000 cells: a tenth of the first and half of the second change neither
+sizes nor quality; 0.4 instead of 0.2 does."""
 GLIDE_TOLERANCE, POLISH_TOLERANCE = 0.3, 1e-2
-"""The same of projections while defects glide and while cells are polished; each begins with the last one's solution.
-Measured on F2 and F3, six starts each: sizes and shapes are those of a tenth of these, for half the iterations (from
-0.6 on, and 0.3 in polishing, the largest errors grow; of a million cells, from 0.03 in polishing)."""
+"""Relative residuals of projections while gliding and polishing. Each projection starts from the last solution.
+Measured on F2 and F3, six starts each: sizes and quality equal those of a tenth of these, for half the iterations. From
+0.6 on, and 0.3 in polishing, the largest errors grow; with a million cells from 0.03 in polishing."""
 EXACT_STEPS, EXACT_ITERATIONS = 8, 45
 EXACT_STEPS_3D = 3
 
 NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
-"""Mean |e|, and share by which the count is off, up to which a given mesh is only corrected. Measured on F2 (see
-bench/restart.py): beyond them its cells lose shape that only reorganizing brings back."""
-FLAW_3D = 0.36
-"""1 - mean Q in 3D up to which a mesh has been smoothed: a random one has 0.47, one of any effort 0.33 or less."""
-WALL_FLAW = 0.45
-"""Over the square root of the number of cells: 1 - mean Q that walls cost, and strain with no room to be relieved."""
+"""Mean |e|, and share of missing cells, up to which a given mesh is only corrected. Measured on F2 (see
+bench/restart.py): beyond them cells lose quality that only insertion and deletion restore."""
+DEFICIT_3D = 0.36
+"""1 - mean Q in 3D up to which a mesh counts as smoothed: a random one has 0.47, one of any effort at most 0.33."""
+WALL_DEFICIT = 0.45
+"""1 - mean Q that walls and unrelieved strain cost in 2D, times the square root of the number of cells."""
 STRIDE = 2.0
-"""Bound of the displacement over h."""
-NEAR_EPS = 0.03
-"""Penalty with which the polishing of a corrected mesh begins: more would let go of the sizes first."""
+"""Largest displacement over h of a stride."""
+NEAR_PENALTY = 0.03
+"""Initial penalty of polishing a corrected mesh: a larger one would give up the sizes first."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """Displace and move all generators, and tessellate anew."""
+    """Displace and move all generators, and tessellate them."""
 
     method: Method
 
 
 @dataclass(frozen=True)
-class Reorganize:
+class InsertDelete:
     """Insert and delete generators.
 
-    `nuclei` is the share of the cells where pairs may be made, `theta` the strain from which on pairs climb, `least`
-    the share by which the count must be off for anything to be done.
+    `nuclei` is the share of the cells where dislocations may be nucleated, `climb_strain` the strain above which they
+    climb, `least` the smallest share of missing cells for which anything is done.
     """
 
     nuclei: float = 0.0
-    theta: float = THETA
+    climb_strain: float = CLIMB_STRAIN
     least: float = 0.0
 
 
 @dataclass(frozen=True)
 class Refine:
-    """Go to the next finer level."""
+    """Refine to the next finer level."""
 
 
 @dataclass(frozen=True)
-class Rest:
-    """Take the momentum away."""
+class ResetMomentum:
+    """Set the velocities to zero."""
 
 
 @dataclass(frozen=True)
-class Settle:
-    """Bring the count to the one that is held.
+class CorrectCount:
+    """Correct the number of cells to the fixed one.
 
-    With `share`, to within that share of what the size field asks for; `ahead`: to what makes the next level's count.
+    With `share`, correct it to within that share of the number that the size field requires; with `ahead`, to the
+    number from which refinement gives that of the next level.
     """
 
     share: float = 0.0
     ahead: bool = False
 
 
-Action = Step | Reorganize | Mend | Refine | Rest | Settle
+Action = Step | InsertDelete | RepairCells | Refine | CorrectCount | ResetMomentum
 
 
 def auto_levels(n: float, dim: int) -> int:
@@ -220,69 +235,78 @@ def auto_levels(n: float, dim: int) -> int:
 def is_near(
     dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float
 ) -> bool:
-    """Tell whether a given mesh of `n` cells needs no more than correction to be as `effort` makes it.
+    """Tell whether a given mesh of `n` cells only needs a correction to be as good as `effort` makes it.
 
     Parameters
     ----------
     missing : float
-        Cells that are missing; negative: that are too many.
+        Number of missing cells; negative if there are too many.
     mean_error : float
         Mean of |e|.
     mean_quality : float
+        Mean of Q.
     """
-    flaw = EFFORTS[effort].flaw + WALL_FLAW / math.sqrt(n) if dim == 2 else FLAW_3D
-    return mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= flaw
+    deficit = EFFORTS[effort].deficit + WALL_DEFICIT / math.sqrt(n) if dim == 2 else DEFICIT_3D
+    return (
+        mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= deficit
+    )
 
 
-def plan_steps(method: Method, steps: int) -> list[Action]:
-    """Return the plan of a method that repeats one kind of step."""
+def repeated_schedule(method: Method, steps: int) -> list[Action]:
+    """Return the schedule of a method that repeats one kind of step."""
     return [Step(method)] * steps
 
 
-def plan_adaptive(
+def adaptive_schedule(
     dim: int,
     effort: str,
     levels: int,
     exact: bool,
-    aim: float | None = None,
+    error_target: float | None = None,
     warm: bool = False,
     near: bool = False,
 ) -> list[Action]:
-    """Return the plan that reaches the size field and good cells, over `levels` coarser levels.
+    """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
     Parameters
     ----------
     effort : str
-        Of `EFFORTS`.
+        One of `EFFORTS`.
     exact : bool
         End with the exact projection.
-    aim : float, optional
-        In the place of the effort's own.
+    error_target : float, optional
+        By default that of the effort.
     warm : bool
-        The start is a mesh already, not a random sample.
+        The start is a mesh, not a random sample.
     near : bool
-        It is near the size field (see `is_near`), and there are no coarser levels.
+        It only needs a correction (see `is_near`). There are no coarser levels then.
     """
-    plan = (EFFORTS if dim == 2 else EFFORTS_3D)[effort]
+    settings = (EFFORTS if dim == 2 else EFFORTS_3D)[effort]
     if near:
-        return list(_correction(dim, plan, exact, plan.aim if aim is None else aim))
+        return list(_correction(dim, settings, exact, error_target or settings.error_target))
     if dim == 3:
-        return list(_adaptive_3d(plan, levels, exact, plan.aim if aim is None else aim, warm))
-    if aim is None:
-        # A mesh that is small enough for one level can be had nearer to its size.
-        aim = plan.aim if levels else min(plan.aim, SINGLE_AIM)
-    return list(_adaptive_2d(plan, levels, exact, aim, warm))
+        return list(
+            _adaptive_3d(settings, levels, exact, error_target or settings.error_target, warm)
+        )
+    if error_target is None:
+        # A mesh that is small enough for one level can reach a smaller error.
+        error_target = (
+            settings.error_target
+            if levels
+            else min(settings.error_target, SINGLE_LEVEL_ERROR_TARGET)
+        )
+    return list(_adaptive_2d(settings, levels, exact, error_target, warm))
 
 
 def _adaptive_2d(
-    effort: Effort, levels: int, exact: bool, aim: float, warm: bool
+    effort: Effort, levels: int, exact: bool, error_target: float, warm: bool
 ) -> Iterator[Action]:
     glide = ProjectedMethod(
-        "lloyd", effort.relaxation, effort.momentum, eps=0.1,
+        "lloyd", effort.relaxation, effort.momentum, penalty=0.1,
         tolerance=GLIDE_TOLERANCE if levels else POLISH_TOLERANCE,
     )  # fmt: skip
     if warm:
-        yield Settle(COUNT_SHARE)
+        yield CorrectCount(COUNT_SHARE)
     for level in range(levels, -1, -1):
         if level < levels:
             yield Refine()
@@ -295,74 +319,86 @@ def _adaptive_2d(
         if levels == 0:
             tolerance = WeightedMethod.tolerance
         yield from [Step(WeightedMethod(cautious=True, tolerance=tolerance))] * couple
-        yield Settle(COUNT_SHARE)
+        yield CorrectCount(COUNT_SHARE)
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
         if levels == 0:
-            # The only level has no coarser one to have done the work.
+            # There are no sweeps on coarser levels.
             sweeps = max(sweeps, effort.sweeps[-1])
         elif level == levels:
             sweeps = min(sweeps, effort.first)
         for sweep in range(sweeps):
             quiet = sweep % 3 or sweep >= sweeps - 8
-            yield Reorganize(0.0 if quiet else effort.nuclei)
+            yield InsertDelete(0.0 if quiet else effort.nuclei)
             yield from [Step(glide)] * effort.glide
         if level == 0 and sweeps < 3:
-            yield Reorganize()
-    yield Settle()
-    yield Rest()
+            yield InsertDelete()
+    yield CorrectCount()
+    yield ResetMomentum()
     if levels == 0:
-        effort = replace(effort, lenience=max(effort.lenience, SINGLE_LENIENCE))
-    yield from _finish_2d(effort, exact, aim, effort.eps)
+        effort = replace(
+            effort, quality_scale=max(effort.quality_scale, SINGLE_LEVEL_QUALITY_SCALE)
+        )
+    yield from _finish_2d(effort, exact, error_target, effort.penalty)
 
 
-def _correction(dim: int, effort: Effort, exact: bool, aim: float) -> Iterator[Action]:
+def _correction(dim: int, effort: Effort, exact: bool, error_target: float) -> Iterator[Action]:
     stride = Step(WeightedMethod(STRIDE, cautious=True))
     yield from [stride] * 2
-    yield Settle(COUNT_LEAST)
+    yield CorrectCount(COUNT_LEAST)
     yield stride
     correct = ProjectedMethod(
-        "lloyd", 0.0, 0.0, eps=1e-2, k=1.0, iterations=60, tolerance=1e-3, sampled_gradient=True
+        "lloyd",
+        0.0,
+        0.0,
+        penalty=1e-2,
+        k=1.0,
+        iterations=60,
+        tolerance=1e-3,
+        gradient_from_field=True,
     )
     yield Step(correct)
-    yield Settle()
-    yield Rest()
-    # What is there stays where it can: the worst cells are as good as they were.
-    effort = replace(effort, mends=())
-    yield from (_finish_2d if dim == 2 else _finish_3d)(effort, exact, aim, NEAR_EPS)
+    yield CorrectCount()
+    yield ResetMomentum()
+    # The worst cells are as good as before, so there are no repairs.
+    effort = replace(effort, repairs=())
+    yield from (_finish_2d if dim == 2 else _finish_3d)(effort, exact, error_target, NEAR_PENALTY)
 
 
-def _finish_2d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[Action]:
+def _finish_2d(
+    effort: Effort, exact: bool, error_target: float, penalty: float
+) -> Iterator[Action]:
     """Polish, and project."""
     polish = ProjectedMethod(
-        "shape", eps=eps, lenience=effort.lenience, bound=effort.bound * aim, k=0.3, aim=aim,
-        emphasis=effort.emphasis, tolerance=POLISH_TOLERANCE,
+        "quality", penalty=penalty, quality_scale=effort.quality_scale,
+        log_ratio_scale=effort.log_ratio_scale * error_target, k=0.3, error_target=error_target,
+        bad_cell_weight=effort.bad_cell_weight, tolerance=POLISH_TOLERANCE,
     )  # fmt: skip
-    mends = dict(effort.mends)
+    repairs = dict(effort.repairs)
     for step in range(effort.polish):
         if step == 3:
-            yield Reorganize(theta=COUNT_THETA, least=COUNT_LEAST)
-            yield Settle()
-        if step in mends:
-            yield mends[step]
-            yield Settle(COUNT_EXACTLY if exact else 0.0)
+            yield InsertDelete(climb_strain=COUNT_CLIMB_STRAIN, least=COUNT_LEAST)
+            yield CorrectCount()
+        if step in repairs:
+            yield repairs[step]
+            yield CorrectCount(COUNT_EXACTLY if exact else 0.0)
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
-            "shape", eps=1e-3, iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3, sampled_gradient=True,
-            keep_mean=True,
+            "quality", penalty=1e-3, iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3, gradient_from_field=True,
+            correct_mean=True,
         )  # fmt: skip
-        # The last two only project: Newton's steps on the sizes.
+        # The last two steps only project: Newton's method for the sizes.
         newton = replace(project, relaxation=0.0, momentum=0.0)
         yield from [Step(project)] * (EXACT_STEPS - 2)
         yield from [Step(newton)] * 2
 
 
 def _adaptive_3d(
-    effort: Effort, levels: int, exact: bool, aim: float, warm: bool
+    effort: Effort, levels: int, exact: bool, error_target: float, warm: bool
 ) -> Iterator[Action]:
     couple = [Step(WeightedMethod(cautious=True))]
     if warm:
-        yield Settle(COUNT_SHARE)
+        yield CorrectCount(COUNT_SHARE)
     for level in range(levels, -1, -1):
         if level < levels:
             yield Refine()
@@ -371,38 +407,45 @@ def _adaptive_3d(
         if level:
             for _ in range(2):
                 yield from couple * effort.couple
-                yield Settle(COUNT_LEAST, ahead=True)
+                yield CorrectCount(COUNT_LEAST, ahead=True)
             yield from couple * effort.couple
     yield from couple * effort.couple_finest
-    yield Settle(COUNT_LEAST)
+    yield CorrectCount(COUNT_LEAST)
     yield from couple * effort.couple_finest
-    yield Settle()
-    yield from _finish_3d(effort, exact, aim, effort.eps)
+    yield CorrectCount()
+    yield from _finish_3d(effort, exact, error_target, effort.penalty)
 
 
-def _finish_3d(effort: Effort, exact: bool, aim: float, eps: float) -> Iterator[Action]:
+def _finish_3d(
+    effort: Effort, exact: bool, error_target: float, penalty: float
+) -> Iterator[Action]:
     """Glide, and project."""
     glide = ProjectedMethod(
-        "lloyd", effort.relaxation, effort.momentum, eps=eps, aim=aim, tolerance=POLISH_TOLERANCE
+        "lloyd",
+        effort.relaxation,
+        effort.momentum,
+        penalty=penalty,
+        error_target=error_target,
+        tolerance=POLISH_TOLERANCE,
     )
     yield from [Step(glide)] * effort.glide
     if exact:
         project = ProjectedMethod(
-            "lloyd", 0.5, 0.0, eps=1e-3, iterations=EXACT_ITERATIONS, sampled_gradient=True,
-            keep_mean=True,
+            "lloyd", 0.5, 0.0, penalty=1e-3, iterations=EXACT_ITERATIONS, gradient_from_field=True,
+            correct_mean=True,
         )  # fmt: skip
         newton = replace(project, relaxation=0.0)
         yield from [Step(project)] * (EXACT_STEPS_3D - 2)
         yield from [Step(newton)] * 2
 
 
-def work_of(plan: list[Action], levels: int, dim: int, cells: float) -> list[float]:
-    """Return the work done before each action, as a share of the whole, for `cells` on the finest level.
+def work_of(schedule: list[Action], levels: int, dim: int, cells: float) -> list[float]:
+    """Return the work before each action as a share of the whole, for `cells` cells on the finest level.
 
-    A step costs as its level has cells, and `STEP_CELLS` more.
+    The work of a step is the number of cells of its level plus `STEP_CELLS`.
     """
     done, total, level = [], 0.0, levels
-    for action in plan:
+    for action in schedule:
         done.append(total)
         if isinstance(action, Refine):
             level -= 1

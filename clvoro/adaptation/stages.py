@@ -1,4 +1,4 @@
-"""All stages of one engine."""
+"""The stages of an engine: tessellation, solvers and the stages of this package."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from ..solvers.poisson import Poisson
 from ..solvers.volume_projection import VolumeProjection
 from ..tessellation.stages import TessellationStages
 from .density import Density
-from .insertion_deletion import PopulationControl
+from .insertion_deletion import InsertionDeletion
 from .metric import Metric
 from .motion import Motion
-from .quality_descent import Shape
+from .quality_descent import QualityDescent
 from .refinement import Refinement
 
 
 class Stages(TessellationStages):
-    """The stages of one engine, each compiled when first used; meshes share their buffers."""
+    """The stages of one engine, each compiled when first used. Meshes share their buffers."""
 
     metric: Metric
     density: Density
     poisson: Poisson
-    projection: VolumeProjection
-    shape: Shape
+    volume_projection: VolumeProjection
+    quality_descent: QualityDescent
     motion: Motion
     refinement: Refinement
-    population: PopulationControl
+    insertion_deletion: InsertionDeletion
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson,
-        "projection": VolumeProjection, "shape": Shape, "motion": Motion, "refinement": Refinement,
-        "population": PopulationControl,
+        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion,
+        "refinement": Refinement, "insertion_deletion": InsertionDeletion,
     }  # fmt: skip

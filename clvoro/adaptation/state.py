@@ -1,9 +1,10 @@
-"""A mesh at work: generators on the device, and what is known about their diagram."""
+"""The state of a mesh on the device: generators, their diagram, sizes, error and quality."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,419 +12,478 @@ import pyopencl.array as cla
 
 from ..geometry.box import Domain
 from ..mesh.diagram import Diagram
+from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries, Summary
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.fetch import fetch_diagram
 from ..tessellation.tessellator import Tessellator
-from .density import Excess, Weighting
-from .insertion_deletion import THETA, Population
+from .density import CellWeights, LloydWeights
+from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .stages import Stages
 
-_DERIVED = ("h", "error", "quality", "reach", "potential")
-"""Arrays of a mesh that follow from its generators."""
-_UNKNOWN = {"tessellation": None, "multipliers": None}
-"""What there is not after generators have come or gone."""
 SUMMARIES = (
-    "error", "quality", "energy", "lloyd", "correction", "changed", "ever", "excess", "weight",
+    "error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio",
+    "weight",
 )  # fmt: skip
 
 
-class Mesh:
-    """Generators of one level, their diagram, sizes, error and quality, all on the device.
+@dataclass
+class CellArrays:
+    """Arrays (n,) real that follow from the generators; see `MeshState`."""
+
+    h: cla.Array
+    error: cla.Array
+    quality: cla.Array
+    local_length: cla.Array
+    potential: cla.Array
+
+    @classmethod
+    def empty(
+        cls,
+        engine: Engine,
+        n: int,
+        h: cla.Array | None = None,
+        potential: cla.Array | None = None,
+    ) -> CellArrays:
+        """Return new arrays for `n` cells. Only the potential is read before it is written, and starts from 0."""
+        return cls(
+            engine.empty(n) if h is None else h,
+            *(engine.empty(n) for _ in range(3)),
+            engine.zeros(n) if potential is None else potential,
+        )
+
+
+@dataclass
+class _Data:
+    """All arrays of one set of generators. An interruption leaves the old or the new set, never a mixture."""
+
+    generators: Generators
+    cells: CellArrays | None = None
+    tessellation: Tessellation | None = None
+    multipliers: cla.Array | None = None
+
+
+def _property(part: str, name: str) -> Any:
+    """Return a property for attribute `name` of `part` of `MeshState._data`."""
+    return property(lambda self: getattr(getattr(self._data, part), name))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all levels of a run have in common.
+
+    Attributes
+    ----------
+    free : Domain
+        Part of the domain, in its frame, in which generators may move.
+    fixed : int
+        Generators with labels below `fixed` do not move, and the size of their cells is their target size.
+    """
+
+    stages: Stages
+    domain: Domain
+    sizing: Sizing
+    free: Domain
+    fixed: int = 0
+
+
+class MeshState:
+    """Generators of one level with their diagram, sizes, error and quality, all on the device.
 
     Parameters
     ----------
-    points : (n, d) real, device
-        Generators in any order, normalized coordinates.
-    labels : (n,) int32, device, optional
-        Names that stay with them; by default 0, 1, ...
-    coarsening : float
+    setup : Setup
+    size_factor : float
         Factor on the size field: 2^k on level k above the finest.
-    free : Domain, optional
-        The part of the domain, in its frame, in which generators may move; by default all of it.
-    fixed : int
-        Generators of smaller labels stay where they are, and the size that their cells have is right.
+    start : dict of device arrays, or _Data
+        Points and labels of the generators, removed from the dict; or all arrays of a saved state.
+    coarser : Tessellator, optional
+        Tessellator of the coarser level.
 
     Attributes
     ----------
     n : int
     points : (n, d) real
-        In an order of the device's own: along its bins.
+        Normalized coordinates, in the order of the bins.
     labels : (n,) int32
-    tessellation : Tessellation
-    h, error, quality, reach : (n,) real
-        `reach` is the lesser of h and L, by which motion is limited.
-    potential : (n,) real
-        Solution of the latest Poisson solve: the next one's start.
-    multipliers : (n,) float32 or None
-        Solution of the latest projection, likewise; None: there has been none.
-    source : (n,) real
-        The Poisson equation's right side; this and what follows is of the workspace, and of a step alone.
-    lloyd, correction : (n, d) real
-        The two halves of the latest step. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
+        Permanent names of the generators.
     velocity : (n, d) real
-        The latest step as it was made.
+        Displacement in the last step.
     signatures : (n,) uint64
-        Of the sets of neighbors; see `Metric.compare_neighbors`.
-    ever : (n,) real
-        1 where the set of neighbors has changed in a step on this level; else 0.
+        Hashes of the sets of neighbors; see `Metric.compare_neighbors`.
+    ever_changed : (n,) real
+        1 where the set of neighbors has changed in a step on this level, else 0.
+    tessellation : Tessellation or None
+    h, error, quality : (n,) real
+    local_length : (n,) real
+        min(L, h), the unit of bounds of the motion.
+    potential : (n,) real
+        Solution of the last Poisson solve, the start of the next one.
+    multipliers : (n,) float32 or None
+        Solution of the last volume projection, the start of the next one.
+    source : (n,) real
+        Right side of the Poisson equation. It and the following arrays are in the workspace, valid for one step.
+    lloyd, correction : (n, d) real
+        The two parts of the displacement. Their lengths over h: `lloyd_speed`, `correction_speed` (n,).
     """
 
-    n: int
-    points: cla.Array
-    labels: cla.Array
-    velocity: cla.Array
-    signatures: cla.Array
-    ever: cla.Array
-    h: cla.Array
-    error: cla.Array
-    quality: cla.Array
-    reach: cla.Array
     source: cla.Array
-    potential: cla.Array
-    multipliers: cla.Array | None
     lloyd: cla.Array
     correction: cla.Array
     lloyd_speed: cla.Array
     correction_speed: cla.Array
-    tessellation: Tessellation | None
+
+    points = _property("generators", "points")
+    labels = _property("generators", "labels")
+    velocity = _property("generators", "velocity")
+    signatures = _property("generators", "signatures")
+    ever_changed = _property("generators", "ever_changed")
+    h = _property("cells", "h")
+    error = _property("cells", "error")
+    quality = _property("cells", "quality")
+    local_length = _property("cells", "local_length")
+    potential = _property("cells", "potential")
 
     def __init__(
         self,
+        setup: Setup,
+        size_factor: float,
+        start: dict[str, cla.Array] | _Data,
+        coarser: Tessellator | None = None,
+    ) -> None:
+        self.setup, self.size_factor = setup, size_factor
+        self.stages, self.domain, self.sizing = setup.stages, setup.domain, setup.sizing
+        self.free, self.fixed = setup.free, setup.fixed
+        self.engine = self.stages.engine
+        self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser)
+        self.summaries = Summaries(self.engine, SUMMARIES)
+        self._ordered: cla.Array | None = None
+        if isinstance(start, _Data):
+            self._data, self.next_label = start, len(start.generators)
+            return
+        n = self.next_label = len(start["points"])
+        start["velocity"] = self.engine.zeros(start["points"].shape)
+        start["signatures"] = self.engine.zeros(n, np.uint64)
+        start["ever_changed"] = self.engine.zeros(n)
+        self.set_generators(start, first=True)
+
+    @classmethod
+    def create(
+        cls,
         stages: Stages,
         domain: Domain,
         sizing: Sizing,
         points: cla.Array,
         labels: cla.Array | None = None,
-        coarsening: float = 1.0,
+        size_factor: float = 1.0,
         free: Domain | None = None,
         fixed: int = 0,
-    ) -> None:
+    ) -> MeshState:
+        """Return the mesh of `points` (n, d) in normalized coordinates; labels are 0, 1, ... by default."""
         if labels is None:
             labels = stages.engine.upload(np.arange(len(points)), np.int32)
-        self._set_up(stages, domain, sizing, coarsening, free, fixed)
-        self._begin({"points": points, "labels": labels})
+        setup = Setup(stages, domain, sizing, domain if free is None else free, fixed)
+        return cls(setup, size_factor, {"points": points, "labels": labels})
 
     @classmethod
-    def saved(
+    def restore(
         cls,
-        stages: Stages,
-        domain: Domain,
-        sizing: Sizing,
-        arrays: dict[str, cla.Array],
-        coarsening: float,
-        free: Domain | None,
-        fixed: int,
-    ) -> Mesh:
-        """Return a mesh of `arrays` by name as another one had them, but for its diagram, which is yet to be set."""
-        mesh = cls.__new__(cls)
-        mesh._set_up(stages, domain, sizing, coarsening, free, fixed)
-        n = len(arrays["points"])
-        mesh.__dict__.update({**dict.fromkeys(_DERIVED), **_UNKNOWN, **arrays, "n": n})
-        mesh._make_room()
-        return mesh
+        setup: Setup,
+        size_factor: float,
+        generators: Generators,
+        h: cla.Array,
+        potential: cla.Array,
+        multipliers: cla.Array | None,
+    ) -> MeshState:
+        """Return a mesh from the arrays of another one. Its diagram is set afterwards."""
+        cells = CellArrays.empty(setup.stages.engine, len(generators), h, potential)
+        return cls(setup, size_factor, _Data(generators, cells, None, multipliers))
 
-    def _set_up(
-        self,
-        stages: Stages,
-        domain: Domain,
-        sizing: Sizing,
-        coarsening: float,
-        free: Domain | None,
-        fixed: int,
-        coarser: Tessellator | None = None,
-    ) -> None:
-        """Make what is not of any generators."""
-        self.engine, self.fixed = stages.engine, fixed
-        self.free = domain if free is None else free
-        self.stages, self.domain, self.sizing, self.coarsening = stages, domain, sizing, coarsening
-        self.tessellator = Tessellator(stages, domain, self._spacing, coarser)
-        self.summaries = Summaries(self.engine, SUMMARIES)
-        self._ordered: cla.Array | None = None
+    @property
+    def n(self) -> int:
+        """Number of generators."""
+        return len(self._data.generators)
 
-    def _begin(self, rows: dict[str, cla.Array]) -> None:
-        """Take the first generators, in `rows`, which is used up: their points and labels."""
-        n = self.next_label = len(rows["points"])
-        rows["velocity"] = self.engine.zeros(rows["points"].shape)
-        rows["signatures"] = self.engine.zeros(n, np.uint64)
-        rows["ever"] = self.engine.zeros(n)
-        self.adopt(rows)
+    @property
+    def tessellation(self) -> Tessellation | None:
+        """The present diagram; None before the first `update`."""
+        return self._data.tessellation
 
-    def _spacing(self, points: np.ndarray) -> np.ndarray:
-        """Return the size that cells are to have at `points` (k, d) on this level, (k,)."""
-        return self.coarsening * np.asarray(self.sizing(points))
+    @tessellation.setter
+    def tessellation(self, t: Tessellation | None) -> None:
+        self._data.tessellation = t
 
-    def adopt(self, rows: dict[str, cla.Array]) -> None:
-        """Take other generators for the present ones, sort them by bin so that neighbors are near in memory.
+    @property
+    def t(self) -> Tessellation:
+        """The present diagram."""
+        assert self._data.tessellation is not None
+        return self._data.tessellation
 
-        `rows` has their points, velocity (n, d), labels, signatures and ever (n,), and is used up: by then nobody else
-        should hold on to these arrays.
+    @property
+    def multipliers(self) -> cla.Array | None:
+        """Solution of the last volume projection, if there is one."""
+        return self._data.multipliers
+
+    @multipliers.setter
+    def multipliers(self, array: cla.Array) -> None:
+        self._data.multipliers = array
+
+    def _target_sizes(self, points: np.ndarray) -> np.ndarray:
+        """Return the target size at `points` (k, d) on this level, (k,)."""
+        return self.size_factor * np.asarray(self.sizing(points))
+
+    def set_generators(self, rows: dict[str, cla.Array], first: bool = False) -> None:
+        """Replace the generators, sort them by bin for locality in memory, and update the mesh.
+
+        Parameters
+        ----------
+        rows : dict of device arrays
+            The fields of `Generators`, removed from the dict. Memory is freed only if there is no other reference.
 
         Raises
         ------
         SizeFieldError
-            If the size of one is not positive and finite.
+            If a size is not positive and finite.
         """
-        stages, first = self.stages, not hasattr(self, "tessellation")
-        n = len(rows["points"])
+        stages, n = self.stages, len(rows["points"])
         binned = stages.bins.build(self.domain, rows["points"], n)
         stages.bins.clear_work()
         items = binned.items[:n].copy()
-        # One after the other, so that each is let go of when it has been sorted.
+        # One array after the other, so that each is freed when it has been sorted.
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
-        # At one stroke: whoever interrupts the run finds arrays that fit each other, or none, which `update` makes.
-        self.__dict__.update({**dict.fromkeys(_DERIVED), **new, "n": n, **_UNKNOWN})
+        self._data = _Data(Generators(**new))
         del new, items
         stages.bins.renumber(binned, n)
         self.update(first, binned)
         stages.bins.clear()
         self.engine.workspace.clear()
 
-    def _make_room(self) -> None:
-        """Make the arrays that there are not, of what follows from the generators."""
-        for name in _DERIVED:
-            if getattr(self, name) is None:
-                # Only the potential is looked at before it is written.
-                make = self.engine.zeros if name == "potential" else self.engine.empty
-                setattr(self, name, make(self.n))
-
-    def begin_step(self) -> None:
-        """Take room for what generators are displaced by, to the end of the workspace's frame."""
+    def allocate_step(self) -> None:
+        """Allocate the displacements, to the end of the workspace's frame."""
         self.lloyd, self.correction = (self.engine.scratch(self.points.shape) for _ in range(2))
 
-    def take_source(self) -> None:
-        """Take room for the right side of a Poisson equation."""
+    def allocate_source(self) -> None:
+        """Allocate the right side of a Poisson equation."""
         self.source = self.engine.scratch(self.n)
 
-    def measure_speeds(self) -> None:
-        """Measure how far generators are displaced, in room for a step alone."""
+    def measure_displacements(self) -> None:
+        """Compute the lengths of both displacements over h."""
         self.lloyd_speed, self.correction_speed = (self.engine.scratch(self.n) for _ in range(2))
         self.stages.motion.measure_displacements(
             self.lloyd, self.correction, self.h, self.lloyd_speed, self.correction_speed
         )
 
-    def note_speeds(self) -> None:
-        """Summarize how far generators are displaced."""
+    def summarize_displacements(self) -> None:
+        """Summarize the lengths of both displacements."""
         speeds = {"lloyd": self.lloyd_speed, "correction": self.correction_speed}
         self.summaries.collect_all(speeds, self.n)
-
-    @property
-    def t(self) -> Tessellation:
-        """The present diagram."""
-        assert self.tessellation is not None
-        return self.tessellation
 
     def update(
         self, first: bool = False, binned: BinnedPoints | None = None, *, check: bool = True
     ) -> None:
-        """Tessellate the generators where they are now, and evaluate size, error and quality.
+        """Tessellate the present points, and evaluate size, error and quality.
 
-        `binned` has them in their bins, where the caller does. Without `check` the next `assess` looks at the sizes.
+        Parameters
+        ----------
+        first : bool
+            There is no earlier diagram to compare neighbors with.
+        binned : BinnedPoints, optional
+            The points in their bins, if the caller has them.
+        check : bool
+            Check the sizes. Otherwise the next `read_summaries` does.
 
         Raises
         ------
         InputError
-            If generators have come too close to each other to be told apart.
+            If generators are too close to each other to be distinct.
         SizeFieldError
-            If the size of one is not positive and finite.
+            If a size is not positive and finite.
         """
-        stages = self.stages
-        self._make_room()
-        self.tessellation = self.tessellator.tessellate(
-            self.points, self.n, self.tessellation, binned=binned
+        stages, data = self.stages, self._data
+        if data.cells is None:
+            data.cells = CellArrays.empty(self.engine, self.n)
+        data.tessellation = self.tessellator.tessellate(
+            self.points, self.n, data.tessellation, binned=binned
         )
         if self.engine.dim == 2:
-            # The next diagrams are repaired from this one, most likely.
+            # The next diagrams are usually updated from this one.
             stages.bins.clear()
-        self.sizing.evaluate(self.points, self.n, self.h, self.coarsening)
+        self.sizing.evaluate(self.points, self.n, self.h, self.size_factor)
         with self.engine.workspace.frame():
             changed = self.engine.scratch(self.n)
             stages.metric.compare_neighbors(
-                self.t, self.labels, first, self.signatures, changed, self.ever
+                self.t, self.labels, first, self.signatures, changed, self.ever_changed
             )
-            self._evaluate_metric({"changed": changed, "ever": self.ever})
-        # Before anything is done with a bad size: the solver, say, would complain of something else.
+            self.evaluate_metric({"changed": changed, "ever_changed": self.ever_changed})
+        # An invalid size must be reported before it causes other errors, in the solver for instance.
         if check:
-            self.sizing.check(self.points, self.h, self.coarsening)
+            self.sizing.check(self.points, self.h, self.size_factor)
 
-    def _evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
-        """Evaluate error and quality, and summarize them, and `others` by name."""
+    def evaluate_metric(self, others: Mapping[str, cla.Array] | None = None) -> None:
+        """Evaluate and summarize error and quality, and summarize `others` by name."""
         if self.fixed:
-            self.stages.metric.hold_sizes(self.labels, self.fixed, self.t.volumes, self.h)
+            self.stages.metric.set_fixed_sizes(self.labels, self.fixed, self.t.volumes, self.h)
         with self.engine.workspace.frame():
             energy = self.engine.scratch(self.n)
             self.stages.metric.evaluate(
-                self.t, self.h, self.error, self.quality, energy, self.reach
+                self.t, self.h, self.error, self.quality, energy, self.local_length
             )
             own = {"error": self.error, "quality": self.quality, "energy": energy}
             self.summaries.collect_all({**own, **(others or {})}, self.n)
 
-    def hold(self, displacement: cla.Array) -> None:
-        """Set `displacement` (n, d) to zero for the generators that stay where they are."""
+    def zero_fixed(self, displacement: cla.Array) -> None:
+        """Set `displacement` (n, d) to zero for fixed generators."""
         if self.fixed:
-            self.stages.motion.hold_generators(self.labels, self.fixed, displacement)
+            self.stages.motion.zero_fixed_displacements(self.labels, self.fixed, displacement)
 
-    def weigh(
-        self, gradient: cla.Array | None = None, excess: cla.Array | None = None
-    ) -> Weighting:
-        """Evaluate density, excess and, as `lloyd`, weighted centroids of the present cells: see `Density.evaluate`."""
-        return self.stages.density.evaluate(self.t, self.h, self.lloyd, gradient, excess)
+    def lloyd_weights(
+        self, gradient: cla.Array | None = None, log_ratio: cla.Array | None = None
+    ) -> LloydWeights:
+        """Evaluate density, log ratios and, as `lloyd`, weighted centroids: see `Density.lloyd_weights`."""
+        return self.stages.density.lloyd_weights(self.t, self.h, self.lloyd, gradient, log_ratio)
 
-    def _excess(self, w: Excess) -> Summary:
-        """Summarize the excess, log(V / h^d)."""
-        self.summaries.collect("excess", w.excess, self.n)
-        return self.summaries.read_one("excess")
+    def _summarize_log_ratio(self, w: CellWeights) -> Summary:
+        self.summaries.collect("log_ratio", w.log_ratio, self.n)
+        return self.summaries.read_one("log_ratio")
 
-    def mean_log_error(self, w: Excess) -> float:
-        """Mean of |log(L / h)|, by a weighting that has just been made."""
-        return self._excess(w).magnitude / self.n / self.engine.dim
+    def mean_log_ratio_error(self, w: CellWeights) -> float:
+        """Return the mean of |log(L / h)|."""
+        return self._summarize_log_ratio(w).magnitude / self.n / self.engine.dim
 
-    def missing(self, w: Excess | None = None) -> float:
-        """Return how many generators the size field asks for beside those that there are (negative: too many).
+    def missing_cells(self, w: CellWeights | None = None) -> float:
+        """Return how many more cells the size field requires; negative if there are too many.
 
-        The sum of V rho, not that of log(V rho), which would be biased by how much the cells' sizes scatter.
+        This is the sum of V rho minus n. The sum of log(V rho) would be biased by the scatter of the cell sizes.
         """
         with self.engine.workspace.frame():
-            w = self.stages.density.weigh(self.t, self.h) if w is None else w
+            w = self.stages.density.cell_weights(self.t, self.h) if w is None else w
             self.summaries.collect("weight", w.weight, self.n)
         return self.summaries.read_one("weight").sum - self.n
 
-    def match_size(self) -> None:
-        """Scale the size field by the one factor that makes the mean of log(L / h) vanish."""
+    def normalize_sizes(self) -> None:
+        """Scale the size field by the factor that makes the mean of log(L / h) zero."""
         with self.engine.workspace.frame():
-            w = self.stages.density.weigh(self.t, self.h)
-            factor = math.exp(self._excess(w).sum / self.n / self.engine.dim)
-        self.coarsening *= factor
-        metric = self.stages.metric
-        metric.scale_sizes(factor, self.h)
-        self._evaluate_metric()
+            w = self.stages.density.cell_weights(self.t, self.h)
+            factor = math.exp(self._summarize_log_ratio(w).sum / self.n / self.engine.dim)
+        self.size_factor *= factor
+        self.stages.metric.scale_sizes(factor, self.h)
+        self.evaluate_metric()
 
-    def reorganize(
+    def insert_delete(
         self,
         nuclei: int = 0,
         n_cells: int | None = None,
         climb: bool = True,
-        theta: float = THETA,
+        climb_strain: float = CLIMB_STRAIN,
         most: float = math.inf,
     ) -> tuple[int, int]:
-        """Insert and delete generators (see `PopulationControl.reorganize`); return how many of each.
+        """Insert and delete generators (see `InsertionDeletion.insert_delete`); return the numbers of both.
 
-        The count goes to `n_cells` or, with None, to what the size field asks for, but not above `most`.
+        The number of generators changes towards `n_cells`, by default that of the size field, but not above `most`.
         """
-        # This takes more than a step does.
+        # This takes more memory than a step.
         self.engine.workspace.clear()
         with self.engine.workspace.frame():
-            w = self.stages.density.weigh(self.t, self.h)
-            total = self.missing(w) if n_cells is None else float(n_cells - self.n)
-            total = min(total, most - self.n)
-            new = self.stages.population.reorganize(
-                self.free, self.t, self.h, self.reach, w.excess, self._rows(), total, self.next_label,
-                nuclei, climb, theta, self.fixed,
+            w = self.stages.density.cell_weights(self.t, self.h)
+            missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.n)
+            missing = min(missing, most - self.n)
+            new = self.stages.insertion_deletion.insert_delete(
+                self.free, self.t, CellSizes(self.h, self.local_length, w.log_ratio),
+                self._data.generators, self.next_label,
+                Change(missing, nuclei, climb, climb_strain), self.fixed,
             )  # fmt: skip
-        rows = _take_apart(new)
+        rows, counts = _take_apart(new)
         del new, w
-        return self._repopulate(rows)
+        return self._replace(rows, counts)
 
-    def mend(self, flaw: float, split: bool) -> tuple[int, int]:
-        """Delete or split the worst cells (see `PopulationControl.mend`); return how many came and went."""
+    def repair_cells(self, deficit: float, split: bool) -> tuple[int, int]:
+        """Delete or split the worst cells (see `InsertionDeletion.repair_cells`); return the numbers of both."""
         self.engine.workspace.clear()
-        new = self.stages.population.mend(
-            self.free, self.t, self.quality, self._rows(), self.next_label, flaw, split, self.fixed
-        )
-        rows = _take_apart(new)
+        new = self.stages.insertion_deletion.repair_cells(
+            self.free, self.t, self.quality, self._data.generators, self.next_label, deficit, split,
+            self.fixed,
+        )  # fmt: skip
+        rows, counts = _take_apart(new)
         del new
-        return self._repopulate(rows)
+        return self._replace(rows, counts)
 
-    def _rows(self) -> Population:
-        """Return the present generators."""
-        return Population(self.points, self.labels, self.velocity, self.signatures, self.ever)
-
-    def _repopulate(self, rows: dict[str, Any]) -> tuple[int, int]:
-        """Take other generators, which are used up, if there are any; return how many came and went."""
+    def _replace(self, rows: dict[str, cla.Array], counts: tuple[int, int]) -> tuple[int, int]:
+        """Replace the generators by `rows`, if there are any; return the numbers of insertions and deletions."""
         self.engine.workspace.clear()
-        self.stages.population.clear()
-        if not rows:
-            return 0, 0
-        inserted, deleted = rows.pop("inserted"), rows.pop("deleted")
-        self.next_label += inserted
-        self.adopt(rows)
-        return inserted, deleted
+        self.stages.insertion_deletion.clear()
+        if rows:
+            self.next_label += counts[0]
+            self.set_generators(rows)
+        return counts
 
-    def assess(self) -> dict[str, Summary]:
-        """Fetch the summaries of the mesh and of the latest step: the scalars that the host sees of it.
+    def read_summaries(self) -> dict[str, Summary]:
+        """Read the summaries of the mesh and of the last step: the scalars that the host needs.
 
         Raises
         ------
         SizeFieldError
-            If the size of a generator is not positive and finite, and `update` has not looked.
+            If a size is not positive and finite, and `update` has not checked it.
         """
         summaries, first = self.summaries.read_with(self.sizing.invalid_index)
-        self.sizing.check(self.points, self.h, self.coarsening, first)
+        self.sizing.check(self.points, self.h, self.size_factor, first)
         return summaries
 
     def refined_count(self) -> int:
-        """Return how many generators `refine` would make."""
+        """Return the number of generators after `refine`."""
         return self.stages.refinement.count(self.t)
 
-    def refine(self) -> Mesh:
-        """Return the mesh of the next finer level; the present generators keep their labels."""
+    def refine(self) -> MeshState:
+        """Return the mesh of the next finer level. The present generators keep their labels."""
         self.stages.metric.scale_sizes(0.5, self.h)
-        rows = {
-            "points": self.stages.refinement.refine(
-                self.free, self.t, self.h, self.labels, self.fixed
-            )
-        }
-        n = len(rows["points"])
-        rows["labels"] = self.engine.upload(self.next_label + np.arange(n) - self.n, np.int32)
-        rows["labels"][: self.n] = self.labels
-        # Should the run be interrupted, `update` makes again what follows from the generators.
-        self.__dict__.update({**dict.fromkeys(_DERIVED), **_UNKNOWN})
-        # Not by its constructor, whose caller would hold on to the arrays.
-        mesh = Mesh.__new__(Mesh)
-        mesh._set_up(
-            self.stages, self.domain, self.sizing, self.coarsening / 2, self.free, self.fixed,
-            self.tessellator,
-        )  # fmt: skip
-        mesh._begin(rows)
+        finer = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, self.fixed)
+        start, n = {"points": finer}, len(finer)
+        del finer
+        start["labels"] = self.engine.upload(self.next_label + np.arange(n) - self.n, np.int32)
+        start["labels"][: self.n] = self.labels
+        # Free the other arrays. After an interruption `update` computes them again.
+        self._data = _Data(self._data.generators)
+        mesh = MeshState(self.setup, self.size_factor / 2, start, self.tessellator)
         mesh.next_label = self.next_label + n - self.n
         return mesh
 
-    # Results: physical units, the caller's order.
+    # Results in physical units, in the order of the caller.
 
-    def values(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
-        """Fetch per-generator `array` (n, ...) in the order of labels, times `factor`."""
-        # Generators get new labels, in an array of their own, whenever their order changes.
+    def to_host(self, array: cla.Array, factor: float = 1.0) -> np.ndarray:
+        """Return `array` (n, ...) on the host in the order of labels, times `factor`."""
+        # The labels are a new array whenever the order changes.
         if self._ordered is not self.labels:
             self._order, self._ordered = np.argsort(self.labels.get(), kind="stable"), self.labels
         return array.get()[self._order].astype(np.float64) * factor
 
-    def complete(self) -> bool:
-        """Let go of what only steps take, and evaluate what there is in full precision: for `finish`.
+    def finalize(self) -> bool:
+        """Free what only steps need, and evaluate the diagram in full precision, for `fetch_diagram`.
 
-        Return whether the diagram has been made anew for that.
+        Return whether the diagram has been computed again for that.
         """
         self.stages.clear("poisson")
         self.engine.workspace.clear()
         whole = self.tessellator.is_whole(self.t)
         if not whole:
-            # Nothing follows from the present diagram any more, and the new one needs room.
+            # Free the present diagram before the new one is computed.
             self.tessellation = None
             self.stages.clear("folded")
             self.tessellation = self.tessellator.make_whole(self.points, self.n)
         self.tessellation, self._unfolded = self.tessellator.final(self.t)
-        self._evaluate_metric()
+        self.evaluate_metric()
         return not whole
 
-    def finish(self) -> Diagram:
-        """Return the diagram and let go of all stages' buffers: the mesh is not to be used any more."""
+    def fetch_diagram(self) -> Diagram:
+        """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
         self.stages.release()
         return fetch_diagram(
             self.engine, self.domain, self.t, self.labels, copy=False, unfolded=self._unfolded
         )
 
 
-def _take_apart(new: Population | None) -> dict[str, Any]:
-    """Return what `new` has, if there is one, by name, so that each can be let go of on its own."""
-    return {} if new is None else dict(vars(new))
+def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:
+    """Return the arrays of the new generators by name, so that each can be freed on its own, and the numbers."""
+    if new is None:
+        return {}, (0, 0)
+    return dict(vars(new.generators)), (new.inserted, new.deleted)

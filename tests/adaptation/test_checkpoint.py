@@ -15,7 +15,7 @@ import pytest
 
 import clvoro
 from clvoro.adaptation import checkpoint
-from clvoro.adaptation.fingerprint import identity
+from clvoro.adaptation.fingerprint import domain_fingerprint
 from clvoro.adaptation.loop import STALLED
 from clvoro.adaptation.resume import Saved
 from clvoro.cli import command as cli
@@ -283,7 +283,7 @@ def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
         clvoro.Adapter(ctx, "float32").run(
             BOX, SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
         )
-    with pytest.raises(InputError, match=r"size field is another.*this field's is [0-9]"):
+    with pytest.raises(InputError, match=r"size field differs.*this field's is [0-9]"):
         clvoro.Adapter(ctx).run(
             BOX, 1.0001 * SIZE, checkpoint=clvoro.Checkpoint(resume=path), **options
         )
@@ -307,12 +307,12 @@ ALIKE = {
 
 def test_domains_of_the_same_extent_are_told_apart(saved):
     """By what files hold of them."""
-    told = {name: identity(domain) for name, domain in ALIKE.items()}
+    told = {name: domain_fingerprint(domain) for name, domain in ALIKE.items()}
     assert len({json.dumps(t, sort_keys=True) for t in told.values()}) == len(ALIKE)
-    assert identity(clvoro.Polygon(RECTANGLE)) == told["polygon"]
+    assert domain_fingerprint(clvoro.Polygon(RECTANGLE)) == told["polygon"]
     for name in set(ALIKE) - {"box"}:
         with pytest.raises(InputError, match=r"domain = Box\(.*'walls': 4.* has domain = "):
-            Saved(saved[0]).fit({**Saved(saved[0]).made_by, "domain": told[name]})
+            Saved(saved[0]).check_fingerprint({**Saved(saved[0]).fingerprint, "domain": told[name]})
 
 
 def test_checkpoints_of_other_versions_are_refused(saved, tmp_path):
@@ -320,7 +320,7 @@ def test_checkpoints_of_other_versions_are_refused(saved, tmp_path):
         return np.array(checkpoint.VERSION - 1) if name == "version" else array
 
     rewrite(saved[0], tmp_path / "state", older)
-    with pytest.raises(InputError, match=rf"of version {checkpoint.VERSION - 1}.*begin anew"):
+    with pytest.raises(InputError, match=rf"of version {checkpoint.VERSION - 1}.*start again"):
         Saved(tmp_path / "state")
 
 
@@ -368,7 +368,7 @@ DAMAGED = {
     "far position": with_state(position=10**9),
     "spare": with_state(spare=10**12),
     "text": with_state(steps="3"),
-    "coarsening": with_state(coarsening="nan"),
+    "size_factor": with_state(size_factor="nan"),
     "shape": lambda name, array: array[:-1] if name == "mesh.velocity" else array,
     "type": lambda name, array: array.astype(np.float32) if name == "mesh.h" else array,
 }

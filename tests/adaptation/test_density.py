@@ -25,15 +25,15 @@ def test_excess(engine):
     t = patch.tessellate(engine, patch.random_points(N, 111))
     h = np.random.default_rng(5).uniform(0.01, 0.2, N)
     density = Density(engine)
-    w = density.evaluate(t, engine.upload(h))
+    w = density.lloyd_weights(t, engine.upload(h))
     volumes, rel = t.volumes.get().astype(float), 64 * float(np.finfo(engine.real).eps)
     assert w.density.get() == pytest.approx(h**-2, rel=rel)
     assert w.weight.get() == pytest.approx(volumes / h**2, rel=rel)
-    assert w.excess.get() == pytest.approx(2 * np.log(np.sqrt(volumes) / h), abs=rel)
-    density.remove_mean(w)
+    assert w.log_ratio.get() == pytest.approx(2 * np.log(np.sqrt(volumes) / h), abs=rel)
+    density.subtract_mean_log_ratio(w)
     excess = np.log(volumes / h**2)
     mean = np.average(excess, weights=volumes / h**2)
-    assert w.excess.get() == pytest.approx(excess - mean, abs=rel)
+    assert w.log_ratio.get() == pytest.approx(excess - mean, abs=rel)
 
 
 def test_gradient_of_an_exponential(engine):
@@ -42,7 +42,7 @@ def test_gradient_of_an_exponential(engine):
     slope = np.array([-1.1, 2.3])
     h = 0.03 * np.exp(points @ slope)
     t = patch.tessellate(engine, points)
-    gradient = Density(engine).evaluate(t, engine.upload(h)).gradient.get()
+    gradient = Density(engine).lloyd_weights(t, engine.upload(h)).gradient.get()
     host = patch.fetch(t)
     told = np.bincount(host.owners[host.neighbors >= 0], minlength=N) > 1
     assert told.sum() == N - 1, "one cell fills a corner alone"
@@ -56,7 +56,7 @@ def test_gradient_is_that_of_least_squares(engine):
     points = patch.random_points(N, 114)
     h = np.random.default_rng(7).uniform(0.02, 0.2, N)
     t = patch.tessellate(engine, points)
-    gradient = Density(engine).evaluate(t, engine.upload(h)).gradient.get()
+    gradient = Density(engine).lloyd_weights(t, engine.upload(h)).gradient.get()
     host, eps = patch.fetch(t), float(np.finfo(engine.real).eps)
     for i in range(N):
         row = host.neighbors[host.starts[i] : host.starts[i + 1]]
@@ -82,9 +82,9 @@ def test_gradient_in_three_dimensions(ctx):
         face_centroids=zeros, volumes=engine.upload(volumes), offsets=engine.zeros((150, 3)), covariances=zeros,
     )  # fmt: skip
     h = 0.1 * np.exp(points @ slope)
-    w = Density(engine).evaluate(t, engine.upload(h))
+    w = Density(engine).lloyd_weights(t, engine.upload(h))
     assert np.abs(w.gradient.get() - slope).max() < 1e-9
-    assert w.excess.get() == pytest.approx(np.log(volumes / h**3), rel=1e-12)
+    assert w.log_ratio.get() == pytest.approx(np.log(volumes / h**3), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_gradient_in_three_dimensions(ctx):
 def test_gradient_that_the_neighbors_do_not_tell(engine, points):
     """One cell, two cells, collinear ones: none is taken, rather than one of any size."""
     points = np.array(points)
-    w = Density(engine).evaluate(
+    w = Density(engine).lloyd_weights(
         patch.tessellate(engine, points), engine.upload(0.1 + 0.3 * points[:, 0])
     )
     assert not w.gradient.get().any()
@@ -134,7 +134,7 @@ def test_weighted_centroids(ctx):
     for factor in (1.0, 0.5):
         slope = factor * np.array([0.8, -0.5])
         h = 0.1 * np.exp(points @ slope)
-        lloyd = Density(engine).evaluate(t, engine.upload(h)).lloyd.get()
+        lloyd = Density(engine).lloyd_weights(t, engine.upload(h)).lloyd.get()
         exact = np.array([weighted_centroid(c.polygon, slope, -4) for c in cells]) - points
         size = np.sqrt([c.area for c in cells])
         off = np.linalg.norm(lloyd - exact, axis=1) / size

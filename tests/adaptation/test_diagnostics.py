@@ -215,7 +215,7 @@ JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
     ("size", "n_cells", "category", "advice"),
     [
         (0.8, None, SizeErrorWarning, "do not fill evenly: use smaller sizes, or n_cells"),
-        (3.0, None, CoarseSizeWarning, "are h and the domain in the same unit"),
+        (3.0, None, CoarseSizeWarning, "do h and the domain have the same unit"),
         (0.8, 2, None, None),
         (0.1, None, None, None),
     ],

@@ -13,22 +13,23 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.estimates import (
     FOLDED,
-    MOST_CELLS,
+    MAX_CELLS,
     OUTPUT,
     PEAK,
     TRIMMED_PEAK,
+    Extras,
     available_memory,
     check_memory,
+    estimate_memory,
     fixed_bytes,
-    memory_needed,
 )
 from clvoro.adaptation.forecast import (
     IMAGE_REACH,
     STEEP_FROM,
     STEEP_TO,
     SURPLUS_RATE,
-    images_expected,
-    surplus_expected,
+    expected_images,
+    expected_surplus,
 )
 from clvoro.adaptation.sampling.start import count_cells, density_tree
 from clvoro.adaptation.schedule import MOST_SURPLUS
@@ -215,7 +216,7 @@ def test_one_diagram_holds_what_is_told(bench, ctx, name, real):
     options = Namespace(device=None, dtype=real)
     _, run, output = bench.peaks(options, lambda a: a.diagram(domain, points))
     engine = Engine(ctx, cl.CommandQueue(ctx), domain.dim, np.dtype(real))
-    told = memory_needed(engine, len(points), domain, run=False)
+    told = estimate_memory(engine, len(points), domain, run=False)
     held = max(sum(run.values()), output) / told
     # Places of the surface are dearer than others, and more where generators are few.
     assert 0.85 <= held <= 1.1
@@ -329,7 +330,7 @@ def test_what_is_told_does_not_depend_on_the_unit_of_length():
     for scale in (1.0, 2.0**80, 2.0**-80):
         box = clvoro.Box((0, 0), (scale, 0.5 * scale), periodic=True)
         tree = density_tree(sizing.Constant(scale), box)
-        found.append(images_expected(box, sizing.Constant(scale), 20000, tree))
+        found.append(expected_images(box, sizing.Constant(scale), 20000, tree))
     assert found == [found[0]] * 3
 
 
@@ -341,15 +342,15 @@ def test_what_is_told_does_not_depend_on_where_seams_are():
             density_tree(sizing.Constant(1.0), box),
             IMAGE_REACH[box.dim] * n ** (-1 / box.dim),
         )
-        found = images_expected(box, sizing.Constant(1.0), n, even)
+        found = expected_images(box, sizing.Constant(1.0), n, even)
         # A sample of 16,384 cells, of which a tenth lies in each margin.
         assert found == pytest.approx((1 + 2 * deep) ** d - 1, rel=0.03)
     surpluses, images = [], []
     for formula in ("fabs(x - 0.5) < 0.01", "x < 0.005 || x > 0.985", "x > 0.98", "y < 0.02"):
         strip = sizing.Expression(f"{formula} ? 0.0025 : 0.08")
         tree = density_tree(strip, TORUS)
-        surpluses.append(surplus_expected(TORUS, strip, tree, 2.0))
-        images.append(images_expected(TORUS, strip, tree.integral, tree))
+        surpluses.append(expected_surplus(TORUS, strip, tree, 2.0))
+        images.append(expected_images(TORUS, strip, tree.integral, tree))
     # Two of eight cells across are near a jump, on either side; the sample may be off by a tenth.
     share = 4 / 8 * (STEEP_TO - STEEP_FROM)
     assert surpluses == pytest.approx(
@@ -421,13 +422,13 @@ def test_no_surplus_where_sizes_change_slowly():
     """None in a field of slope 0.08, many where each cell is twice as large as the next, and beside a jump
     as it has cells."""
     field = sizing.Distance(sizing.Circle((0.45, 0.5), 0.2), h_min=0.004, slope=0.08)
-    assert surplus_expected(SQUARE, field, density_tree(field, SQUARE), 2.0) == 0
+    assert expected_surplus(SQUARE, field, density_tree(field, SQUARE), 2.0) == 0
     # Of slope 0.6, so that two cells on sizes are 2.2 times as large; towards the walls there is nothing beyond.
     steep = sizing.Expression("0.0005 + 0.6 * fabs(x - 0.5)")
-    most = surplus_expected(SQUARE, steep, density_tree(steep, SQUARE), 2.0)
+    most = expected_surplus(SQUARE, steep, density_tree(steep, SQUARE), 2.0)
     assert most == pytest.approx(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * 0.8)), rel=0.05)
     jump = sizing.Expression("x < 0.5 ? 0.01 : 0.1")
-    found = surplus_expected(SQUARE, jump, density_tree(jump, SQUARE), 2.0)
+    found = expected_surplus(SQUARE, jump, density_tree(jump, SQUARE), 2.0)
     # 2 h deep of the half that is fine, which has all but a hundredth of the cells; the sample may be off by a fifth.
     share = 2 * 0.01 / 0.5
     assert found == pytest.approx(MOST_SURPLUS * (1 - np.exp(-SURPLUS_RATE * share)), rel=0.2)
@@ -499,7 +500,7 @@ def test_periodic_boxes_hold_images_and_folded_graphs(bench, monkeypatch, ctx, d
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(np.float64))
     cells = found["cells"]
     tree = density_tree(field, box)
-    images = images_expected(box, field, cells, tree)
+    images = expected_images(box, field, cells, tree)
     figures = [
         sum(f * size * share for f, size in zip(numbers, (8, 4), strict=True))
         for numbers, share in ((PEAK[dim], 1 + images), (FOLDED[dim], 1))
@@ -507,12 +508,12 @@ def test_periodic_boxes_hold_images_and_folded_graphs(bench, monkeypatch, ctx, d
     run, output = sum(figures), OUTPUT[dim][8] * (1 + images)
     fixed = fixed_bytes(engine, cells) / cells
     expected = max(run + fixed, output)
-    assert memory_needed(engine, cells, box, images) == pytest.approx(expected * cells)
+    assert estimate_memory(engine, cells, box, Extras(images)) == pytest.approx(expected * cells)
     run += fixed
     # Where large cells are few, balls are not as deep along all of a seam.
     assert (0.9 if dim == 2 else 0.85) <= found["run"] / run <= 1.1
     assert 0.75 <= found["output"] / output <= 1.1 or found["output"] < found["run"]
-    assert run > 1.5 * memory_needed(engine, cells) / cells or dim == 3
+    assert run > 1.5 * estimate_memory(engine, cells) / cells or dim == 3
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -524,10 +525,10 @@ def test_what_does_not_fit_is_refused(ctx, dim, real):
     size = engine.real.itemsize
     reals, integers = PEAK[dim]
     most = max(reals * size + 4 * integers, OUTPUT[dim][size])
-    fits = min(room / most, MOST_CELLS)
-    check_memory(engine, 0.99 * fits, memory_needed(engine, 0.99 * fits))
+    fits = min(room / most, MAX_CELLS)
+    check_memory(engine, 0.99 * fits, estimate_memory(engine, 0.99 * fits))
     with pytest.raises(MemoryLimitError, match="GiB"):
-        check_memory(engine, 1.01 * fits, memory_needed(engine, 1.01 * fits))
+        check_memory(engine, 1.01 * fits, estimate_memory(engine, 1.01 * fits))
     with pytest.raises(MemoryLimitError, match="GiB"):
         clvoro.Adapter(ctx, real).run(
             clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.01 * fits)

@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 
 from clvoro.adaptation.insertion_deletion import (
-    EXCESS_RINGS,
-    LARGEST_CHANGE,
-    MENDED_SHARE,
+    CLIMB_STRAIN,
+    LOG_RATIO_RINGS,
+    MAX_CHANGE,
     NUCLEUS_RINGS,
     PAIR_RINGS,
+    REPAIRED_SHARE,
     SPLIT_DISTANCE,
-    THETA,
-    Population,
-    PopulationControl,
+    CellSizes,
+    Change,
+    Generators,
+    InsertionDeletion,
 )
 from clvoro.geometry.box import Box
 from tests.reference import patch
 
-QUIET = THETA + 0.001  # above THETA pairs at walls are left alone
+QUIET = CLIMB_STRAIN + 0.001  # above CLIMB_STRAIN pairs at walls are left alone
 
 
 @pytest.fixture(scope="module")
@@ -28,61 +30,64 @@ def engine(ctx):
 
 
 class Sweep:
-    """One call of `reorganize`, or of `mend` where the quality is given, and what it has done, by labels."""
+    """One call of `insert_delete`, or of `repair_cells` if the quality is given, and its changes by labels."""
 
     def __init__(self, engine, points, h, total, control=None, **options):
         n, rng = len(points), np.random.default_rng(808)
         self.n, self.points, self.h = n, points, np.broadcast_to(h, n)
         self.labels = rng.permutation(3 * n)[:n].astype(np.int32)
         self.velocity = rng.normal(size=(n, 2)).astype(engine.real)
-        self.ever = (rng.random(n) < 0.5).astype(engine.real)
+        self.ever_changed = (rng.random(n) < 0.5).astype(engine.real)
         self.signatures = rng.integers(1, 2**63, n).astype(np.uint64)
         self.t = patch.tessellate(engine, points)
         self.host = patch.fetch(self.t)
-        reach = np.minimum(self.h, np.sqrt(self.host.volumes))
-        self.excess = np.log(self.host.volumes / self.h**2)
-        rows = Population(
+        local_length = np.minimum(self.h, np.sqrt(self.host.volumes))
+        self.log_ratio = np.log(self.host.volumes / self.h**2)
+        rows = Generators(
             self.t.points, engine.upload(self.labels, np.int32), engine.upload(self.velocity),
-            engine.upload(self.signatures, np.uint64), engine.upload(self.ever),
+            engine.upload(self.signatures, np.uint64), engine.upload(self.ever_changed),
         )  # fmt: skip
         self.first_new = 5 * n
-        control = control or PopulationControl(engine)
+        control = control or InsertionDeletion(engine)
         if "quality" in options:
             quality = engine.upload(options.pop("quality"))
-            self.new = control.mend(patch.BOX, self.t, quality, rows, self.first_new, **options)
+            self.new = control.repair_cells(
+                patch.BOX, self.t, quality, rows, self.first_new, **options
+            )
         else:
-            self.new = control.reorganize(
-                patch.BOX, self.t, engine.upload(self.h), engine.upload(reach), engine.upload(self.excess), rows,
-                total, self.first_new, **options,
-            )  # fmt: skip
+            sizes = CellSizes(*map(engine.upload, (self.h, local_length, self.log_ratio)))
+            fixed = options.pop("fixed", 0)
+            self.new = control.insert_delete(
+                patch.BOX, self.t, sizes, rows, self.first_new, Change(total, **options), fixed
+            )
         if self.new is not None:
             self.account()
 
     def account(self):
         """Every generator that was is there, but those that are counted as deleted; the new ones are counted too."""
-        new = self.new
+        new = self.new.generators
         self.new_points, labels = new.points.get(), new.labels.get()
-        assert len(labels) == self.n + new.inserted - new.deleted
+        assert len(labels) == self.n + self.new.inserted - self.new.deleted
         assert len(np.unique(labels)) == len(labels), "a label is given twice"
         old = np.isin(labels, self.labels)
-        assert (~old).sum() == new.inserted
+        assert (~old).sum() == self.new.inserted
         born = np.sort(labels[~old])
-        assert np.array_equal(born, self.first_new + np.arange(new.inserted))
+        assert np.array_equal(born, self.first_new + np.arange(self.new.inserted))
         assert patch.BOX.contains(self.new_points).all()
         row = {label: i for i, label in enumerate(self.labels)}
         self.rows = np.array(
             [row[label] for label in labels[old]], int
         )  # the row before, of each that was
         self.deleted = np.setdiff1d(np.arange(self.n), self.rows)
-        assert len(self.deleted) == new.deleted
+        assert len(self.deleted) == self.new.deleted
         moved = (self.new_points[old] != self.points[self.rows]).any(axis=1)
         self.moved, self.moved_to = self.rows[moved], self.new_points[old][moved]
         assert np.array_equal(new.velocity.get()[old][~moved], self.velocity[self.rows[~moved]])
         assert not new.velocity.get()[old][moved].any()
         assert np.array_equal(new.signatures.get()[old], self.signatures[self.rows])
-        assert np.array_equal(new.ever.get()[old], self.ever[self.rows])
+        assert np.array_equal(new.ever_changed.get()[old], self.ever_changed[self.rows])
         assert not new.velocity.get()[~old].any()
-        assert (new.ever.get()[~old] == 1).all()
+        assert (new.ever_changed.get()[~old] == 1).all()
         self.born = self.new_points[~old]
 
     def neighbors(self, i):
@@ -129,7 +134,7 @@ def test_kinds_and_strain(engine):
     n = 80
     points, h = patch.random_points(n, 41), np.random.default_rng(42).uniform(0.05, 0.2, n)
     t = patch.tessellate(engine, points)
-    host, control = patch.fetch(t), PopulationControl(engine)
+    host, control = patch.fetch(t), InsertionDeletion(engine)
     found = [array.get().reshape(n, -1) for array in control._measure(t, engine.upload(h))]
     rows = [host.neighbors[a:b] for a, b in itertools.pairwise(host.starts)]
     walls = np.array([(row < 0).sum() for row in rows])
@@ -162,7 +167,7 @@ H = A * np.sqrt(np.sqrt(3) / 2)
 
 def test_stretched_pair_is_split_at_the_seven(engine):
     """Into two across the pair: the extra half row grows."""
-    sweep = Sweep(engine, dislocated(A, 0.06), H, 1.0, theta=QUIET)
+    sweep = Sweep(engine, dislocated(A, 0.06), H, 1.0, climb_strain=QUIET)
     five, seven = the_pair(sweep)
     assert (sweep.new.inserted, sweep.new.deleted) == (1, 0)
     assert sweep.moved.tolist() == [seven]
@@ -175,7 +180,7 @@ def test_stretched_pair_is_split_at_the_seven(engine):
 
 
 def test_compressed_pair_goes_at_the_five(engine):
-    sweep = Sweep(engine, dislocated(A, -0.06), H, -1.0, theta=QUIET)
+    sweep = Sweep(engine, dislocated(A, -0.06), H, -1.0, climb_strain=QUIET)
     five, _ = the_pair(sweep)
     assert (sweep.new.inserted, sweep.new.deleted) == (0, 1)
     assert sweep.deleted.tolist() == [five]
@@ -184,13 +189,13 @@ def test_compressed_pair_goes_at_the_five(engine):
 
 def test_unstrained_pair_stays(engine):
     """Without strain, and with the count right, there is nothing to do."""
-    assert Sweep(engine, dislocated(A, 0.0), H, 0.0, theta=QUIET).new is None
+    assert Sweep(engine, dislocated(A, 0.0), H, 0.0, climb_strain=QUIET).new is None
 
 
 def test_count_overrules_strain(engine):
     """One pair cannot climb where the count is right; where it is not, the pair gives way first."""
-    assert Sweep(engine, dislocated(A, 0.06), H, 0.0, theta=QUIET).new is None
-    against = Sweep(engine, dislocated(A, 0.0), H, 1.0, theta=QUIET)
+    assert Sweep(engine, dislocated(A, 0.06), H, 0.0, climb_strain=QUIET).new is None
+    against = Sweep(engine, dislocated(A, 0.0), H, 1.0, climb_strain=QUIET)
     assert against.moved.tolist() == [the_pair(against)[1]]
 
 
@@ -214,7 +219,7 @@ def test_two_pairs_of_opposite_strain_both_climb(engine):
     points[:, 0] -= 0.06 / (2 * np.pi) * np.cos(2 * np.pi * points[:, 0])
     points[:, 1] = 0.375 + (points[:, 1] - 0.375) / wide
     points = points[patch.BOX.contains(points)]
-    sweep = Sweep(engine, points, a * H / A, 0.0, theta=QUIET)
+    sweep = Sweep(engine, points, a * H / A, 0.0, climb_strain=QUIET)
     assert (sweep.new.inserted, sweep.new.deleted) == (1, 1)
     sides = np.diff(sweep.host.starts)
     assert sides[sweep.moved].tolist() == [7]
@@ -229,7 +234,7 @@ def test_count_to_the_last(engine, total):
     points = patch.relaxed_points(n, 61, steps=2)
     sweep = Sweep(engine, points, np.sqrt(0.75 / n), total, climb=False)
     expected = int(np.trunc(total + np.copysign(0.3, total)))
-    expected = int(np.clip(expected, -LARGEST_CHANGE * n, LARGEST_CHANGE * n))
+    expected = int(np.clip(expected, -MAX_CHANGE * n, MAX_CHANGE * n))
     change = sweep.new.inserted - sweep.new.deleted
     # Sites three rings apart take up to 37 cells each: some of 500 may find no place.
     assert change == expected if abs(expected) < 10 else 10 <= abs(change) <= abs(expected)
@@ -237,8 +242,8 @@ def test_count_to_the_last(engine, total):
     assert min(sweep.new.inserted, sweep.new.deleted) == 0
     sites = (sweep.moved if total > 0 else sweep.deleted).tolist()
     assert len(sites) == abs(change)
-    assert len(sites) == 1 or sweep.rings_between(sites) > EXCESS_RINGS
-    score = np.sign(total) * (sweep.excess + 0.2 * (np.diff(sweep.host.starts) - 6))
+    assert len(sites) == 1 or sweep.rings_between(sites) > LOG_RATIO_RINGS
+    score = np.sign(total) * (sweep.log_ratio + 0.2 * (np.diff(sweep.host.starts) - 6))
     assert score.argmax() in sites
 
 
@@ -279,7 +284,7 @@ def test_alike_cells_are_told_apart(engine):
 
 def test_limit_keeps_the_strongest(engine):
     """Keys from far apart to an ulp apart and equal but for the index."""
-    control, rng = PopulationControl(engine), np.random.default_rng(3)
+    control, rng = InsertionDeletion(engine), np.random.default_rng(3)
     spans = [10**6, 300, 40, 1]
     for trial in range(24):
         n = int(rng.integers(1, 400))
@@ -308,7 +313,7 @@ def strained(a=0.04, stretch=0.15):
 def test_pairs_are_made_where_the_lattice_is_strained(engine):
     """In turn: a generator in the longest edge, and two merged in their middle."""
     h = 0.04 * H / A
-    sweep = Sweep(engine, strained(), h, 0.0, nuclei=2, theta=QUIET)
+    sweep = Sweep(engine, strained(), h, 0.0, nuclei=2, climb_strain=QUIET)
     assert 2 <= sweep.new.inserted + sweep.new.deleted <= 4
     assert abs(sweep.new.inserted - sweep.new.deleted) <= 1
     edges = [
@@ -346,7 +351,8 @@ def test_pairs_are_made_where_the_lattice_is_strained(engine):
 
 def test_no_pairs_in_an_unstrained_lattice(engine):
     assert (
-        Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, theta=QUIET).new is None
+        Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, climb_strain=QUIET).new
+        is None
     )
 
 
@@ -354,14 +360,18 @@ def test_no_pairs_in_an_unstrained_lattice(engine):
 def test_repeats_bit_by_bit(ctx, real):
     engine = patch.make_engine(ctx, real)
     points = patch.random_points(700, 12).astype(real).astype(float)
-    used = PopulationControl(engine)
+    used = InsertionDeletion(engine)
     sweeps = [
         Sweep(engine, points, 0.033, 20.0, control, nuclei=3) for control in (None, used, used)
     ]
     for sweep in sweeps[1:]:
         assert sweep.new.inserted == sweeps[0].new.inserted > 3
-        assert np.array_equal(sweep.new.points.get(), sweeps[0].new.points.get())
-        assert np.array_equal(sweep.new.labels.get(), sweeps[0].new.labels.get())
+        assert np.array_equal(
+            sweep.new.generators.points.get(), sweeps[0].new.generators.points.get()
+        )
+        assert np.array_equal(
+            sweep.new.generators.labels.get(), sweeps[0].new.generators.labels.get()
+        )
 
 
 SPOTS = {(0.2, 0.2): 0.9, (0.8, 0.2): 0.8, (0.2, 0.6): 0.93, (0.8, 0.6): 0.95}
@@ -383,7 +393,9 @@ class TestMend:
     @pytest.mark.parametrize("split", [False, True])
     def test_those_below_the_bound_are_mended(self, engine, split):
         points, quality, sites = self.lattice(SPOTS)
-        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, split=split, share=0.1)
+        sweep = Sweep(
+            engine, points, 0.02, 0.0, quality=quality, deficit=0.06, split=split, share=0.1
+        )
         changed, others = (sweep.moved, sweep.deleted) if split else (sweep.deleted, sweep.moved)
         assert sorted(changed) == sorted(sites[:3])
         assert len(others) == 0
@@ -395,12 +407,12 @@ class TestMend:
     @pytest.mark.parametrize("split", [False, True])
     def test_five_go_and_seven_are_split_either_way(self, engine, split):
         points, quality, _ = self.lattice({})
-        five, seven = the_pair(Sweep(engine, points, 0.02, 0.0, theta=QUIET))
+        five, seven = the_pair(Sweep(engine, points, 0.02, 0.0, climb_strain=QUIET))
         for i in (five, seven):
             poor = quality.copy()
             poor[i] = 0.9
             sweep = Sweep(
-                engine, points, 0.02, 0.0, quality=poor, flaw=0.06, split=split, share=0.1
+                engine, points, 0.02, 0.0, quality=poor, deficit=0.06, split=split, share=0.1
             )
             assert (sweep.deleted.tolist(), sweep.moved.tolist()) == (
                 ([five], []) if i == five else ([], [seven])
@@ -411,25 +423,30 @@ class TestMend:
         n = len(points)
         for most in (1, 2):
             sweep = Sweep(
-                engine, points, 0.02, 0.0, quality=quality, flaw=0.01, share=(most + 0.5) / n
+                engine, points, 0.02, 0.0, quality=quality, deficit=0.01, share=(most + 0.5) / n
             )
             assert sorted(sweep.deleted) == sorted([sites[1], sites[0]][:most])
-        assert n * MENDED_SHARE > 1
+        assert n * REPAIRED_SHARE > 1
         assert (
-            Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.01, share=0.9 / n).new is None
+            Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.01, share=0.9 / n).new
+            is None
         )
 
     def test_good_meshes_and_walls_are_left_alone(self, engine):
         points, quality, _ = self.lattice({})
-        assert Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0).new is None
+        assert (
+            Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
+        )
         host = patch.fetch(patch.tessellate(engine, points))
         quality[host.owners[host.neighbors < 0]] = 0.5
-        assert Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0).new is None
+        assert (
+            Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
+        )
 
     def test_four_sides_go_and_eight_are_split_whatever_their_quality(self, engine):
         """Those that are far from all others; every other one has such a one within a few rings."""
         points = patch.relaxed_points(600, 71, steps=1)
-        sweep = Sweep(engine, points, 0.04, 0.0, quality=np.ones(600), flaw=0.5, share=1.0)
+        sweep = Sweep(engine, points, 0.04, 0.0, quality=np.ones(600), deficit=0.5, share=1.0)
         sides = np.diff(sweep.host.starts)
         inner = np.ones(600, bool)
         inner[sweep.host.owners[sweep.host.neighbors < 0]] = False
@@ -444,12 +461,12 @@ class TestMend:
     def test_generators_that_stay(self, engine):
         """Neither they nor their neighbors are touched."""
         points, quality, sites = self.lattice(SPOTS)
-        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0)
+        sweep = Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0)
         beside = min(j for j in sweep.neighbors(sites[1]) if j >= 0)
         for held in (sites[1], beside):
             fixed = int(sweep.labels[held]) + 1
             again = Sweep(
-                engine, points, 0.02, 0.0, quality=quality, flaw=0.06, share=1.0, fixed=fixed
+                engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0, fixed=fixed
             )
             still = again.labels < fixed
             free = [

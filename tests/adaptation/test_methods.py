@@ -13,7 +13,7 @@ from clvoro.adaptation.methods import (
     make_method,
 )
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import Mesh
+from clvoro.adaptation.state import MeshState
 from clvoro.errors import SizeFieldError
 from clvoro.sizing import Sizing
 from clvoro.solvers.conjugate_gradient import Limits
@@ -32,7 +32,9 @@ def stages(ctx):
 def make_mesh(stages, points=None, field=FIELD):
     points = patch.relaxed_points(N, 5005, steps=2) if points is None else points
     engine = stages.engine
-    mesh = Mesh(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points))
+    mesh = MeshState.create(
+        stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points)
+    )
     return mesh, patch.fetch(mesh.t)
 
 
@@ -113,7 +115,7 @@ def test_weighted_displacements(stages):
     weight = host.volumes * rho
     psi = solve(host, weight * (r - np.average(r, weights=weight)), rho)
     assert mesh.correction.get() == pytest.approx(gradient(host, psi), rel=1e-7, abs=1e-9)
-    w = stages.density.evaluate(mesh.t, mesh.h)
+    w = stages.density.lloyd_weights(mesh.t, mesh.h)
     assert np.array_equal(mesh.lloyd.get(), w.lloyd.get())
 
 
@@ -144,7 +146,14 @@ def test_a_mesh_that_is_right_stays(stages, name):
     mesh, host = make_mesh(stages, points, sizing.Constant(0.125))
     method = {
         "glide": ProjectedMethod("lloyd", 1.3, 0.7),
-        "polish": ProjectedMethod("shape", 0.0, eps=0.3, lenience=0.03, bound=0.02, aim=0.002),
+        "polish": ProjectedMethod(
+            "quality",
+            0.0,
+            penalty=0.3,
+            quality_scale=0.03,
+            log_ratio_scale=0.02,
+            error_target=0.002,
+        ),
     }.get(name) or make_method(name, Relaxation())
     for _ in range(5):
         method.displace(mesh)
@@ -158,18 +167,19 @@ def test_projected_displacements(stages):
     mesh, _ = make_mesh(stages)
     velocity = np.random.default_rng(9).normal(0, 0.003, (N, 2))
     mesh.velocity.set(velocity)
-    w = stages.density.evaluate(mesh.t, mesh.h)
-    lloyd, r = w.lloyd.get(), w.excess.get()
-    stages.density.remove_mean(w)
+    w = stages.density.lloyd_weights(mesh.t, mesh.h)
+    lloyd, r = w.lloyd.get(), w.log_ratio.get()
+    stages.density.subtract_mean_log_ratio(w)
     expected = 1.3 * lloyd + 0.6 * velocity
     correction = stages.engine.empty((N, 2))
-    stages.projection.project(
-        mesh.t, Targets(mesh.reach, w.gradient, w.excess, mesh.quality), stages.engine.upload(expected), correction,
+    stages.volume_projection.project(
+        mesh.t, Targets(mesh.local_length, w.gradient, w.log_ratio, mesh.quality),
+        stages.engine.upload(expected), correction,
         Penalty(0.2, 0.1, 0.3), Limits(1e-2, 25),
     )  # fmt: skip
-    ProjectedMethod("lloyd", 1.3, 0.6, eps=0.2, lenience=0.1, bound=0.3, iterations=25).displace(
-        mesh
-    )
+    ProjectedMethod(
+        "lloyd", 1.3, 0.6, penalty=0.2, quality_scale=0.1, log_ratio_scale=0.3, iterations=25
+    ).displace(mesh)
     assert mesh.lloyd.get() == pytest.approx(expected, abs=1e-15)
     assert np.array_equal(mesh.correction.get(), correction.get())
     assert np.abs(r).max() > 0.1
@@ -180,7 +190,7 @@ def test_penalty_is_steered_to_the_error_aimed_at(stages):
     mesh, host = make_mesh(stages)
     h = FIELD(host.points)
     error = np.abs(np.log(np.sqrt(host.volumes) / h)).mean()
-    assert mesh.mean_log_error(stages.density.weigh(mesh.t, mesh.h)) == pytest.approx(
+    assert mesh.mean_log_ratio_error(stages.density.cell_weights(mesh.t, mesh.h)) == pytest.approx(
         error, rel=1e-9
     )
     for aim, factor in (
@@ -189,24 +199,24 @@ def test_penalty_is_steered_to_the_error_aimed_at(stages):
         (1.1 * error, 1.1),
         (50 * error, 1.33),
     ):
-        method = ProjectedMethod(eps=0.1, aim=aim)
+        method = ProjectedMethod(penalty=0.1, error_target=aim)
         for _ in range(3):
             method.displace(mesh)
-        assert method.eps == 0.1, "the first steps only settle in"
+        assert method.penalty == 0.1, "the first steps only settle in"
         method.displace(mesh)
-        assert method.eps == pytest.approx(0.1 * factor, rel=1e-6)
+        assert method.penalty == pytest.approx(0.1 * factor, rel=1e-6)
         for _ in range(40):
             method.displace(mesh)
-        assert method.eps == pytest.approx({True: 3.0, False: 1e-3}[aim > error])
+        assert method.penalty == pytest.approx({True: 3.0, False: 1e-3}[aim > error])
 
 
 def test_mean_log_error_of_cells_that_are_right(stages):
     """No division by an error of nothing."""
     mesh, _ = make_mesh(stages, np.array([[0.5, 0.375]]), sizing.Constant(np.sqrt(0.75)))
-    method = ProjectedMethod("shape", aim=0.002)
+    method = ProjectedMethod("quality", error_target=0.002)
     for _ in range(6):
         method.displace(mesh)
-    assert np.isfinite(method.eps)
+    assert np.isfinite(method.penalty)
 
 
 @pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
@@ -217,25 +227,29 @@ def test_a_bad_size_is_named_as_the_field_has_it(stages, value):
     engine = stages.engine
     printed = {"0.0": "0", "0.0/0.0": "nan"}.get(value, value)
     with pytest.raises(SizeFieldError, match=rf"is -?{printed} at \(0\.8, 0\.6\)"):
-        Mesh(
-            stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points), coarsening=8
+        MeshState.create(
+            stages,
+            patch.BOX,
+            Sizing(engine, patch.BOX, field),
+            engine.upload(points),
+            size_factor=8,
         )
 
 
 def test_a_bad_size_that_no_update_looked_at_is_found_by_the_next_assessment(stages):
     engine, good = stages.engine, np.array([[0.2, 0.3], [0.6, 0.6], [0.5, 0.1]])
     size = Sizing(engine, patch.BOX, sizing.Expression("x > 0.7 ? 0.0/0.0 : 0.05"))
-    mesh = Mesh(stages, patch.BOX, size, engine.upload(good), coarsening=4)
-    assert mesh.assess()["error"].magnitude > 0
+    mesh = MeshState.create(stages, patch.BOX, size, engine.upload(good), size_factor=4)
+    assert mesh.read_summaries()["error"].magnitude > 0
     mesh.points.set(np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]]))
     with pytest.raises(SizeFieldError, match=r"nan at \(0\.8, 0\.6\)"):
         mesh.update()
     mesh.update(check=False)
     with pytest.raises(SizeFieldError, match=r"nan at \(0\.8, 0\.6\)"):
-        mesh.assess()
+        mesh.read_summaries()
     mesh.points.set(good)
     mesh.update(check=False)
-    assert mesh.assess()["error"].magnitude > 0
+    assert mesh.read_summaries()["error"].magnitude > 0
 
 
 def test_names():

@@ -224,7 +224,7 @@ def test_other_arguments(adapter):
     refused(lambda: adapter.run(BOX, 0.2, callback=lambda a, b: None), "one argument, a row")
     refused(lambda: adapter.run(BOX, 0.2, layers=0.01), "clvoro.Layers(0.01)")
     layers = clvoro.Layers(0.02, edges=[2])
-    refused(lambda: adapter.run(BOX, 0.1, layers=layers, n_cells=20), "layers take", "n_cells out")
+    refused(lambda: adapter.run(BOX, 0.1, layers=layers, n_cells=20), "layers have", "n_cells out")
 
 
 # Domains.

@@ -23,7 +23,7 @@ def t(engine):
 
 def follow(engine, t, psi):
     u = engine.empty((t.n, 2))
-    Motion(engine).follow_potential(t, engine.upload(psi), u)
+    Motion(engine).compute_potential_gradient(t, engine.upload(psi), u)
     return u.get()
 
 
@@ -70,7 +70,7 @@ def test_relax_globally(engine, limit, k):
     summaries.collect("other", engine.upload(10 * speed), N)
     on_device = engine.upload(u), engine.upload(speed)
     summaries.collect("speed", on_device[1], N)
-    Motion(engine).relax_globally(summaries, "speed", limit, k, *on_device)
+    Motion(engine).relax_correction(summaries, "speed", limit, k, *on_device)
     alpha = min(limit, k / speed.max())
     eps = float(np.finfo(engine.real).eps)
     assert on_device[0].get() == pytest.approx(alpha * u, rel=8 * eps)
@@ -82,7 +82,7 @@ def test_relax_nothing(engine):
     summaries = Summaries(engine, ("speed",))
     u, speed = engine.zeros((N, 2)), engine.zeros(N)
     summaries.collect("speed", speed, N)
-    Motion(engine).relax_globally(summaries, "speed", 2.0, 0.5, u, speed)
+    Motion(engine).relax_correction(summaries, "speed", 2.0, 0.5, u, speed)
     assert not u.get().any()
     assert not speed.get().any()
 

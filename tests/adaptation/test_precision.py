@@ -1,4 +1,4 @@
-"""What a precision cannot resolve is said before a run begins; what it can is met as well as in double precision."""
+"""What a precision cannot resolve is said before a run begins; what it can is met as well as in double diagnostics."""
 
 import warnings
 
@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.adaptation import precision
+from clvoro.adaptation import diagnostics
 from clvoro.errors import InputError, PrecisionWarning
 from clvoro.opencl.engine import Engine
 from clvoro.sizing import Circle, Distance, Expression, Sizing
@@ -29,7 +29,7 @@ def stage(ctx, real, size, box=BOX):
 
 def test_the_mean_is_that_over_the_points(ctx, real):
     points = BOX.lower + np.random.default_rng(5).random((50, 2)) * BOX.extent
-    found = precision.check_precision(stage(ctx, real, lambda x: 0.1 * x[:, 0]), BOX, points, 0.5)
+    found = diagnostics.check_precision(stage(ctx, real, lambda x: 0.1 * x[:, 0]), BOX, points, 0.5)
     assert found == pytest.approx((SPACING[real] / (0.05 * points[:, 0])).mean(), rel=1e-5)
 
 
@@ -39,7 +39,7 @@ def test_warns_and_refuses_at_the_bounds(ctx, real):
 
     def check(size, size_beyond_2=1.0):
         field = stage(ctx, real, lambda x: np.where(x[:, 0] > 2, size_beyond_2, size))
-        precision.check_precision(field, BOX, points)
+        diagnostics.check_precision(field, BOX, points)
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -47,7 +47,7 @@ def test_warns_and_refuses_at_the_bounds(ctx, real):
         check(1.0, unit * 16.1)
     with pytest.warns(PrecisionWarning, match=f"{real} .* mean error of 0.001"):
         check(unit / 0.0103)
-    with pytest.warns(PrecisionWarning, match="0.063 of the least"):
+    with pytest.warns(PrecisionWarning, match="0.063 of the smallest"):
         check(1.0, unit * 15.9)
     with pytest.raises(InputError, match=r"coincide.*(float64|smaller domain)"):
         check(1.0, unit * 0.99)
@@ -60,14 +60,16 @@ def test_warns_and_refuses_at_the_bounds(ctx, real):
     ("box", "h"), [(clvoro.Box((0, 0), (1, 1)), 0.05), (clvoro.Box((0,) * 3, (1,) * 3), 0.15)]
 )
 def test_what_rounding_adds(ctx, box, h, noise):
-    """Generators off by up to half a spacing: `ADDED` holds for uniform meshes, to a third."""
+    """Generators off by up to half a spacing: `ROUND_OFF_ERROR` holds for uniform meshes, to a third."""
     adapter = clvoro.Adapter(ctx)
     result = adapter.run(box, h, effort="fast", seed=1)
     by = np.random.default_rng(3).uniform(-noise, noise, result.points.shape) * h
     moved = adapter.diagram(box, np.clip(result.points + by, box.lower, box.upper))
     length = moved.volumes ** (1 / box.dim)
     change = np.abs((length - h) / np.minimum(length, h) - result.size_error).mean()
-    assert 0.6 * precision.ADDED < change / (2 * noise) < 1.1 * precision.ADDED
+    assert (
+        0.6 * diagnostics.ROUND_OFF_ERROR < change / (2 * noise) < 1.1 * diagnostics.ROUND_OFF_ERROR
+    )
 
 
 def test_runs_say_it_before_they_begin(ctx):
@@ -86,7 +88,7 @@ def test_runs_say_it_before_they_begin(ctx):
 
 
 def test_single_precision_meets_a_thousandfold_grading(ctx):
-    """As well as double precision, to 1e-3 in the mean, and silently; `bench/precision.py` has it for 1e6 cells."""
+    """As well as double precision, to 1e-3 in the mean, and silently; `bench/diagnostics.py` has it for 1e6 cells."""
     box = clvoro.Box((0, 0), (2.5, 1.5))
     field = Distance([Circle((0.9, 0.75), 0.0)], 1.5e-4, slope=999 * 1.5e-4 / 1.767)
     mean = {}

@@ -5,7 +5,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.adaptation.quality_descent import Shape
+from clvoro.adaptation.quality_descent import QualityDescent
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
@@ -32,12 +32,18 @@ def energy(points, omega):
     return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
 
 
-def descend(engine, points, h, emphasis, rate=0.1, longest=0.2, quality=None):
+def descend(engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None):
     t = patch.tessellate(engine, points)
     quality = engine.upload(qualities(points)[:, 0] if quality is None else quality)
     out = engine.empty((len(points), 2))
-    Shape(engine).descend(
-        t, engine.upload(h), quality, out, emphasis=emphasis, rate=rate, longest=longest
+    QualityDescent(engine).descend(
+        t,
+        engine.upload(h),
+        quality,
+        out,
+        bad_cell_weight=bad_cell_weight,
+        rate=rate,
+        max_displacement=max_displacement,
     )
     return out.get()
 
@@ -53,16 +59,16 @@ def gradient_of(energy, points, some=None, step=1e-5):
     return gradient
 
 
-@pytest.mark.parametrize("emphasis", [0.0, 20.0])
-def test_gradient(ctx, emphasis):
+@pytest.mark.parametrize("bad_cell_weight", [0.0, 20.0])
+def test_gradient(ctx, bad_cell_weight):
     """Every generator, those at walls and in corners included, moves by -rate h^2 dE/dx."""
     points = patch.relaxed_points(N, 2112, steps=3)
     h = np.random.default_rng(6).uniform(0.05, 0.2, N)
-    u = descend(patch.make_engine(ctx), points, h, emphasis, rate=0.3, longest=1e9)
-    omega = 1 - emphasis * np.log(qualities(points)[:, 0])
+    u = descend(patch.make_engine(ctx), points, h, bad_cell_weight, rate=0.3, max_displacement=1e9)
+    omega = 1 - bad_cell_weight * np.log(qualities(points)[:, 0])
     gradient = gradient_of(lambda x: energy(x, omega), points)
     expected = -0.3 * h[:, None] ** 2 * gradient
-    # Central differences: rounding of E (about 100 (1 + emphasis)) over the step, curvature times its square.
+    # Central differences: rounding of E (about 100 (1 + bad_cell_weight)) over the step, curvature times its square.
     assert u == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
 
 
@@ -86,8 +92,14 @@ def test_gradient_in_a_polygon(ctx):
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
     q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)
     out = engine.empty((n, 2))
-    Shape(engine).descend(
-        t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
+    QualityDescent(engine).descend(
+        t,
+        engine.upload(h),
+        engine.upload(q),
+        out,
+        bad_cell_weight=5.0,
+        rate=0.3,
+        max_displacement=1e9,
     )
     # E is the same in any unit.
     unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
@@ -118,8 +130,14 @@ def test_gradient_across_seams(ctx, periodic):
     engine = patch.make_engine(ctx, box=box)
     placed = engine.upload(box.place(points, engine.real))
     t, out = Tessellator(Stages(engine), box).tessellate(placed, n), engine.empty((n, 2))
-    Shape(engine).descend(
-        t, engine.upload(h), engine.upload(q), out, emphasis=5.0, rate=0.3, longest=1e9
+    QualityDescent(engine).descend(
+        t,
+        engine.upload(h),
+        engine.upload(q),
+        out,
+        bad_cell_weight=5.0,
+        rate=0.3,
+        max_displacement=1e9,
     )
     omega = 1 - 5 * np.log(q)
 
@@ -149,8 +167,8 @@ def test_longest(ctx):
     points = patch.relaxed_points(N, 2114, steps=0)
     h = np.full(N, 0.1)
     engine = patch.make_engine(ctx)
-    free = descend(engine, points, h, 5.0, longest=1e9)
-    u = descend(engine, points, h, 5.0, longest=0.03)
+    free = descend(engine, points, h, 5.0, max_displacement=1e9)
+    u = descend(engine, points, h, 5.0, max_displacement=0.03)
     length = np.linalg.norm(free, axis=1)
     assert 3 < (length > 0.003).sum() < N
     assert u == pytest.approx(free * np.minimum(1, 0.003 / length)[:, None], rel=1e-9, abs=1e-15)

@@ -81,7 +81,7 @@ def children_in(shape, tangents, host, h, labels, fixed):
             inwards = np.array([-tangents[-1 - j, 1], tangents[-1 - j, 0]])
             gap = -m @ inwards
             ways = host.points[host.neighbors[row][host.neighbors[row] >= 0]] - x
-            room = patch.room_inwards(ways, inwards, gap, h[i] / 2)
+            room = patch.free_depth(ways, inwards, gap, h[i] / 2)
             way = min(gap / 2, h[i] / 4) if gap > h[i] / 8 else room / 2
             goal = x + m + way * inwards
             children.append(apart(x, goal, kept(x + m, goal), h[i] / 16))

@@ -5,10 +5,12 @@ import pytest
 
 import clvoro
 from clvoro import Box, sizing
-from clvoro.adaptation.schedule import EFFORTS, is_near, plan_adaptive
+from clvoro.adaptation.schedule import EFFORTS, adaptive_schedule, is_near
 
 BOXES = {2: Box((0, 0), (1, 0.8)), 3: Box((0, 0, 0), (1, 0.8, 0.7))}
-SHORT = {dim: len(plan_adaptive(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)}
+SHORT = {
+    dim: len(adaptive_schedule(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)
+}
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from clvoro.adaptation.insertion_deletion import (
+    CLIMB_STRAIN,
     SHIFT_STEP,
     SHIFTS,
     SPLIT_DISTANCE,
-    THETA,
-    WALL_THETA,
-    PopulationControl,
+    WALL_STRAIN,
+    InsertionDeletion,
     _Marks,
 )
 from tests.reference import patch
@@ -45,7 +45,7 @@ class Mesh:
             [rng.choice([-2, -1, 0, 1, 2], N, p=[0.1, 0.35, 0.1, 0.35, 0.1]), rng.choice([0, 0, 1, 2], N)], axis=1
         )  # fmt: skip
         self.strain = rng.normal(size=(N, 4)).astype(np.float32)
-        self.rng, self.stage = rng, PopulationControl(engine)
+        self.rng, self.stage = rng, InsertionDeletion(engine)
         self.kernels = self.stage._kernels
         self.graph = self.t.starts, self.t.neighbors
 
@@ -86,7 +86,7 @@ def partner_of(mesh, i, at_walls):
         S = np.array([[xx, xy], [xy, yy]])
         pull = across @ S @ across - along @ S @ along
         first = ends == 1 or charge == -2 or mesh.kinds[j, 0] == 2
-        rank = abs(pull) + WALL_THETA * first
+        rank = abs(pull) + WALL_STRAIN * first
         if rank > best[2]:
             best = j, pull, rank
     return best
@@ -120,12 +120,12 @@ def change_of(pull, minus, plus, shift):
     if plus[1] == 0 and plus[0] == 2:
         return 1
     if minus[1] > 0:
-        return -1 if pull < WALL_THETA else 0
+        return -1 if pull < WALL_STRAIN else 0
     if plus[1] > 0:
-        return 1 if pull > -WALL_THETA else 0
-    if pull > THETA - shift:
+        return 1 if pull > -WALL_STRAIN else 0
+    if pull > CLIMB_STRAIN - shift:
         return 1
-    return -1 if -pull > THETA + shift else 0
+    return -1 if -pull > CLIMB_STRAIN + shift else 0
 
 
 def test_pairs_are_split_or_deleted(mesh):
@@ -148,15 +148,15 @@ def test_pairs_are_split_or_deleted(mesh):
         mesh.upload(mesh.kinds, np.int32), mesh.upload(partners, np.int32),
     )  # fmt: skip
     tally = engine.zeros(SHIFTS, np.int32)
-    mesh.run("tally_pairs", *given, THETA, tally)
+    mesh.run("count_pair_changes", *given, CLIMB_STRAIN, tally)
     assert np.array_equal(tally.get(), changes.sum(axis=1))
     assert len(np.unique(tally.get())) > 10
 
-    reach = mesh.rng.uniform(0.01, 0.02, N)
+    local_length = mesh.rng.uniform(0.01, 0.02, N)
     for m in (0, SHIFTS // 2, SHIFTS - 1):
         marks = mesh.marks()
         mesh.run(
-            "mark_pairs", *given, THETA, float(shifts[m]), mesh.t.points, mesh.upload(reach, engine.real),
+            "mark_pairs", *given, CLIMB_STRAIN, float(shifts[m]), mesh.t.points, mesh.upload(local_length, engine.real),
             *marks.arrays, marks.busy,
         )  # fmt: skip
         kept, born, busy = np.ones(N), np.zeros(N), np.zeros(N)
@@ -168,7 +168,9 @@ def test_pairs_are_split_or_deleted(mesh):
             elif change > 0:
                 d = mesh.way(i, j)
                 born[j] = 1
-                moved[j] = SPLIT_DISTANCE * reach[j] * np.array([-d[1], d[0]]) / np.linalg.norm(d)
+                moved[j] = (
+                    SPLIT_DISTANCE * local_length[j] * np.array([-d[1], d[0]]) / np.linalg.norm(d)
+                )
         assert np.array_equal(marks.kept.get()[:N], kept)
         assert np.array_equal(marks.born.get()[:N], born)
         assert np.array_equal(marks.busy.get() != 0, busy != 0)
@@ -220,17 +222,17 @@ def test_nuclei_are_sites_in_a_strained_lattice(mesh):
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_cells_too_large_or_too_small_are_sites(mesh, sign):
-    """By their excess and their faces; far beyond, all are alike. The last of its piece of a domain does not go."""
+    """By their log ratio and their faces; far beyond, all are alike. The last of its piece of a domain does not go."""
     engine = mesh.engine
-    excess, keys = mesh.rng.uniform(-5, 5, N), engine.empty(N, np.uint64)
+    log_ratio, keys = mesh.rng.uniform(-5, 5, N), engine.empty(N, np.uint64)
     alone = mesh.rng.random(N) < 0.1
     neighbors = np.where(alone[mesh.host.owners], -1, mesh.host.neighbors)
     mesh.run(
-        "score_excess", mesh.t.starts, mesh.upload(neighbors, np.int32),
-        mesh.upload(excess, engine.real), sign, keys,
+        "score_log_ratio", mesh.t.starts, mesh.upload(neighbors, np.int32),
+        mesh.upload(log_ratio, engine.real), sign, keys,
     )  # fmt: skip
     faces = np.diff(mesh.host.starts)
-    magnitudes = np.clip(2 + sign * (excess + 0.2 * (faces - 6)), 0, 4)
+    magnitudes = np.clip(2 + sign * (log_ratio + 0.2 * (faces - 6)), 0, 4)
     magnitudes[alone & (sign < 0)] = 0
     assert_keys(keys.get(), magnitudes)
     assert min((magnitudes == 0).sum(), (magnitudes == 4).sum()) > N / 8
@@ -240,7 +242,7 @@ def test_flaws_are_inner_cells_above_the_bound(mesh):
     """The bound itself is none; cells of four sides, or eight, are flaws of any quality, and come first."""
     flaw, keys = 0.25, mesh.engine.empty(N, np.uint64)
     quality = mesh.rng.choice([0.5, 0.74, 0.75, 0.76, 1.0], N)
-    mesh.run("score_flaws", *mesh.graph, mesh.upload(quality, mesh.engine.real), flaw, keys)
+    mesh.run("score_bad_cells", *mesh.graph, mesh.upload(quality, mesh.engine.real), flaw, keys)
     sides = np.diff(mesh.host.starts)
     odd = (sides < 5) | (sides > 7)
     sites = np.where(~mesh.walled & (odd | (1 - quality > flaw)), 1 - quality + odd, 0)
@@ -256,6 +258,6 @@ def test_sites_at_generators_that_stay_are_struck_out(mesh):
     for around, out in ((0, held), (1, held | beside)):
         keys = mesh.upload(first, np.uint64)
         mesh.run(
-            "exempt_fixed", *mesh.graph, mesh.upload(labels, np.int32), np.int32(fixed), np.int32(around), keys
+            "drop_fixed_sites", *mesh.graph, mesh.upload(labels, np.int32), np.int32(fixed), np.int32(around), keys
         )  # fmt: skip
         assert np.array_equal(keys.get(), np.where(out, 0, first))

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from clvoro.adaptation.density import Density
-from clvoro.adaptation.insertion_deletion import LARGEST_CHANGE, Population, PopulationControl
+from clvoro.adaptation.insertion_deletion import (
+    MAX_CHANGE,
+    CellSizes,
+    Change,
+    Generators,
+    InsertionDeletion,
+)
 from clvoro.adaptation.metric import Metric
 from clvoro.adaptation.motion import Motion
 from clvoro.adaptation.refinement import Refinement
@@ -90,17 +96,17 @@ def test_density(engine):
     points = random_points(N, 111, engine.real)
     t, density = tessellate(engine, points), Density(engine)
     h = 0.1 * np.exp(points @ SLOPE)
-    w = density.evaluate(t, engine.upload(h))
+    w = density.lloyd_weights(t, engine.upload(h))
     volumes, eps = t.volumes.get().astype(float), float(np.finfo(engine.real).eps)
     assert w.density.get() == pytest.approx(h**-3, rel=64 * eps)
     assert w.weight.get() == pytest.approx(volumes / h**3, rel=64 * eps)
     excess = np.log(volumes / h**3)
-    assert w.excess.get() == pytest.approx(excess, abs=64 * eps)
+    assert w.log_ratio.get() == pytest.approx(excess, abs=64 * eps)
     # log h linear is fitted exactly; it rounds by a few eps over distances of 0.03 and more.
     assert np.abs(w.gradient.get() - SLOPE).max() < 8000 * eps
-    density.remove_mean(w)
+    density.subtract_mean_log_ratio(w)
     mean = np.average(excess, weights=volumes / h**3)
-    assert w.excess.get() == pytest.approx(excess - mean, abs=256 * eps)
+    assert w.log_ratio.get() == pytest.approx(excess - mean, abs=256 * eps)
 
 
 def weighted_centroid(samples, slope):
@@ -116,7 +122,7 @@ def test_weighted_centroids(double):
     samples = patch.random_points(200_000, 5, BOX)
     owner = ((samples[:, None] - points) ** 2).sum(axis=2).argmin(axis=1)
     slope = 0.2 * SLOPE
-    w = Density(double).evaluate(t, double.upload(0.1 * np.exp(points @ slope)))
+    w = Density(double).lloyd_weights(t, double.upload(0.1 * np.exp(points @ slope)))
     lloyd, offsets = w.lloyd.get(), t.offsets.get()
     for i in range(40):
         own = samples[owner == i]
@@ -133,7 +139,7 @@ def test_gradient_of_a_linear_potential(engine):
     t = tessellate(engine, points)
     host, u = patch.fetch(t), engine.empty((600, 3))
     psi = engine.upload(5 + points @ SLOPE)
-    Motion(engine).follow_potential(t, psi, u)
+    Motion(engine).compute_potential_gradient(t, psi, u)
     closed = ~at_walls(host)
     assert 100 < closed.sum() < 600
     # Differences of psi (about 5) over distances that go down to 0.01.
@@ -234,29 +240,29 @@ def test_body_centered_lattice_is_carried_over(double):
     assert quotient == pytest.approx(np.full(inside.sum(), 0.753367), abs=1e-6)
 
 
-# Population.
+# Generators.
 
 
 class Sweep:
-    """One call of `reorganize`, which changes the count alone."""
+    """One call of `insert_delete` that corrects the number only."""
 
     def __init__(self, engine, points, h, total):
         n = len(points)
         self.t = t = tessellate(engine, points)
         self.host = patch.fetch(t)
-        self.excess = np.log(self.host.volumes / h**3)
+        self.log_ratio = np.log(self.host.volumes / h**3)
         labels = np.random.default_rng(8).permutation(3 * n)[:n]
         zeros = engine.zeros(n)
-        self.new = PopulationControl(engine).reorganize(
-            BOX, t, engine.upload(np.full(n, h)), engine.upload(np.full(n, h)), engine.upload(self.excess),
-            Population(
+        self.new = InsertionDeletion(engine).insert_delete(
+            BOX, t, CellSizes(*map(engine.upload, (np.full(n, h), np.full(n, h), self.log_ratio))),
+            Generators(
                 t.points, engine.upload(labels, np.int32), engine.zeros((n, 3)), engine.zeros(n, np.uint64), zeros
             ),
-            total, 5 * n, climb=False,
+            5 * n, Change(total, climb=False),
         )  # fmt: skip
         if self.new is None:
             return
-        self.points, found = self.new.points.get(), self.new.labels.get()
+        self.points, found = self.new.generators.points.get(), self.new.generators.labels.get()
         assert len(found) == n + self.new.inserted - self.new.deleted
         assert len(np.unique(found)) == len(found)
         assert BOX.contains(self.points).all()
@@ -278,12 +284,12 @@ def test_count_to_the_last(engine, total):
     change = sweep.new.inserted - sweep.new.deleted
     assert min(sweep.new.inserted, sweep.new.deleted) == 0
     assert change * total > 0
-    most = int(LARGEST_CHANGE * n)
+    most = int(MAX_CHANGE * n)
     assert change == total if abs(total) < 3 else abs(change) <= min(abs(total), most)
     sites = sweep.moved if total > 0 else sweep.deleted
     assert len(sites) == abs(change)
     # Among those that are most too large, or too small; one near a stronger one has to wait.
-    rank = np.argsort(np.argsort(-np.sign(total) * sweep.excess))
+    rank = np.argsort(np.argsort(-np.sign(total) * sweep.log_ratio))
     assert np.median(rank[sites]) < n / 10
 
 

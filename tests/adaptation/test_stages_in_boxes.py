@@ -36,7 +36,7 @@ def inner_faces(host):
 def test_gradient_of_log_h(engine, box, t):
     """By least squares over neighbors, of any values, weighted by 1 / distance^2; and what that does to centroids."""
     h = np.random.default_rng(5602).uniform(0.02, 0.2, N)
-    w = Density(engine).evaluate(t, engine.upload(h))
+    w = Density(engine).lloyd_weights(t, engine.upload(h))
     host, dim = patch.fetch(t), box.dim
     ways, gradient, lloyd = patch.ways(host, box), w.gradient.get(), w.lloyd.get()
     k, i, j = inner_faces(host)
@@ -59,7 +59,7 @@ def test_gradient_of_log_h(engine, box, t):
 
 def test_gradient_of_a_potential(engine, box, t):
     psi, u = np.random.default_rng(5603).normal(size=N), engine.empty((N, box.dim))
-    Motion(engine).follow_potential(t, engine.upload(psi), u)
+    Motion(engine).compute_potential_gradient(t, engine.upload(psi), u)
     host, expected = patch.fetch(t), np.zeros((N, box.dim))
     k, i, j = inner_faces(host)
     distances = np.linalg.norm(patch.ways(host, box)[k], axis=1)
@@ -87,7 +87,7 @@ def test_moves(engine, box, clip):
     on_device, velocity = engine.upload(points), engine.empty((N, box.dim))
     ways = [engine.upload(a) for a in (lloyd, correction)]
     for way in ways:
-        Motion(engine).hold_generators(engine.upload(labels, np.int32), 60, way)
+        Motion(engine).zero_fixed_displacements(engine.upload(labels, np.int32), 60, way)
         assert not way.get()[held].any()
     for way, given in zip(ways, (lloyd, correction), strict=True):
         assert np.array_equal(way.get()[~held], given[~held])
@@ -127,7 +127,7 @@ def test_moves_longer_than_the_domain(engine, box):
 def test_sizes_that_are_held(engine, box, t):
     labels, h = np.random.default_rng(5606).permutation(N), np.linspace(0.1, 0.2, N)
     on_device = engine.upload(h)
-    Metric(engine).hold_sizes(engine.upload(labels, np.int32), 70, t.volumes, on_device)
+    Metric(engine).set_fixed_sizes(engine.upload(labels, np.int32), 70, t.volumes, on_device)
     lengths = t.volumes.get() ** (1 / box.dim)
     expected = np.where(labels < 70, lengths, h)
     assert on_device.get() == pytest.approx(expected, rel=4 * np.finfo(float).eps)

@@ -289,11 +289,11 @@ def test_files_hold_the_domain(tmp_path) -> None:
 
 
 def test_checkpoints_tell_domains_apart() -> None:
-    from clvoro.adaptation.fingerprint import describe
+    from clvoro.adaptation.fingerprint import run_fingerprint
 
     domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
     options: dict = {"layers": []}
-    described = [json.dumps(describe(d, options, np.dtype(float), None)) for d in domains]
+    described = [json.dumps(run_fingerprint(d, options, np.dtype(float), None)) for d in domains]
     assert len(set(described)) == 3
-    again = describe(clvoro.Polygon(SQUARE.copy()), options, np.dtype(float), None)
+    again = run_fingerprint(clvoro.Polygon(SQUARE.copy()), options, np.dtype(float), None)
     assert json.dumps(again) == described[0]

@@ -10,7 +10,7 @@ import pytest
 from clvoro import sizing
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import Mesh
+from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.workspace import MOST_VIEWS
 from tests.reference import patch
@@ -140,14 +140,16 @@ def test_steps_allocate_nothing(engine, made, method):
     """Once there have been two like it: a step displaces, moves, repairs the diagram and judges it."""
     field = sizing.Expression("0.05 + 0.02 * x")
     points = engine.upload(patch.relaxed_points(500, 3) / patch.BOX.frame[1])
-    mesh = Mesh(Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points)
+    mesh = MeshState.create(
+        Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points
+    )
     counts = []
     for _ in range(7):
         with engine.workspace.frame():
             method.displace(mesh)
             method.move(mesh)
         mesh.update()
-        mesh.assess()
+        mesh.read_summaries()
         counts.append(len(made))
     assert counts[3:] == counts[3:4] * 4
 
@@ -156,11 +158,11 @@ def test_nothing_to_mend_leaves_no_memory(engine, made):
     """What the search takes is not kept beside the next diagram."""
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
     points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
-    mesh = Mesh(Stages(engine), patch.BOX, size, points)
+    mesh = MeshState.create(Stages(engine), patch.BOX, size, points)
     mesh.fixed, before = mesh.n, len(made)  # all stay where they are
-    assert mesh.mend(flaw=0.06, split=False) == (0, 0)
+    assert mesh.repair_cells(deficit=0.06, split=False) == (0, 0)
     assert len(made) > before  # it has looked
-    assert not mesh.stages.population._room._arrays
+    assert not mesh.stages.insertion_deletion._room._arrays
 
 
 def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
@@ -178,7 +180,7 @@ def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
     gc.disable()
     try:
         size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
-        mesh = Mesh(stages, patch.BOX, size, engine.upload(host))
+        mesh = MeshState.create(stages, patch.BOX, size, engine.upload(host))
         for method in (
             PublishedMethod(Relaxation(), True, True),
             WeightedMethod(),
@@ -188,7 +190,7 @@ def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
                 method.displace(mesh)
                 method.move(mesh)
             mesh.update()
-        mesh.reorganize()
+        mesh.insert_delete()
         stages.poisson.set_up_multigrid(
             stages.poisson.assemble(
                 mesh.t.starts, mesh.t.neighbors, mesh.t.face_measures, mesh.points

@@ -69,7 +69,7 @@ def ways(host, box):
     return across - np.rint(across / periods) * np.where(box.periodic, periods, 0)
 
 
-def room_inwards(ways, inwards, gap, most):
+def free_depth(ways, inwards, gap, most):
     """How far a cell reaches from a wall, by the `ways` to its neighbors (k, d), up to `most`; see refinement.cl."""
     ahead = ways @ inwards > 0
     reach = (ways**2).sum(axis=1)[ahead] / (2 * (ways @ inwards)[ahead])
@@ -92,7 +92,7 @@ def children(host, box, h, held=None):
             wall = (box.lower, box.upper)[upper][axis]
             gap, most = abs(child[axis] - wall), min(h[i], box.extent[axis] / 2)
             inwards = (1 - 2 * upper) * np.eye(box.dim)[axis]
-            room = room_inwards(across[host.owners == i], inwards, gap, most)
+            room = free_depth(across[host.owners == i], inwards, gap, most)
             between = gap > most / 8 or room < 3 * gap
             way = min(gap / 2, h[i] / 4) if between else room / 2
             child[axis] = wall - way if upper else wall + way

@@ -12,9 +12,17 @@ import numpy as np
 
 import clvoro
 from clvoro.adaptation import preparation
-from clvoro.adaptation.insertion_deletion import PopulationControl
+from clvoro.adaptation.insertion_deletion import InsertionDeletion
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
-from clvoro.adaptation.schedule import Action, Mend, Refine, Reorganize, Rest, Settle, Step
+from clvoro.adaptation.schedule import (
+    Action,
+    CorrectCount,
+    InsertDelete,
+    Refine,
+    RepairCells,
+    ResetMomentum,
+    Step,
+)
 from clvoro.sizing import Expression
 from clvoro.tessellation import incremental as repair
 
@@ -48,8 +56,13 @@ def large(work: Work) -> Work:
 def polishing(dim: int) -> list[Action]:
     """Return the steps that end a run: descent with a penalty, then sizes alone."""
     descent = "shape" if dim == 2 else "lloyd"
-    exact = ProjectedMethod(descent, eps=1e-3, k=0.3, sampled_gradient=True, keep_mean=True)
-    return [Step(ProjectedMethod(descent, lenience=0.02, bound=0.03, k=0.3)), Step(exact)]
+    exact = ProjectedMethod(
+        descent, penalty=1e-3, k=0.3, gradient_from_field=True, correct_mean=True
+    )
+    return [
+        Step(ProjectedMethod(descent, quality_scale=0.02, log_ratio_scale=0.03, k=0.3)),
+        Step(exact),
+    ]
 
 
 def every_action(dim: int, levels: int) -> list[Action]:
@@ -59,11 +72,17 @@ def every_action(dim: int, levels: int) -> list[Action]:
         Step(WeightedMethod(cautious=True)),
     ]
     if levels:
-        plan += [Settle(0.01, ahead=True), Refine(), Settle()]
+        plan += [CorrectCount(0.01, ahead=True), Refine(), CorrectCount()]
     if dim == 2:
-        plan += [Reorganize(nuclei=SHARE), Step(ProjectedMethod())]
-        plan += [Mend(0.05), Settle(), Step(ProjectedMethod()), Mend(0.05, split=True), Settle()]
-    return [*plan, Rest(), *polishing(dim)]
+        plan += [InsertDelete(nuclei=SHARE), Step(ProjectedMethod())]
+        plan += [
+            RepairCells(0.05),
+            CorrectCount(),
+            Step(ProjectedMethod()),
+            RepairCells(0.05, split=True),
+            CorrectCount(),
+        ]
+    return [*plan, ResetMomentum(), *polishing(dim)]
 
 
 def every_step(
@@ -77,10 +96,10 @@ def every_step(
 
     def work(adapter: clvoro.Adapter) -> None:
         def run(plan: list[Action], levels: int, points: np.ndarray | None) -> clvoro.Result:
-            mended = partialmethod(PopulationControl.mend, share=SHARE)
+            mended = partialmethod(InsertionDeletion.mend, share=SHARE)
             with (
-                mock.patch.object(preparation, "plan_adaptive", return_value=plan),
-                mock.patch.object(PopulationControl, "mend", mended),
+                mock.patch.object(preparation, "adaptive_schedule", return_value=plan),
+                mock.patch.object(InsertionDeletion, "mend", mended),
             ):
                 result = adapter.run(
                     domain,

@@ -19,7 +19,7 @@ import pyopencl as cl
 from scipy.spatial import ConvexHull
 
 import clvoro
-from clvoro.adaptation.insertion_deletion import Population, PopulationControl
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
@@ -285,7 +285,7 @@ def comb(adapter: clvoro.Adapter) -> None:
 
 
 def periodic(adapter: clvoro.Adapter) -> None:
-    """Boxes that close upon themselves in some directions."""
+    """BoxTree that close upon themselves in some directions."""
     near = lattice(4, 3) + 0.05 * (points(64, 3) - 0.5)
     for x, which in (
         (points(60), (True, True)),
@@ -394,17 +394,19 @@ def nuclei(adapter: clvoro.Adapter) -> None:
     x = hexagons(0.08, clvoro.Box((-1, -1), (2, 2))) * (stretch, 1 / stretch) + 0.1
     t = tessellate(engine, x := x[PATCH.contains(x)])
     n, h = len(x), 0.08 * (3**0.5 / 2) ** 0.5
-    rows = Population(
+    rows = Generators(
         t.points, engine.upload(np.arange(n), np.int32), engine.zeros((n, 2)), engine.zeros(n, np.uint64),
         engine.zeros(n),
     )  # fmt: skip
-    sizes, excess = engine.upload(np.full(n, h)), engine.zeros(n)
-    control = PopulationControl(engine)
-    found = control.reorganize(PATCH, t, sizes, sizes, excess, rows, 0.0, n, nuclei=2)
+    sizes, log_ratio = engine.upload(np.full(n, h)), engine.zeros(n)
+    control = InsertionDeletion(engine)
+    found = control.insert_delete(
+        PATCH, t, CellSizes(sizes, sizes, log_ratio), rows, n, Change(0.0, nuclei=2)
+    )
     assert found is not None
     assert found.inserted + found.deleted >= 2
     quality = engine.upload(np.linspace(0.8, 1, n))
-    found = control.mend(PATCH, t, quality, rows, n, flaw=0.1, split=True, share=0.5)
+    found = control.repair_cells(PATCH, t, quality, rows, n, deficit=0.1, split=True, share=0.5)
     assert found is not None
     assert found.inserted >= 1
 

@@ -56,13 +56,17 @@ ALIKE = {
 """Files, and kernels of others, that work alike whatever the domain: that they run in any is enough."""
 IN_PLANE = {
     "cells", "hulls", "incremental", "quality_descent", "vertices", "insertion_deletion.average_strain",
-    "insertion_deletion.flag_sites", "insertion_deletion.mark_flaws", "insertion_deletion.mark_nuclei",
-    "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_flaws",
-    "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.tally_pairs",
+    "insertion_deletion.flag_sites", "insertion_deletion.mark_bad_cells", "insertion_deletion.mark_nuclei",
+    "insertion_deletion.mark_pairs", "insertion_deletion.measure_strain", "insertion_deletion.score_bad_cells",
+    "insertion_deletion.score_pairs", "insertion_deletion.score_strain", "insertion_deletion.count_pair_changes",
 }  # fmt: skip
 IN_SPACE = {"consistency", "half_faces", "polyhedra", "walks"}
 AT_POLYGONS = {"boundary_crossings", "trim"}
-AT_LAYERS = {"metric.hold_sizes", "motion.hold_generators", "insertion_deletion.exempt_fixed"}
+AT_LAYERS = {
+    "metric.set_fixed_sizes",
+    "motion.zero_fixed_displacements",
+    "insertion_deletion.drop_fixed_sites",
+}
 NOT_FOR = {
     "plane": IN_SPACE | AT_POLYGONS | {"ghost_images"},
     "polygon": IN_SPACE | {"ghost_images", "cells.measure_faces"},

@@ -88,8 +88,9 @@ def test_other_results_are_found(harmless, built):
 
 
 FUNCTIONS = {
-    "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "insertion_deletion.mark_excess",
-    "insertion_deletion.mark_flaws", "volume_projection.assemble_projection", "quality_descent.load_cells",
+    "bins.sort_bins", "density.evaluate_density", "metric.evaluate_metric", "insertion_deletion.mark_split_delete",
+    "insertion_deletion.mark_bad_cells", "volume_projection.assemble_projection",
+    "quality_descent.compute_tension_pressure",
     "size_field.evaluate_size", "size_field.evaluate_size_gradient",
 }  # fmt: skip
 """Kernels with functions that OpenCL does not ask to be rounded correctly (log, pow, cbrt, hypot): libraries differ."""

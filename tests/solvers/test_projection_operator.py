@@ -23,7 +23,7 @@ class Given:
         self.held = self.labels < self.fixed
         self.h = 0.1 * np.exp(rng.uniform(-1, 1, self.n))
         self.gradient = rng.normal(size=(self.n, box.dim))
-        self.excess = rng.normal(size=self.n)
+        self.log_ratio = rng.normal(size=self.n)
         self.quality = rng.uniform(0.3, 1, self.n)
         self.displacement = 0.01 * rng.normal(size=(self.n, box.dim))
         self.displacement[self.held] = 0
@@ -31,7 +31,7 @@ class Given:
     def project(self, tolerance, max_iterations):
         """Return the solution, its correction, what it leaves as the next start, and the iteration's arrays."""
         u, start = self.engine.empty((self.n, self.box.dim)), self.engine.empty(self.n, np.float32)
-        names = ("h", "gradient", "excess", "quality", "displacement")
+        names = ("h", "gradient", "log_ratio", "quality", "displacement")
         *targets, displacement = (self.engine.upload(getattr(self, name)) for name in names)
         stage, taken = VolumeProjection(self.engine), []
         reserve = stage._reserve
@@ -44,7 +44,7 @@ class Given:
         return solution, u.get(), start.get(), taken[0]
 
     def operator(self):
-        """J = d excess / dx (n, n, d) by the diagram's faces, and eps (n,)."""
+        """J = d log_ratio / dx (n, n, d) by the diagram's faces, and eps (n,)."""
         host, dim = patch.fetch(self.t), self.box.dim
         J, worst = np.zeros((self.n, self.n, dim)), self.quality.copy()
         ways = patch.ways(host, self.box)
@@ -57,7 +57,7 @@ class Given:
         J[np.arange(self.n), np.arange(self.n)] -= dim * self.gradient
         J[:, self.held] = 0
         eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / QUALITY_SCALE**2), 3)
-        return J, eps / (1 + (self.excess / LOG_RATIO_SCALE) ** 2)
+        return J, eps / (1 + (self.log_ratio / LOG_RATIO_SCALE) ** 2)
 
 
 @pytest.fixture(
@@ -82,7 +82,7 @@ def test_correction(kind, share, monkeypatch):
     host = patch.fetch(given.t)
     J, eps = given.operator()
     B = (J * given.h[None, :, None]).reshape(given.n, -1)
-    b = given.excess + np.einsum("ija,ja->i", J, given.displacement)
+    b = given.log_ratio + np.einsum("ija,ja->i", J, given.displacement)
     y = np.linalg.solve(B @ B.T + np.diag(eps), b)
     expected = -(B.T @ y).reshape(given.n, -1) * given.h[:, None]
     tolerance = 1e-6 if given.engine.real == np.float32 else 1e-11

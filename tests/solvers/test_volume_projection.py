@@ -35,7 +35,7 @@ def sizes(points):
     return 0.1 * np.exp(points @ SLOPE)
 
 
-def excess(points, h=None):
+def log_ratios(points, h=None):
     """r = log(V / h^2), V by Qhull; h moves with the field unless it is given."""
     cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
     return np.log([c.area for c in cells]) - 2 * np.log(sizes(points) if h is None else h)
@@ -103,7 +103,7 @@ def differences(points):
             ahead, behind = points.copy(), points.copy()
             ahead[j, a] += step
             behind[j, a] -= step
-            J[:, j, a] = (excess(ahead) - excess(behind)) / (2 * step)
+            J[:, j, a] = (log_ratios(ahead) - log_ratios(behind)) / (2 * step)
     return J
 
 
@@ -129,7 +129,7 @@ def test_diagonal(assembled):
 
 def test_right_side(engine, points):
     """r + J Ld."""
-    r, lloyd = excess(points), np.random.default_rng(17).normal(0, 0.01, (N, 2))
+    r, lloyd = log_ratios(points), np.random.default_rng(17).normal(0, 0.01, (N, 2))
     made = Assembled(
         engine,
         points,
@@ -158,7 +158,7 @@ def project(engine, points, h, gradient, r, displacement, tolerance=1e-6, **opti
 @pytest.mark.parametrize("log_ratio_scale", [0.0, 0.2])
 def test_projection(engine, points, log_ratio_scale):
     """u' = -W J^T (J W J^T + eps)^-1 (r + J Ld), by dense algebra; a cell that is far off has the smaller eps."""
-    r, lloyd = excess(points), np.random.default_rng(14).normal(0, 0.01, (N, 2))
+    r, lloyd = log_ratios(points), np.random.default_rng(14).normal(0, 0.01, (N, 2))
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), r, lloyd)
     made = Assembled(engine, *given, eps=0.02, log_ratio_scale=log_ratio_scale)
     eps = 0.02 / (1 + (r / log_ratio_scale) ** 2 if log_ratio_scale else np.ones(N))
@@ -183,7 +183,7 @@ def test_projection(engine, points, log_ratio_scale):
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_tolerance(engine, points, tolerance):
     """The residual, by dense algebra, is what the recurrence says; vectors in single precision down to 1e-4."""
-    r, h, gradient = excess(points), sizes(points), np.tile(SLOPE, (N, 1))
+    r, h, gradient = log_ratios(points), sizes(points), np.tile(SLOPE, (N, 1))
     made = Assembled(engine, points, h, gradient, r, eps=0.05)
     u, solution = project(
         engine, points, h, gradient, r, np.zeros((N, 2)), eps=0.05, max_iterations=60, tolerance=tolerance
@@ -198,7 +198,7 @@ def test_tolerance(engine, points, tolerance):
 
 
 def test_max_iterations(engine, points):
-    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), log_ratios(points), np.zeros((N, 2)))
     _, solution = project(engine, *given, eps=0.02, max_iterations=5, tolerance=1e-9)
     assert (solution.iterations, solution.converged) == (5, False)
     assert solution.reason == "max_iterations"
@@ -214,7 +214,7 @@ def test_unwritten_rows_of_the_record_cause_no_warning(ctx, points, monkeypatch)
             array.view(np.uint32).fill(np.uint32(0x7FA00001))
         return array
 
-    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), log_ratios(points), np.zeros((N, 2)))
     monkeypatch.setattr(Engine, "empty", full_of_nan)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -223,7 +223,7 @@ def test_unwritten_rows_of_the_record_cause_no_warning(ctx, points, monkeypatch)
 
 
 def test_result_does_not_depend_on_the_lookahead(engine, points):
-    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points))
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), log_ratios(points))
     t, results = patch.tessellate(engine, points), []
     for ahead in (1, 2, 7, 40):
         projection, out = VolumeProjection(engine), engine.empty((N, 2))
@@ -242,7 +242,7 @@ def test_result_does_not_depend_on_the_lookahead(engine, points):
 @pytest.mark.parametrize("of", ["solution", "scaled", "turned", "other", "zero"])
 def test_start(engine, points, of):
     """From any start the solution is the same, and what it leaves is the next start; a good one saves iterations."""
-    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), excess(points), np.zeros((N, 2)))
+    given = (points, sizes(points), np.tile(SLOPE, (N, 1)), log_ratios(points), np.zeros((N, 2)))
     made = Assembled(engine, *given, eps=0.05)
     B = made.B.reshape(N, -1)
     y = np.linalg.solve(B @ B.T + np.diag(made.eps), made.rhs)
@@ -275,7 +275,7 @@ def test_start(engine, points, of):
 
 
 def test_not_finite(engine, points):
-    r = excess(points)
+    r = log_ratios(points)
     r[7] = np.nan
     with pytest.raises(SolverError, match="not finite"):
         project(
@@ -299,20 +299,20 @@ def test_penalty_of_bad_cells(engine, points, assembled):
 
 
 def test_perturbed_mesh_converges_quadratically(engine):
-    """Targets are a mesh's own sizes, so that excess arises by the perturbation alone; one projection squares it."""
+    """Targets are a mesh's own sizes, so that log ratios arise from the perturbation; one projection squares them."""
     points = patch.relaxed_points(N, 607)
-    h = np.exp(excess(points, np.ones(N)) / 2)
+    h = np.exp(log_ratios(points, np.ones(N)) / 2)
     noise = np.random.default_rng(21).normal(size=(N, 2))
     left = []
     for amount in (2e-3, 1e-3, 5e-4):
         moved = points + amount * noise
-        r = excess(moved, h)
+        r = log_ratios(moved, h)
         weight = np.exp(r)
         r -= np.average(r, weights=weight)
         u, _ = project(
             engine, moved, h, np.zeros((N, 2)), r, np.zeros((N, 2)), eps=1e-6, max_iterations=3000, tolerance=1e-8
         )  # fmt: skip
-        after = excess(moved + u, h)
+        after = log_ratios(moved + u, h)
         left.append(np.abs(after - after.mean()).max())
         assert left[-1] < 0.1 * np.abs(r).max()
     # Each half of the perturbation leaves a quarter.
@@ -322,7 +322,7 @@ def test_perturbed_mesh_converges_quadratically(engine):
 
 def test_single_precision(ctx, points):
     engine = patch.make_engine(ctx, "float32")
-    r = excess(points)
+    r = log_ratios(points)
     gradient, nothing = np.tile(SLOPE, (N, 1)), np.zeros((N, 2))
     options = {"eps": 0.05, "max_iterations": 60}
     u, solution = project(engine, points, sizes(points), gradient, r, nothing, **options)
@@ -337,8 +337,8 @@ def test_one_cell(engine):
     """No neighbors: nothing can be done, and nothing breaks."""
     one = np.array([[0.4, 0.3]])
     t = patch.tessellate(engine, one)
-    w = Density(engine).evaluate(t, engine.upload([0.2]))
+    w = Density(engine).lloyd_weights(t, engine.upload([0.2]))
     u, _ = project(
-        engine, one, np.array([0.2]), w.gradient.get(), w.excess.get(), np.zeros((1, 2)), eps=0.1, max_iterations=40
+        engine, one, np.array([0.2]), w.gradient.get(), w.log_ratio.get(), np.zeros((1, 2)), eps=0.1, max_iterations=40
     )  # fmt: skip
     assert not u.any()

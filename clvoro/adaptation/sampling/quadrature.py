@@ -12,18 +12,18 @@ import numpy as np
 
 from ...errors import InputTypeError, SizeFieldError
 from ...sizing.advice import advice_for_size
-from .boxes import Boxes, hilbert_tables
-from .cover import cover_of
+from .box_tree import BoxTree, hilbert_tables
+from .coverage import coverage_of
 
 if TYPE_CHECKING:
     from ...geometry.box import Domain
 
-_BASE = {2: 1024, 3: 4096}  # boxes that are looked at in any case
-_MOST_BASE = {2: 16384, 3: 65536}  # counting those outside the domain
-_MOST = {2: 1 << 17, 3: 1 << 17}  # boxes after which refinement ends, whatever the error
+_BASE = {2: 1024, 3: 4096}  # initial boxes inside the domain, at least
+_MAX_BASE = {2: 16384, 3: 65536}  # initial boxes in total, at most
+_MAX_BOXES = {2: 1 << 17, 3: 1 << 17}  # at which refinement ends
 _BATCH = 1 << 19  # points evaluated at once
 
-# Refinement below the error estimate's demand: see `DensityTree`.
+# Ratios of sizes for refinement beyond the error estimate: see `DensityTree`.
 _STEEP = 2.0
 _JUMP = 4.0
 
@@ -42,51 +42,47 @@ class DensityTree:
 
     A box is split
 
-    (a) while it has one of the largest error estimates whose sum exceeds `tolerance` times the
-        integral: half of what the last split changed, or, where h jumps by more than a factor of 4
-        between the box and its neighbors, what may be hidden between the last sample and the wall;
-    (b) while it is longer than the least h known in it and its neighbors, and h varies by more
-        than a factor of 2 among these: so a dip of which one sample has been seen is resolved down
-        to its own h;
-    (c) while it is more than twice as large as a neighbor. By (b) and (c) a thin dip along a curve
-        is followed from box to box.
+    (a) while it has one of the largest error estimates whose sum exceeds `tolerance` times the integral. The estimate
+        is half the change by the last split or, where h jumps by more than a factor of 4 between the box and its
+        neighbors, the integral that the samples can miss beyond the last Gauss point;
+    (b) while it is longer than the smallest known h in it and its neighbors, and h varies by more than a factor of 2
+        among these: a local minimum with one sample in it is resolved down to its own h;
+    (c) while it is more than twice as large as a neighbor. With (b) and (c) a thin minimum along a curve is followed
+        from box to box.
 
-    Known values are those at the 3^d Gauss points of each box, at a grid of 33 x 33 nodes or more
-    (17^3 in 3D), walls included, and at the `landmarks` that the field names (on the curves of a
-    `Distance`, at the lowest values of a `Raster`). A dip is found for certain if it holds a
-    landmark or is wider than about 1/40 of the domain's shorter side (1/25 in 3D); a thinner one in
-    a formula or a callable may be missed.
+    Known values are those at the 3^d Gauss points of each box, at a grid of at least 33 x 33 nodes (17^3 in 3D), walls
+    included, and at the landmarks of the field (on the curves of a `Distance`, at minima of a `Raster`). A local
+    minimum is certainly found if it contains a landmark or is wider than about 1/40 of the domain's shorter side (1/25
+    in 3D); a thinner one in a formula or a callable can be missed.
 
-    Work is bounded: refinement ends at 2^17 boxes or about 30 levels (20 in 3D), and `error` then
-    tells what was reached.
+    Work is bounded: refinement ends at 2^17 boxes or about 30 levels (20 in 3D). `error` has the error reached.
 
     Parameters
     ----------
     field : callable
         h(points (n, d)) -> (n,); a `Field`, or a `Sizing` (evaluated on its device).
     domain : Domain
-        Boxes that its boundary cuts count by their share in it, exactly; those outside hold no cells. h is
-        evaluated inside only: places of the rules that lie outside are replaced by one inside, box by box.
+        Boxes at its boundary count by their exact share inside. h is evaluated inside only: Gauss points outside are
+        replaced by a point inside the box.
     tolerance : float
-        Relative to the integral.
+        Relative error of the integral.
 
     Attributes
     ----------
-    boxes : Boxes
-    cover : Cover
-        What of each box lies in the domain.
+    boxes : BoxTree
+    coverage : FullCoverage
+        The part of each box inside the domain.
     cells : (m,) float
-        Integral of h^-d over each box's part of the domain.
+        Integral of h^-d over the part of each box inside the domain.
     slopes : (m, d) float
-        Mean change of log(h^-d) from side to side of each box.
+        Mean change of log(h^-d) across each box.
     error : float
         Sum of the error estimates, in cells.
 
     Raises
     ------
     SizeFieldError
-        If h is not positive and finite, or too small for h^-d to be finite, at a point that was
-        looked at.
+        If h is not positive and finite, or h^-d is not finite, at a sampled point.
     """
 
     def __init__(
@@ -96,19 +92,19 @@ class DensityTree:
             raise InputTypeError(
                 f"field is {type(field).__name__}, expected a field of clvoro.sizing"
             )
-        self.field, self._domain, self.boxes = field, domain, Boxes(domain)
-        self.cover = cover_of(self.boxes, domain)
+        self.field, self._domain, self.boxes = field, domain, BoxTree(domain)
+        self.coverage = coverage_of(self.boxes, domain)
         dim = domain.dim
         while (
-            np.count_nonzero(self.cover.reached) << dim < _BASE[dim]
-            and len(self.boxes) << dim < _MOST_BASE[dim]
+            np.count_nonzero(self.coverage.occupied) << dim < _BASE[dim]
+            and len(self.boxes) << dim < _MAX_BASE[dim]
         ):
-            self.cover.split(self.cover.reached)
+            self.coverage.split(self.coverage.occupied)
         m = len(self.boxes)
         self.cells, self._differences, self._low, self._high = np.zeros((4, m))
         self.slopes = np.zeros((m, dim))
         self._integrate(np.ones(m, bool))
-        self._mark(domain)
+        self._evaluate_landmarks(domain)
         self._refine(np.ones(m, bool))
         while True:
             chosen = self._to_split(tolerance)
@@ -127,7 +123,13 @@ class DensityTree:
         return float(self._errors.sum())
 
     def sizes(self, points: np.ndarray) -> np.ndarray:
-        """Return h at `points` (n, d), (n,) float64, or raise SizeFieldError naming the place."""
+        """Return h at `points` (n, d), (n,) float64.
+
+        Raises
+        ------
+        SizeFieldError
+            If a value is not positive and finite; the message has the point.
+        """
         found = np.empty(len(points))
         for first in range(0, len(points), _BATCH):
             part = points[first : first + _BATCH]
@@ -137,47 +139,47 @@ class DensityTree:
                 where = ", ".join(f"{c:.6g}" for c in part[bad[0]])
                 raise SizeFieldError(
                     f"the size field is {h[bad[0]]:g} at ({where}), expected a positive, finite "
-                    f"size on the whole domain; {self._remedy(float(h[bad[0]]))}"
+                    f"size on the whole domain; {self._advice(float(h[bad[0]]))}"
                 )
             found[first : first + _BATCH] = h
         return found
 
-    def _remedy(self, value: float) -> str:
+    def _advice(self, value: float) -> str:
         return advice_for_size(value, self._domain, getattr(self.field, "on_device", False))
 
     def _integrate(self, chosen: np.ndarray) -> None:
-        """Apply the rules to the boxes where `chosen` is true."""
-        outside = chosen & ~self.cover.reached
+        """Apply the Gauss rule to the boxes where `chosen` is true."""
+        outside = chosen & ~self.coverage.occupied
         self.cells[outside], self.slopes[outside] = 0, 0
         self._low[outside], self._high[outside] = np.inf, 0
         chosen = chosen & ~outside
         at, weight = _rule(self.boxes.dim)
-        points = self.cover.keep(self.boxes.points(at, chosen), chosen)
+        points = self.coverage.move_inside(self.boxes.points(at, chosen), chosen)
         m, p, dim = points.shape
         h = self.sizes(points.reshape(-1, dim)).reshape(m, p)
         with np.errstate(over="ignore"):
-            # The cells that the box would hold at each sample's size.
+            # Number of cells in the box for the size at each sample.
             density = reduce(np.multiply, (e[:, None] / h for e in self.boxes.edges(chosen).T))
         if not np.isfinite(density).all():
             i, j = np.argwhere(~np.isfinite(density))[0]
             where = ", ".join(f"{c:.6g}" for c in points[i, j])
             raise SizeFieldError(
                 f"the size field is {h[i, j]:g} at ({where}): the number of cells overflows; "
-                f"{self._remedy(float(h[i, j]))}"
+                f"{self._advice(float(h[i, j]))}"
             )
         offset = at - 0.5
-        self.cells[chosen] = self.cover.weigh(density @ weight, chosen)
-        samples = np.ascontiguousarray(h.T)  # NumPy is slow along short axes
+        self.cells[chosen] = self.coverage.scale_by_share(density @ weight, chosen)
+        samples = np.ascontiguousarray(h.T)  # faster than NumPy along a short axis
         self._low[chosen], self._high[chosen] = samples.min(axis=0), samples.max(axis=0)
         self.slopes[chosen] = -dim * (np.log(h) @ offset) / (offset[:, 0] ** 2).sum()
 
-    def _mark(self, domain: Domain) -> None:
-        """Evaluate the landmarks: a grid of corners of base boxes and what the field names."""
+    def _evaluate_landmarks(self, domain: Domain) -> None:
+        """Evaluate h at the landmarks: a grid of corners of boxes, and the landmarks of the field."""
         boxes, dim = self.boxes, self.boxes.dim
         step = 0.5 ** (1 + int(boxes.level.max()))
         axes = [np.arange(round(end / step) + 1) * step for end in boxes.end]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
-        grid = grid[self.cover.holds(boxes.origin + boxes.root * grid)]
+        grid = grid[self.coverage.contains(boxes.origin + boxes.root * grid)]
         named = getattr(self.field, "landmarks", None)
         if named is not None:
             named = named(domain)
@@ -203,27 +205,26 @@ class DensityTree:
             np.minimum.at(low, i, self._low[j])
             np.maximum.at(high, i, self._high[j])
 
-        # (a) All but the small errors whose sum is within the tolerance. What a jump cuts off
-        # between two samples goes unseen by the rule; up to 0.056 of the box lies beyond the last
-        # sample.
-        volumes = self.cover.weigh(boxes.volumes(), np.ones(len(boxes), bool))
-        reached = self.cover.reached
+        # (a) All but the small errors whose sum is within the tolerance. The rule does not see jumps beyond the last
+        # sample, which are up to 0.056 of the box.
+        volumes = self.coverage.scale_by_share(boxes.volumes(), np.ones(len(boxes), bool))
+        reached = self.coverage.occupied
         jumps = reached & (high > _JUMP * low)
         sliver = np.zeros(len(boxes))
-        with np.errstate(over="ignore"):  # as many cells as that are refused where they are counted
+        with np.errstate(over="ignore"):  # too many cells are rejected later
             sliver[jumps] = 0.056 * volumes[jumps] * (low[jumps] ** -dim - high[jumps] ** -dim)
         self._errors = np.maximum(self._differences, sliver)
         by_error = np.argsort(self._errors, kind="stable")
         within = np.cumsum(self._errors[by_error]) <= tolerance * self.integral
         chosen = np.zeros(len(boxes), bool)
         chosen[by_error[~within]] = True
-        # (b) Dips that are not resolved.
+        # (b) Local minima that are not resolved.
         chosen |= (boxes.longest() > low) & (high > _STEEP * low)
         # (c) Neighbors of much smaller boxes.
         chosen[there[boxes.level[there] < boxes.level[here] - 1]] = True
         chosen &= reached & (boxes.level < boxes.deepest)
 
-        room = (_MOST[dim] - len(boxes)) // ((1 << dim) - 1)
+        room = (_MAX_BOXES[dim] - len(boxes)) // ((1 << dim) - 1)
         if np.count_nonzero(chosen) > room:
             worst = np.argsort(np.where(chosen, -self._errors, 1.0), kind="stable")[: max(room, 0)]
             chosen[:] = False
@@ -233,12 +234,12 @@ class DensityTree:
     def _refine(self, chosen: np.ndarray) -> None:
         boxes = self.boxes
         _, _, rank = hilbert_tables(boxes.dim)
-        # Which child of its box each landmark falls into.
+        # The child box of each landmark.
         box = self._landmark_box
         half = 0.5 ** (boxes.level[box] + 1.0)[:, None]
         bits = (self._landmarks >= boxes.corner[box] + half) @ (1 << np.arange(boxes.dim))
         child_rank = np.where(chosen[box], rank[boxes.state[box], bits], 0)
-        parent, child = self.cover.split(chosen)
+        parent, child = self.coverage.split(chosen)
         first = np.searchsorted(parent, np.arange(len(chosen)))
         self._landmark_box = first[box] + child_rank
         fresh = child >= 0
@@ -247,11 +248,10 @@ class DensityTree:
             setattr(self, name, getattr(self, name)[parent])
         self._integrate(fresh)
         self._lower_by_landmarks()
-        # What the split has changed is the parents' error, nearly. Their children's is in sum 1/4
-        # of it at a kink of h, 1/64 where h is smooth; half is said, as a change may be small by
-        # chance.
+        # The change is approximately the parents' error. The sum of the children's errors is 1/4 of it at a kink of h,
+        # and 1/64 where h is smooth. The estimate is half of it, because a change can be small by chance.
         family = self.cells[fresh].reshape(-1, 1 << boxes.dim)
         change = np.abs(family.sum(axis=1) - before) / 2
-        reached = self.cover.reached[fresh].reshape(family.shape)
+        reached = self.coverage.occupied[fresh].reshape(family.shape)
         change /= np.maximum(np.count_nonzero(reached, axis=1), 1)
         self._differences[fresh] = (change[:, None] * reached).ravel()

@@ -1,4 +1,4 @@
-"""How many cells, and where they start."""
+"""The number of cells, and random initial generators."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from ...errors import InputError, InputTypeError
 from ...geometry.box import Domain
 from ...geometry.polygon import Polygon
 from ...sizing import as_field
-from .boxes import Boxes
-from .cover import PolygonCover, cover_of
+from .box_tree import BoxTree
+from .coverage import PolygonCoverage, coverage_of
 from .quadrature import DensityTree
 
-_TRIES = 40
-_ROUNDINGS = 4  # of the precision, within which of a polygon's boundary no point is put
-_MOST_COVER = 1 << 15  # boxes that cover a polygon for uniform points
-_SHARE = 1.0  # most points that a box of the sampling may expect
-_TOLERANCE = 1e-3  # of the integral, in the tree that points are sampled from
+_ATTEMPTS = 40
+_ULPS = 4  # least distance of points from the boundary of a polygon
+_MAX_BOXES = 1 << 15  # over a polygon, for uniform points
+_MAX_EXPECTED = 1.0  # points per box
+_TOLERANCE = 1e-3  # relative error of the integral in the tree for sampling
 
 
 def count_cells(
     field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4
 ) -> float:
-    """Return the number of cells that `field` asks for: the integral of h^-d over the domain.
+    """Return the number of cells that `field` requires: the integral of h^-d over the domain.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ def count_cells(
         A `Sizing` is evaluated on its device, anything else on the host.
     domain : Domain
     tolerance : float
-        Relative error aimed at; see `clvoro.adaptation.sampling.quadrature.DensityTree` for what is guaranteed.
+        Relative error; see `clvoro.adaptation.sampling.quadrature.DensityTree`.
 
     Returns
     -------
     float
-        May be less than 1 (h larger than the domain), and may be more than any memory holds.
+        Can be less than 1, if h is larger than the domain.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def count_cells(
 
 
 def density_tree(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain) -> DensityTree:
-    """Return the tree that `sample_density` needs, whose integral is the number of cells, good to 0.1 %.
+    """Return the tree for `sample_density`. Its integral is the number of cells, with an error of 0.1 %.
 
     Raises
     ------
@@ -73,10 +73,9 @@ def sample_density(
 ) -> np.ndarray:
     """Return `n` points distributed as h^-d.
 
-    The domain is cut into boxes that expect at most one point each, in the order of a Hilbert
-    curve; points are dealt out along the curve at equal steps of the cumulated expectation
-    (systematic sampling). So every box of the tree, large or small, gets its share rounded up or
-    down. Within its box a point is drawn from the log-linear density that fits there.
+    The domain is divided into boxes of at most one expected point each, in the order of a Hilbert curve. Points are
+    distributed along the curve at equal steps of the cumulated expectation (systematic sampling), so that every box of
+    the tree gets its share, rounded up or down. Within its box a point is drawn from a log-linear density.
 
     Parameters
     ----------
@@ -85,12 +84,12 @@ def sample_density(
     n : int
         At least 1.
     seed : int
-        Of numpy's PCG64; the same seed gives the same points.
+        Seed of numpy's PCG64.
     real : dtype, optional
-        Precision in which the points are told apart, in the device's coordinates; by default the
-        field's (`Sizing.real`), else float64.
+        Precision in which the points are distinct in the device's coordinates; by default that of the field
+        (`Sizing.real`) or float64.
     tree : DensityTree, optional
-        Of the field, by `density_tree`, if there is one already; it is used up.
+        The tree of the field from `density_tree`. It is changed.
 
     Returns
     -------
@@ -102,14 +101,14 @@ def sample_density(
     SizeFieldError
         If h is not positive and finite somewhere; names the place.
     InputError
-        If `n` points cannot be told apart in the precision.
+        If the precision has not `n` distinct points.
     """
-    n, seed = _checked(n, seed)
+    n, seed = _check_arguments(n, seed)
     field = _evaluator(field)
     tree = density_tree(field, domain) if tree is None else tree
-    boxes, cover, slopes = tree.boxes, tree.cover, tree.slopes
+    boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
     share = tree.cells * (n / tree.integral)
-    while (chosen := (share > _SHARE) & (boxes.level < 45)).any():
+    while (chosen := (share > _MAX_EXPECTED) & (boxes.level < 45)).any():
         share, slopes = _halve(tree, chosen, share, slopes)
     reached = np.cumsum(share)
     rng = np.random.Generator(np.random.PCG64(seed))
@@ -118,15 +117,15 @@ def sample_density(
 
     def draw(rows: np.ndarray, attempt: int) -> np.ndarray:
         mine = box[rows]
-        slope = slopes[mine] * cover.sides(mine)
-        return cover.draw(_log_linear(rng.random((len(rows), domain.dim)), slope), mine, attempt)
+        slope = slopes[mine] * coverage.relative_edges(mine)
+        return coverage.draw(_log_linear(rng.random((len(rows), domain.dim)), slope), mine, attempt)
 
     precision = getattr(field, "real", np.float64) if real is None else real
     return _distinct(draw, domain, n, np.dtype(precision))
 
 
 def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
-    """Return `n` independent uniform random points, the paper's start.
+    """Return `n` independent uniform random points, the start in the paper.
 
     Parameters
     ----------
@@ -134,9 +133,9 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
     n : int
         At least 1.
     seed : int
-        Of numpy's PCG64; the same seed gives the same points.
+        Seed of numpy's PCG64.
     real : dtype
-        Precision in which the points are told apart, in the device's coordinates.
+        Precision in which the points are distinct in the device's coordinates.
 
     Returns
     -------
@@ -146,9 +145,9 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
     Raises
     ------
     InputError
-        If `n` points cannot be told apart in the precision.
+        If the precision has not `n` distinct points.
     """
-    n, seed = _checked(n, seed)
+    n, seed = _check_arguments(n, seed)
     rng = np.random.Generator(np.random.PCG64(seed))
     place = _uniform_in(domain, rng)
 
@@ -161,7 +160,7 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
 
 @runtime_checkable
 class _Evaluator(Protocol):
-    """A field of a precision, as `Sizing` is."""
+    """A field with a precision, such as `Sizing`."""
 
     @property
     def real(self) -> np.dtype: ...
@@ -170,11 +169,11 @@ class _Evaluator(Protocol):
 
 
 def _evaluator(field: object) -> Callable[[np.ndarray], np.ndarray]:
-    """Return `field` if it has a precision of its own (a stage), else as a `Field`."""
+    """Return `field` itself if it has a precision, else as a `Field`."""
     return field if isinstance(field, _Evaluator) else as_field(field)
 
 
-def _checked(n: int, seed: int) -> tuple[int, int]:
+def _check_arguments(n: int, seed: int) -> tuple[int, int]:
     for name, value, least in (("n", n, 1), ("seed", seed, 0)):
         if not isinstance(value, Integral) or isinstance(value, bool):
             raise InputTypeError(f"{name} is {value!r}, expected an integer")
@@ -186,28 +185,30 @@ def _checked(n: int, seed: int) -> tuple[int, int]:
 def _halve(
     tree: DensityTree, chosen: np.ndarray, share: np.ndarray, slopes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Split boxes of the tree; deal their shares out to the children as h^-d at the centers.
+    """Split boxes of the tree and divide their shares among the children in proportion to h^-d at the centers.
 
-    Returns the new shares, and slopes: for a child, those between the centers of its siblings.
+    Returns the new shares and slopes; the slopes of a child are those between the centers of its siblings.
     """
-    boxes, cover, dim = tree.boxes, tree.cover, tree.boxes.dim
-    parent, child = cover.split(chosen)
+    boxes, coverage, dim = tree.boxes, tree.coverage, tree.boxes.dim
+    parent, child = coverage.split(chosen)
     new = child >= 0
     share, slopes = share[parent], slopes[parent]
     centers = boxes.points(np.full((1, dim), 0.5), new)
-    reached = cover.reached[new]
+    reached = coverage.occupied[new]
     log_density = np.full(len(reached), -np.inf)
-    log_density[reached] = -dim * np.log(tree.sizes(cover.keep(centers, new)[reached, 0]))
+    log_density[reached] = -dim * np.log(tree.sizes(coverage.move_inside(centers, new)[reached, 0]))
     log_density = log_density.reshape(-1, 1 << dim)
     densest = log_density.max(axis=1, keepdims=True)
-    # A family without any part in the domain: slivers that were lost.
+    # Siblings without a part inside the domain, because slivers were dropped.
     densest[densest == -np.inf] = 0
-    weight = cover.weigh(np.exp(log_density - densest).ravel(), new).reshape(log_density.shape)
+    weight = coverage.scale_by_share(np.exp(log_density - densest).ravel(), new).reshape(
+        log_density.shape
+    )
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-    # No slope towards where there is no domain.
+    # No slope towards the outside of the domain.
     log_density = np.where(log_density == -np.inf, densest, log_density)
     share[new] *= weight.ravel()
-    # Which side of its parent each child is on, -1 or 1 per axis.
+    # Side of each child in its parent, -1 or 1 per axis.
     middle = centers.reshape(-1, 1 << dim, dim)
     side = np.sign(middle - middle.mean(axis=1, keepdims=True))
     slope = np.einsum("pkd,pk->pd", side, log_density) / (1 << (dim - 1))
@@ -216,7 +217,7 @@ def _halve(
 
 
 def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Turn uniform `u` into numbers in [0, 1] of density proportional to exp(slope x)."""
+    """Transform uniform `u` to numbers in [0, 1] with a density proportional to exp(slope x)."""
     slope = np.clip(slope, -30, 30)
     flat = np.abs(slope) < 1e-6
     safe = np.where(flat, 1.0, slope)
@@ -226,11 +227,11 @@ def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
 def _distinct(
     draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, n: int, real: np.dtype
 ) -> np.ndarray:
-    """Draw points; draw again those that coincide or lie on a wall in precision `real`."""
+    """Draw points. Repeat those that coincide or are on a wall in precision `real`."""
     origin, scale = domain.frame
     points = np.empty((n, domain.dim))
     rows, inside = np.arange(n), np.zeros(n, bool)
-    for attempt in range(_TRIES):
+    for attempt in range(_ATTEMPTS):
         points[rows] = draw(rows, attempt)
         working = ((points - origin) / scale).astype(real)
         inside[rows] = _strictly_inside(domain, points[rows], working[rows])
@@ -238,20 +239,20 @@ def _distinct(
         if not rows.size:
             return _in_all_pieces(domain, points)
     raise InputError(
-        f"n is {n}: that many distinct points do not fit the size field in {real.name}; "
+        f"n is {n}, but {real.name} has not as many distinct points for this size field; "
         + ("use dtype='float64' or " if real != np.float64 else "")
-        + "ask for fewer cells"
+        + "use fewer cells"
     )
 
 
 def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) -> np.ndarray:
-    """Tell for each of `points` (n, d) whether it and what the precision makes of it lies off the boundary.
+    """Tell for each of `points` (n, d) whether it is inside and off the boundary, also after rounding.
 
     `working` are the points in the domain's frame.
     """
     origin, scale = domain.frame
     if isinstance(domain, Polygon):
-        margin = _ROUNDINGS * float(np.finfo(working.dtype).eps) * scale
+        margin = _ULPS * float(np.finfo(working.dtype).eps) * scale
         return domain.contains_well(points, margin)
     lower, upper = (
         ((np.array(c) - origin) / scale).astype(working.dtype) for c in (domain.lower, domain.upper)
@@ -262,12 +263,12 @@ def _strictly_inside(domain: Domain, points: np.ndarray, working: np.ndarray) ->
 
 
 def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
-    """Give each piece of a domain a point, from the end of those of the piece that has most."""
+    """Move points from the piece with most of them, so that each piece of the domain has one."""
     if not isinstance(domain, Polygon) or domain.n_pieces == 1:
         return points
     if len(points) < domain.n_pieces:
         raise InputError(
-            f"n is {len(points)}, expected at least {domain.n_pieces}: each piece of the domain holds a cell"
+            f"n is {len(points)}, expected at least {domain.n_pieces}, one per piece of the domain"
         )
     piece = domain.piece_of(points)
     counts = np.bincount(piece, minlength=domain.n_pieces)
@@ -281,19 +282,19 @@ def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
 
 
 def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
-    """Return a function that draws so many uniform random points of the domain.
+    """Return a function that draws a number of uniform random points in the domain.
 
-    In a polygon: of boxes that cover it, at least half of them inside, those that lie in it.
+    In a polygon points are drawn in boxes over it, at least half of whose area is inside. Those outside are rejected.
     """
-    boxes = Boxes(domain)
-    cover = cover_of(boxes, domain)
-    if not isinstance(cover, PolygonCover):
+    boxes = BoxTree(domain)
+    coverage = coverage_of(boxes, domain)
+    if not isinstance(coverage, PolygonCoverage):
         return lambda n: domain.lower + domain.extent * rng.random((n, domain.dim))
     while True:
-        areas = np.where(cover.reached, boxes.volumes(), 0)
-        if areas.sum() <= 2 * domain.measure or len(boxes) >= _MOST_COVER:
+        areas = np.where(coverage.occupied, boxes.volumes(), 0)
+        if areas.sum() <= 2 * domain.measure or len(boxes) >= _MAX_BOXES:
             break
-        cover.split(cover.reached & (cover.share < 1))
+        coverage.split(coverage.occupied & (coverage.share < 1))
     ends = np.cumsum(areas) / areas.sum()
 
     def place(n: int) -> np.ndarray:
@@ -302,16 +303,16 @@ def _uniform_in(domain: Domain, rng: np.random.Generator) -> Callable[[int], np.
             m = 2 * (n - len(found)) + 16
             box = np.minimum(np.searchsorted(ends, rng.random(m), side="right"), len(boxes) - 1)
             x = boxes.points(rng.random((m, 1, 2)), box)[:, 0]
-            found = np.concatenate([found, x[cover.holds(x)]])
+            found = np.concatenate([found, x[coverage.contains(x)]])
         return found[:n]
 
     return place
 
 
 def _repeated(points: np.ndarray) -> np.ndarray:
-    """Tell for each of `points` (n, d) whether an earlier one is the same."""
+    """Tell for each of `points` (n, d) whether it equals an earlier one."""
     repeated = np.zeros(len(points), bool)
-    # Only points whose first coordinate occurs twice can coincide: in double precision hardly any.
+    # Only points whose first coordinate occurs twice can coincide.
     order = np.argsort(points[:, 0], kind="stable")
     first = points[order, 0]
     twin = np.flatnonzero(first[1:] == first[:-1])

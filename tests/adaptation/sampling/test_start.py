@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clvoro import sizing
-from clvoro.adaptation.sampling.boxes import Boxes, hilbert_tables
+from clvoro.adaptation.sampling.box_tree import BoxTree, hilbert_tables
 from clvoro.adaptation.sampling.quadrature import DensityTree
 from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
 from clvoro.errors import InputError, InputTypeError, SizeFieldError
@@ -160,7 +160,7 @@ def test_bad_input(make, error, message):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_hilbert_curve_is_continuous(dim):
     """In a uniform tree each box shares a face with the one before, roots included."""
-    boxes = Boxes(Box((0,) * dim, (2.9, 1.9, 1.0)[:dim]))
+    boxes = BoxTree(Box((0,) * dim, (2.9, 1.9, 1.0)[:dim]))
     for level in range(1, 4):
         boxes.split(np.ones(len(boxes), bool))
         step = 0.5**level
@@ -302,7 +302,7 @@ def test_more_points_than_the_precision_can_tell_apart():
     field = sizing.Distance(sizing.Circle((0.7, 0.7), 0), 1e-10, slope=0.3)
     box = Box((0, 0), (1, 1))
     assert len(sample_density(field, box, 1500, 99)) == 1500
-    with pytest.raises(InputError, match=r"n is 1500.* do not fit .*float32; use dtype='float64'"):
+    with pytest.raises(InputError, match=r"n is 1500.*float32 has not.*use dtype='float64'"):
         sample_density(field, box, 1500, 99, np.float32)
 
 

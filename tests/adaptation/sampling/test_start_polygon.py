@@ -5,8 +5,8 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.sampling.boxes import Boxes
-from clvoro.adaptation.sampling.cover import PolygonCover
+from clvoro.adaptation.sampling.box_tree import BoxTree
+from clvoro.adaptation.sampling.coverage import PolygonCoverage
 from clvoro.adaptation.sampling.quadrature import DensityTree
 from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
 from clvoro.errors import InputError
@@ -62,25 +62,25 @@ def test_counts_of_varying_sizes(field) -> None:
 @pytest.mark.parametrize("name", DOMAINS)
 def test_shares_are_those_of_area(name: str) -> None:
     domain = DOMAINS[name]
-    boxes = Boxes(domain)
-    cover = PolygonCover(boxes, domain)
+    boxes = BoxTree(domain)
+    coverage = PolygonCoverage(boxes, domain)
     for _ in range(4):
-        cover.split(cover.reached)
+        coverage.split(coverage.occupied)
         areas = np.prod(boxes.edges(), axis=1)
-        assert (cover.share * areas).sum() == pytest.approx(domain.measure, rel=1e-9)
-    assert (cover.share == 0).any()
-    cut = (cover.share > 0) & (cover.share < 1)
-    assert domain.covers(cover.inner[cut]).all()
+        assert (coverage.share * areas).sum() == pytest.approx(domain.measure, rel=1e-9)
+    assert (coverage.share == 0).any()
+    cut = (coverage.share > 0) & (coverage.share < 1)
+    assert domain.covers(coverage.inner[cut]).all()
     lower, upper = boxes.points(np.array([[0.0, 0.0], [1, 1]])).transpose(1, 0, 2)
-    assert ((cover.inner >= lower) & (cover.inner <= upper))[cut].all()
+    assert ((coverage.inner >= lower) & (coverage.inner <= upper))[cut].all()
     rng = np.random.default_rng(1)
     at = boxes.points(rng.random((len(boxes), 200, 2)))
     inside = domain.contains(at.reshape(-1, 2)).reshape(-1, 200)
-    assert inside[cover.share == 1].all()
-    assert not inside[cover.share == 0].any()
+    assert inside[coverage.share == 1].all()
+    assert not inside[coverage.share == 0].any()
     # 200 trials each: six standard deviations of a binomial, over a thousand boxes.
     spread = 6 * np.sqrt(0.25 / 200)
-    assert np.abs(inside.mean(axis=1) - cover.share).max() < spread
+    assert np.abs(inside.mean(axis=1) - coverage.share).max() < spread
 
 
 @pytest.mark.sparse
@@ -127,11 +127,11 @@ def test_samples_follow_the_density() -> None:
 def test_uniform_samples_are_uniform() -> None:
     n, side = 20000, 8
     points = sample_uniform(ANNULUS, n, 5)
-    boxes = Boxes(clvoro.Box((-1, -1), (1, 1)))
-    cover = PolygonCover(boxes, ANNULUS)
+    boxes = BoxTree(clvoro.Box((-1, -1), (1, 1)))
+    coverage = PolygonCoverage(boxes, ANNULUS)
     for _ in range(3):
-        cover.split(np.ones(len(boxes), bool))
-    expected = cover.share * 4 / len(boxes) / ANNULUS.measure * n
+        coverage.split(np.ones(len(boxes), bool))
+    expected = coverage.share * 4 / len(boxes) / ANNULUS.measure * n
     cell = boxes.find((points + 1) / 2)
     got = np.bincount(cell, minlength=side * side)
     used = expected > 5

@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.adaptation.insertion_deletion import Population, PopulationControl
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
 from clvoro.adaptation.stages import Stages
 from clvoro.solvers.components import connected_components
 from clvoro.tessellation.tessellator import Tessellator
@@ -72,7 +72,7 @@ def test_what_is_split_off_is_apart(ctx, name):
     expected = np.array(expected)
     new = reorganized(engine, domain, t, 1.0)
     assert (new.inserted, new.deleted) == (1, 0)
-    found = new.points.get() * scale + origin
+    found = new.generators.points.get() * scale + origin
     assert found[0] == pytest.approx(corner[0], abs=1e-15)
     farthest = np.hypot(*(expected - corner).T)
     at = expected[farthest >= farthest.max() - 1e-12]  # of some alike, rounding chooses
@@ -82,12 +82,13 @@ def test_what_is_split_off_is_apart(ctx, name):
 def reorganized(engine, domain, t, total):
     """Return the population after the count has changed by `total`, where cells have their target size."""
     one = engine.upload(np.ones(t.n))
-    rows = Population(
+    rows = Generators(
         t.points, engine.upload(np.arange(t.n), np.int32), engine.zeros((t.n, 2)),
         engine.zeros(t.n, np.uint64), engine.zeros(t.n),
     )  # fmt: skip
-    return PopulationControl(engine).reorganize(
-        domain, t, one, one, engine.zeros(t.n), rows, total, t.n, climb=False
+    sizes = CellSizes(one, one, engine.zeros(t.n))
+    return InsertionDeletion(engine).insert_delete(
+        domain, t, sizes, rows, t.n, Change(total, climb=False)
     )
 
 

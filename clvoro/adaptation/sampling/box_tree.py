@@ -1,4 +1,4 @@
-"""Boxes of a quadtree (octree) over the domain, kept in the order of a Hilbert curve."""
+"""A quadtree (octree) of boxes over the domain, in the order of a Hilbert curve."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 _HALVED = 0.5 ** np.arange(64)
 _ALL = slice(None)
-_BITS = {2: 31, 3: 21}  # of a place per axis in a Morton key of 64 bits
+_BITS = {2: 31, 3: 21}  # per axis in a Morton key of 64 bits
 
 
 @lru_cache
@@ -26,12 +26,11 @@ def hilbert_tables(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns
     -------
     place : (states, 2^d, d) int
-        Which half of the box, 0 or 1 per axis, is the k-th child on the curve.
+        Half of the box, 0 or 1 per axis, of the k-th child on the curve.
     after : (states, 2^d) int
         State of that child.
     rank : (states, 2^d) int
-        The inverse of `place`: k of the child whose halves are the bits of the index (axis 0 the
-        lowest).
+        The inverse of `place`: k of the child whose halves are the bits of the index (axis 0 is the lowest bit).
     """
     full, states = 1 << dim, dim << dim
 
@@ -59,13 +58,13 @@ def hilbert_tables(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return place, after, rank
 
 
-class Boxes:
+class BoxTree:
     """Boxes that tile the domain's bounding box, in the order of a Hilbert curve.
 
     Attributes
     ----------
     corner : (m, d) float
-        Lower corners in units of the root boxes' edges: multiples of powers of two, hence exact.
+        Lower corners in units of the edges of the root boxes: multiples of powers of two, hence exact.
     level : (m,) int8
         The edges are 2^-level root edges.
     state : (m,) int8
@@ -78,7 +77,7 @@ class Boxes:
 
     def __init__(self, domain: Domain):
         self.origin = np.array(domain.lower)
-        # As many roots per axis as make them nearly cubes; a needle's stay long.
+        # As many root boxes per axis as make them nearly cubes, with a limit for very long domains.
         shape = np.clip(np.rint(domain.extent / domain.extent.min()), 1, 64).astype(int)
         self.root = domain.extent / shape
         self.upper = np.array(domain.upper)
@@ -111,25 +110,25 @@ class Boxes:
         """Return the points (m, p, d) at relative positions `at` (p, d) or (m, p, d) in [0, 1]."""
         step, corner = _HALVED[self.level[chosen]][:, None], self.corner[chosen]
         found = np.empty((len(corner), *at.shape[-2:]))
-        for a in range(self.dim):  # NumPy is slow along short axes
+        for a in range(self.dim):  # faster than NumPy along a short axis
             x = self.origin[a] + self.root[a] * (corner[:, a, None] + step * at[..., a])
             np.clip(x, self.origin[a], self.upper[a], out=found[..., a])
         return found
 
     @property
     def deepest(self) -> int:
-        """The finest level at which `find` still works."""
+        """The finest level at which `find` works."""
         return _BITS[self.dim] - int(self.end.max()).bit_length()
 
     def find(self, places: np.ndarray) -> np.ndarray:
-        """Return the index (n,) of the box that holds each of `places` (n, d), in root units."""
+        """Return the index (n,) of the box that contains each of `places` (n, d), in root units."""
         starts = self._keys(self.corner)
         order = np.argsort(starts)
         at = np.searchsorted(starts[order], self._keys(places), side="right") - 1
         return order[at]
 
     def _keys(self, places: np.ndarray) -> np.ndarray:
-        """Interleave the bits of `places` (n, d) to Morton keys; roots come first."""
+        """Return Morton keys of `places` (n, d)."""
         whole = np.floor(places * 2.0**self.deepest).astype(np.uint64)
         key = np.zeros(len(places), np.uint64)
         for a in range(self.dim):
@@ -137,9 +136,9 @@ class Boxes:
         return key
 
     def neighbors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return pairs (i, j): box j lies across the middle of a face of box i.
+        """Return pairs (i, j): box j is across the center of a face of box i.
 
-        Of smaller neighbors one is found per face; those find this box in turn.
+        Of several smaller neighbors one is found per face; each of them finds this box.
         """
         step = _HALVED[self.level][:, None]
         out = np.concatenate([s * e for s in (-1, 1) for e in np.eye(self.dim)[:, None, :]])
@@ -151,14 +150,14 @@ class Boxes:
         return i, self.find(places[inside])
 
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Replace the boxes where `chosen` (m,) is true by their children, in place on the curve.
+        """Replace the boxes where `chosen` (m,) is true by their children, in the order of the curve.
 
         Returns
         -------
         parent : (m',) int
-            For each box now, the index before of itself or of its parent.
+            For each new box, the old index of itself or of its parent.
         child : (m',) int8
-            Rank among the siblings, -1 for boxes that were not split.
+            Rank among the siblings; -1 for boxes that were not split.
         """
         place, after, _ = hilbert_tables(self.dim)
         counts = np.where(chosen, 1 << self.dim, 1)
@@ -177,7 +176,7 @@ class Boxes:
 
 
 def _snake(shape: np.ndarray) -> np.ndarray:
-    """Order the boxes of a grid so that each touches the one before: (m, d) int."""
+    """Return the boxes of a grid in an order in which each touches the previous one, (m, d) int."""
     rows = np.zeros((1, 0), np.int64)
     for count in shape[::-1]:
         line = np.arange(count)

@@ -1,13 +1,12 @@
-/* New generators in a polygon: apart from those that bring them, also where a corner of the boundary hides a cell from
-   its generator, or the generator stands in a corner. */
+/* New generators in a polygon: keep them separate from their parents where a corner of the boundary hides a part of the
+   cell from its generator, or the generator is in a corner. */
 #include "geometry/domain.h"
 #include "tessellation/clipped/outline.h"
 
 #ifdef POLYGON
-/* A place in the cell of x whether it is seen from there or not: the middle of a face, x + m, or `way` inwards from
-   that of one on the boundary; half-way to what is across from it, if that is nearer. Where layers keep a part of the
-   cells for themselves (`fixed` > 0) it is to be seen from x, as what is hidden may be theirs, unless x stands on their
-   edge. */
+/* A position in the cell of x at a face, visible from x or not: the center x + m of the face, moved inwards by `way`
+   for a boundary edge, but at most half-way to the opposite side. With layers (`fixed` > 0) it must be visible from x,
+   unless x is on their edge, because hidden positions may belong to the layers. */
 inline REAL2 place_at_face(const REAL *x, REAL2 m, int label, REAL way, int fixed, global const REAL2 *tangents,
                            DOMAIN_ARGS)
 {
@@ -34,9 +33,9 @@ inline REAL squared_gap(const REAL *x, REAL2 y)
     return dot(d, d);
 }
 
-/* Keep the new generator that comes from x to y inside, as `keep_inside` does. If that puts it nearer to x than `least`
-   it goes to `other` instead, unless that is nearer still. */
-inline void keep_apart(const REAL *x, REAL *y, REAL least, REAL2 other, DOMAIN_ARGS)
+/* Keep the new generator from x to y inside the domain. If it is then closer to x than `least`, it goes to `other`,
+   unless that is closer still. */
+inline void keep_separate(const REAL *x, REAL *y, REAL least, REAL2 other, DOMAIN_ARGS)
 {
     keep_inside(x, y, DOMAIN);
     const REAL gap2 = squared_gap(x, (REAL2)(y[0], y[1]));
@@ -46,11 +45,12 @@ inline void keep_apart(const REAL *x, REAL *y, REAL least, REAL2 other, DOMAIN_A
     }
 }
 
-/* The generator at x and a new one have been sent to y and `child`, which were to be `way` apart. If the boundary has
-   left an eighth of that or less, the generator stays, and the new one goes to the face that is farthest away, of those
-   behind `begin` up to `end`; true. */
-inline bool take_apart(const REAL *x, REAL *y, REAL *child, REAL2 way, int fixed, global const int *neighbors,
-                       global const FACE *face_centroids, int begin, int end, global const REAL2 *tangents, DOMAIN_ARGS)
+/* The parent at x moves to y and the new generator to `child`, at a distance of |way|. If the boundary leaves at most
+   an eighth of that, the parent stays at x, the new generator goes to the farthest face (from `begin` to `end`), and
+   the result is true. */
+inline bool separate_child(const REAL *x, REAL *y, REAL *child, REAL2 way, int fixed, global const int *neighbors,
+                           global const FACE *face_centroids, int begin, int end, global const REAL2 *tangents,
+                           DOMAIN_ARGS)
 {
     const REAL apart2 = dot(way, way);
     if (squared_gap(y, (REAL2)(child[0], child[1])) > apart2 / 64)
