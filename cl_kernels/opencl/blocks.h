@@ -1,6 +1,6 @@
-/* Block-wise work: group g owns the items [block_begin(n), block_end(n)), its work-items stride through them.
-   With GROUP_SIZE 1 this is a plain loop per CPU core, with 128 it is coalesced on a GPU. Which items a group sums
-   depends on n and the device alone, so sums repeat bit by bit from run to run. */
+/* Block-wise kernels: a group works on the items [block_begin(n), block_end(n)), its work-items with stride GROUP_SIZE.
+   On CPUs, with GROUP_SIZE 1, this is a plain loop. On GPUs accesses are coalesced. The items of a group depend on n
+   and the number of groups only, so that sums have the same bits in every run. */
 #ifndef GROUP_SIZE
 #error "build with -DGROUP_SIZE=work-items per group"
 #endif

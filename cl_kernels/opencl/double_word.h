@@ -10,7 +10,7 @@ inline wide_t wide_sum(REAL a, REAL b)
     return (wide_t)(s, (a - (s - t)) + (b - t));
 }
 
-/* Of a number and one that is no larger. */
+/* The same for |a| >= |b|. */
 inline wide_t wide_sum_ordered(REAL a, REAL b)
 {
     const REAL s = a + b;

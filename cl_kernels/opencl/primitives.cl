@@ -1,7 +1,7 @@
 #include "opencl/real.h"
 #include "opencl/blocks.h"
 
-/* Exclusive prefix sums in two passes. One work-item stands for one contiguous chunk of the array. */
+/* Exclusive prefix sums in two passes. Each work-item has one contiguous chunk of the array. */
 
 inline int chunk_begin(int n, int w, int width)
 {
@@ -20,7 +20,7 @@ kernel void chunk_sums(const int size, global const int *values, const int first
 }
 
 /* out[i] = values[first] + ... + values[first + i - 1]; out[n] is the total. `values` may be `out` if first is 0. Each
-   work-item adds up the chunks before its own itself: all read the same, and none has to wait for one that does. */
+   work-item adds up the sums of the chunks before its own. */
 kernel void scan_chunks(const int size, global const int *values, const int first, global const int *sums,
                         global int *out, const int n)
 {
@@ -52,8 +52,8 @@ kernel void scan_few(const int size, global const int *values, const int first, 
     out[n] = total;
 }
 
-/* Sum, sum of magnitudes, least and largest of an array. Sums are compensated (Neumaier, with Knuth's exact difference,
-   which has no branch), so that float32 totals of millions of terms stay exact to a few ulp. */
+/* Sum, sum of magnitudes, minimum and maximum of an array. Sums are compensated (Neumaier, with Knuth's exact
+   difference, which has no branch): float32 sums of millions of terms err by a few ulp. */
 typedef struct {
     REAL sum, sum_low, magnitude, magnitude_low, least, largest;
 } summary_t;
@@ -86,7 +86,7 @@ inline void add_value(summary_t *a, REAL value)
 #if GROUP_SIZE == 1
 #define REAL8 CLVORO_JOIN(REAL, 8)
 
-/* Items [begin, end) eight at a time: one after the other they would wait for each other's sums. */
+/* Items [begin, end), eight at a time, because one sum would wait for each addition. */
 inline void add_run(summary_t *a, global const REAL *values, int begin, int end)
 {
     REAL8 sum = 0, sum_low = 0, magnitude = 0, magnitude_low = 0, least = REAL_MAX, largest = -REAL_MAX;
@@ -148,8 +148,8 @@ kernel void summarize_blocks(global const REAL *a0, global const REAL *a1, globa
     }
 }
 
-/* One work-item per slot whose bit is set in `which`: out[4 slot ...] = sum, sum of magnitudes, least, largest. Behind
-   them all comes the first of `note`, where there is one: the host reads all at once. */
+/* One work-item per slot. If bit `slot` of `which` is set, out[4 slot ...] = sum, sum of magnitudes, minimum, maximum.
+   If `noted`, the first number of `note` follows the last slot: the host reads all in one transfer. */
 kernel void combine_blocks(const int size, global const summary_t *partials, const int groups, const int which,
                            const int noted, global const int *note, global REAL *out, global int *behind)
 {
@@ -168,7 +168,7 @@ kernel void combine_blocks(const int size, global const summary_t *partials, con
     put[3] = all.largest;
 }
 
-/* Row p of `out` is row items[p] of `rows`; a row is `words` 32-bit words, whatever they mean. */
+/* Row p of `out` is row items[p] of `rows`; a row has `words` 32-bit words of any type. */
 kernel void gather_rows(const int size, global const int *items, global const uint *rows, const int words,
                         global uint *out)
 {

@@ -5,11 +5,11 @@
 #ifndef REAL
 #error "build with -DREAL=double or -DREAL=float"
 #endif
-/* Geometry relies on each operation being rounded as written; only fma() contracts. */
+/* Geometry relies on the rounding of each operation. fma() is the only contraction. */
 #pragma OPENCL FP_CONTRACT OFF
 
-/* Intel's CPU compiler runs several work-items as the lanes of one vector, and then gets private arrays in loops that
-   diverge wrong (seen in 2026.2: cells of negative area). One lane is as this is written. */
+/* Intel's CPU compiler runs several work-items in the lanes of a vector. Version 2026.2 then miscompiles private arrays
+   in divergent loops (cells of negative area). With one lane it does not. */
 #ifdef cl_intel_vec_len_hint
 #define kernel __attribute__((intel_vec_len_hint(1))) __kernel
 #endif
@@ -32,21 +32,20 @@
 #define REAL2 CLVORO_JOIN(REAL, 2)
 #define REAL3 CLVORO_JOIN(REAL, 3)
 #define REAL4 CLVORO_JOIN(REAL, 4)
-/* EACH_AXIS(a) ...: a loop over the axes, unrolled: PoCL keeps such loops, and with them every array of DIM values in
-   memory. */
+/* EACH_AXIS(a) ...: an unrolled loop over the axes. PoCL does not unroll such loops, and then keeps arrays of DIM
+   values in memory. */
 #define EACH_AXIS(a) _Pragma("unroll") for (int a = 0; a < DIM; ++a)
 /* A literal in the working precision: R(0.5). */
 #define R(x) ((REAL)(x))
 
-/* The index of a work-item, one of `size`, the kernel's first argument; the rest of the last work-group is idle.
-   Launches are rounded up to whole groups of one fixed size: PoCL compiles a kernel anew for every group size it
-   meets. */
+/* The index of a work-item below `size`, the kernel's first argument. Launches are rounded up to whole groups of one
+   size, because PoCL compiles a kernel for every group size; the other items of the last group return. */
 #define WORK_ITEM(i)                                                                                                   \
     const int i = get_global_id(0);                                                                                    \
     if (i >= size)                                                                                                     \
     return
 
-/* Rounds to 1 ulp where a*b and c*d cancel (Kahan): the determinant of two short vectors. */
+/* a b - c d, with an error of 1 ulp even if the products cancel (Kahan): the determinant of two vectors. */
 inline REAL difference_of_products(REAL a, REAL b, REAL c, REAL d)
 {
     const REAL cd = c * d;

@@ -1,11 +1,10 @@
-/* Sums and maxima that repeat bit by bit: every group writes one partial value per quantity, and whoever needs the
-   total adds the partial values of all groups in their order. Include after blocks.h and real.h.
+/* Deterministic sums and maxima. Every group writes one partial value per quantity; a later kernel adds the partial
+   values of all groups in their order. Include after blocks.h and real.h.
 
-   All hold barriers. A kernel must not return before one, not even all of its work-items alike: PoCL then runs astray
-   with groups of more than one. What is not to be done becomes a loop of no turns. */
+   All functions contain barriers. A kernel must not return before a barrier, not even with all work-items: PoCL
+   miscompiles this for groups of more than one item. Use a loop without iterations instead. */
 
-/* Running sum of one work-item; compensated (Kahan) in single precision, where a CPU's work-item adds up many
-   thousands. */
+/* Running sum of one work-item, which on a CPU adds up many thousands of terms; compensated (Kahan) in float32. */
 typedef struct {
     REAL value;
 #if !IS_DOUBLE
@@ -72,7 +71,7 @@ inline REAL group_max(REAL x, local REAL *scratch)
     return x;
 }
 
-/* Total (maximum) of the partial values that a block-wise kernel has left, one per group. */
+/* Sum (maximum) of the partial values of a block-wise kernel, one per group. */
 inline REAL total_sum(global const REAL *partial, local REAL *scratch)
 {
     REAL x = 0;

@@ -1,18 +1,18 @@
-/* Entries of rows, AT_ONCE at a time: eight, in the lanes of vectors, on a CPU, where a work-item goes through many
-   rows; one on a GPU. Rows are short and of all lengths, so that a loop over their entries waits for mispredicted
-   branches most of the time; in the plane next to every row ends within eight.
+/* Entries of rows, AT_ONCE at a time: eight in the lanes of vectors on a CPU, one on a GPU. Rows are short and have
+   different lengths, so that a loop over single entries spends most of its time on mispredicted branches. In 2D almost
+   all rows have at most eight entries.
 
        for (int k = starts[i]; k < end; k += AT_ONCE) {
            const MANY(int) inside = INSIDE(k, end), j = TAKE(int, columns, k, size);
            sum += SUM(REAL, select(..., x, inside));
        }
 
-   Lanes behind the row's end hold entries of the next rows, or the last of all `size`: they have to be left out.
+   Lanes beyond the row's end hold entries of the next rows, or the last of all `size`: mask them.
    Include after domain.h and blocks.h. */
 #if GROUP_SIZE == 1
 #define AT_ONCE 8
 #define MANY(TYPE) CLVORO_JOIN(TYPE, 8)
-/* Which entries lie before the end. */
+/* Mask of the entries before the end. */
 #define INSIDE(k, end) ((k) + (int8)(0, 1, 2, 3, 4, 5, 6, 7) < (end))
 #define PICK(TYPE, array, j, stride, a)                                                                                \
     ((MANY(TYPE))((array)[(j).s0 * (stride) + (a)], (array)[(j).s1 * (stride) + (a)],                                  \
@@ -48,7 +48,7 @@ AT_ONCE_FOR(double)
 #define mask_int(lanes) (lanes)
 #define mask_float(lanes) (lanes)
 #define mask_double(lanes) convert_long8(lanes)
-/* `x` in the lanes that are `chosen`, else `other`. */
+/* `x` where `chosen`, else `other`. */
 #define CHOOSE(TYPE, chosen, x, other) select((MANY(TYPE))(other), x, CLVORO_JOIN(mask_, TYPE)(chosen))
 
 inline float least_float(float8 x)
@@ -58,8 +58,8 @@ inline float least_float(float8 x)
     return fmin(x2.s0, x2.s1);
 }
 
-/* The entries from k on, up to the row's `end`. Whoever writes rows in their order may write behind that, `until` where
-   somebody else's rows begin. */
+/* Write entries k to the row's `end`. If rows are written in their order, the entries up to `until`, where the rows of
+   another work-item begin, may be overwritten. */
 inline void put_float(float8 x, global float *array, int k, int end, int until)
 {
     if (k + 8 <= until) {

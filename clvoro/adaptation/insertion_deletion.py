@@ -14,7 +14,7 @@ import pyopencl.array as cla
 from ..geometry.box import Domain
 from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
-from ..opencl.primitives import Room, Scan
+from ..opencl.primitives import NamedArrays, Scan
 from ..tessellation.device_diagram import Tessellation
 
 CLIMB_STRAIN = 0.06
@@ -98,7 +98,7 @@ class InsertionDeletion:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._room = Room(engine)
+        self._room = NamedArrays(engine)
         self._kernels = engine.kernels(
             "adaptation/insertion_deletion",
             {
@@ -397,7 +397,7 @@ class _Marks:
     busy: cla.Array
 
     @classmethod
-    def clean(cls, room: Room, n: int, dim: int) -> _Marks:
+    def clean(cls, room: NamedArrays, n: int, dim: int) -> _Marks:
         return cls(
             room("kept", size=n + 1, dtype=np.int32).fill(1),
             room.zeros("shifts", size=dim * n),

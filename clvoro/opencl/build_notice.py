@@ -1,4 +1,4 @@
-"""Say that a first run builds its kernels."""
+"""A line on the terminal while a first run builds kernels."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class BuildNotice:
             self.clear()
 
     def clear(self, row: object = None) -> None:
-        """Clear the line; `row`, of the history, is not looked at."""
+        """Clear the line; `row`, of the history, is ignored."""
         if self._shown:
             self._write("\r\x1b[K")
             self._shown = False
@@ -58,19 +58,19 @@ class BuildNotice:
 def noticed_builds(
     engine: Engine, on_build: Callable[[int, int], object] | None
 ) -> Iterator[BuildNotice | None]:
-    """Build kernels of a first run ahead, and say meanwhile how far this is.
+    """Let workers build kernels of a first run, and report the progress inside the ``with`` block.
 
     Parameters
     ----------
     engine : Engine
     on_build : callable or None
-        Called with the number of kernels built and of all; without it a line on the terminal is shown, if the standard
-        error is one.
+        Called with the number of kernels built and of all. With None, the standard error shows a line if it is a
+        terminal.
 
     Yields
     ------
     BuildNotice or None
-        What shows the line.
+        The line, if there is one.
     """
     total, notice = build_ahead(engine), None
     if total and on_build is None and sys.stderr is not None and sys.stderr.isatty():

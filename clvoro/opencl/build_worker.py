@@ -1,7 +1,7 @@
 """A process that builds kernels into PoCL's cache; `prebuild` starts it.
 
-It is run as a file, so that it need not import the package. PoCL compiles a kernel when it is first launched, for that
-size of a work-group. So each kernel is launched once, with all its numbers zero: it is to work on no items.
+It runs as a file, without the import of the package. PoCL compiles a kernel at its first launch, for the size of the
+work-group. So each kernel is launched once. All its numbers are zero, so that it works on no items.
 """
 
 import contextlib
@@ -15,10 +15,10 @@ _BUFFER_BYTES = 1 << 20
 
 
 def work(platform: int, device: int) -> None:
-    """Build the programs, and launch the kernels, that the standard input lists: see `prebuild.Work`."""
+    """Build the programs and launch the kernels of the `prebuild.Work` on the standard input."""
     ctx = cl.Context([cl.get_platforms()[platform].get_devices()[device]])
     queue = cl.CommandQueue(ctx)
-    # The first program takes the longest. It is built while the parent process finds out what is needed.
+    # The first build loads the compiler, while the parent process prepares the run.
     cl.Program(ctx, "kernel void nothing(void) {}").build(["-D_OPENCL_H_"])
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     zeros = cl.Buffer(ctx, flags, hostbuf=np.zeros(_BUFFER_BYTES, np.uint8))

@@ -1,4 +1,4 @@
-"""What kernels and steps have cost, as a `Profile` counts it, and as tables."""
+"""Times of kernels and steps, as a `Profile` counts them, and their tables."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from .profile import Profile
 
 SMALL = 0.005
-"""Share of the device's time below which a table puts kernels together."""
+"""Share of the device's time below which a table sums kernels up in one row."""
 
 
 @dataclass
 class Cost:
-    """What a kernel has cost, or several together.
+    """Time and memory traffic of one kernel, or of several.
 
     Attributes
     ----------
@@ -24,10 +24,9 @@ class Cost:
     seconds : float
         Device time, from start to end of each call.
     bytes : int
-        Sizes of the buffers that were bound to the calls, each buffer once a call. An estimate of
-        what they move. It is rather too high, since buffers may be longer than what a call needs of
-        them and a cache may hold them; it is too low where something is both read and written, or
-        read again after it has left the cache.
+        Sizes of the buffers that were bound to the calls, each buffer once a call: an estimate of
+        the memory traffic. It is too high where a call uses a part of a buffer only, and too low
+        where memory is read and written, or read twice.
     seconds_known : float
         Time of those calls whose buffers are known.
     """
@@ -58,7 +57,7 @@ class Span:
     Attributes
     ----------
     step, level, cells : int or None
-        Of the row that ended it: step 0 is all that comes before the first step. None: what came after the last row.
+        Of the row at its end. Step 0 is the time before the first step. None: the time after the last row.
     wall : float
         Seconds by the clock.
     stages : dict
@@ -120,11 +119,10 @@ def tabulate(profile: Profile) -> str:
         name = f"{len(profile.costs) + 1 - len(kernels)} smaller ones"
         kernels.append([name, *_kernel_row(small, time_of, moving)])
     notes = [
-        f"host: the clock less the device's time; {1e3 * profile.building:.0f} ms of it built "
-        "programs; this profile's own work is in it",
-        f"copy: {1e-9 * profile.bandwidth:.1f} GB/s, read and written by copying a large buffer",
-        "GB/s, MB: as if a call passed once over every buffer bound to it; an estimate, rather "
-        "too high",
+        f"host: wall less the device's time; includes {1e3 * profile.building:.0f} ms of building "
+        "programs, and the profile itself",
+        f"copy: a large buffer is read and written at {1e-9 * profile.bandwidth:.1f} GB/s",
+        "GB/s, MB: each buffer bound to a call counts once; mostly too high",
     ]
     for name, spans in groups.items():
         cells = max(s.cells or 0 for s in spans)

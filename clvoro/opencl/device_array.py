@@ -1,8 +1,7 @@
-"""Arrays on the device: PyOpenCL's, of which a run makes thousands, at a tenth of the host's time.
+"""Contiguous PyOpenCL arrays on one in-order queue.
 
-PyOpenCL's arrays may have any strides and lie on any queue. Those here are contiguous, and all that is done with them
-goes through one in-order queue: no event has to be kept, nothing is to be checked when one is made of another's first
-rows.
+A run makes thousands of arrays and views. PyOpenCL's may have any strides and queue: it checks them and keeps events.
+Here neither is needed. Making an array takes a tenth of the time.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 _QUICK = "_fast" in inspect.signature(cla.Array.__init__).parameters
-"""Whether PyOpenCL's constructor has a flag that skips the checks of its arguments; it is not public."""
+"""Whether PyOpenCL's constructor has a private option that skips checks."""
 _PATTERN = 64
-"""Bytes that a device is given at most to fill memory with: the more at once, the faster."""
+"""Largest pattern in bytes to fill memory with; long patterns are faster."""
 _ZEROS = np.zeros(_PATTERN, np.uint8)
 _LARGEST_FILL = 2**31
-"""Bytes from which on NVIDIA's way to fill memory fails, and PyOpenCL's kernel takes over."""
+"""Bytes from which NVIDIA's fill fails; PyOpenCL's kernel is used instead."""
 _marks = count()
 
 
@@ -32,18 +31,18 @@ class DeviceArray(cla.Array):
 
     @cached_property
     def mark(self) -> int:
-        """A number that no other array has, or ever had, but views that begin where this one does.
+        """A number for this array and its views of the first rows. No array before had the same.
 
-        It distinguishes the arguments of a kernel from its last ones, whose memory another array may own by now.
+        An address cannot tell arrays apart, because freed memory is used again.
         """
         return next(_marks)
 
     def _place(self) -> tuple[cl.CommandQueue, cl.Buffer]:
-        """Return queue and buffer of an array that is not empty; PyOpenCL's need not have them."""
+        """Return queue and buffer of an array that is not empty."""
         return cast("tuple[cl.CommandQueue, cl.Buffer]", (self.queue, self.base_data))
 
     def __getitem__(self, index: Any) -> cla.Array:
-        """Return a view: quickly of the first rows, ``[:n]``, and of one number."""
+        """Return a view; ``[:n]`` and ``[i]`` are fast."""
         if not self.size:
             return super().__getitem__(index)
         if type(index) is slice and index.start is None and index.step is None:
@@ -94,12 +93,12 @@ class DeviceArray(cla.Array):
 
 
 def buffer_of(array: cla.Array) -> cl.Buffer:
-    """Return the buffer that `array` begins, for what PyOpenCL does with buffers; its arrays may lie elsewhere."""
+    """Return the buffer of `array`, which must begin at the start of it."""
     return cast("cl.Buffer", array.data)
 
 
 def read_number(array: cla.Array, index: int) -> Any:
-    """Fetch one number of a flat array: as ``array[index].get()`` does, but for the view, which costs as much."""
+    """Fetch one number of a 1D array, without the view that ``array[index].get()`` makes."""
     if not 0 <= index < len(array):
         raise IndexError(f"index {index} of an array of {len(array)}")
     host = np.empty(1, array.dtype)
@@ -116,10 +115,7 @@ def make_array(
     data: cl.Buffer | None = None,
     offset: int = 0,
 ) -> DeviceArray:
-    """Return an array of `shape` in `data`, from the byte `offset` on, or in a buffer of its own.
-
-    Its content is what is there: of a new buffer, arbitrary.
-    """
+    """Return an array of `shape` at byte `offset` of `data`, or in a new buffer with arbitrary content."""
     shape = shape if isinstance(shape, tuple) else (int(shape),)
     if not _QUICK:
         return DeviceArray(queue, shape, dtype, data=data, offset=offset)

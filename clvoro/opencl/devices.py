@@ -1,7 +1,7 @@
-"""Devices: which ones work, and the best of them.
+"""Find OpenCL devices that work, and choose the best.
 
-A device counts only once a small kernel has been built and run on it: runtimes exist that list a
-device and cannot build anything for it.
+A device works if a small kernel has been built and run on it. Some runtimes list devices for which
+they cannot build kernels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ INSTALL_HINT = (
     "install a CPU runtime (`apt-get install pocl-opencl-icd`, or without root rights on x86-64 "
     'Linux `pip install "clvoro[cpu]"`) or your GPU\'s OpenCL driver'
 )
-"""The remedy in every message about a missing device."""
+"""Advice in messages about a missing device."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class DeviceInfo:
     platform, name, version : str
         As the runtime reports them.
     kind : str
-        ``"gpu"``, ``"cpu"``, ``"accelerator"`` or ``"simulator"`` (Oclgrind, never chosen unasked).
+        ``"gpu"``, ``"cpu"``, ``"accelerator"`` or ``"simulator"`` (Oclgrind, never the default).
     memory : int
         Global memory in bytes.
     units : int
@@ -50,11 +50,11 @@ class DeviceInfo:
     fp64 : bool
         Whether it computes in float64.
     works : bool
-        Whether a kernel has been built and run on it with the right result.
+        Whether a test kernel gives the right result.
     reason : str
         Why it does not work; empty if it does.
     default : bool
-        Whether `create_context()` picks it.
+        Whether `create_context()` takes it.
     """
 
     index: str
@@ -72,7 +72,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A device, where it stands in the lists of platforms, and how it is called."""
+    """A device with its indices and names."""
 
     index: str
     device: cl.Device
@@ -117,7 +117,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     Raises
     ------
     DeviceError
-        If no device that fits works; the message says what was found and what to install.
+        If no such device works. The message lists the devices found and what to install.
     InputTypeError
         If `device` is of another type.
     """
@@ -132,7 +132,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     if device is None and os.environ.get("PYOPENCL_CTX"):
         return _checked_context(_from_environment(), fp64)
 
-    # Indices ask that platform alone: the way around one that crashes.
+    # With indices no other platform is queried: some crash.
     index = re.fullmatch(r"\s*(\d+)\s*:\s*\d+\s*", device or "")
     found, broken = _candidates(only=int(index[1]) if index else None)
     if device is None or not device.strip():
@@ -152,10 +152,10 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Try every OpenCL device and return one entry for each, in the order of the platforms.
+    """Test every OpenCL device and return one entry for each, in the order of the platforms.
 
-    A child process tries them first, so that a runtime that crashes is listed with its reason. That
-    takes about a second.
+    A child process tests them first. So runtimes that crash are listed with a reason. This takes about
+    a second.
 
     Returns
     -------
@@ -194,7 +194,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def format_devices(devices: Sequence[DeviceInfo]) -> str:
-    """Return `devices` as a table in plain text; ``*`` marks the one that is used unasked."""
+    """Return `devices` as a table in plain text; ``*`` marks the default."""
     if not devices:
         return f"No OpenCL device found: {INSTALL_HINT}."
     header = ("", "index", "kind", "units", "memory", "float64", "works", "platform / device")
@@ -224,7 +224,7 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
     elif os.environ.get("PYOPENCL_CTX"):
         lines.append(f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} chooses no working device.")
     else:
-        lines.append(f"None is used unasked: {INSTALL_HINT}.")
+        lines.append(f"There is no default: {INSTALL_HINT}.")
     return "\n".join(lines)
 
 
@@ -241,13 +241,13 @@ def require_fp64(where: cl.Context | cl.Device, dtype: DTypeLike = np.float64) -
     device = getattr(where, "devices", [where])[0]  # a context, or the device itself
     if not has_fp64(device):
         raise DeviceError(
-            f"dtype is 'float64', but the device {device.name.strip()} has no double "
-            "precision; use dtype='float32', or another device (`clvoro devices` lists them)"
+            f"dtype is 'float64', but the device {device.name.strip()} has no double precision; use "
+            "dtype='float32', or another device (`clvoro devices` lists them)"
         )
 
 
 def _describe(device: cl.Device, index: str) -> _Candidate:
-    """Name a device; Oclgrind calls itself CPU, GPU and accelerator at once."""
+    """Return a device with its names. Oclgrind has the types CPU, GPU and accelerator at once."""
     platform, name = device.platform.name.strip(), device.name.strip()
     if "oclgrind" in f"{platform} {name}".lower():
         kind = "simulator"
@@ -263,16 +263,16 @@ def _describe(device: cl.Device, index: str) -> _Candidate:
 def _candidates(
     only: int | None = None, skip: Mapping[int, str] | None = None
 ) -> tuple[list[_Candidate], list[tuple[str, str, str]]]:
-    """Return all devices, and (index, platform, reason) of each platform that lists none.
+    """Return all devices, and (index, platform, reason) of each platform without any.
 
-    With `only`, no other platform is asked; neither are those in `skip`, which gives their reasons.
+    With `only`, no other platform is queried. `skip` has reasons not to query platforms.
     """
     try:
         platforms = cl.get_platforms()
-    except cl.Error:  # the loader's way of saying that there is no platform
+    except cl.Error:  # the loader raises if there is no platform
         return [], []
     if only is not None and only >= len(platforms):
-        only = None  # the message shall list what there is
+        only = None  # for the message, which lists all devices
     found: list[_Candidate] = []
     broken: list[tuple[str, str, str]] = []
     for p, platform in enumerate(platforms):
@@ -294,13 +294,13 @@ def _candidates(
 
 
 def _matching(found: Iterable[_Candidate], query: str) -> list[_Candidate]:
-    """Return the devices that `query` means: equal indices, else a platform's name or the kind, else a device's."""
+    """Return the devices that match `query`: by indices, else by platform or kind, else by name or vendor."""
     by_index = [c for c in found if c.index == query.replace(" ", "")]
     if by_index:
         return by_index
     text = query.lower()
     aliases = {"Portable Computing Language": "pocl"}
-    # The runtime before the device: PoCL calls a device by its processor, which may be an "Intel" one.
+    # Platforms first: PoCL names its device after the processor, such as "Intel".
     for parts in (
         lambda c: f"{c.platform} / {aliases.get(c.platform, '')}",
         lambda c: f"{c.device.vendor} / {c.platform} / {c.name}",
@@ -331,7 +331,7 @@ def _context_on(device: cl.Device) -> cl.Context:
 
 
 def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
-    """Return a context on exactly this device, or say why it is of no use."""
+    """Return a context on this device, or raise with the reason."""
     ctx, reason = _try_device(candidate.device, fp64)
     if ctx is None:
         raise DeviceError(
@@ -342,7 +342,7 @@ def _checked_context(candidate: _Candidate, fp64: bool) -> cl.Context:
 
 
 def _try_device(device: cl.Device, fp64: bool) -> tuple[cl.Context | None, str]:
-    """Return a context on `device`, or None and the reason why it is of no use."""
+    """Return a context on `device` and an empty string, or None and the reason against the device."""
     if fp64 and not has_fp64(device):
         return None, "it has no double precision (use dtype='float32')"
     start_workers(device)
@@ -350,7 +350,7 @@ def _try_device(device: cl.Device, fp64: bool) -> tuple[cl.Context | None, str]:
         ctx = _context_on(device)
     except cl.Error as error:
         return None, _probe.failure(error)
-    # In a context of the trial's own PoCL would load what it compiles with once more, which takes 0.4 s.
+    # A second context would make PoCL load its compiler's library again, which takes 0.4 s.
     reason = _probe.verdict(device, ctx)
     return (None, reason) if reason else (ctx, "")
 
@@ -360,7 +360,7 @@ def _default_index(
 ) -> str | None:
     """Return the index of the device that `create_context()` takes.
 
-    `avoid` are names of platforms that must not be asked.
+    `avoid` has names of platforms that must not be queried.
     """
     wish = os.environ.get("PYOPENCL_CTX")
     if wish:
@@ -386,9 +386,9 @@ def _complaint(
     chosen: bool,
     fp64: bool,
 ) -> str:
-    """Put together the message: what was looked for, what was there, what to do.
+    """Return the error message: the request, the devices found, and advice.
 
-    `chosen` tells that what is taken unasked may be another than the best of what was `found`.
+    `chosen` is True if a device was requested by indices or the environment.
     """
     lines = [subject]
     lines += [f"  tried {text}" for text in failures]
@@ -403,7 +403,7 @@ def _complaint(
     left = [c for c in others if c.kind != "simulator" and (has_fp64(c.device) or not fp64)]
     if left:
         best = min(left, key=lambda c: c.rank)
-        how = f"ask for {best.index!r}" if chosen else "leave the device out"
+        how = f"use device={best.index!r}" if chosen else "leave the device out"
         remedy = f"{how} to use {best.title}, or install the OpenCL driver of the one that you want"
-    lines.append(f"  remedy: {remedy}; `clvoro devices` shows the verdict on each device")
+    lines.append(f"  remedy: {remedy}; `clvoro devices` tests each device")
     return "\n".join(lines)

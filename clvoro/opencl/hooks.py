@@ -1,9 +1,9 @@
-"""Watch what is enqueued on a queue, whoever enqueues it.
+"""Watch all commands of a queue.
 
-While anything is watched, PyOpenCL's ways to enqueue something (`enqueue_nd_range_kernel`,
-`Kernel.__call__`, `enqueue_copy`, `enqueue_fill`) are replaced by ones that also show the event to
-the watchers of that queue, and `Kernel.set_args` notes the size of the buffers it binds. So no
-stage needs to know of it, and what is not watched is no slower.
+While a queue is watched, PyOpenCL's functions that enqueue commands (`enqueue_nd_range_kernel`,
+`Kernel.__call__`, `enqueue_copy`, `enqueue_fill`) are replaced by functions that also pass the event
+to the watchers, and `Kernel.set_args` records the sizes of buffers. So stages need no code for
+profiles, and runs without one are not slower.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any, Protocol
 import pyopencl as cl
 
 MEMORY = "memory"
-"""Stage of what is no kernel: copies, fills, reads and writes by the host."""
+"""Stage of copies, fills, reads and writes by the host."""
 ARRAYS = "arrays"
 """Stage of PyOpenCL's own kernels."""
 
 
 class Watcher(Protocol):
-    """Takes each event, its stage, the name of its kernel, its bytes if known, whether it has ended."""
+    """Called with each event, its stage and kernel, its bytes if known, and whether it has ended."""
 
     def __call__(
         self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
@@ -38,7 +38,7 @@ _original: dict[str, Callable[..., Any]] = {}
 
 @contextmanager
 def watching(queue: cl.CommandQueue, watcher: Watcher) -> Iterator[None]:
-    """Show every command on `queue` to `watcher` meanwhile."""
+    """Pass every command on `queue` to `watcher` inside the ``with`` block."""
     entry = (queue, watcher)
     with _lock:
         if not _watched:
@@ -84,7 +84,7 @@ def _set_args(kernel: cl.Kernel, *args: Any) -> None:
 
 
 def _bytes_of(arguments: tuple[Any, ...]) -> int:
-    """Return the sum of the sizes of the buffers (or of the arrays' buffers), each once."""
+    """Return the sum of the sizes of buffers, each counted once."""
     given = (getattr(a, "base_data", a) for a in arguments)
     buffers = {a.int_ptr: a.size for a in given if isinstance(a, cl.MemoryObject)}
     return sum(buffers.values())
@@ -99,7 +99,7 @@ def _enqueue_copy(queue: cl.CommandQueue, dest: Any, src: Any, **options: Any) -
     else:
         host = dest if name == "read" else src
         moved = getattr(host, "nbytes", None)
-    # A blocking transfer has ended, and its event would keep the host's array alive.
+    # A blocking transfer has ended. Its event would keep the host's array in memory.
     done = name != "copy" and options.get("is_blocking", True)
     for watch in _of(queue):
         watch(event, MEMORY, name, moved, done)

@@ -1,4 +1,4 @@
-"""How much memory this process may have on the host."""
+"""The memory that this process may use on the host."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-"""Where Linux says what control groups may take, and which ones this process is in."""
+"""Linux's files with the limits of control groups, and with those of this process."""
 
 
 def _group_limits() -> Iterator[float]:
     """Yield the limits of this process's control groups, as containers and batch systems set them."""
     paths = {(GROUPS, "memory.max", "."), (GROUPS / "memory", "memory.limit_in_bytes", ".")}
-    with contextlib.suppress(ValueError, OSError):  # not as expected, or none
+    with contextlib.suppress(ValueError, OSError):  # another format, or no such file
         for line in OWN_GROUPS.read_text().splitlines():
             _, kinds, path = line.split(":", 2)
             if not kinds:
@@ -29,9 +29,9 @@ def _group_limits() -> Iterator[float]:
 
 
 def host_memory() -> float:
-    """Return the bytes that the machine has, or fewer if a container, a batch system or the shell (ulimit -v) says so.
+    """Return the memory of the machine, or the limit of a container, a batch system or the shell (ulimit -v), in bytes.
 
-    Infinite where the system does not say.
+    Infinite if the system gives none.
     """
     limits = [math.inf]
     with contextlib.suppress(AttributeError, ValueError, OSError):  # systems other than POSIX

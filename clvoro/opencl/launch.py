@@ -1,4 +1,4 @@
-"""Launches of block-wise kernels that are repeated, and who makes do with one work-group."""
+"""Repeated launches of block-wise kernels."""
 
 from __future__ import annotations
 
@@ -9,20 +9,27 @@ from .engine import Engine
 from .kernels import bind, set_args, with_buffers
 
 
-def most_alone(engine: Engine) -> int:
-    """Return up to how many unknowns one work-group is through an iteration before others could be of help.
+def one_group_limit(engine: Engine) -> int:
+    """Return the number of unknowns up to which one work-group iterates faster than many.
 
-    On a CPU the launches of an iteration cost some 20 us, as much as a core takes for 500 unknowns; with two cores at
-    work, half of the unknowns would be its own in any case.
+    On a CPU the launches of an iteration take some 20 us. In this time a core does 500 unknowns.
     """
     return 2000 if engine.group_size == 1 else 4 * engine.group_size
 
 
 class Launch:
-    """A block-wise kernel with its arguments set: calling it costs no more than the enqueueing.
+    """A block-wise kernel with its arguments set. A call only enqueues it.
 
-    It is enqueued over as many `groups`, by default the engine's. The kernel must not be used elsewhere meanwhile, as
-    it has but one set of arguments.
+    The kernel must not be used elsewhere at the same time, because it has one set of arguments.
+
+    Parameters
+    ----------
+    engine : Engine
+    kernel : pyopencl.Kernel
+    *args
+        Arguments of the kernel.
+    groups : int, optional
+        Number of work-groups, by default the engine's.
     """
 
     def __init__(

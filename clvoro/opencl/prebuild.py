@@ -1,9 +1,9 @@
-"""Before a first run: let other processes build kernels that this one needs soon.
+"""Build kernels of a first run in other processes.
 
-PoCL builds one program or kernel at a time in a process, however many threads ask for it. So, if a device of PoCL is
-used for the first time, processes of its own (`build_worker`) build into PoCL's cache what a run of the same kind has
-been recorded to need (`first_kernels.json`, written by `bench/first_run.py --record`). They begin with what is needed
-last. What they have not built when this process needs it, this process builds itself.
+A process builds one PoCL program or kernel at a time, whatever the number of threads. So, before a first run with PoCL,
+worker processes (`build_worker`) build kernels into PoCL's cache. `first_kernels.json` lists the kernels of each kind
+of run; `bench/first_run.py --record` writes it. The workers begin with the kernels that are needed last. This process
+builds those that it needs before a worker has built them.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ class Work(NamedTuple):
 
 
 def start_workers(device: cl.Device) -> None:
-    """Start workers for `device` if nothing has been built for it; they prepare to compile, and wait for work."""
+    """Start workers for `device` if no kernel has been built for it. They load the compiler and wait for work."""
     if _is_new("device", device):
         _start(device)
 
 
 def build_ahead(engine: Engine) -> int:
-    """Let workers build what a run on `engine` needs, if none of this kind has been built for.
+    """Let workers build the kernels of a run on `engine`, if this is the first run of its kind.
 
     Returns
     -------
     int
-        Kernels that the run will need, by the record; 0 if they are built already, or nothing is recorded.
+        Number of recorded kernels of such a run; 0 if it is not the first, or nothing is recorded.
     """
     kind = kind_of(engine)
     recorded = _record().get(kind)
@@ -101,14 +101,14 @@ def _work(engine: Engine, recorded: dict) -> Work:
 
 
 def _share(launches: list[Launch], index: int, count: int) -> list[Launch]:
-    """Return the launches that worker `index` of `count` builds for: whole programs, the last needed first."""
+    """Return the launches for worker `index` of `count`: those of whole programs, in reverse order."""
     order = list(dict.fromkeys(launch.program for launch in reversed(launches)))
     mine = order[index::count]
     return [launch for launch in reversed(launches) if launch.program in mine]
 
 
 def _is_new(what: str, device: cl.Device) -> bool:
-    """Tell whether a marker for `what` on `device` is missing in the cache, and put it there."""
+    """Return whether the cache has no marker for `what` on `device`, and add the marker."""
     if device.platform.name.strip() != POCL or os.environ.get("POCL_KERNEL_CACHE") == "0":
         return False
     with contextlib.suppress(OSError, RuntimeError):
@@ -124,9 +124,9 @@ def _is_new(what: str, device: cl.Device) -> bool:
 
 
 def _start(device: cl.Device) -> None:
-    """Start workers, as many as there are idle cores; none if this process may not start others."""
+    """Start a worker for each other core; none if this process cannot start others."""
     name = Path(sys.executable or "").name
-    if not name.startswith(("python", "pypy")):  # an application with Python inside
+    if not name.startswith(("python", "pypy")):  # Python is embedded in an application
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     index = _index_of(device)
@@ -152,7 +152,7 @@ def _index_of(device: cl.Device) -> tuple[int, int]:
 
 
 def _send(worker: subprocess.Popen[bytes], work: Work) -> None:
-    """Give `worker` its work; one that has ended gets none."""
+    """Send `worker` its work, unless it has ended."""
     assert worker.stdin is not None
     with contextlib.suppress(OSError):
         pickle.dump((work.programs, [tuple(launch) for launch in work.launches]), worker.stdin)
@@ -160,7 +160,7 @@ def _send(worker: subprocess.Popen[bytes], work: Work) -> None:
 
 
 def _stop_workers() -> None:
-    """End the workers; what they have not built is built when it is needed."""
+    """End the workers."""
     for worker in _workers:
         if worker.poll() is None:
             worker.kill()

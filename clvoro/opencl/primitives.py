@@ -1,7 +1,7 @@
-"""Scans and reductions on the device, deterministic and without work-group scans.
+"""Deterministic scans and reductions on the device.
 
-pyopencl's generic scan was measured first: 3.4 ms for 1e6 integers on PoCL with two cores, where plain
-loops of `primitives.cl` take 0.5 ms, and 1.7 s to compile at the first use.
+PyOpenCL's scan takes 3.4 ms for 10^6 integers on PoCL with two cores, and 1.7 s to compile. The loops of
+`primitives.cl` take 0.5 ms.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .device_array import buffer_of, make_array
 from .engine import Engine
 
 AT_ONCE = 8
-"""Arrays that are summarized by one launch, at most."""
+"""Largest number of arrays that one launch summarizes."""
 
 
 def scan_width(engine: Engine) -> int:
@@ -34,7 +34,7 @@ class Scan:
         self.engine = engine
         cpu = bool(engine.queue.device.type & cl.device_type.CPU)
         self.width = scan_width(engine)
-        # On a CPU one work-item is through with so many before two launches are.
+        # On a CPU one work-item sums so many numbers in the time of two launches.
         self._few = 8192 if cpu else 0
         self._kernels = engine.kernels("opencl/primitives")
         self._sums = engine.empty(self.width, np.int32)
@@ -55,7 +55,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Summary:
-    """Sum, sum of magnitudes, least and largest of an array; `peak` is the largest magnitude."""
+    """Sum, sum of magnitudes, minimum and maximum of an array."""
 
     sum: float
     magnitude: float
@@ -69,12 +69,13 @@ class Summary:
 
 
 class Summaries:
-    """Summaries of named arrays, kept on the device until one `read` fetches them all.
+    """Summaries of named arrays, kept on the device until `read` fetches all of them in one transfer.
 
     Parameters
     ----------
+    engine : Engine
     names : sequence of str
-        At most 31: one slot each, in their order.
+        One slot each; at most 31.
     """
 
     def __init__(self, engine: Engine, names: Sequence[str]) -> None:
@@ -84,7 +85,7 @@ class Summaries:
         self._partials = engine.empty(6 * engine.groups * len(names))
         self._slots_of: dict[tuple[str, ...], tuple[np.ndarray, int]] = {}
         self._pending = 0
-        # Behind the figures there is room for an integer that the host reads with them.
+        # An integer follows the summaries; the host reads it in the same transfer.
         size = 4 * len(names) * engine.real.itemsize
         self._record = engine.zeros(size + np.dtype(np.int32).itemsize, np.uint8)
         shape = (len(names), 4)
@@ -95,7 +96,7 @@ class Summaries:
         self.collect_all({name: array}, n)
 
     def collect_all(self, arrays: Mapping[str, cla.Array], n: int) -> None:
-        """Summarize the first `n` of each of `AT_ONCE` arrays at most into the slot of its name."""
+        """Summarize the first `n` of each array into the slot of its name; at most `AT_ONCE` arrays."""
         given, names = list(arrays.values()), tuple(arrays)
         spare = given[:1] * (AT_ONCE - len(given))
         if names not in self._slots_of:
@@ -111,13 +112,13 @@ class Summaries:
 
     @property
     def values(self) -> cla.Array:
-        """What there is on the device: a row for each name of sum, sum of magnitudes, least, largest."""
+        """The device array of summaries: for each name the sum, the sum of magnitudes, minimum and maximum."""
         if self._pending:
             self._combine(None)
         return self._values
 
     def _combine(self, note: cla.Array | None) -> None:
-        """Bring the figures up to date, and put the first of `note` behind them."""
+        """Combine the partial summaries, and write the first number of `note` after them."""
         self.engine.run_each(
             self._kernels.combine_blocks, len(self.slots), self._partials, np.int32(self.engine.groups),
             np.int32(self._pending), np.int32(note is not None), self._record if note is None else note,
@@ -135,7 +136,7 @@ class Summaries:
         return self.read_with(None)[0]
 
     def read_with(self, other: cla.Array | None) -> tuple[dict[str, Summary], int]:
-        """Fetch every slot, and the first of `other`, int32, in the same transfer (0 if there is none)."""
+        """Fetch every slot and the first number of `other`, int32, in one transfer; the number is 0 without `other`."""
         if self._pending or other is not None:
             self._combine(other)
         size = self._values.nbytes
@@ -161,13 +162,20 @@ class Gather:
         return out
 
 
-class Room:
-    """Device arrays by name that grow when needed, by a share to `spare` more, and else are handed out again."""
+class NamedArrays:
+    """Device arrays by name, which are kept and grow when needed.
+
+    Parameters
+    ----------
+    engine : Engine
+    spare : float
+        Share of the size that a new array has more.
+    """
 
     def __init__(self, engine: Engine, spare: float = 0.0) -> None:
         self._engine, self._spare = engine, spare
         self._arrays: dict[tuple, cla.Array] = {}
-        # The part of each that was handed out last: to cut one costs as much as a launch.
+        # The last view of each: to make one takes as long as a launch.
         self._parts: dict[tuple, cla.Array] = {}
 
     def __call__(self, *name: object, size: int, dtype: DTypeLike | None = None) -> cla.Array:
@@ -175,7 +183,7 @@ class Room:
         array = self._arrays.get(name)
         if array is None or len(array) < size:
             room = max(size + int(self._spare * size), 1)
-            # Free the old one first.
+            # The old array is freed first.
             array = None
             self._arrays.pop(name, None)
             self._parts.pop(name, None)
@@ -186,12 +194,12 @@ class Room:
         return part
 
     def clear(self, *names: object) -> None:
-        """Let go of all arrays, or of those whose names begin with one of `names`."""
+        """Free all arrays, or those whose names begin with one of `names`."""
         gone = [n for n in self._arrays if not names or n[0] in names]
         for name in gone:
             del self._arrays[name]
             self._parts.pop(name, None)
 
     def zeros(self, *name: object, size: int, dtype: DTypeLike | None = None) -> cla.Array:
-        """Return the same, filled with zeros."""
+        """Return the same array filled with zeros."""
         return self(*name, size=size, dtype=dtype).fill(0)

@@ -1,4 +1,4 @@
-"""Does a device work? Build and run a small kernel on it, and see what comes back."""
+"""Test devices: build and run a small kernel, and check its result."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ _PROBE_SIZE = 64
 _lock = threading.Lock()
 _verdicts: dict[int, str] = {}
 _process: int | None = None
-"""The process in which OpenCL is at work."""
+"""The process that uses OpenCL."""
 
 
 def check_process() -> None:
-    """Refuse a process that was forked from one where OpenCL is at work: without its threads, calls wait for ever.
+    """Raise if this process was forked from one that uses OpenCL: calls hang without its threads.
 
     Raises
     ------
@@ -49,21 +49,21 @@ def check_process() -> None:
         _process = os.getpid()
     if _process != os.getpid():
         raise DeviceError(
-            "this process was forked from one that has used OpenCL, whose threads did not come along; start processes "
-            "anew, as by multiprocessing.get_context('spawn'), or fork before anything of clvoro is used"
+            "this process was forked from one that uses OpenCL, whose threads it lacks; expected a spawned process; "
+            "use multiprocessing.get_context('spawn'), or fork before clvoro is used"
         )
 
 
 def has_fp64(device: cl.Device) -> bool:
-    """Tell whether `device` computes in float64."""
+    """Return whether `device` computes in float64."""
     try:
         return bool(device.double_fp_config) or "cl_khr_fp64" in device.extensions.split()
-    except cl.Error:  # the query is unknown to runtimes without the extension
+    except cl.Error:  # runtimes without the extension do not know the query
         return False
 
 
 def verdict(device: cl.Device, ctx: cl.Context | None = None) -> str:
-    """Return why `device` does not work, or an empty string; a device is tried once, in `ctx` if one is given."""
+    """Return the reason why `device` does not work, or an empty string. A device is tested once, in `ctx` if given."""
     key = device.int_ptr
     with _lock:
         if key not in _verdicts:
@@ -72,7 +72,7 @@ def verdict(device: cl.Device, ctx: cl.Context | None = None) -> str:
 
 
 def probe(device: cl.Device, ctx: cl.Context | None = None) -> str:
-    """Build and run a small kernel on `device`; return what went wrong, or an empty string."""
+    """Build and run a small kernel on `device`; return the reason of a failure, or an empty string."""
     try:
         if not device.available or not device.compiler_available:
             return "the runtime says that it is not available"
@@ -87,7 +87,7 @@ def probe(device: cl.Device, ctx: cl.Context | None = None) -> str:
         program.clvoro_probe(queue, (_PROBE_SIZE,), None, given, out)
         cl.enqueue_copy(queue, got, out)
         queue.finish()
-    except Exception as error:  # whatever a broken runtime does, it is that device's verdict
+    except Exception as error:  # a broken runtime may raise anything
         return failure(error)
     if not np.array_equal(got, 4 * values):
         return "it computes wrong results"
@@ -100,15 +100,14 @@ def failure(error: Exception) -> str:
 
 
 def crashing_platforms(timeout: float = 300.0) -> dict[int, str]:
-    """Try all devices of all platforms in a child process; return those that end it, and how.
+    """Test all devices in a child process; return the platforms that end the process.
 
-    Runtimes do that: PoCL, for one, calls `abort` while it lists its devices, if it is refused
-    `/sys` or finds too little memory.
+    For example, PoCL calls `abort` if it cannot read `/sys` or finds too little memory.
 
     Returns
     -------
     dict
-        Reason by the platform's index; empty too if no child process can be started.
+        Reason by the platform's index; empty if no child process can be started.
     """
     crashed: dict[int, str] = {}
     search = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
@@ -129,7 +128,7 @@ def crashing_platforms(timeout: float = 300.0) -> dict[int, str]:
         except subprocess.TimeoutExpired as error:
             out = error.stdout.decode(errors="replace") if error.stdout else ""
             code, last_words, how = -1, "", f"it does not answer within {timeout:g} seconds"
-        except (OSError, TypeError, ValueError):  # Python is embedded, or may not start processes
+        except (OSError, TypeError, ValueError):  # Python is embedded, or cannot start processes
             return crashed
         begun = [int(line) for line in out.split() if line.isdigit()]
         if code == 0 or not begun or begun[-1] in crashed:
@@ -139,7 +138,7 @@ def crashing_platforms(timeout: float = 300.0) -> dict[int, str]:
 
 
 def survey() -> None:
-    """Try all devices, print each platform's index before; leave out the indices in `sys.argv`."""
+    """Test all devices, except for platforms with indices in `sys.argv`; print each platform's index before."""
     from . import devices as device  # noqa: F401  prepares the runtimes
 
     try:
@@ -153,12 +152,12 @@ def survey() -> None:
         try:
             for each in platform.get_devices():
                 probe(each)
-        except cl.Error:  # the parent meets it too, and reports it
+        except cl.Error:  # the parent process reports it
             pass
 
 
 def _ending(code: int) -> str:
-    """Name the signal that ended a child process, or its exit code."""
+    """Return the name of the signal that ended a child process, or its exit code."""
     try:
         return signal.Signals(-code).name
     except ValueError:
@@ -166,6 +165,6 @@ def _ending(code: int) -> str:
 
 
 def one_line(text: str, limit: int) -> str:
-    """Fold a message, often a compiler's log, into one line of at most `limit` characters."""
+    """Return a message, such as a compiler's log, as one line of at most `limit` characters."""
     folded = " ".join(text.split())
     return folded if len(folded) <= limit else folded[: limit - 3] + "..."

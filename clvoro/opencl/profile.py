@@ -1,6 +1,6 @@
-"""Where the time of a run goes: every kernel's own time, from the device's events.
+"""The time that each kernel of a run takes, from the device's events.
 
-Every command is timed, by whichever stage it is enqueued (see `_hooks`). A run without a profile keeps no events.
+All commands of a queue are timed (see `hooks`). A run without a profile keeps no events.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from ..adapter import Adapter
 
 PENDING = 2048
-"""Most events that are kept: the older half is then read and let go, while the newer ones run."""
+"""Largest number of events that are kept. Then the older half is read and released."""
 LARGE = 256 << 20
-"""Bytes of the buffer that is copied to measure the bandwidth: more than any cache holds."""
+"""Bytes of the buffer that is copied to measure the bandwidth; larger than caches."""
 
 _bandwidths: dict[int, float] = {}
 
 
 class Profile:
-    """Times everything that an adapter does on the device while the profile is open.
+    """Times all commands of an adapter on the device while the profile is open.
 
-    The adapter works on another queue of its context meanwhile, one whose events know their times,
-    with buffers of its own. A first run also compiles; profile a second one to leave that out.
+    Meanwhile the adapter uses another queue, with profiling enabled, and other buffers. A first run
+    also builds kernels: profile a second one.
 
     Parameters
     ----------
@@ -42,11 +42,11 @@ class Profile:
     Attributes
     ----------
     costs : dict of (str, str) to Cost
-        Per stage and kernel; a stage is a file of kernels. Complete once the profile is closed.
+        Per stage and kernel; a stage is a file of kernels. Complete after the profile is closed.
     spans : list of Span
-        The history's rows, each with the time that led to it, and what came after the last.
+        The time before each row of the history, and that after the last row.
     wall, building : float
-        Seconds by the clock between opening and closing, and those of them that went into building programs.
+        Wall time in seconds between opening and closing, and the part of it that built programs.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class Profile:
         try:
             self._collect(len(self._pending))
         except cl.Error:
-            if kind is None:  # otherwise the run has failed, and has said why
+            if kind is None:  # otherwise the run has raised its own error
                 raise
         finally:
             self._pending.clear()
@@ -103,12 +103,12 @@ class Profile:
             self.spans.append(self._span)
             self._closing.close()
 
-    # What the hooks and the loop call.
+    # Called by the hooks and by the run.
 
     def _add(
         self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False
     ) -> None:
-        """Note a command; `moved` are its bytes if they are known, `done` tells that it has ended."""
+        """Record a command; `moved` are its bytes, if known, and `done` is True if it has ended."""
         entry = (event, (stage, name), moved, self._span)
         if done:
             self._count(*entry)
@@ -125,7 +125,7 @@ class Profile:
         self._span = Span(now)
 
     def _collect(self, count: int) -> None:
-        """Wait for the oldest `count` events, read their times, let them go."""
+        """Wait for the oldest `count` events, read their times and release them."""
         if count:
             self._pending[count - 1][0].wait()
         for entry in self._pending[:count]:
@@ -141,14 +141,14 @@ class Profile:
         cost.seconds += seconds
         if moved is not None:
             cost.bytes += moved
-            # Between host and device it is another memory's bandwidth that counts.
+            # Transfers between host and device have another bandwidth.
             if key[1] not in ("read", "write") or key[0] != _hooks.MEMORY:
                 cost.seconds_known += seconds
             elif key[1] == "read":
                 span.read += moved
         span.stages[key[0]] = span.stages.get(key[0], 0.0) + seconds
 
-    # What came of it.
+    # Results.
 
     @property
     def launches(self) -> int:
@@ -162,7 +162,7 @@ class Profile:
 
     @property
     def host(self) -> float:
-        """Seconds that it did not: the host's own work, building programs, launches, waiting."""
+        """Seconds that the device did not work: work of the host, building of programs, launches, waiting."""
         return self.wall - self.device
 
     @property
@@ -190,7 +190,7 @@ class Profile:
         return dict(sorted(sums.items(), key=lambda item: -item[1].seconds))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all of it as numbers, strings, lists and dicts; times in seconds, shares of `wall`."""
+        """Return all figures in a form for JSON; times in seconds, shares of `wall`."""
         self._require_closed()
 
         def figures(cost: Cost) -> dict[str, Any]:
@@ -229,8 +229,8 @@ class Profile:
     def _require_closed(self) -> None:
         if not self.spans or self.spans[-1].step is not None:
             raise InputError(
-                "the profile is open or has never been opened, expected a closed one; ask for its "
-                "figures after the `with` block"
+                "the profile is open or has never been opened, expected a closed one; use it after "
+                "the `with` block"
             )
 
     def ranked(self) -> list[tuple[tuple[str, str], Cost]]:
@@ -239,23 +239,21 @@ class Profile:
 
 
 def profiled_queue(ctx: cl.Context) -> cl.CommandQueue:
-    """Return a queue whose events know their times."""
+    """Return a queue with profiling enabled."""
     return cl.CommandQueue(ctx, properties=cl.command_queue_properties.PROFILING_ENABLE)
 
 
 def copy_bandwidth(ctx: cl.Context, repeat: int = 5) -> float:
-    """Return the bytes per second that are read and written by copying a large buffer on the device.
+    """Return the bytes per second that a copy of a large buffer on the device reads and writes.
 
-    The better of the driver's own copy, which on a CPU may use one core only, and a kernel's; the
-    best of `repeat` calls.
+    The best of `repeat` copies by the driver, which may use one core of a CPU only, and by a kernel.
     """
     queue = profiled_queue(ctx)
     device = queue.device
     size = min(LARGE, device.max_mem_alloc_size // 4, device.global_mem_size // 8) // 4096 * 4096
     source, target = (cl.Buffer(ctx, cl.mem_flags.READ_WRITE, size) for _ in range(2))
-    cl.enqueue_fill(
-        queue, source, np.ones(1, np.int8), size
-    )  # pages exist once they have been written
+    # The first write allocates the pages.
+    cl.enqueue_fill(queue, source, np.ones(1, np.int8), size)
     kernel = build_program(ctx, "opencl/copy.cl", {}, "").all_kernels()[0]
     kernel.set_args(source, target)
     best = float("inf")

@@ -1,19 +1,18 @@
-"""What OpenCL runtimes need before the first query of platforms: to be found, and a cache to write.
+"""Prepare OpenCL runtimes before the first query of platforms: register Intel's, and provide a kernel cache.
 
-pip cannot write to `/etc/OpenCL/vendors`, where the loader looks for runtimes. Intel's CPU runtime
-(`pip install "clvoro[cpu]"`) therefore lies in `<prefix>/lib` unseen. Loaders read two further
-places that only *add* to the system's runtimes, and both are filled here, before the first query
-of platforms:
+The loader looks for runtimes in `/etc/OpenCL/vendors`, where pip cannot write. So it does not find
+Intel's CPU runtime (`pip install "clvoro[cpu]"`), which lies in `<prefix>/lib`. Loaders read two
+more places, which *add* runtimes to those of the system. Both are filled here:
 
-- `$PYOPENCL_HOME/.libs/*.icd`, in the loader that PyOpenCL's wheel brings (ocl-icd). PyOpenCL
-  points that variable at its own folder when imported; the folder made here repeats its entries.
-- `$OCL_ICD_FILENAMES`, in Khronos' loader, which other builds of PyOpenCL use.
+- `$PYOPENCL_HOME/.libs/*.icd`, for the loader in PyOpenCL's wheel (ocl-icd). When imported,
+  PyOpenCL sets the variable to its own folder; the folder made here repeats its entries.
+- `$OCL_ICD_FILENAMES`, for Khronos' loader, which other builds of PyOpenCL use.
 
-`OCL_ICD_VENDORS` would *replace* the system's runtimes, and stays the user's.
+`OCL_ICD_VENDORS` would *replace* the system's runtimes. It is not changed.
 
-PoCL lists no device and PyOpenCL's cache of binaries raises if the user's cache folder cannot be
-written (a container under a foreign user id, a cluster's read-only home), and PoCL ends the process
-if its disk is full. The process then gets a cache of its own.
+If the user's cache folder is not writable (in a container, on a cluster), PoCL lists no device and
+PyOpenCL's cache of binaries raises. If its disk is full, PoCL ends the process. In both cases the
+process gets a temporary cache.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from importlib import metadata
 from pathlib import Path
 
 _ROOM = 1 << 22
-"""Bytes that must be left where kernels are cached: those of a run take two to twenty million."""
+"""Bytes that must be free in the cache. The kernels of a run take 2 to 20 MB."""
 _DISTRIBUTION = "intel-opencl-rt"
 _LIBRARY = "libintelocl.so"
 
 
 def prepare() -> None:
-    """Do both; call it after `import pyopencl` and before the first query of platforms."""
+    """Provide a cache and register Intel's runtime; call it after `import pyopencl`, before platforms are queried."""
     provide_cache()
-    announce()
+    register_runtime()
 
 
 def provide_cache() -> Path | None:
@@ -45,11 +44,13 @@ def provide_cache() -> Path | None:
     Returns
     -------
     pathlib.Path or None
-        The temporary folder, if one was needed and there is a place for it. It goes away with this process.
+        The temporary folder, if one is needed and can be made. It is removed when this process ends.
     """
     if not sys.platform.startswith("linux"):
         return None
-    with contextlib.suppress(OSError, RuntimeError):  # no such folder can be made, or nobody's home
+    with contextlib.suppress(
+        OSError, RuntimeError
+    ):  # the folder cannot be made, or the user has no home
         place = cache_home()
         place.mkdir(parents=True, exist_ok=True)
         if _has_room(place):
@@ -60,29 +61,29 @@ def provide_cache() -> Path | None:
                 folder = _temporary_folder(parent)
                 os.environ["XDG_CACHE_HOME"] = str(folder)
                 return folder
-    return None  # devices that do not work then are reported with `cache_remedy`
+    return None  # messages about devices that do not work include `cache_remedy`
 
 
 def _has_room(folder: Path | str | None) -> bool:
-    """Tell whether files can be made in `folder`, with `_ROOM` bytes; None: where temporary files go."""
+    """Return whether `_ROOM` bytes can be written to `folder`, or with None to the folder of temporary files."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             os.posix_fallocate(file.fileno(), 0, _ROOM)
-    except OSError as error:  # not every file system can tell by this call
+    except OSError as error:  # not every file system supports this call
         return error.errno in (errno.EINVAL, errno.EOPNOTSUPP)
     return True
 
 
 def cache_remedy() -> str:
-    """Return what to do about kernels in caches that are damaged or full: runtimes do not recover from that."""
+    """Return advice about damaged or full kernel caches, which runtimes do not repair."""
     try:
         home = cache_home()
-    except RuntimeError:  # nobody's home
+    except RuntimeError:  # the user has no home
         home = Path("~/.cache")
     pocl = os.environ.get("POCL_CACHE_DIR") or home / "pocl"
     return (
-        f"If kernels in a cache are damaged (after a power cut, say), remove {pocl} and {home / 'pytools'}; if its "
-        "disk is full or not to be written, set XDG_CACHE_HOME to another folder"
+        f"If kernels in a cache are damaged (after a power cut, say), remove {pocl} and {home / 'pytools'}; if "
+        "its disk is full or not writable, set XDG_CACHE_HOME to another folder"
     )
 
 
@@ -91,16 +92,16 @@ def cache_home() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
-def announce() -> Path | None:
-    """Announce Intel's CPU runtime, if pip installed it and nobody announced it before.
+def register_runtime() -> Path | None:
+    """Register Intel's CPU runtime, if pip has installed it and the loader does not know it.
 
-    Costs a fraction of a millisecond when the runtime is not installed. Never raises: a runtime
-    that cannot be announced is a device less, which the choice of a device reports.
+    Takes a fraction of a millisecond if the runtime is not installed. Never raises: a missing runtime
+    is reported when a device is chosen.
 
     Returns
     -------
     pathlib.Path or None
-        The runtime's library, if it was announced.
+        The runtime's library, if it was registered.
     """
     if not sys.platform.startswith("linux"):
         return None
@@ -112,7 +113,7 @@ def announce() -> Path | None:
     except (OSError, RuntimeError, ValueError, metadata.PackageNotFoundError):
         return None
     os.environ["PYOPENCL_HOME"] = str(home)
-    # A child process inherits this variable, while PyOpenCL resets the other one in it.
+    # Child processes inherit this variable. In them PyOpenCL sets the other one again.
     others = os.environ.get("OCL_ICD_FILENAMES", "")
     if "intelocl" not in others:
         os.environ["OCL_ICD_FILENAMES"] = f"{others}:{library}" if others else str(library)
@@ -129,11 +130,11 @@ def _installed_library() -> Path | None:
 
 
 def _known_to_system() -> bool:
-    """Tell whether the loader finds an Intel CPU runtime anyway; two copies would collide."""
+    """Return whether the loader finds another Intel CPU runtime; two copies would collide."""
     vendors = os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH")
     place = Path(vendors or "/etc/OpenCL/vendors")
     entries = place.glob("*.icd") if place.is_dir() else [place] if place.is_file() else []
-    # The library must exist too: a removed oneAPI leaves its entry behind.
+    # The library must exist, too. When oneAPI is removed, its entry stays.
     for entry in entries:
         name = entry.read_text(errors="replace").strip()
         if "intelocl" in name and (os.sep not in name or Path(name).is_file()):
@@ -144,8 +145,8 @@ def _known_to_system() -> bool:
 def _loader_home(library: Path) -> Path:
     """Return a folder with `.libs/*.icd` for the loader: PyOpenCL's own entries and `library`.
 
-    The folder's name is a hash of what is in it, so that environments do not disturb each other
-    and a second process finds it complete.
+    The folder's name is a hash of its content. So environments do not share a folder, and other
+    processes find it complete.
     """
     own = Path(os.environ.get("PYOPENCL_HOME", os.devnull)) / ".libs"
     entries = {"clvoro-intel-cpu.icd": str(library)}
@@ -159,7 +160,7 @@ def _loader_home(library: Path) -> Path:
 
 
 def _write_home(home: Path, entries: dict[str, str]) -> Path:
-    """Fill `home`, file by file with an atomic replace, unless all is there already."""
+    """Write missing files to `home`, each by an atomic replace."""
     folder = home / ".libs"
     folder.mkdir(parents=True, exist_ok=True)
     for name, library in entries.items():
@@ -173,12 +174,12 @@ def _write_home(home: Path, entries: dict[str, str]) -> Path:
 
 
 def _temporary_folder(parent: str | None = None) -> Path:
-    """Make a private temporary folder that goes away with this process."""
+    """Make a private temporary folder, which is removed when this process ends."""
     import atexit
     import shutil
 
     folder = Path(tempfile.mkdtemp(prefix="clvoro-cache-", dir=parent))
-    owner = os.getpid()  # a forked child runs the hook too, and must leave the folder
+    owner = os.getpid()  # forked children call `remove`, too, and must keep the folder
 
     def remove() -> None:
         if os.getpid() == owner:

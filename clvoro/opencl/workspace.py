@@ -1,14 +1,13 @@
-"""Device memory that stages use in turn.
+"""A stack of device memory for temporary arrays.
 
-Much of what a stage works on is of no use to anybody once it is done: lists of candidate faces, the vectors of a linear
-solve, the marks of insertions. Such arrays are taken from one stretch of memory for the time of a frame,
+Stages need temporary arrays: lists of candidate faces, the vectors of a linear solve. They take them from the workspace
+for the time of a frame,
 
     with engine.workspace.frame():
         marks = engine.scratch(n, np.int32)
 
-or by a method that is `framed`, as local variables are from the stack of a program: frames nest, and at the end of one
-all that was taken within it is given back, to be taken by the next. The queue is in order, so that commands which still
-use it are done by then.
+or in a method with the decorator `framed`. Frames nest. At the end of a frame its memory is free for other arrays.
+Commands that still use it are done before, because the queue is in order.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from .device_array import make_array
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 MOST_VIEWS = 1000
-"""Arrays that are kept to be taken again; numbers of faces, say, change from step to step."""
+"""Largest number of arrays that are kept. Sizes, such as the number of faces, change from step to step."""
 
 
 def framed(method: Method) -> Method:
-    """Have a stage's method run within a frame of its engine's workspace."""
+    """Decorate a method of a stage: it runs in a frame of its engine's workspace."""
 
     @wraps(method)
     def run(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -43,8 +42,8 @@ def framed(method: Method) -> Method:
 class Workspace:
     """A stack of device arrays.
 
-    The memory grows while a frame needs more than any before and is then kept, in one piece: what is repeated step by
-    step allocates nothing.
+    The memory grows when a frame needs more than all before, and is kept in one piece. So repeated steps allocate
+    nothing.
 
     Parameters
     ----------
@@ -53,29 +52,29 @@ class Workspace:
 
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
-        # Sub-buffers have to begin at multiples of this; a cache line at least keeps arrays apart.
+        # Sub-buffers must begin at multiples of this. No two arrays share a cache line.
         self._unit = max(64, queue.device.mem_base_addr_align // 8)
-        # Per frame that is open, what was taken of each piece when it began.
+        # For each open frame, the bytes in use of each piece when it began.
         self._before: list[list[int]] = []
         self.clear()
 
     def clear(self) -> None:
-        """Let go of all memory, outside of any frame; within one, nothing is done."""
+        """Free all memory, if no frame is open."""
         if self._before:
             return
-        # Each piece is taken from its beginning on; so many bytes of it are.
+        # The pieces, and the bytes in use from the start of each.
         self._pieces: list[cl.Buffer] = []
         self._taken: list[int] = []
         self._views: dict[tuple[object, ...], tuple[cla.Array, int]] = {}
         self._most = 0
 
     def frame(self) -> Workspace:
-        """Return what, at the end of a ``with``, gives back all that is taken meanwhile."""
+        """Return a context manager; at its end all arrays taken inside are given back."""
         return self
 
     def __enter__(self) -> None:
         if not self._before and len(self._pieces) > 1:
-            # One piece in the place of those that it took to find out how much is needed.
+            # The size is known now: one piece replaces the others.
             self._pieces, self._taken, self._views = [], [], {}
             self._add(self._most)
         if not self._before and len(self._views) > MOST_VIEWS:
@@ -87,7 +86,7 @@ class Workspace:
         self._taken[:] = before + [0] * (len(self._pieces) - len(before))
 
     def take(self, shape: int | tuple[int, ...], dtype: np.dtype) -> cla.Array | None:
-        """Return an array whose content is arbitrary, valid to the end of the frame; None outside of any."""
+        """Return an array with arbitrary content, valid to the end of the frame; None if no frame is open."""
         if not self._before:
             return None
         if len(self._taken) == 1:
@@ -106,7 +105,7 @@ class Workspace:
         start = self._taken[number]
         key = number, start, shape, dtype
         if key not in self._views:
-            # Kept with its end, as to make one costs as much as a launch.
+            # The view is kept, because to make one takes as long as a launch.
             view = self._pieces[number].get_sub_region(start, size)
             self._views[key] = make_array(self._queue, shape, dtype, view), start + size
         array, self._taken[number] = self._views[key]

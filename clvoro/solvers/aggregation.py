@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.primitives import Room, Scan
+from ..opencl.primitives import NamedArrays, Scan
 
 MATCHING_ROUNDS = 3
 """Rounds of matching per pass. The third still matches every fifth cell; a fourth is not worth its time."""
@@ -111,7 +111,7 @@ class Aggregation:
         self._kernels_of: dict[np.dtype, Kernels] = {}
         self._kernels = self._kernels_from(engine.real)
         self._scan = Scan(engine)
-        self._room = Room(engine)
+        self._room = NamedArrays(engine)
         self.exponent = 0
 
     def _kernels_from(self, source: np.dtype) -> Kernels:

@@ -13,7 +13,7 @@ import pyopencl.array as cla
 from ..errors import SolverError
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.launch import Launch, most_alone
+from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
 
 Apply = Callable[[cla.Array, cla.Array], object]
@@ -138,7 +138,7 @@ class ConjugateGradient:
         self.state = engine.zeros(6)
         self._record_capacity = 0
         self._group_state = engine.zeros(_STATE + 4)
-        self._most_alone = most_alone(engine)
+        self._one_group_limit = one_group_limit(engine)
 
     def kernels_in(self, store: np.dtype) -> Kernels:
         """Return the kernels for vectors in `store`."""
@@ -192,7 +192,7 @@ class ConjugateGradient:
             self.record = self.engine.zeros(4 * (limits.max_iterations + 1))
             self._group_state = self.engine.zeros(_STATE + 4 * (limits.max_iterations + 1))
         if operator.rows is not None and isinstance(precondition, cla.Array):
-            if len(rhs) <= self._most_alone:
+            if len(rhs) <= self._one_group_limit:
                 return self._solve_by_group(
                     operator, rhs, x, precondition, limits, from_zero, store
                 )

@@ -12,8 +12,8 @@ import pyopencl.array as cla
 
 from ..opencl.engine import Engine
 from ..opencl.kernels import bind, comparison_key
-from ..opencl.launch import most_alone
-from ..opencl.primitives import Room
+from ..opencl.launch import one_group_limit
+from ..opencl.primitives import NamedArrays
 from .aggregation import WORK_GROUP, Aggregates, Graph, PairInverse, round_to_work_group
 
 # Chebyshev's polynomial of degree 2 on [_LOWEST, 2], as the damping factors of two steps. Smaller eigenvalues are left
@@ -52,8 +52,8 @@ class Cycle:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._most_alone = most_alone(engine)
-        self._room = Room(engine)
+        self._one_group_limit = one_group_limit(engine)
+        self._room = NamedArrays(engine)
         self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
         self.clear()
 
@@ -110,7 +110,7 @@ class Cycle:
     def _is_small(self, depth: int) -> bool:
         """Tell whether one work-group does all steps of a level."""
         level = self._levels[depth]
-        return depth > 0 and level.aggregates is not None and len(level) <= self._most_alone
+        return depth > 0 and level.aggregates is not None and len(level) <= self._one_group_limit
 
     def _descend(self, depth: int, r: cla.Array | None) -> None:
         """Smooth from zero and restrict the defect. The right side is rounded from `r`, if given."""

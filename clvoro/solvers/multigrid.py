@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..opencl.engine import Engine
-from ..opencl.primitives import Room
+from ..opencl.primitives import NamedArrays
 from .aggregation import Aggregates, Aggregation, Graph, PairInverse
 from .cycle import Cycle, Level
 
@@ -113,7 +113,7 @@ class Multigrid:
         self._kernels = self._single.kernels("solvers/multigrid", {"SOURCE": "float"})
         self._aggregation = Aggregation(self._single)
         self._cycle = Cycle(self._single)
-        self._room = Room(self._single)
+        self._room = NamedArrays(self._single)
         self._levels: list[Level] = []
         self._factor: cla.Array | None = None
 

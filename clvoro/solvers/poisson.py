@@ -16,7 +16,7 @@ import pyopencl.array as cla
 from ..errors import InputError
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.launch import Launch, most_alone
+from ..opencl.launch import Launch, one_group_limit
 from .conjugate_gradient import (
     CURVATURE,
     BreakdownError,
@@ -328,7 +328,7 @@ class Poisson:
         )
         system = _System(laplacian, operator, rhs, potential, tolerance)
         if preconditioner == "auto":
-            one_group = n <= most_alone(self.engine)
+            one_group = n <= one_group_limit(self.engine)
             jacobi, multigrid = expected_costs(n, self.engine.dim, tolerance, one_group)
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
         if preconditioner == "jacobi":

@@ -14,7 +14,7 @@ import pyopencl.array as cla
 from ..errors import SolverError
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from ..opencl.launch import Launch, most_alone
+from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
 from ..tessellation.device_diagram import Tessellation
 from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING, Limits, Solution
@@ -95,7 +95,7 @@ class VolumeProjection:
         self._record = engine.zeros(4 * 64)
         self._kernels: dict[np.dtype, Kernels] = {}
         self._ahead = 8
-        self._most_alone = most_alone(engine)
+        self._one_group_limit = one_group_limit(engine)
 
     def _kernels_in(self, store: np.dtype) -> Kernels:
         if store not in self._kernels:
@@ -163,7 +163,7 @@ class VolumeProjection:
         store = np.dtype(np.float32) if single else engine.real
         v, k = self._reserve(n, m, store, most), self._kernels_in(store)
         start = engine.scratch(n, np.float32) if start is None else start
-        groups = 1 if n <= self._most_alone else engine.groups
+        groups = 1 if n <= self._one_group_limit else engine.groups
         Launch(
             engine, k.assemble_projection, np.int32(n), np.int32(m), t.starts, t.neighbors, t.face_measures,
             t.face_centroids, t.volumes, t.points, targets.gradient, targets.h, targets.quality,

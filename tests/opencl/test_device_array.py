@@ -1,4 +1,4 @@
-"""Device arrays made the quick way are as PyOpenCL's own, and as NumPy's."""
+"""Device arrays behave as PyOpenCL's and NumPy's."""
 
 import numpy as np
 import pyopencl as cl
@@ -16,7 +16,7 @@ def queue(ctx):
 
 @pytest.fixture(params=[True, False])
 def quick(request, monkeypatch):
-    """Also where PyOpenCL has no constructor that trusts its arguments."""
+    """Also without PyOpenCL's private option to skip checks."""
     monkeypatch.setattr(_device_array, "_QUICK", request.param and _device_array._QUICK)
 
 
@@ -92,7 +92,7 @@ def test_an_index_too_deep_is_refused(queue):
 @pytest.mark.parametrize("size", [1, 2, 3, 16, 33, 1000, 1024])
 @pytest.mark.parametrize("value", [0, 5])
 def test_a_fill_reaches_all_and_no_more(queue, dtype, size, value):
-    """Of a whole array, of its first items and from an odd place on: each has another largest pattern that fits."""
+    """A whole array, its first items, and items from an odd offset on have different largest patterns."""
     array = make_array(queue, size + 40, np.dtype(dtype))
     for begin in (0, 1, 8):
         host = np.arange(size + 40).astype(dtype)

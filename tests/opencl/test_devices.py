@@ -1,4 +1,4 @@
-"""Devices: the probe, the choice, the messages; and runtimes that pip installed."""
+"""Tests of devices, their choice, error messages, and the registration of Intel's runtime."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 
 class FakeDevice:
-    """As much of a pyopencl.Device as the choice looks at."""
+    """The attributes of a pyopencl.Device that the choice uses."""
 
     def __init__(self, key, platform, name, kind, fp64=True, vendor="Maker"):
         self.int_ptr, self.name, self.type, self.vendor = key, name, kind, vendor
@@ -38,7 +38,7 @@ BIG_GPU = FakeDevice(-5, "Vendor", "Tensor 9000", GPU)
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Pretend that a machine has some devices, of which some are broken; contexts are the lists."""
+    """Replace the devices of the machine by given ones, some of them broken; a context is a list of devices."""
 
     def install(*devices, broken=()):
         monkeypatch.delenv("PYOPENCL_CTX", raising=False)
@@ -90,7 +90,7 @@ def test_runtime_comes_before_the_name_of_a_processor(machine, query):
     assert device.create_context(query) == device.create_context("genuine") == [ON_INTEL]
 
 
-def test_simulator_is_never_taken_unasked(machine):
+def test_simulator_is_never_the_default(machine):
     machine(GRIND)
     with pytest.raises(DeviceError, match="pocl-opencl-icd"):
         device.create_context()
@@ -127,7 +127,7 @@ def test_choice_by_name_kind_and_index(machine, query, expected):
         ([POCL, BIG_GPU], "amd", f"leave the device out to use {BIG_GPU.platform.name} / {BIG_GPU.name}, or install "),
         ([POCL], "gpu", "install the OpenCL driver of the one that you want"),
         # Indices ask one platform alone, beside which there may be better ones.
-        ([POCL, BIG_GPU], "0:7", "ask for '1:0' to use "),
+        ([POCL, BIG_GPU], "0:7", "use device='1:0' to use "),
         ([GRIND], "gpu", "pocl-opencl-icd"),
         ([POCL], "pocl", "pocl-opencl-icd"),  # and it does not work
         ([SMALL_GPU, INTEL, POCL], "pocl", f"use {INTEL.platform.name} / "),  # the GPU has no float64
@@ -252,7 +252,7 @@ class FakeFile:
 
 @pytest.fixture
 def pip_runtime(tmp_path, monkeypatch):
-    """A pretended installation of Intel's runtime, and an environment of its own."""
+    """A fake installation of Intel's runtime, and an environment for it."""
     library = tmp_path / "prefix with space" / "lib" / "libintelocl.so"
     library.parent.mkdir(parents=True)
     library.write_bytes(b"")
@@ -273,7 +273,7 @@ def pip_runtime(tmp_path, monkeypatch):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
 def test_pip_runtime_is_added_to_what_was_there(pip_runtime, tmp_path):
     before = Path(os.environ["PYOPENCL_HOME"])
-    assert _runtimes.announce() == pip_runtime
+    assert _runtimes.register_runtime() == pip_runtime
     icds = Path(os.environ["PYOPENCL_HOME"], ".libs").glob("*.icd")
     assert sorted(icd.read_text() for icd in icds) == sorted(
         [f"{pip_runtime}\n", f"{before / '.libs' / 'libpocl-1.so'}\n"]
@@ -282,7 +282,7 @@ def test_pip_runtime_is_added_to_what_was_there(pip_runtime, tmp_path):
     assert os.environ["OCL_ICD_VENDORS"] == str(tmp_path / "vendors")
     # In a child, PyOpenCL resets its variable and the other one is inherited.
     after, os.environ["PYOPENCL_HOME"] = os.environ["PYOPENCL_HOME"], str(before)
-    assert _runtimes.announce() == pip_runtime
+    assert _runtimes.register_runtime() == pip_runtime
     assert os.environ["PYOPENCL_HOME"] == after
     assert os.environ["OCL_ICD_FILENAMES"] == str(pip_runtime)
 
@@ -290,9 +290,9 @@ def test_pip_runtime_is_added_to_what_was_there(pip_runtime, tmp_path):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
 def test_runtime_that_the_system_knows_is_not_added_twice(pip_runtime, tmp_path):
     (tmp_path / "vendors" / "intel.icd").write_text("/removed/libintelocl.so\n")
-    assert _runtimes.announce() == pip_runtime  # its library is gone
+    assert _runtimes.register_runtime() == pip_runtime  # its library is gone
     (tmp_path / "vendors" / "intel.icd").write_text(f"{pip_runtime}\n")
-    assert _runtimes.announce() is None
+    assert _runtimes.register_runtime() is None
 
 
 def test_nothing_is_touched_without_a_pip_runtime(monkeypatch):
@@ -301,7 +301,7 @@ def test_nothing_is_touched_without_a_pip_runtime(monkeypatch):
 
     monkeypatch.setattr(_runtimes.metadata, "distribution", missing)
     before = dict(os.environ)
-    assert _runtimes.announce() is None
+    assert _runtimes.register_runtime() is None
     assert dict(os.environ) == before
 
 

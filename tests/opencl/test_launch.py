@@ -1,4 +1,4 @@
-"""Arguments of kernels are set when they have changed, and only then; nothing is kept in memory for that."""
+"""Arguments of kernels are set only when they have changed, and arrays are not kept in memory for the comparison."""
 
 import sys
 
@@ -26,7 +26,7 @@ def engine(ctx):
 
 @pytest.fixture
 def settings(monkeypatch):
-    """How often arguments have been set."""
+    """The calls of `set_args`."""
     plain, calls = cl.Kernel.set_args, []
 
     def noted(kernel, *args):
@@ -48,7 +48,7 @@ def put(engine, kernel, source, to, x=0.0, shift=(0, 0), n=4):
 
 
 def test_what_has_changed_is_set(engine, kernel, settings):
-    """Each argument in turn: numbers, also by the sign of zero, vectors, arrays, views."""
+    """Each argument changes in turn: numbers, the sign of zero, vectors, arrays, views."""
     source = engine.upload(np.arange(8.0))
     first, second = engine.zeros(8), engine.zeros(8)
     cases = [
@@ -81,7 +81,7 @@ def test_what_has_not_is_not(engine, kernel, settings):
 
 
 def test_memory_is_let_go_of(engine, kernel):
-    """An array in the place of one that is gone, most likely at the same address, is another argument."""
+    """A new array, probably at the address of one that was freed, is another argument."""
     for turn in range(20):
         source, to = engine.upload(np.full(8, float(turn))), engine.zeros(8)
         held = sys.getrefcount(to.base_data), sys.getrefcount(to)

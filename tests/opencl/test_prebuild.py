@@ -1,4 +1,4 @@
-"""Kernels of a first run are built by other processes, too; a line on the terminal tells of it."""
+"""Workers build kernels of a first run, and a line on the terminal shows it."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""Scans, summaries and gathers against NumPy and exact sums, in groups as on a CPU and as on a GPU."""
+"""Scans, summaries and gathers agree with NumPy and exact sums, with work-groups of CPUs and of GPUs."""
 
 import math
 
@@ -78,7 +78,7 @@ def test_summaries_together_are_those_alone(engine, count):
 
 
 def test_summaries_are_read_together_with_an_integer(engine):
-    """Also those that were collected, or read, before; a slot that never was holds zeros."""
+    """Slots keep their values until they are collected again. A slot that was never collected holds zeros."""
     rng, n = np.random.default_rng(8), 500
     arrays = {name: rng.normal(size=n).astype(engine.real) for name in "abc"}
     summaries, note = Summaries(engine, "zabc"), engine.upload([-7, 5], np.int32)
@@ -101,7 +101,7 @@ def test_summaries_are_read_together_with_an_integer(engine):
 
 
 def test_summaries_are_compensated(engine):
-    """Large terms that cancel: a plain sum would lose the small ones altogether."""
+    """Large terms cancel; a plain sum would lose the small ones."""
     n = 200001
     values = np.full(n, 0.1, engine.real)
     large = engine.real.type(1e3 / np.finfo(engine.real).eps)

@@ -1,4 +1,4 @@
-"""The profile: its numbers add up, every command is seen, and what is not profiled is left alone."""
+"""Profiles count every command, their times add up, and other queues are not affected."""
 
 import json
 

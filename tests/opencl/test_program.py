@@ -1,4 +1,4 @@
-"""Programs are built when they are first needed, and read as few declarations as they can."""
+"""Programs are built for the first kernel that is used, from short declarations with PoCL."""
 
 import numpy as np
 import pyopencl as cl
@@ -60,7 +60,7 @@ def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch)
 
 
 def test_programs_are_the_same_for_all_periods(ctx):
-    """And stages, with their memory, are kept for one of them."""
+    """Stages and their memory are kept for the last periods only."""
     adapter = clvoro.Adapter(ctx)
     engines = [
         adapter._stages_for(clvoro.Box((0, 0, 0), (1, 1, z), periodic=True)).engine

@@ -1,4 +1,4 @@
-"""Memory that stages use in turn: arrays of a frame do not overlap, those of the next take their place."""
+"""Arrays of a frame do not overlap; the next frame uses the same memory."""
 
 import gc
 import weakref
@@ -23,7 +23,7 @@ def engine(ctx):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Sizes of the buffers that have been made."""
+    """Sizes of the buffers that were allocated."""
     sizes, plain = [], cl.Buffer
 
     class Counted(plain):
@@ -39,7 +39,7 @@ SHAPES = [(5, np.int32), ((100, 2), None), (1, np.uint8), (0, None), (7000, np.f
 
 
 def take(engine):
-    """Take arrays of all kinds and fill each with a number of its own."""
+    """Take arrays of several types and fill each with another number."""
     arrays = [engine.scratch(*shape) for shape in SHAPES]
     for k, array in enumerate(arrays):
         if array.size:
@@ -55,7 +55,7 @@ def check(arrays):
 
 
 def test_arrays_of_open_frames_do_not_overlap(engine):
-    """Also those of a frame within another, when the memory grows meanwhile, and once it is in one piece."""
+    """Also in nested frames, while the memory grows, and after it is in one piece."""
     for _ in range(3):
         with engine.workspace.frame():
             outer = take(engine)
@@ -69,7 +69,7 @@ def test_arrays_of_open_frames_do_not_overlap(engine):
 
 
 def test_frames_take_the_same_memory_in_turn(engine, made):
-    """Without allocations from the third on: the first finds out how much it takes, the second makes one piece."""
+    """The first frame finds the size, the second allocates one piece, and later ones allocate nothing."""
     for turn in range(5):
         if turn == 2:
             before = len(made)
@@ -124,7 +124,7 @@ def test_clearing_lets_go_of_the_memory_but_not_within_a_frame(engine, made):
 
 
 def test_few_views_are_kept(engine):
-    """Of all the sizes that there have been."""
+    """Arrays of many sizes are not kept."""
     with engine.workspace.frame():
         engine.scratch(10**5)
     for n in range(3 * MOST_VIEWS // 2):
@@ -137,7 +137,7 @@ def test_few_views_are_kept(engine):
     "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("shape", 0.3)]
 )
 def test_steps_allocate_nothing(engine, made, method):
-    """Once there have been two like it: a step displaces, moves, repairs the diagram and judges it."""
+    """After two similar steps, a step of displacement, motion, update of the diagram and quality allocates nothing."""
     field = sizing.Expression("0.05 + 0.02 * x")
     points = engine.upload(patch.relaxed_points(500, 3) / patch.BOX.frame[1])
     mesh = MeshState.create(
@@ -155,7 +155,7 @@ def test_steps_allocate_nothing(engine, made, method):
 
 
 def test_nothing_to_mend_leaves_no_memory(engine, made):
-    """What the search takes is not kept beside the next diagram."""
+    """Memory of the search is freed before the next diagram."""
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
     points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
     mesh = MeshState.create(Stages(engine), patch.BOX, size, points)
@@ -166,7 +166,7 @@ def test_nothing_to_mend_leaves_no_memory(engine, made):
 
 
 def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
-    """At once, not when Python looks for references in circles: a launch that refers to its stage would make one."""
+    """Memory is freed at once, without the collection of reference cycles."""
     alive, plain = weakref.WeakSet(), cl.Buffer
 
     class Watched(plain):

@@ -37,8 +37,8 @@ def as_for_many() -> Iterator[None]:
     """Do what is done for large meshes: iterations take their launches, repaired cells are found in lanes."""
     with ExitStack() as patches:
         for name, module in list(sys.modules.items()):
-            if name.startswith("clvoro.") and hasattr(module, "most_alone"):
-                patches.enter_context(mock.patch.object(module, "most_alone", return_value=0))
+            if name.startswith("clvoro.") and hasattr(module, "one_group_limit"):
+                patches.enter_context(mock.patch.object(module, "one_group_limit", return_value=0))
         patches.enter_context(mock.patch.object(repair, "FEW", 8))
         yield
 

@@ -373,7 +373,7 @@ def multigrid(adapter: clvoro.Adapter) -> None:
         assert solution.converged
         stage.apply(laplacian, potential, rhs)
     # The levels below the finest by one work-group each.
-    with mock.patch.object(cycle, "most_alone", return_value=n):
+    with mock.patch.object(cycle, "one_group_limit", return_value=n):
         potential, kind = engine.zeros(n), "multigrid"
         alone = Poisson(engine).solve(
             laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind

@@ -193,7 +193,7 @@ def test_levels_of_one_work_group_give_the_same_bits(make, monkeypatch, name, gr
     right = np.random.default_rng(6).standard_normal(W.shape[0])
     engine = patch.make_engine(make().ctx, group_size=group_size)
     for most in (0, 10**6):
-        monkeypatch.setattr(cycle, "most_alone", lambda _, most=most: most)
+        monkeypatch.setattr(cycle, "one_group_limit", lambda _, most=most: most)
         multigrid = Multigrid(engine)
         multigrid.set_up(*upload(engine, W))
         assert len(multigrid.sizes) > 2 or name == "star"
@@ -522,7 +522,7 @@ def test_entries_behind_the_last_row_are_ignored(make, rest):
 
 
 def test_set_up_again_for_another_graph(make):
-    """Room of a larger graph is used again for a smaller one."""
+    """Memory of a larger graph is used again for a smaller one."""
     engine = make()
     multigrid = Multigrid(engine)
     small, large = random_weights(500, seed=76), random_weights(2500, seed=77)

@@ -23,7 +23,7 @@ def make(request):
     ctx = create_context()
     queue = cl.CommandQueue(ctx)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(conjugate_gradient, "most_alone", lambda engine: request.param)
+        patched.setattr(conjugate_gradient, "one_group_limit", lambda engine: request.param)
         yield lambda dim=2, real=np.float64: Engine(ctx, queue, dim, np.dtype(real))
 
 
@@ -421,7 +421,7 @@ def test_one_work_group_solves_alike(n, group_size, monkeypatch):
     ctx, results = create_context(), []
     b = np.random.default_rng(59).standard_normal(n)
     for few in (0, n):
-        monkeypatch.setattr(conjugate_gradient, "most_alone", lambda engine, few=few: few)
+        monkeypatch.setattr(conjugate_gradient, "one_group_limit", lambda engine, few=few: few)
         engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
         if group_size is not None:
             object.__setattr__(engine, "group_size", group_size)

@@ -87,7 +87,7 @@ def test_correction(kind, share, monkeypatch):
     expected = -(B.T @ y).reshape(given.n, -1) * given.h[:, None]
     tolerance = 1e-6 if given.engine.real == np.float32 else 1e-11
     for alone in (0, 1000):
-        monkeypatch.setattr(projection, "most_alone", lambda engine, most=alone: most)
+        monkeypatch.setattr(projection, "one_group_limit", lambda engine, most=alone: most)
         solution, u, start, v = given.project(max_iterations=500, tolerance=tolerance)
         assert solution.converged
         # Derivatives in single precision, in a system whose condition number is a thousand.

@@ -27,7 +27,7 @@ def engine(ctx, request):
     """On a CPU and as on a GPU; in many launches and in one."""
     group_size, alone = request.param
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(projection, "most_alone", lambda engine: alone)
+        patched.setattr(projection, "one_group_limit", lambda engine: alone)
         yield patch.make_engine(ctx, group_size=group_size)
 
 

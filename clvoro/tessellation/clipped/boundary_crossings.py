@@ -10,7 +10,7 @@ import pyopencl.array as cla
 from ...errors import InputError
 from ...geometry.polygon import Polygon
 from ...opencl.engine import Engine
-from ...opencl.primitives import Room, Scan
+from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
 
 LOST, OUTSIDE = 1, 2  # bits of the flags in boundary_crossings.cl
@@ -97,7 +97,7 @@ class Boundary:
     def __init__(self, engine: Engine, domain: Polygon) -> None:
         self.engine = engine
         # Counts change little between steps.
-        self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
+        self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/boundary_crossings")
         origin, scale = domain.frame
         oriented = domain.oriented

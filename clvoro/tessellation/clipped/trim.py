@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from ...geometry.polygon import Polygon
 from ...opencl.engine import Engine
-from ...opencl.primitives import Room, Scan
+from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
 from .boundary_crossings import LOST, BoundaryError, Chords
 
@@ -46,7 +46,7 @@ class Trim:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         # Counts change a little from step to step.
-        self._scan, self._room = Scan(engine), Room(engine, spare=1 / 16)
+        self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/trim")
         self._flags = engine.empty(1, np.int32)
 

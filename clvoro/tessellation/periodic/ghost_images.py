@@ -9,7 +9,7 @@ import pyopencl.array as cla
 
 from ...geometry.box import Box
 from ...opencl.engine import Engine
-from ...opencl.primitives import Room, Scan
+from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
 from ..device_diagram import Tessellation
 from .halo import Margins, block_count, block_counts, seam_defines
@@ -123,7 +123,7 @@ class Seam:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
-        self._room = Room(engine, spare=1 / 16)  # sizes change a little from step to step
+        self._room = NamedArrays(engine, spare=1 / 16)  # sizes change a little from step to step
         self._kernels = engine.kernels("tessellation/periodic/ghost_images", seam_defines(engine))
         self._report = engine.empty(3, np.int32)
         self._turn = 0

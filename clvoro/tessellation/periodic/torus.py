@@ -125,7 +125,7 @@ class Torus:
             if enough:
                 break
             factor, grow = 1.0, True
-            # Room for what is made anew.
+            # Memory for the new diagram.
             del images, binned, args, t, folded
         if flags & COLLAPSED:
             raise CloseError(points, n)
