@@ -32,11 +32,12 @@ WORDS_OF_OTHERS = {
 """British words, and parts of paths where others have chosen them."""
 PLAIN = (
     "bench/", "cl_kernels/adaptation/", "cl_kernels/geometry/", "cl_kernels/opencl/", "cl_kernels/remapping/",
-    "cl_kernels/simd/", "cl_kernels/sizing/", "cl_kernels/solvers/", "clvoro/cli/", "clvoro/geometry/", "clvoro/io/",
-    "clvoro/mesh/", "clvoro/opencl/", "clvoro/plotting/", "clvoro/remapping/", "clvoro/sizing/", "clvoro/solvers/",
-    "clvoro/tessellation/", "docs/", "tests/cli/", "tests/geometry/", "tests/io/", "tests/mesh/", "tests/opencl/",
-    "tests/plotting/", "tests/reference/", "tests/remapping/", "tests/robustness/", "tests/sizing/", "tests/solvers/",
-    "tests/tessellation/", "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "CITATION.cff", ".pre-commit-config.yaml",
+    "cl_kernels/simd/", "cl_kernels/sizing/", "cl_kernels/solvers/", "clvoro/adaptation/", "clvoro/cli/",
+    "clvoro/geometry/", "clvoro/io/", "clvoro/mesh/", "clvoro/opencl/", "clvoro/plotting/", "clvoro/remapping/",
+    "clvoro/sizing/", "clvoro/solvers/", "clvoro/tessellation/", "docs/", "tests/cli/", "tests/geometry/",
+    "tests/io/", "tests/mesh/", "tests/opencl/", "tests/plotting/", "tests/reference/", "tests/remapping/",
+    "tests/robustness/", "tests/sizing/", "tests/solvers/", "tests/tessellation/", "README.md", "CONTRIBUTING.md",
+    "CHANGELOG.md", "CITATION.cff", ".pre-commit-config.yaml",
 )  # fmt: skip
 """Where dialect words are refused. Add a folder once it is clean."""
 TEXT = {".py", ".cl", ".h", ".c", ".md", ".rst", ".toml", ".cff", ".yaml", ".css"}
