@@ -1,4 +1,4 @@
-"""What a file of a mesh holds: a diagram, what a run knows of its cells, and data of the caller."""
+"""The contents of a mesh file: a diagram, cell data of a run, and data of the caller."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
 OWN = frozenset(
     ("size", "error", "quality", "volume", "area", "sides", "faces_of_cell", "label", "boundary", "generator", "wall")
 )  # fmt: skip
-"""Names that clvoro's own cell data have in some format."""
+"""Names of clvoro's own cell data in any format."""
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file holds.
+    """The contents of a mesh file.
 
     Attributes
     ----------
@@ -60,12 +60,12 @@ class Contents:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings of the run; none of a diagram."""
+        """Settings of the run; empty for a diagram."""
         return {} if self.result is None else self.result.settings
 
     @property
     def of_run(self) -> dict[str, np.ndarray]:
-        """What the run knows of the cells: size, error and quality; nothing of a diagram."""
+        """Cell data of the run: size, error and quality; empty for a diagram."""
         r = self.result
         if r is None:
             return {}
@@ -73,7 +73,7 @@ class Contents:
 
 
 def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
-    """Return the caller's data as arrays of types that files have."""
+    """Return the caller's data as arrays of types that file formats have."""
     if cell_data is None:
         return {}
     if not isinstance(cell_data, Mapping):
@@ -84,7 +84,11 @@ def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
     found = {}
     for name, values in cell_data.items():
         if not isinstance(name, str) or not _WORD.fullmatch(name) or name in OWN:
-            why = "which is clvoro's own" if name in OWN else "no word of ASCII letters and digits"
+            why = (
+                "which clvoro uses itself"
+                if name in OWN
+                else "expected a word of ASCII letters and digits"
+            )
             raise InputError(f"cell_data has the name {name!r:.60}, {why}; choose another name")
         if np.ma.is_masked(values):
             raise InputError(f"cell_data[{name!r}] has masked numbers, expected none; fill them")
@@ -102,7 +106,7 @@ def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
 
 
 def _in_known_type(array: np.ndarray) -> np.ndarray:
-    """Return `array` in the smallest of the types that holds all its values."""
+    """Return `array` in the smallest type that holds all its values."""
     if array.dtype.kind == "b":
         return array.astype(np.uint8)
     if array.dtype.kind == "f":

@@ -56,7 +56,7 @@ def to_pyvista(contents: Contents) -> pyvista.UnstructuredGrid:
         described = polyhedra(diagram)
         kind, items = _VTK_POLYHEDRON, described["faces"]
         starts = np.concatenate([[0], described["faceoffsets"]])
-    # Before the items of each cell stands their number.
+    # The number of items precedes the items of each cell.
     cells = np.insert(items.astype(np.int64), starts[:-1], np.diff(starts))
     grid = pyvista.UnstructuredGrid(cells, np.full(n, kind, np.uint8), in_space(diagram.vertices))
     for name, values in cell_data(contents).items():
@@ -96,5 +96,5 @@ def _polyhedra(
 
 
 def _known(values: np.ndarray) -> np.ndarray:
-    """Return integers in 64 bits: what meshio calls 32 of them, VTK does not know."""
+    """Return integers in 64 bits: VTK does not read the name that meshio writes for 32 bits."""
     return values.astype(np.int64) if values.dtype.kind == "i" else values

@@ -74,7 +74,7 @@ class CyclicPair:
     def align(
         self, points: np.ndarray, starts: np.ndarray, corners: np.ndarray, first: int
     ) -> np.ndarray:
-        """Return the corners of all faces; a lower face begins with the image of the upper face's first corner.
+        """Return the corners of all faces; the first corner of each lower face is the image of that of the upper one.
 
         Parameters
         ----------

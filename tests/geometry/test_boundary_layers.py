@@ -1,4 +1,4 @@
-"""Layers of cells along walls: generators that stay where they are."""
+"""Boundary layers: layers of cells along walls, whose generators do not move."""
 
 import numpy as np
 import pytest
@@ -27,13 +27,13 @@ def adapter():
     return clvoro.Adapter()
 
 
-def test_bisectors_lie_where_layers_meet():
+def test_bisectors_are_the_borders_of_layers():
     layers = Layers(0.01, count=4, growth=1.3)
     tops = np.cumsum(layers.heights)
     assert layers.heights == pytest.approx(0.01 * 1.3 ** np.arange(4))
     assert (layers.rows[1:] + layers.rows[:-1]) / 2 == pytest.approx(tops)
     assert layers.thickness == pytest.approx(tops[-1])
-    # Every generator lies at the same share of its layer.
+    # Every generator is at the same share of its layer.
     assert (tops - layers.rows[:-1]) / layers.heights == pytest.approx(1.3 / 2.3)
 
 
@@ -42,7 +42,7 @@ def test_layers_of_a_straight_wall_are_rectangles(adapter):
     result = adapter.run(BOX, 0.1, layers=layers, effort="fast")
     rows = place_layers(BOX, [layers])
     n, d = len(rows), result.diagram
-    # They are the first, and have not moved (to the rounding of the device's coordinates).
+    # They come first and have not moved, up to round-off of the device's coordinates.
     assert np.abs(result.points[:n] - rows).max() < 1e-14
     first = np.flatnonzero(np.isclose(rows[:, 1], layers.rows[0]))
     columns = round(2 / layers.width)
@@ -52,7 +52,7 @@ def test_layers_of_a_straight_wall_are_rectangles(adapter):
     assert d.volumes[second] == pytest.approx(0.03 * 2 / columns, rel=1e-12)
     for i in first:
         assert d.neighbor_starts[i + 1] - d.neighbor_starts[i] == 4
-    # The others are what a run without layers gives: of twelve starts between 0.010 and 0.021.
+    # The error of the others is that of a run without layers: 0.010 to 0.021 for twelve seeds.
     error = np.abs(result.size_error)
     assert error[:n].max() == 0
     assert error[n:].mean() < 0.025
@@ -73,8 +73,8 @@ RAGGED = clvoro.Polygon(
      (CHANNEL, range(4, 84), 0.034), (RAGGED, range(4, 13), 0.06)],
     ids=["ramp", "circle, two to an edge", "circle, one to an edge", "circle, two edges each", "loop"],
 )  # fmt: skip
-def test_cells_have_their_corners_at_those_of_the_wall(adapter, domain, edges, spacing):
-    """Where there is room for it: no wall's face is a sliver, cut off by a corner of the wall."""
+def test_corners_of_the_wall_are_corners_of_cells(adapter, domain, edges, spacing):
+    """No face on the wall is a sliver that a corner of the wall cuts off."""
     layers = Layers(0.4 * spacing, count=2, spacing=spacing, edges=edges)
     rows = place_layers(domain, [layers])
     diagram = adapter.diagram(domain, rows)
@@ -83,11 +83,11 @@ def test_cells_have_their_corners_at_those_of_the_wall(adapter, domain, edges, s
     mine = np.isin(walls, edges)
     lengths = diagram.face_measures[mine]
     ends = domain.boundary_distance(rows[owners[mine]]) < 1.01 * layers.rows[0]
-    assert ends.all()  # the first row has all of the wall
+    assert ends.all()  # the first row covers the wall
     each = np.unique(owners[mine], return_counts=True)[1]
     two_edges = spacing > 0.03 and domain is CHANNEL
     assert (each == (2 if two_edges else 1)).all()
-    # Half an edge of two, to rounding, or a column whose edge is not a multiple of the spacing.
+    # Half the length of two edges, or a column on an edge that is no multiple of the spacing.
     assert lengths.min() > (0.4 if two_edges else 0.7) * spacing
     assert lengths.max() < 1.3 * spacing
     assert lengths.sum() == pytest.approx(
@@ -97,7 +97,7 @@ def test_cells_have_their_corners_at_those_of_the_wall(adapter, domain, edges, s
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
-    """On both walls, rectangles all around: those at the seam are like the others."""
+    """Cells on both walls are rectangles, also at the seam."""
     shape = (2.0, 1.0) if axis == 0 else (1.0, 2.0)
     channel = clvoro.Box((0, 0), shape, periodic=(axis == 0, axis == 1))
     layers = Layers(0.02, count=3, growth=1.2)
@@ -114,7 +114,7 @@ def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
         assert d.volumes[layer] == pytest.approx(height * 2 / columns, rel=1e-12)
         assert (np.diff(d.neighbor_starts)[layer] == 4).all()
     assert d.volumes.sum() == pytest.approx(2, rel=1e-12)
-    # The others are what a run without layers gives, as in a box; none has come between the rows.
+    # The error of the others is that of a run without layers. None is between the rows.
     assert np.abs(result.size_error[len(rows) :]).mean() < 0.025
     others = result.points[len(rows) :, 1 - axis]
     assert np.minimum(others, 1 - others).min() > layers.rows[-1]
@@ -128,7 +128,7 @@ def test_sizes_grow_from_the_layers(adapter):
     result = adapter.run(CHANNEL, 0.2, layers=layers, effort="fast")
     distance = np.hypot(*result.points.T) - 0.2
     beyond = np.flatnonzero((distance > layers.rows[-1] * 1.01) & (distance < 0.25))
-    # Sizes by the distance from the edges; the middles of edges lie a little within the circle.
+    # Sizes depend on the distance to edges, whose middles are inside the circle.
     expected = layers.width + np.log(1.2) * distance[beyond]
     assert result.target_size[beyond] == pytest.approx(expected, abs=1e-3)
     n = len(place_layers(CHANNEL, [layers]))
@@ -138,7 +138,7 @@ def test_sizes_grow_from_the_layers(adapter):
 
 
 @pytest.mark.parametrize("method", ["lloyd", "coupled", "weighted", "exact"])
-def test_every_method_leaves_them_where_they_are(adapter, method):
+def test_no_method_moves_generators_of_layers(adapter, method):
     layers = Layers(0.04, count=2, edges=range(4, 84))
     options = (
         {"max_steps": 8}
@@ -151,13 +151,13 @@ def test_every_method_leaves_them_where_they_are(adapter, method):
     assert free.contains(result.points[len(rows) :]).all()
 
 
-def test_walls_share_corners_and_gaps():
+def test_layers_in_corners_and_gaps_belong_to_the_nearest_wall():
     comb = clvoro.Polygon([(0, 0), (3, 0), (3, 1), (2, 1), (2, 0.15), (1, 0.15), (1, 1), (0, 1)])
     layers = Layers(0.02, count=3, growth=1.2)
     rows = place_layers(comb, [layers])
     assert comb.contains(rows).all()
     near = comb.boundary_distance(rows)
-    # On one of the rows each, counted from the wall that is nearest.
+    # Each is on a row, counted from the nearest wall.
     off = np.abs(near[:, None] - layers.rows).min(axis=1)
     assert off.max() < 0.1 * layers.rows[-1] + 1e-12
     gaps = np.hypot(*(rows[:, None] - rows).T) + np.eye(len(rows))
@@ -202,7 +202,7 @@ def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
         (lambda: free_domain(CHANNEL, [Layers(0.4)]), "no room"),
     ],
 )
-def test_what_cannot_be_is_refused(make, words):
+def test_impossible_layers_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
 
@@ -210,7 +210,7 @@ def test_what_cannot_be_is_refused(make, words):
 @pytest.mark.parametrize(
     ("layers", "expected"),
     [
-        # Refused in no time: what they would take is known before any generator is made.
+        # Refused at once: the number of generators is estimated before any is placed.
         (lambda: Layers(1e-9), MemoryLimitError),
         (lambda: Layers(5e-324), MemoryLimitError),
         (lambda: Layers(1e-3, spacing=1e-9), MemoryLimitError),
@@ -232,7 +232,7 @@ def test_what_cannot_be_is_refused(make, words):
     ],
 )
 @pytest.mark.filterwarnings("error")
-def test_layers_out_of_all_proportion_are_refused(adapter, layers, expected):
+def test_layers_of_extreme_size_are_refused(adapter, layers, expected):
     for domain in (BOX, CHANNEL):
         with pytest.raises(expected):
             adapter.run(domain, 0.2, layers=layers(), effort="fast")
@@ -246,7 +246,7 @@ def test_thickness_is_that_of_all_heights(growth):
 
 
 @pytest.mark.parametrize(("domain", "edges"), [(BOX, None), (CHANNEL, None), (CHANNEL, range(4))])
-def test_no_more_are_placed_than_are_counted(domain, edges):
+def test_the_count_bounds_the_number_of_generators(domain, edges):
     layers = Layers(0.02, count=3, edges=edges)
     count, placed = count_rows(domain, [layers]), len(place_layers(domain, [layers]))
     assert 0.8 * count < placed <= count
@@ -254,7 +254,7 @@ def test_no_more_are_placed_than_are_counted(domain, edges):
 
 @pytest.mark.parametrize("beside", [-1e-13, -1e-14, 0, 1e-14, 1e-13, 1e-10])
 def test_strips_may_end_beside_corners(adapter, beside):
-    """What they leave has no edge there that is as short as a rounding."""
+    """The region beyond them has no edge as short as round-off there."""
     layer = clvoro.Layers(0.05, count=1, spacing=0.1, edges=[0])
     reach = layer.rows[-1] + 0.03
     shore = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1), (0, reach + beside)])
@@ -272,7 +272,7 @@ def test_domains_without_walls_in_2d_are_refused():
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
-    """Cells of narrow tips reach around corners, into the layers on the other side: these were given generators."""
+    """Cells in narrow tips reach around corners into the layers on the other side. No generator is inserted there."""
     for seed in (4, 6, 15):
         tips = int(np.random.default_rng(seed).integers(12, 40))
         star = clvoro.Polygon(shores.star(tips, seed, (0.5, 0.5), 0.5))

@@ -31,7 +31,7 @@ def turned(orientation) -> list[np.ndarray]:
 
 
 def segments(rings) -> list[shapely.LineString]:
-    """The edges as the caller counts them."""
+    """The edges in the caller's order."""
     return [
         shapely.LineString([ring[k], ring[(k + 1) % len(ring)]])
         for ring in rings

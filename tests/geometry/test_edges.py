@@ -1,4 +1,4 @@
-"""Ways that lead out of a polygon, and generators that stay inside whatever pushes them."""
+"""Steps of generators that would leave a polygon: they stay inside."""
 
 from itertools import pairwise
 
@@ -54,7 +54,7 @@ def in_frame(domain):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_way_against_shapely(move, name):
+def test_one_step_agrees_with_shapely(move, name):
     domain = POLYGONS[name]()
     n, rng, eps = 600, np.random.default_rng(3), float(np.finfo(move.real).eps)
     origin, scale = domain.frame
@@ -66,7 +66,7 @@ def test_one_way_against_shapely(move, name):
     goal = (x + way).astype(float)
     ways = shapely.linestrings(np.stack([x.astype(float), goal], axis=1))
     free = ~shapely.intersects(shore, ways)
-    # Those whose way is free go it; those that end inside have not crossed an edge.
+    # A free path is followed; a path that ends inside crosses no edge.
     near = shapely.distance(shore, ways) < 64 * eps
     sure = ~near & (shapely.distance(shore, shapely.points(x)) > 64 * eps)
     assert np.abs(y - goal)[free & sure].max() < 4 * eps
@@ -75,17 +75,17 @@ def test_one_way_against_shapely(move, name):
     assert shapely.covers(whole, shapely.points(y)).all()
     thin = 1e-6 if name.startswith("thin") else 0
     for i in hit:
-        # Half-way to the first edge, or the goal's image in that edge, if nothing is in between.
+        # Half-way to the first edge, or the mirror image of the target if its path is free.
         crossing = shapely.intersection(shore, ways[i])
         first = min(np.linalg.norm(p - x[i]) for p in shapely.get_coordinates(crossing))
         length = np.linalg.norm(goal[i] - x[i])
         half = x[i] + first / 2 / length * (goal[i] - x[i])
-        # Edges are crossed at angles down to a two-hundredth.
+        # Paths cross edges at angles down to 1/200.
         if np.linalg.norm(y[i] - half) < 1024 * eps:
             continue
         taken = shapely.LineString([x[i].astype(float), y[i]])
         assert not shapely.crosses(taken, shore) or thin, (name, i)
-        middle = shapely.Point((y[i] + goal[i]) / 2)  # on the line of the edge
+        middle = shapely.Point((y[i] + goal[i]) / 2)  # on the line through the edge
         a, b = (
             np.array(e)
             for e in zip(*edges(domain, origin, scale), strict=True)
@@ -102,14 +102,14 @@ def edges(domain, origin, scale):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_whoever_is_pushed_stays_inside(move, name):
+def test_generators_pushed_outwards_stay_inside(move, name):
     domain = POLYGONS[name]()
     n, rng = 1000, np.random.default_rng(4)
     origin, scale = domain.frame
     x = ((scattered(domain, n, 6) - origin) / scale).astype(move.real)
     ahead = 0.05 * rng.standard_normal((n, 2))
     for step in range(90):
-        # Half of them are always pushed the same way, and come as near to the boundary as may be.
+        # Half of them are always pushed in one direction, and come as near to the boundary as possible.
         way = rng.standard_normal((n, 2)) * 10 ** rng.uniform(-6, 0, (n, 1))
         way[::2] = ahead[::2]
         x = move(domain, x, way)
@@ -117,7 +117,7 @@ def test_whoever_is_pushed_stays_inside(move, name):
             assert domain.covers(x.astype(float) * scale + origin).all()
     near = domain.boundary_distance(x.astype(float) * scale + origin) / scale
     assert (near < 100 * np.finfo(move.real).eps).sum() > 200
-    # And may leave it again.
+    # They can move away again.
     back = move(domain, x, -ahead * 1e-3)
     moved = np.abs(back - x).max(axis=1) > 0
     assert moved[::2].mean() > 0.8
@@ -133,7 +133,7 @@ def test_generators_on_the_boundary_may_leave_it(move):
     y = move(domain, x, inwards)
     assert np.abs(y - x - inwards).max() < 4 * np.finfo(move.real).eps
     y = move(domain, x, -inwards)
-    # Those that are pushed out come back as far.
+    # Those that are pushed out are mirrored.
     distance = domain.boundary_distance(y.astype(float) * scale + origin) / scale
     assert distance.max() < 1e-4 + 32 * np.finfo(move.real).eps
     off = ~domain.covers(y.astype(float) * scale + origin)
@@ -143,12 +143,12 @@ def test_generators_on_the_boundary_may_leave_it(move):
 
 
 @pytest.mark.parametrize("name", ["square", "koch", "far", "thin spit"])
-def test_bins_hold_their_edges(name):
+def test_bins_list_all_edges_in_them(name):
     domain = POLYGONS[name]()
     begins, ends = domain.oriented.vertices, domain.oriented.vertices[domain.oriented.next_vertex]
     frame, shape, starts, listed = bin_edges(begins, ends)
     held = [set(listed[a:b].tolist()) for a, b in pairwise(starts)]
-    # Points all along each edge are in bins that list it.
+    # Points on each edge are in bins that list it.
     for t in np.linspace(0, 1, 200):
         at = (((1 - t) * begins + t * ends - frame[:2]) * frame[2]).astype(int)
         at = np.clip(at, 0, shape[:2] - 1)
@@ -178,8 +178,7 @@ def test_runs_stay_inside(ctx, method, real):
 
 
 def test_refinement_from_generators_on_a_slanted_edge_far_from_0(ctx):
-    """There they lie off it by more than the device's rounding, on either side; middles of edges between them are
-    outside."""
+    """There they are off the edge by more than the round-off of the device; midpoints between them are outside."""
     vee = np.array([(0, 0), (1, 0.37), (2, 0), (2, 1), (1, 1.37), (0, 1)]) - (6168.3, 244326.7)
     domain, adapter = clvoro.Polygon(vee), clvoro.Adapter(ctx)
     for seed in range(10):

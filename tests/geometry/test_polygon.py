@@ -1,4 +1,4 @@
-"""Polygonal domains: rings as they are given, as they are kept, and what is refused."""
+"""Polygonal domains: vertices of the caller, oriented rings, and invalid input."""
 
 import json
 import pickle
@@ -14,7 +14,7 @@ from clvoro.geometry.box import LARGEST_EDGE
 from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
 
 
-def test_rings_are_kept_with_the_interior_on_the_left() -> None:
+def test_rings_are_oriented() -> None:
     for outer in (SQUARE, SQUARE[::-1]):
         for hole in (HOLE, HOLE[::-1]):
             domain = clvoro.Polygon(outer, [hole])
@@ -42,7 +42,7 @@ def test_rings_are_kept_with_the_interior_on_the_left() -> None:
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
 def test_edges_are_numbered_as_given(closed: bool, turned: bool) -> None:
-    # Vertices 2 and 3 are the same, 5 is on a straight line.
+    # Vertices 2 and 3 are equal, vertex 5 is on a straight line.
     outer = np.array([(0.0, 0), (4, 0), (4, 3), (4, 3), (2, 3), (1, 3), (0, 3)])
     rings = [outer, HOLE, OTHER]
     if turned:
@@ -62,7 +62,7 @@ def test_edges_are_numbered_as_given(closed: bool, turned: bool) -> None:
 
 
 def test_pieces() -> None:
-    island = HOLE * 0.5 + (0.75, 0.75)  # within the hole of the first
+    island = HOLE * 0.5 + (0.75, 0.75)  # in the hole of the first piece
     domain = clvoro.Polygon.from_pieces([[SQUARE, HOLE], [island[::-1]]])
     assert domain.n_pieces == 2
     assert domain.piece_of_ring.tolist() == [0, 0, 1]
@@ -75,7 +75,7 @@ def test_pieces() -> None:
     assert touching.measure == 13
 
 
-def test_sources_agree(tmp_path) -> None:
+def test_all_sources_give_the_same_domain(tmp_path) -> None:
     parts = [shapely.Polygon(SQUARE, [HOLE]), shapely.Polygon(SQUARE[::-1] + 10)]
     several = clvoro.Polygon.from_pieces([[SQUARE, HOLE], [SQUARE[::-1] + 10]])
     whole = shapely.MultiPolygon(parts)
@@ -108,7 +108,7 @@ def test_equal_domains() -> None:
     assert one == same
     assert hash(one) == hash(same)
     others = [
-        clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE[::-1], [HOLE]),  # numbered otherwise
+        clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE[::-1], [HOLE]),  # other numbers of edges
         clvoro.Polygon(SQUARE, [HOLE + 1e-15]), clvoro.Box((0, 0), (4, 3)),
         clvoro.Polygon.from_pieces([[SQUARE], [HOLE + 9]]),
     ]  # fmt: skip
@@ -121,7 +121,7 @@ def test_equal_domains() -> None:
 
 
 def test_area_is_exact() -> None:
-    # Far from the origin the products of coordinates have 32 digits before the area's.
+    # Far from the origin products of coordinates have 32 digits more than the area.
     far = np.array([2.0**33, -(2.0**33)])
     ring = (ragged(200) * 2**10).round(6) / 2**10 + far
     x = [(Fraction(a), Fraction(b)) for a, b in ring.tolist()]
@@ -129,7 +129,7 @@ def test_area_is_exact() -> None:
     assert clvoro.Polygon(ring).measure == float(twice / 2)
 
 
-def test_places() -> None:
+def test_points_are_located() -> None:
     rings = [ragged(150), ragged(60, 5, (0.05, 0.0), 0.2)]
     domain = clvoro.Polygon(rings[0], rings[1:])
     x = np.random.default_rng(1).uniform(-1.2, 1.2, (4000, 2))
@@ -137,7 +137,7 @@ def test_places() -> None:
     assert 500 < inside.sum() < 3500
     assert (domain.contains(x) == inside).all()
     distance = distances(x, rings)
-    # Coordinates up to 1.2 round by 1.1e-16; projections have a dozen operations.
+    # Round-off of coordinates up to 1.2 is 1.1e-16; a projection has a dozen operations.
     assert np.abs(domain.boundary_distance(x) - distance).max() < 4e-15
     nearest = domain.nearest(x)
     assert (nearest[inside] == x[inside]).all()
@@ -154,7 +154,7 @@ def test_the_boundary_belongs_to_the_domain() -> None:
         points = (a + t * (b - a)).reshape(-1, 2)
         assert domain.contains(points).all()
         assert domain.contains(domain.vertices).all()
-        # Less than the rounding off, not more.
+        # The tolerance is not larger than round-off.
         out = np.array([[domain.upper[0] * (1 + np.sign(domain.upper[0]) * 1e-14), points[0, 1]]])
         assert not domain.contains(out).any()
 
@@ -227,13 +227,13 @@ PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])
         (lambda: clvoro.Polygon.from_geojson({"type": "MultiPolygon", "coordinates": [3]}), "MultiPolygon of 3"),
     ],
 )  # fmt: skip
-def test_what_is_refused(make, says: str) -> None:
+def test_invalid_polygons_are_refused(make, says: str) -> None:
     with pytest.raises((InputError, InputTypeError), match=says):
         make()
 
 
 def test_holes_may_touch_in_points() -> None:
-    touching = [(0, 1), (1, 1), (1, 2)]  # the wall, in a vertex of the hole's
+    touching = [(0, 1), (1, 1), (1, 2)]  # touches the outer ring with a vertex of the hole
     corner = [(4, 3), (3, 2), (3.5, 2)]  # a corner
     domain = clvoro.Polygon(SQUARE, [touching, corner])
     assert domain.measure == 12 - 0.5 - 0.25
@@ -262,7 +262,7 @@ def test_damaged_descriptions_are_refused(name: str, value: object) -> None:
 
 
 def result_of(domain: clvoro.Polygon) -> clvoro.Result:
-    """A result with a single cell, whatever it holds."""
+    """A result with a single cell and arbitrary values."""
     from clvoro.mesh.diagram import Diagram
     from clvoro.mesh.results import HISTORY_DTYPE
 

@@ -37,7 +37,7 @@ CUBE = (
 
 
 def soup(n, seed):
-    """Triangles of sizes from 1e-4 to 1, thin ones, flat ones (sides only) and points among them."""
+    """Triangles of sizes from 1e-4 to 1, among them thin ones, segments and points."""
     rng = np.random.default_rng(seed)
     middle = rng.uniform(DOMAIN.lower, DOMAIN.upper, (n, 1, 3))
     corners = middle + 10 ** rng.uniform(-4, 0, (n, 1, 1)) * rng.normal(size=(n, 3, 3))
@@ -52,7 +52,7 @@ def soup(n, seed):
 
 
 def brute_force(points, vertices, triangles):
-    """Least distance over all triangles and all of their seven features, one after the other."""
+    """Smallest distance to all triangles, by the seven features of each."""
     best = np.full(len(points), np.inf)
     for corners in vertices[triangles]:
         for k in range(3):
@@ -63,7 +63,7 @@ def brute_force(points, vertices, triangles):
                 foot = a + t[:, None] * d
                 away = np.linalg.norm(points - foot, axis=1)
                 best = np.where((t >= 0) & (t <= 1), np.minimum(best, away), best)
-        # The foot on the plane, by an orthonormal basis of it.
+        # The projection onto the plane, in an orthonormal basis.
         q, r = np.linalg.qr((corners[1:] - corners[0]).T)
         if abs(r[0, 0] * r[1, 1]) > 1e-13 * np.abs(r).max() ** 2:
             s, t = np.linalg.solve(r, q.T @ (points - corners[0]).T)
@@ -107,14 +107,14 @@ def test_distance_on_the_device_is_that_of_brute_force(engine, name):
     points = near_and_far(vertices, triangles, 150, 929)
     found = sizing.Sizing(engine, DOMAIN, field)(points) - 1
     expected = brute_force(points, vertices, np.asarray(triangles))
-    # h = 1 + distance in a frame of scale 2: rounding of coordinates and of h; triangles thinner
+    # h = 1 + distance in a frame of scale 2: round-off of coordinates and of h; triangles thinner
     # than 1e-7 of their length count as their sides.
     assert np.abs(found - expected).max() < 40 * np.finfo(engine.real).eps + 2e-7 * (name == "soup")
     assert np.abs(field(points) - 1 - expected).max() < 1e-14 + 2e-7 * (name == "soup")
 
 
-def test_all_kinds_of_shapes_together(engine):
-    """The least over spheres, curves, a box and two surfaces, under a common cap."""
+def test_distance_to_shapes_of_all_kinds(engine):
+    """The minimum over spheres, curves, a box and two surfaces, with a common upper bound."""
     rng = np.random.default_rng(4711)
     shapes = [
         sizing.Sphere((3.5, 0.5, 10.4), 0.2),
@@ -129,7 +129,7 @@ def test_all_kinds_of_shapes_together(engine):
     field = sizing.Distance(shapes, 0.01, slope=0.4, h_max=0.05)
     assert np.allclose(field(points), np.min(each, axis=0), rtol=0, atol=1e-15)
     found = sizing.Sizing(engine, DOMAIN, field)(points)
-    # Slope 0.4 times the rounding of coordinates in a frame of scale 2.
+    # Slope 0.4 times the round-off of coordinates in a frame of scale 2.
     assert np.abs(found - field(points)).max() < 20 * np.finfo(engine.real).eps
 
 
@@ -157,13 +157,13 @@ def test_landmarks_lie_on_the_surface_and_reach_all_of_it():
     assert surface.distance2(marks).max() < 1e-28
     assert len(marks) <= 1 << 14
     gap = np.linalg.norm(marks[:, None] - surface.vertices[None, ::7], axis=2).min(axis=0)
-    # Twice the spacing of 1.5 / 64 between them.
+    # Twice their spacing of 1.5 / 64.
     assert gap.max() < 3 / 64
 
 
 @pytest.mark.slow
-def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
-    """Number of cells: the thin shell of small ones is found, and is that of the exact sphere."""
+def test_a_triangulated_ball_needs_as_many_cells_as_a_sphere(engine):
+    """The thin shell of small cells is found, and their number is that of the exact sphere."""
     from clvoro.adaptation.sampling.quadrature import DensityTree
 
     n, m = 24, 36  # rings from pole to pole
@@ -174,7 +174,7 @@ def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
     triangles = np.vstack([np.column_stack([here, here + m, there + m]),
                            np.column_stack([here, there + m, there])])  # fmt: skip
     center = (4.0, 0.0, 10.75)
-    # The vertices of a pole differ by rounding.
+    # The vertices of a pole differ by round-off.
     surface = sizing.Surface(center + 0.5 * ball.reshape(-1, 3), triangles, join=1e-12)
     assert surface.closed
     law = {"h_min": 0.02, "slope": 0.5, "h_max": 0.2}
@@ -182,7 +182,7 @@ def test_a_fine_ball_of_triangles_wants_the_cells_of_a_sphere(engine):
         DensityTree(sizing.Sizing(engine, DOMAIN, sizing.Distance(s, **law)), DOMAIN, 1e-3).integral
         for s in (surface, sizing.Sphere(center, 0.5))
     ]
-    # The facets' area is short of the sphere's by 0.7 %, and a little more in the shell's cells.
+    # The area of the facets is 0.7 % less than that of the sphere; the number of cells differs a little more.
     assert counts[0] == pytest.approx(counts[1], rel=8e-3)
 
 
@@ -222,7 +222,7 @@ def test_closed_surfaces():
     whole = sizing.Surface(vertices, triangles)
     assert whole.closed
     whole.require_closed()
-    # The same as separate triangles, and with triangles that have shrunk to an edge.
+    # The same with separate triangles, and with triangles of two equal corners.
     apart = sizing.Surface(
         vertices[triangles].reshape(-1, 3), np.arange(triangles.size).reshape(-1, 3)
     )
@@ -254,19 +254,19 @@ def test_inside_of_a_torus():
     points = np.random.default_rng(606).uniform(DOMAIN.lower, DOMAIN.upper, (3000, 3))
     ring = np.hypot(*(points - center)[:, :2].T) - 0.5
     depth = np.hypot(ring, (points - center)[:, 2]) - 0.2
-    off = np.abs(depth) > 0.01  # the facets lie up to 0.5 (pi / 48)^2 off the torus
+    off = np.abs(depth) > 0.01  # facets are off the torus by up to 0.5 (pi / 48)^2
     surface = sizing.Surface(*torus(48, 24))
     assert np.array_equal(surface.contains(points)[off], depth[off] < 0)
     flipped = sizing.Surface(surface.vertices, surface.triangles[:, ::-1])
     assert np.array_equal(flipped.contains(points), surface.contains(points))
 
 
-def test_sound_surfaces_do_not_cross():
+def test_valid_surfaces_have_no_intersections():
     for vertices, triangles in (torus(24, 12), CUBE, torus(7, 5)):
         surface = sizing.Surface(vertices, triangles)
         assert surface.crossings().shape == (0, 2)
         surface.check()
-    # Two cubes side by side share a wall's place and corners; boxes that touch do not cross.
+    # Two cubes side by side share a side; boxes in contact do not intersect.
     shifted = sizing.Surface(
         np.vstack([CUBE[0], CUBE[0] + (1.0, 1.0, 0)]), np.vstack([CUBE[1], CUBE[1] + 8])
     )
@@ -274,7 +274,7 @@ def test_sound_surfaces_do_not_cross():
 
 
 def pierces(a, b):
-    """Whether a side of a runs through b: signs of volumes, one pair at a time."""
+    """Whether a side of a intersects b, by signs of volumes, for one pair."""
 
     def volume(*p):
         return np.linalg.det(np.subtract(p[1:], p[0]))
@@ -288,7 +288,7 @@ def pierces(a, b):
     return False
 
 
-def test_crossing_agrees_with_one_pair_at_a_time():
+def test_intersections_agree_with_a_scalar_reference():
     rng = np.random.default_rng(1618)
     a, b = rng.uniform(0, 1, (2, 1500, 3, 3))
     expected = np.array([pierces(s, t) or pierces(t, s) for s, t in zip(a, b, strict=True)])
@@ -297,11 +297,11 @@ def test_crossing_agrees_with_one_pair_at_a_time():
     assert np.array_equal(crossing(b, a), expected)
 
 
-def test_crossing_in_one_plane_and_at_common_corners():
+def test_intersections_in_one_plane_and_at_common_corners():
     flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
     cases = [
-        (flat, flat, True),  # the same twice
-        (flat, flat[[1, 2, 0]] * 0.25 + (0.1, 0.1, 0), True),  # one within the other
+        (flat, flat, True),  # equal
+        (flat, flat[[1, 2, 0]] * 0.25 + (0.1, 0.1, 0), True),  # one in the other
         (flat, np.array([[1, 0, 0], [0, 1, 0], [1, 1, 0]]), False),  # neighbors in a plane
         (flat, np.array([[1, 0, 0], [0, 1, 0], [0.1, 0.1, 0]]), True),  # folded over
         (flat, np.array([[1, 0, 0], [0, 1, 0], [1, 1, 0.5]]), False),  # neighbors at an angle
@@ -382,15 +382,15 @@ def test_broken_files_are_refused(tmp_path):
         sizing.Surface.read(tmp_path / "part.step")
 
 
-def test_normals_that_are_none_do_not_matter(tmp_path, caplog):
-    """A surface has those of its triangles; what its reader thinks of it is not printed."""
+def test_invalid_normals_in_files_are_ignored(tmp_path, caplog):
+    """Normals are those of the triangles; warnings of the reader are not printed."""
     pytest.importorskip("trimesh")
     corners = "vertex 0 0 0 vertex 1 0 0 vertex 0 1 0"
     (tmp_path / "part.stl").write_text(
         f"solid\nfacet normal 0 zero 1\nouter loop\n{corners}\nendloop\nendfacet\nendsolid\n"
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # as numpy has it at last
+        warnings.simplefilter("error", DeprecationWarning)  # raised by NumPy
         assert len(sizing.Surface.read(tmp_path / "part.stl")) == 1
     assert not caplog.records
 

@@ -1,4 +1,4 @@
-"""Files and meshes of other libraries: of a diagram alone, and with data of the caller."""
+"""Files, and meshes of other libraries: of diagrams, and with data of the caller."""
 
 import io
 import zipfile
@@ -100,8 +100,8 @@ def test_own_data_in_other_formats(diagram, result, tmp_path):
 @pytest.mark.parametrize(
     ("data", "error", "message"),
     [
-        ({"size": [1]}, InputError, "'size', which is clvoro's own"),
-        ({"a b": [1]}, InputError, "no word of ASCII letters"),
+        ({"size": [1]}, InputError, "'size', which clvoro uses itself"),
+        ({"a b": [1]}, InputError, "expected a word of ASCII letters"),
         ({1: [1]}, InputError, "has the name 1"),
         ({"p": [1, 2]}, InputError, r"shape \(2,\), expected \(1,\) or \(1, k\)"),
         ({"p": [[[1]]]}, InputError, r"shape \(1, 1, 1\)"),
@@ -163,7 +163,7 @@ def test_to_meshio(diagram):
     assert sorted(seen) == list(range(n))
 
 
-def test_sizes_come_along(result):
+def test_sizes_are_cell_data(result):
     pytest.importorskip("meshio")
     mesh = result.to_meshio()
     order = np.concatenate(mesh.cell_data["label"])

@@ -1,4 +1,4 @@
-"""OpenFOAM's polyMesh, read back as its documentation describes it and checked as checkMesh does."""
+"""OpenFOAM's polyMesh: read back by its documentation, with the checks of checkMesh."""
 
 import os
 import re
@@ -34,7 +34,7 @@ def result(request):
 
 
 def entries(path):
-    """Number and text of the list in one of OpenFOAM's files."""
+    """Length and text of the list in a file of OpenFOAM."""
     text = path.read_text()
     head, body = text.split("}", 1)
     assert f"object      {path.name};" in head
@@ -92,7 +92,7 @@ def test_order_is_upper_triangular(mesh):
     assert all(i < j for i, j in inner)
 
 
-def test_cells_are_closed_and_faces_look_away_from_their_owners(result, mesh):
+def test_cells_are_closed_and_faces_point_away_from_their_owners(result, mesh):
     points, faces, owner, neighbor, _ = mesh
     n, inner = len(result.points), len(neighbor)
     areas = np.array([solids.loop_area(points[f]) for f in faces])
@@ -104,7 +104,7 @@ def test_cells_are_closed_and_faces_look_away_from_their_owners(result, mesh):
         if k < inner:
             openness[neighbor[k]] -= areas[k]
             volumes[neighbor[k]] -= areas[k] @ middles[k] / 3
-    # Sums of some 20 products of coordinates below 4, each rounded.
+    # Round-off of sums of 20 products of coordinates below 4.
     assert np.abs(openness).max() < 1e-12
     np.testing.assert_allclose(volumes, prism_volumes(result, points), rtol=0, atol=1e-11)
     generators = np.pad(result.points, ((0, 0), (0, 3 - result.points.shape[1])))
@@ -143,7 +143,7 @@ def test_patches_are_the_walls(result, mesh):
             assert kind == "wall"
             plane = (box.upper if upper else box.lower)[axis]
             on_wall = points[sorted({v for f in part for v in f}), axis]
-            assert on_wall == pytest.approx(plane, abs=1e-14)  # Qhull's rounding
+            assert on_wall == pytest.approx(plane, abs=1e-14)  # round-off of Qhull
             wanted = box.measure / box.extent[axis] * depth * (1 if upper else -1)
             assert area == pytest.approx(wanted * np.eye(3)[axis], abs=1e-12)
     assert after == len(faces)
@@ -151,7 +151,7 @@ def test_patches_are_the_walls(result, mesh):
     assert sorted({v for f in faces for v in f}) == list(range(len(points)))
 
 
-def test_texts_are_the_same_in_parts(solid, tmp_path, monkeypatch):
+def test_text_does_not_depend_on_the_size_of_parts(solid, tmp_path, monkeypatch):
     io.save(solid, tmp_path / "one" / "polyMesh")
     monkeypatch.setattr(foam, "_CHUNK", 37)
     io.save(solid, tmp_path / "two" / "polyMesh")
@@ -159,7 +159,7 @@ def test_texts_are_the_same_in_parts(solid, tmp_path, monkeypatch):
         assert (tmp_path / "two" / "polyMesh" / path.name).read_bytes() == path.read_bytes()
 
 
-def test_marker_puts_the_mesh_into_its_case(solid, tmp_path):
+def test_a_marker_file_puts_the_mesh_into_its_case(solid, tmp_path):
     tmp_path = tmp_path / "made" / "as needed"
     io.save(solid, tmp_path / "case.foam")
     assert (tmp_path / "case.foam").read_bytes() == b""
@@ -186,12 +186,12 @@ def test_as_vtk_reads_it(result, tmp_path):
     sizes.Update()
     found = vtk_to_numpy(sizes.GetOutput().GetBlock(0).GetCellData().GetArray("Volume"))
     volumes = prism_volumes(result, read(tmp_path / "constant" / "polyMesh")[0])
-    # VTK keeps such points in single precision, and disagrees with itself on which way round a wedge is.
+    # VTK stores these points in single precision, and orients wedges in two ways.
     np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
 
 
 def check_mesh(result, folder):
-    """What OpenFOAM's checkMesh says of a result saved in `folder`."""
+    """The output of checkMesh for a result saved in `folder`."""
     io.save(result, folder / "case.foam")
     system = folder / "system"
     system.mkdir()
@@ -201,7 +201,7 @@ def check_mesh(result, folder):
     for name, text in {"controlDict": times, "fvSchemes": schemes, "fvSolution": ""}.items():
         head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {name}; }}\n"
         (system / name).write_text(head + text)
-    # Where Debian's package has its settings; others set it themselves.
+    # The settings of Debian's package; other installations set the variable.
     env = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
     done = subprocess.run(
         ["checkMesh", "-case", str(folder)], env=env, capture_output=True, text=True, check=False

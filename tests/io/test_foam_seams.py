@@ -1,4 +1,4 @@
-"""OpenFOAM's polyMesh of periodic boxes: what is cut at the seams is joined by cyclic patches."""
+"""OpenFOAM's polyMesh of periodic boxes: cyclic patches connect the cells at the seams."""
 
 import os
 import re
@@ -50,7 +50,7 @@ def test_cells_are_whole_and_closed(result, mesh):
     flux = np.einsum("ij,ij->i", areas, middles) / 3
     np.add.at(volumes, owner, flux)
     np.add.at(volumes, neighbor, -flux[: len(neighbor)])
-    # Sums of some 20 products of coordinates below 4, each rounded.
+    # Round-off of sums of 20 products of coordinates below 4.
     assert np.abs(openness).max() < 1e-12
     depth = np.ptp(points[:, 2]) if box.dim == 2 else 1.0
     np.testing.assert_allclose(volumes, result.diagram.volumes * depth, rtol=0, atol=1e-11)
@@ -74,7 +74,7 @@ def test_both_sides_of_a_seam_are_images_in_the_same_order(result, mesh):
         steps = set()
         for k in range(size):
             face, twin = faces[start + k], faces[there + k]
-            # In reverse order, but from the same corner on.
+            # In reverse order, with the same first corner.
             images = points[[twin[0], *twin[:0:-1]]]
             away = np.rint((images - points[face]).mean(axis=0)[: box.dim] / box.extent)
             steps.add(tuple(away.astype(int).tolist()))
@@ -114,7 +114,7 @@ def test_only_walls_are_patches(result, mesh):
         assert points[corners, axis] == pytest.approx(plane, abs=1e-14)
 
 
-def test_names_of_cyclic_patches_are_taken(ctx, tmp_path):
+def test_names_of_cyclic_patches_are_reserved(ctx, tmp_path):
     box = clvoro.Box((0, 0), (1, 1), periodic=(True, False), names={"xMin": "yMin"})
     points = np.random.default_rng(2).random((30, 2))
     diagram = clvoro.Adapter(ctx).diagram(box, points)
@@ -146,7 +146,7 @@ def test_one_cell_is_its_own_neighbor(ctx, tmp_path):
 @needs_openfoam
 @pytest.mark.skipif(shutil.which("laplacianFoam") is None, reason="laplacianFoam is not installed")
 def test_openfoam_conducts_heat_across_the_seams(result, tmp_path):
-    """One implicit step of diffusion is what the diagram's own faces give."""
+    """One implicit step of diffusion agrees with one computed from the diagram."""
     check_mesh(result, tmp_path)
     d, box = result.diagram, result.diagram.domain
     n, conductivity = len(d), 0.01

@@ -1,4 +1,4 @@
-"""Files: what comes back is what was saved, other programs can read it, nothing is half written."""
+"""Files: loading returns what was saved, other programs read them, and they are complete or unchanged."""
 
 import csv
 import dataclasses
@@ -31,7 +31,7 @@ BOX = Box((-1.0, 0.5), (1.5, 2.0))
 
 
 def make_diagram(points):
-    """A Diagram of the reference's cells; corners closer than 1e-9 are one vertex."""
+    """A Diagram of the reference cells; corners closer than 1e-9 are one vertex."""
     cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
     corners = np.concatenate([cell.polygon for cell in cells])
     nexts = np.concatenate([np.roll(cell.polygon, -1, axis=0) for cell in cells])
@@ -47,7 +47,7 @@ def make_diagram(points):
             "neighbors": np.concatenate([cell.neighbors for cell in cells]).astype(np.int32),
             "face_measures": np.linalg.norm(nexts - corners, axis=1),
             "face_centroids": (nexts + corners) / 2,
-            "vertices": lambda: corners[first],  # read when first used, as from a device
+            "vertices": lambda: corners[first],  # fetched on first access, as from a device
             "cell_vertex_starts": starts,
             "cell_vertices": ids.ravel().astype(np.int32),
         },
@@ -133,7 +133,7 @@ def test_diagrams_of_a_device_can_be_pickled_and_listed():
 
 
 def test_npz_knows_every_array_of_a_diagram():
-    # Whoever adds an array to a Diagram says here what shape a file must give it.
+    # A new array of Diagram needs an entry with its shape here.
     assert {f"diagram.{name}" for name in Diagram._NAMES} <= set(npz._SHAPES)
 
 
@@ -154,7 +154,7 @@ def test_npz_is_repeatable_and_readable_by_numpy(result, tmp_path):
         assert_same_array(arrays["diagram.volumes"], result.diagram.volumes)
 
 
-def test_settings_that_json_does_not_know(result, tmp_path):
+def test_settings_of_types_without_json(result, tmp_path):
     odd = {"a": np.float64(0.1), "b": np.arange(3), "c": (1, 2), "d": len, "e": np.bool_(True)}
     io.save(dataclasses.replace(result, settings=odd), tmp_path / "a.npz")
     back = io.load(tmp_path / "a.npz").settings
@@ -188,7 +188,7 @@ class Bomb:
 
 
 def huge_array():
-    """A header that claims 2**62 floats, and no data."""
+    """A header of 2**62 floats without data."""
     stream = streams.BytesIO()
     header = {"descr": "<f8", "fortran_order": False, "shape": (2**62,)}
     np.lib.format.write_array_header_1_0(stream, header)
@@ -240,7 +240,7 @@ def test_foreign_and_missing_files_are_refused(tmp_path):
         io.load(tmp_path)
 
 
-def test_every_truncation_and_flipped_byte_is_noticed(result, tmp_path):
+def test_every_truncation_and_changed_byte_is_detected(result, tmp_path):
     path = tmp_path / "mesh.npz"
     io.save(result, path)
     whole = path.read_bytes()
@@ -257,7 +257,7 @@ def test_every_truncation_and_flipped_byte_is_noticed(result, tmp_path):
             back = io.load(path)
         except InputError:
             continue
-        # Some bytes of a zip file mean nothing here: dates, attributes, extra fields.
+        # Some bytes of a zip file have no effect: dates, attributes, extra fields.
         assert_same_array(back.size_error, result.size_error)
         assert_same_array(back.diagram.cell_vertices, result.diagram.cell_vertices)
 
@@ -272,7 +272,7 @@ def test_vtu_as_meshio_reads_it(result, tmp_path, compress, meshio_for_vtu):
     mesh = meshio_for_vtu.read(path)
     d = result.diagram
     np.testing.assert_array_equal(mesh.points[:, :2], d.vertices)
-    # meshio puts runs of cells with equally many sides into a block; their order is kept.
+    # meshio makes a block of each run of cells with equally many sides, in their order.
     found = [list(cell) for block in mesh.cells for cell in block.data]
     s = d.cell_vertex_starts
     assert found == [list(d.cell_vertices[s[i] : s[i + 1]]) for i in range(len(d))]
@@ -368,7 +368,7 @@ def test_history_reads_back_exactly(result, tmp_path):
         assert [float(row[name]) for row in rows] == result.history[name].tolist()
 
 
-# --- nothing half written ---
+# --- complete or unchanged ---
 
 WRITERS = {
     "mesh.npz": io.save,
@@ -413,12 +413,12 @@ def test_success_replaces_the_old_file(result, tmp_path, name):
     assert link.is_symlink()
     assert path.stat().st_size > len("the old one")
     assert [p.name for p in path.parent.iterdir()] == [name]
-    (tmp_path / "plain").write_text("")  # has the rights that the umask leaves
+    (tmp_path / "plain").write_text("")  # has the permissions of the umask
     assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
 
 
 def unwritable(tmp_path):
-    """Places where no file can be made, for root neither."""
+    """Paths where no file can be created, not even by root."""
     (tmp_path / "file").write_text("")
     return {
         tmp_path / "absent" / "mesh.npz": "create it first",
@@ -457,6 +457,6 @@ def test_check_writable_leaves_nothing(tmp_path):
     assert (tmp_path / "old.npz").read_text() == "old"
 
 
-def test_save_refuses_what_is_no_result(result, tmp_path):
+def test_save_refuses_other_objects(result, tmp_path):
     with pytest.raises(InputTypeError, match=r"mesh is a ndarray, expected a clvoro.Result"):
         io.save(result.points, tmp_path / "mesh.npz")

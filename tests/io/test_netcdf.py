@@ -1,4 +1,4 @@
-"""netCDF files by the UGRID conventions, and what all netCDF files have in common."""
+"""netCDF files by the UGRID conventions, and properties of all netCDF files."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def mesh(result, tmp_path):
 
 
 def rows(mesh, name):
-    """Rows of a table without what is not there."""
+    """Rows of a table without missing items."""
     table = mesh[f"mesh_{name}s"]
     missing = mesh.about[f"mesh_{name}s"].get("_FillValue", -1)
     assert missing == -1
@@ -56,7 +56,7 @@ def sides(corners):
 # --- UGRID ---
 
 
-def test_topology_names_what_is_there(mesh):
+def test_topology_names_all_variables(mesh):
     assert b"UGRID-1.0" in mesh.attributes["Conventions"]
     topology = mesh.about["mesh"]
     assert topology["cf_role"] == b"mesh_topology"
@@ -88,7 +88,7 @@ def test_faces_are_the_cells(result, mesh):
         expected = [a for a, b in sides(expected) if a != b]
         assert sorted(corners) == sorted(expected)
         assert len(corners) >= 3
-        # A dozen products of coordinates below 4 relative to a corner.
+        # Round-off of a dozen products of coordinates below 4.
         assert shoelace(nodes[corners]) == pytest.approx(d.volumes[i], rel=0, abs=1e-14)
     assert np.array_equal(mesh["area"], d.volumes)
     for name, attribute in (
@@ -102,7 +102,7 @@ def test_faces_are_the_cells(result, mesh):
 
 
 def test_edges_have_their_faces_on_both_sides(result, mesh):
-    """Against all sides of all faces: an edge is two of them in opposite directions, or one."""
+    """Compared with all sides of all faces: an edge is a pair of opposite ones, or a single one."""
     faces, face_edges = rows(mesh, "face_node"), rows(mesh, "face_edge")
     ends, beside = mesh["mesh_edge_nodes"], mesh["mesh_edge_faces"]
     directed = Counter((a, b, i) for i, corners in enumerate(faces) for a, b in sides(corners))
@@ -142,7 +142,7 @@ def test_walls_are_numbered(result, mesh):
     single = (mesh["mesh_edge_faces"] < 0).any(axis=1)
     assert (wall[~single] == -1).all()
     if any(domain.periodic):
-        # Edges at seams have one face, and no wall.
+        # Edges at seams have one face and no wall.
         assert (single & (wall == -1)).sum() == result.diagram.shifts.any(axis=1).sum()
     else:
         assert (wall[single] >= 0).all()
@@ -188,7 +188,7 @@ def test_as_ugrids_checker_reads_it(result, tmp_path):
 
 
 def test_units_are_the_callers(room, tmp_path):
-    """CF asks for units of coordinates; a projection's are lengths, longitudes and latitudes are degrees."""
+    """Coordinates have units: lengths of a projection, or degrees of longitude and latitude."""
     wanted = {
         None: ("m", "m", "m2", "projection_x_coordinate"),
         "km": ("km", "km", "km2", "projection_x_coordinate"),
@@ -234,7 +234,7 @@ def test_as_xarray_reads_it(room, tmp_path):
                     assert np.array_equal(found[name].values, values)
 
 
-@pytest.mark.filterwarnings("ignore:Projected")  # of areas on a sphere, which the test does not use
+@pytest.mark.filterwarnings("ignore:Projected")  # about areas on a sphere, which are not used
 def test_as_uxarray_reads_it(result, tmp_path):
     uxarray = pytest.importorskip("uxarray")
     result.save(tmp_path / "mesh.nc")
@@ -286,7 +286,7 @@ def test_conventions_are_for_netcdf_alone(room, tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
-def test_space_is_refused(tmp_path):
+def test_meshes_in_3d_are_refused(tmp_path):
     points = np.random.default_rng(1).random((20, 3))
     solid = solids.solid_result(solids.solid_diagram((0, 0, 0), (1, 1, 1), points))
     for convention in (None, *BOTH):
@@ -302,7 +302,7 @@ def test_files_are_not_read_back(room, tmp_path):
 
 
 @pytest.mark.parametrize("convention", BOTH)
-def test_what_the_format_has_no_room_for_is_refused(room, tmp_path, monkeypatch, convention):
+def test_variables_too_large_for_the_format_are_refused(room, tmp_path, monkeypatch, convention):
     largest = {"ugrid": "mesh_face_nodes", "mpas": "edgesOnEdge"}[convention]
     room.save(tmp_path / "mesh.nc", convention=convention)
     size = read(tmp_path / "mesh.nc")[largest].nbytes

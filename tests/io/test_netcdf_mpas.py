@@ -1,4 +1,4 @@
-"""netCDF files by the MPAS mesh specification, against what it says of them and the theory of their C grids.
+"""netCDF files by the MPAS mesh specification: its definitions, and the theory of C grids.
 
 Tables are looked at one by one, as loops over what the file itself says; places are nearest images.
 """
@@ -29,11 +29,11 @@ MEASURES = {
     "weightsOnEdge": ("nEdges", "maxEdges2"),
 }  # fmt: skip
 OFF_BISECTORS = {"shore", "slit"}
-"""Where cells have got pieces of others: their edges there are not across the line between the generators."""
+"""Domains where cells include parts of other regions, whose edges are on no bisector."""
 
 
 class Mesh:
-    """A file's tables, with indices from 0, -1 for none, and rows without what is behind their end."""
+    """The tables of a file with indices from 0, -1 for missing items, and rows without padding."""
 
     def __init__(self, path, name):
         self.name, self.file = name, read(path)
@@ -95,11 +95,11 @@ def mesh(result, name, tmp_path_factory):
 
 
 def tight(mesh, reference=1.0):
-    """What rounds by some dozens of coordinates below 4 times lengths below that."""
+    """Tolerance for sums of dozens of products of coordinates below 4."""
     return pytest.approx(reference, rel=0, abs=2e-13)
 
 
-def test_file_has_what_the_specification_asks_for(result, mesh):
+def test_the_file_has_all_variables_of_the_specification(result, mesh):
     file, domain = mesh.file, result.diagram.domain
     assert file.attributes["on_a_sphere"] == b"NO"
     assert file.attributes["mesh_spec"] == b"1.0"
@@ -122,7 +122,7 @@ def test_file_has_what_the_specification_asks_for(result, mesh):
     np.testing.assert_allclose(file["meshDensity"], density / density.max(), rtol=1e-13)
     degree = 4 if "squares" in mesh.name else 3
     if mesh.name in ("shore", "slit", "two pieces"):
-        degree = max(map(len, mesh.edgesOnVertex))  # where a bisector meets a corner
+        degree = max(map(len, mesh.edgesOnVertex))  # where a bisector ends in a corner
     assert file.dimensions["vertexDegree"] == degree
     for table, missing in (("edgesOnVertex", 0), ("cellsOnVertex", 0), ("kiteAreasOnVertex", 0)):
         known = file["edgesOnVertex"] > 0
@@ -133,7 +133,7 @@ def test_file_has_what_the_specification_asks_for(result, mesh):
         assert not file[table][np.arange(file[table].shape[1]) >= counts[:, None]].any()
 
 
-def test_places_are_within_the_domain(result, mesh):
+def test_coordinates_are_within_the_domain(result, mesh):
     domain = result.diagram.domain
     lower, upper = np.array(domain.lower), np.array(domain.upper)
     for places in (mesh.cell, mesh.edge, mesh.vertex):
@@ -141,8 +141,8 @@ def test_places_are_within_the_domain(result, mesh):
         assert ((places < upper) | (~np.array(domain.periodic) & (places <= upper))).all()
 
 
-def test_numbers_of_cells_edges_and_vertices_fit(result, mesh):
-    """Euler's formula: pieces less holes, or nothing on a torus or a ring."""
+def test_euler_formula_holds(result, mesh):
+    """Pieces minus holes; 0 on a torus or a ring."""
     expected = {"torus": 0, "channel": 0, "hexagons": 0, "squares without walls": 0, "shore": 0}
     wanted = {"two pieces": 2, **expected}.get(mesh.name, 1)
     assert mesh.v - mesh.e + mesh.n == wanted
@@ -169,7 +169,7 @@ def test_tables_agree(mesh):
             e, onward, vertex = edges[a], edges[(a + 1) % k], mesh.verticesOnCell[i][a]
             beside[e].append(i)
             assert sorted([i, mesh.cellsOnCell[i][a]]) == sorted(mesh.cellsOnEdge[e])
-            # The vertex between an edge and the next one, of which it is an end.
+            # The vertex between an edge and the next one is an end of both.
             assert vertex in mesh.verticesOnEdge[e]
             assert vertex in mesh.verticesOnEdge[onward]
             assert i in mesh.cellsOnVertex[vertex]
@@ -191,23 +191,23 @@ def test_tables_agree(mesh):
             assert cells[a] in mesh.cellsOnEdge[edges[(a + 1) % k]]
 
 
-def test_rounds_are_counter_clockwise(result, mesh):
+def test_edges_and_vertices_are_in_counter_clockwise_order(result, mesh):
     for i in range(mesh.n):
         corners = [mesh.away(mesh.cell[i], mesh.vertex[v]) for v in mesh.verticesOnCell[i]]
         assert shoelace(np.array(corners)) == tight(mesh, result.diagram.volumes[i])
     for v, edges in enumerate(mesh.edgesOnVertex):
-        # Along the edges to their other ends.
+        # Along the edges to their other vertices.
         angles = []
         for e in edges:
             (other,) = (w for w in mesh.verticesOnEdge[e] if w != v)
             x, y = mesh.away(mesh.vertex[v], mesh.vertex[other])
             angles.append(np.arctan2(y, x))
         steps = np.mod(np.diff([*angles, angles[0]]), 2 * np.pi)
-        # Once around.
+        # One full turn.
         assert steps.sum() == pytest.approx(2 * np.pi, abs=1e-9)
 
 
-def test_edges_look_from_their_first_cell_to_the_second(mesh):
+def test_normals_point_from_the_first_cell_to_the_second(mesh):
     for e in range(mesh.e):
         i, j = mesh.cellsOnEdge[e]
         a, b = mesh.verticesOnEdge[e]
@@ -220,7 +220,7 @@ def test_edges_look_from_their_first_cell_to_the_second(mesh):
         if j < 0:
             assert mesh["dcEdge"][e] == pytest.approx(3**0.5 * mesh["dvEdge"][e], rel=1e-15)
             assert foot == tight(mesh, (begin + end) / 2)
-            # Outwards: the cell is on the left.
+            # The normal points outwards if the cell is on the left.
             assert normal @ (along[1], -along[0]) == tight(mesh, np.hypot(*along))
             continue
         line = mesh.normal(e)
@@ -230,14 +230,14 @@ def test_edges_look_from_their_first_cell_to_the_second(mesh):
             assert foot == tight(mesh, (begin + end) / 2)
             continue
         assert foot == tight(mesh, line / 2)
-        # Orthogonal, and right-handed.
+        # Orthogonal and right-handed.
         assert along @ line == tight(mesh, 0)
         assert line[0] * along[1] - line[1] * along[0] == tight(
             mesh, np.hypot(*along) * np.hypot(*line)
         )
 
 
-def test_only_pieces_of_others_are_off_bisectors(mesh):
+def test_only_edges_of_adopted_parts_are_off_bisectors(mesh):
     off = 0
     for e in range(mesh.e):
         if (line := mesh.normal(e)) is not None:
@@ -256,7 +256,7 @@ def test_kites_are_the_parts_of_cells_and_triangles(result, mesh):
                 assert kites[v, k] == 0
                 continue
             of_cells[i] += kites[v, k]
-            # From the vertex: the edge, the generator, the next edge.
+            # The kite: vertex, edge, generator, next edge.
             around = [
                 mesh.away(mesh.vertex[v], place)
                 for place in (
@@ -266,7 +266,7 @@ def test_kites_are_the_parts_of_cells_and_triangles(result, mesh):
             assert kites[v, k] == tight(mesh, shoelace(np.array([(0, 0), *around])))
         assert mesh["areaTriangle"][v] == tight(mesh, kites[v].sum())
         if len(edges) == sum(i >= 0 for i in cells) and mesh.name not in OFF_BISECTORS:
-            # All around: the triangle (or more) of the generators.
+            # All kites of a vertex: the polygon of its generators.
             corners = [mesh.away(mesh.vertex[v], mesh.cell[i]) for i in cells if i >= 0]
             assert mesh["areaTriangle"][v] == tight(mesh, shoelace(np.array(corners)))
     np.testing.assert_allclose(of_cells, mesh["areaCell"], rtol=1e-13)
@@ -275,8 +275,8 @@ def test_kites_are_the_parts_of_cells_and_triangles(result, mesh):
         assert areas.sum() == pytest.approx(domain.measure, rel=1e-12)
 
 
-def test_a_piece_all_but_on_a_bisector_is_none(ctx, tmp_path):
-    """An edge of a piece from another cell whose middle is 0.0006 of the distance off, found among a hundred meshes."""
+def test_an_adopted_part_close_to_a_bisector_is_recognized(ctx, tmp_path):
+    """The middle of its edge is off the bisector by 0.0006 of the distance; found in one of a hundred meshes."""
     domain = clvoro.Polygon.from_shapely(blocks(np.random.default_rng(85), 4))
     diagram = clvoro.Adapter(ctx).diagram(domain, scattered(domain, 60, 85))
     result_of(diagram).save(tmp_path / "mesh.nc", convention="mpas")
@@ -288,7 +288,7 @@ def test_a_piece_all_but_on_a_bisector_is_none(ctx, tmp_path):
 
 
 def slow_weights(mesh, e):
-    """Edge by edge as the formula has it: others and their weights, around the first cell, then the second."""
+    """Other edges and their weights by the formula, around the first cell, then the second."""
     found = []
     for i in mesh.cellsOnEdge[e]:
         if i < 0:
@@ -321,10 +321,10 @@ def matrix(mesh):
 
 
 def check_energy(mesh):
-    """No energy is made: W is antisymmetric in the inner product of velocities, whose weights are dv dc."""
+    """Energy is conserved: W is antisymmetric in the inner product of velocities with the weights dv dc."""
     power = mesh["dvEdge"][:, None] * mesh["dcEdge"][:, None] * matrix(mesh)
     assert np.abs(power).max() > 0
-    # Shares of an area sum up to 1 to some roundings.
+    # Shares of an area sum to 1 up to round-off.
     assert np.abs(power + power.T).max() < 1e-14 * np.abs(power).max()
 
 
@@ -333,7 +333,7 @@ def test_the_coriolis_force_does_no_work(mesh):
 
 
 def check_divergence(mesh):
-    """What flows out of a triangle by the rotated velocities is the kites' mean of what flows out of the cells.
+    """The flow out of a triangle by the rotated velocities is the mean over its kites of the flow out of the cells.
 
     So it is for any velocities (Ringler et al., J. Comput. Phys. 229 (2010) 3065, 2.5), and a flow without divergence
     has none when it is rotated: geostrophic balance stays steady.
@@ -349,7 +349,7 @@ def check_divergence(mesh):
         cells = [i for i in mesh.cellsOnVertex[vertex] if i >= 0]
         if len(cells) < len(edges):
             continue
-        # Velocities along the edges go through the triangle's sides, which are dc long.
+        # Tangential velocities cross the sides of the triangle, of length dc.
         out = [1 if mesh.verticesOnEdge[e][0] == vertex else -1 for e in edges]
         flows = [s * v[e] * mesh["dcEdge"][e] for s, e in zip(out, edges, strict=True)]
         expected = sum(mesh.kite(vertex, i) * divergence[i] for i in cells)
@@ -358,16 +358,16 @@ def check_divergence(mesh):
     assert tested > 20
 
 
-def test_divergence_of_the_rotated_flow_is_that_of_the_flow(mesh):
+def test_divergence_of_the_rotated_flow_is_the_mean_of_the_cells(mesh):
     check_divergence(mesh)
 
 
 @pytest.mark.parametrize("name", ["room", "torus"])
-def test_balances_hold_in_single_precision_too(ctx, tmp_path, name):
+def test_balances_hold_in_single_precision(ctx, tmp_path, name):
     result = made(ctx, name, "float32")
     result.save(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", name)
-    # Corners are rounded to 2^-24 of the frame, cells some 0.1 wide.
+    # Round-off of corners is 2^-24 of the frame; cells are 0.1 wide.
     np.testing.assert_allclose(mesh["areaCell"], result.diagram.volumes, rtol=1e-4)
     kites = np.bincount(
         np.maximum(mesh["cellsOnVertex"].ravel() - 1, 0), mesh["kiteAreasOnVertex"].ravel()
@@ -377,7 +377,7 @@ def test_balances_hold_in_single_precision_too(ctx, tmp_path, name):
     check_divergence(mesh)
 
 
-def test_both_sides_of_a_needle_without_width_have_vertices_of_their_own(ctx, tmp_path):
+def test_each_side_of_a_slit_without_width_has_its_own_vertices(ctx, tmp_path):
     domain = clvoro.Polygon(spit(1e-12))
     diagram = clvoro.Adapter(ctx, "float32").diagram(domain, scattered(domain, 20))
     walls = face_ends(diagram)[diagram.neighbors < 0]
@@ -391,7 +391,7 @@ def test_both_sides_of_a_needle_without_width_have_vertices_of_their_own(ctx, tm
 
 
 def test_faces_without_length_are_no_edges(tmp_path):
-    """Between cells that meet in a corner: four cells share it."""
+    """Four cells share a corner; the face between two of them has no length."""
     points = netcdf_files.grid(BOX, 5, 4)
     points += 1e-12 * np.random.default_rng(4).standard_normal(points.shape)
     diagram = make_diagram(points)
@@ -408,7 +408,7 @@ def test_faces_without_length_are_no_edges(tmp_path):
 
 
 def test_weights_of_regular_hexagons(ctx, tmp_path):
-    """Thuburn et al.'s: 1/3, 1/6, 0, 1/6, 1/3 over the square root of 3, with which constant flows are exact."""
+    """Thuburn et al.: 1/3, 1/6, 0, 1/6, 1/3 over the square root of 3, exact for constant flows."""
     made(ctx, "hexagons").save(tmp_path / "mesh.nc", convention="mpas")
     mesh = Mesh(tmp_path / "mesh.nc", "hexagons")
     assert {len(row) for row in mesh.edgesOnEdge} == {10}
@@ -430,7 +430,7 @@ def test_weights_of_regular_hexagons(ctx, tmp_path):
     np.testing.assert_allclose(mesh["kiteAreasOnVertex"], 3**0.5 / 12, rtol=1e-12)
 
 
-# --- what the specification has no place for ---
+# --- meshes that the specification excludes ---
 
 
 def test_a_cell_around_an_island_is_refused(ctx, tmp_path):

@@ -34,7 +34,7 @@ def bay() -> Polygon:
 
 
 def ring() -> Polygon:
-    """A ragged ring around a hole whose corners turn by 30 degrees, where rounding decides what is a side."""
+    """A ragged ring around a hole with corners of 30 degrees, where round-off decides on sides."""
     rng, k = np.random.default_rng(3), 150
     angle = (np.arange(k) + rng.uniform(0, 0.9, k)) * 2 * np.pi / k
     r = 1 + 0.25 * np.sin(5 * angle) + rng.uniform(-0.05, 0.05, k)
@@ -58,7 +58,7 @@ DOMAINS = {"bay": bay, "ring": ring, "comb": comb, "three": three}
 
 
 def scattered(domain: Polygon, n: int, seed: int = 1) -> np.ndarray:
-    """Return `n` places well inside, some in every piece."""
+    """Return `n` points well inside, some in every piece."""
     rng = np.random.default_rng(seed)
     inner = np.array([domain.inner_point(p) for p in range(domain.n_pieces)])
     x = rng.uniform(domain.lower, domain.upper, (20 * n, 2))
@@ -88,7 +88,7 @@ def result(ctx) -> clvoro.Result:
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("n", [3, 60, 900])
 @pytest.mark.parametrize("name", list(DOMAINS))
-def test_right_meshes_pass(ctx, name: str, n: int, dtype: str) -> None:
+def test_correct_meshes_pass(ctx, name: str, n: int, dtype: str) -> None:
     report = mesh(ctx, DOMAINS[name](), n, dtype).check()
     assert report.ok, report
     expected = {
@@ -121,14 +121,14 @@ SPOILT = {
 
 
 def test_a_generator_in_a_corner_where_pieces_touch(ctx) -> None:
-    """It belongs to one piece; in the other one, cells may be nearer to it than to their own."""
+    """It belongs to one piece; in the other one it may be nearer to cells than their own generators."""
     domain = Polygon.from_pieces([[SQUARE * 0.5], [SQUARE * 0.5 + 0.5]])
     points = [(0, 0), (0, 0.5), (0.5, 0), (0.5, 0.5), (0.5, 1), (1, 0.5), (1, 1)]
     report = clvoro.Adapter(ctx).diagram(domain, points).check()
     assert report, report
 
 
-def test_a_face_of_a_rounding_is_a_side_or_none(ctx) -> None:
+def test_a_face_as_short_as_round_off_may_be_a_side(ctx) -> None:
     a = np.array([(0, 4), (1, 4), (1, 5), (0, 5)]) / 7
     domain = Polygon.from_pieces([[a], [a + np.array([1, -1]) / 7]])
     x = [(0.1369047619047619, 0.5718085607390168), (0.14247715354669752, 0.5773809523809523),
@@ -139,7 +139,7 @@ def test_a_face_of_a_rounding_is_a_side_or_none(ctx) -> None:
 
 
 def test_sides_in_a_corner_of_two_holes(ctx) -> None:
-    """Parts of a cell come together in the corner: where its sides end there is a matter of taste."""
+    """Parts of a cell meet in the corner: the ends of its sides there are ambiguous."""
     holes = [[(0.25, 0.75), (0.5, 0.5), (0.25, 0.25)], [(0.75, 0.75), (0.75, 0.25), (0.5, 0.5)]]
     x = [(0.5122103171985511, 0.48721031719855123), (0.48778968280144874, 0.48721031719855123),
          (0.5135252778420708, 0.5142524999357069), (0.5113436115611626, 0.5164341662166151),
@@ -148,7 +148,7 @@ def test_sides_in_a_corner_of_two_holes(ctx) -> None:
         Polygon(SQUARE, holes), 0.05, points=x, method="lloyd", max_steps=0
     )
     assert made.check(), made.check()
-    # Elsewhere it is none: one side more or less is found.
+    # Elsewhere they are not: a side more or less is detected.
     quality = made.quality.copy()
     quality[5] *= 6 * np.tan(np.pi / 6) / (5 * np.tan(np.pi / 5))
     assert not dataclasses.replace(made, quality=quality).check()
@@ -168,7 +168,7 @@ def test_checks_in_any_unit(ctx, scale: float) -> None:
 
 
 @pytest.mark.parametrize("case", list(SPOILT))
-def test_what_is_wrong_is_named(result, case: str) -> None:
+def test_checks_name_each_fault(result, case: str) -> None:
     changes, name = SPOILT[case]
     report = spoilt(result, **changes).check()
     assert name in {finding.name for finding in report.findings}, report
@@ -181,7 +181,7 @@ def test_open_loops_are_found(result) -> None:
 
 
 def test_diagram_of_other_generators_is_found(result) -> None:
-    # Closed, symmetric, of the right sum; only not the Voronoi diagram of these generators.
+    # Closed, symmetric and of the correct sum, but not the Voronoi diagram of these generators.
     d = result.diagram
     i, j = 8, int(d.neighbors[d.neighbor_starts[8] : d.neighbor_starts[9]].max())
     x = d.points.copy()
@@ -198,7 +198,7 @@ def test_numbers_of_a_result_are_recomputed(result, name: str) -> None:
     assert ("quality" if name == "quality" else "size_error") in {f.name for f in report.findings}
 
 
-# What the boundary looks like to faces.
+# Walls.
 
 
 def test_walls_of_polygons() -> None:
@@ -215,13 +215,13 @@ def test_walls_of_polygons() -> None:
 
 
 def cells_of(diagram) -> list:
-    """Each cell as a shapely geometry, from the ends of its faces alone."""
+    """Each cell as a shapely geometry, from the ends of its faces only."""
     x, ends = diagram.vertices, face_ends(diagram)
     found = []
     for a, b in zip(diagram.neighbor_starts[:-1], diagram.neighbor_starts[1:], strict=True):
         lines = [shapely.LineString(x[e]) for e in ends[a:b] if (x[e[0]] != x[e[1]]).any()]
         parts = shapely.get_parts(shapely.polygonize(lines))
-        # What is on the left of its outline is the cell; islands in it are not.
+        # The cell is on the left of its outline; islands in it are not parts of it.
         islands = [shapely.Polygon(hole) for part in parts for hole in part.interiors]
         kept = [p for p in parts if not any(p.equals(island) for island in islands)]
         found.append(shapely.union_all(kept))
@@ -230,7 +230,7 @@ def cells_of(diagram) -> list:
 
 def test_faces_are_the_outlines_of_cells(result) -> None:
     cells = cells_of(result.diagram)
-    # Sums of a dozen products of numbers up to 4.
+    # Round-off of sums of a dozen products of numbers up to 4.
     assert np.abs(shapely.area(cells) - result.diagram.volumes).max() < 1e-13
     assert any(len(part.interiors) for cell in cells for part in shapely.get_parts(cell))
     following = next_faces(result.diagram)
@@ -282,7 +282,7 @@ def test_quality_is_that_of_the_cell_with_straight_sides(ctx, dtype: str) -> Non
             area = (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
             perimeter = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
             expected = 4 * max(area, 0) * n * np.tan(np.pi / n) / perimeter**2
-            # Corners round by eps of the domain, four wide at most, where cells are a tenth as wide as that.
+            # Round-off of corners is eps of the domain, which is up to 4 wide and 10 cells across.
             assert result.quality[i] == pytest.approx(expected, abs=4096 * eps)
             edges = diagram.neighbors[diagram.neighbor_starts[i] : diagram.neighbor_starts[i + 1]]
             joined += len(set(edges[edges < 0].tolist())) < (edges < 0).sum()
@@ -290,11 +290,11 @@ def test_quality_is_that_of_the_cell_with_straight_sides(ctx, dtype: str) -> Non
     assert joined > 10
 
 
-def test_a_bent_side_is_no_better_than_a_straight_one(ctx) -> None:
-    """A regular pentagon, a corner of which is but the bend of a wall: as four sides it would have Q = 1.10."""
+def test_a_bent_side_counts_as_one_straight_side(ctx) -> None:
+    """A regular pentagon with one corner in a bend of a wall. Counted as four sides it would have Q = 1.10."""
     angle = np.arange(5) * 2 * np.pi / 5
     pentagon = np.column_stack([np.cos(angle), np.sin(angle)])
-    # The wall's corner is made as flat as a side may be; the other corners are where they were.
+    # The corner on the wall is as flat as a side may be; the other corners stay.
     a, b = pentagon[1], pentagon[4]
     flat = (a + b) / 2 + (0.5 * np.linalg.norm(a - b) * np.tan(np.radians(14.9)), 0)
     domain = Polygon([flat, a, pentagon[2], pentagon[3], b])
@@ -316,7 +316,7 @@ def test_a_cell_without_neighbors_has_the_sides_of_its_piece(ctx) -> None:
     assert count_sides(diagram).tolist() == [4]
     circle = Polygon([(np.cos(t), np.sin(t)) for t in np.arange(100) * np.pi / 50])
     diagram = clvoro.Adapter(ctx).diagram(circle, np.array([(0.0, 0.0)]))
-    # 100 turns of 3.6 degrees: after each 9 of them a new side, and the last of one edge.
+    # 100 turns of 3.6 degrees: a new side after each 9, and a last side of one edge.
     assert count_sides(diagram).tolist() == [12]
     begun_amid = Polygon(np.vstack([(0.5, 0), SQUARE[1:], SQUARE[:1]]))
     diagram = clvoro.Adapter(ctx).diagram(begun_amid, np.array([(0.5, 0.5)]))
@@ -352,7 +352,7 @@ def same_diagram(one, other) -> None:
 
 
 @pytest.mark.parametrize("name", list(DOMAINS))
-def test_npz_loses_nothing(ctx, tmp_path, name: str) -> None:
+def test_npz_keeps_everything(ctx, tmp_path, name: str) -> None:
     made = mesh(ctx, DOMAINS[name](), 40)
     made.save(tmp_path / "mesh.npz")
     again = clvoro.load(tmp_path / "mesh.npz")
@@ -404,8 +404,8 @@ def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
 
 
 @pytest.mark.parametrize("named", [True, False], ids=["edges named", "edges found"])
-def test_vtu_with_a_needle_of_no_width(ctx, tmp_path, monkeypatch, named) -> None:
-    """Both sides of the needle have the same corners in single precision, as a bridge between loops would."""
+def test_vtu_with_a_slit_without_width(ctx, tmp_path, monkeypatch, named) -> None:
+    """In single precision both sides of the slit have the same corners, like a bridge between loops."""
     shore = np.vstack([spit(1e-12)[:-1], (0, 1), (0, 0.5)])
     domain = Polygon(shore, [star(7, 3, (0.3, 0.3), 0.1), star(5, 4, (0.2, 0.8), 0.05)])
     made = mesh(ctx, domain, 3, "float32")
@@ -430,7 +430,7 @@ def test_a_moved_corner_in_a_vtu_is_found(result, tmp_path) -> None:
 
 
 def assert_same_areas(read, d: clvoro.Diagram, slack: float) -> None:
-    """Of what meshio has read."""
+    """Areas of the cells that meshio read."""
     assert sum(len(block) for block in read.cells) == len(d)
     x = read.points[:, :2]
     areas = [
@@ -444,7 +444,7 @@ def assert_same_areas(read, d: clvoro.Diagram, slack: float) -> None:
 def test_other_programs_read_the_cells(result, tmp_path, name) -> None:
     meshio = pytest.importorskip("meshio")
     result.save(tmp_path / name)
-    # The others than VTK's hold fewer digits.
+    # The other formats have fewer digits than VTK's.
     assert_same_areas(
         meshio.read(tmp_path / name), result.diagram, 1e-13 if name == "mesh.vtk" else 1e-5
     )
@@ -473,7 +473,7 @@ def test_openfoam_cells_are_closed(pond, tmp_path) -> None:
     assert len(set(pairs)) < len(pairs)
     assert all(i < j for i, j in pairs)
     areas = np.array([solids.loop_area(points[f]) for f in faces])
-    # Of a face that is not convex the mean of its corners is not the centroid, but lies in its plane.
+    # The mean of the corners of a concave face is not its centroid, but in its plane.
     cones = (areas * np.array([points[f].mean(axis=0) for f in faces])).sum(axis=1) / 3
     openness, volumes = np.zeros((n, 3)), np.zeros(n)
     np.add.at(openness, owner, areas)
@@ -493,7 +493,7 @@ def test_openfoam_cells_are_closed(pond, tmp_path) -> None:
 
 
 def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
-    """Length of each patch, by its first edge's prisms."""
+    """Length of each patch, from the areas of its faces."""
     depth = points[:, 2].max()
     area = {
         name: sum(np.linalg.norm(solids.loop_area(points[f])) for f in faces[start : start + count])
@@ -543,7 +543,7 @@ def test_wrong_patches_are_refused(pond, tmp_path, patches: object, says: str) -
     assert not list(tmp_path.iterdir())
 
 
-def test_what_openfoam_cannot_hold_is_refused(result, pond, tmp_path) -> None:
+def test_cells_around_islands_are_refused_for_openfoam(result, pond, tmp_path) -> None:
     with pytest.raises(
         InputError, match=r"cell \d+ \(1 in all\) goes around a part of the boundary"
     ):
@@ -574,13 +574,13 @@ def test_cells_fill_the_domain_and_nothing_else(result, color: str) -> None:
     figure = result.plot(color, edges=False)
     figure.set_dpi(400)  # the speck is three hundredths of a unit
     assert all(pixel(figure, place) == [255, 255, 255] for place in OUTSIDE)
-    if color not in ("error", "sides"):  # whose middle is white, or nearly
+    if color not in ("error", "sides"):  # their color maps have a white middle
         assert all(pixel(figure, place) != [255, 255, 255] for place in INSIDE)
     lines = [patch for patch in figure.axes[0].patches if len(patch.get_path().vertices) == 20]
     assert len(lines) == 1  # all four rings, closed
 
 
-def test_size_is_asked_for_inside_only(result) -> None:
+def test_size_is_evaluated_inside_only(result) -> None:
     pytest.importorskip("matplotlib")
     from clvoro.plotting import plot_size
 
@@ -594,7 +594,7 @@ def test_size_is_asked_for_inside_only(result) -> None:
     figure.set_dpi(200)
     assert all(pixel(figure, place) == [255, 255, 255] for place in OUTSIDE)
     assert all(max(pixel(figure, place)) < 250 for place in INSIDE)
-    # Up to the boundary: a hundredth beside it, where a raster would end in steps.
+    # Up to the boundary: a raster would end in steps there.
     beside = np.add(*domain.edge_ends(np.arange(len(domain.vertices)))) / 2
     inward = beside - 0.02 * wall_planes(domain, np.arange(len(beside)))[0]
     kept = inward[:9][domain.contains(inward[:9])]
@@ -602,7 +602,7 @@ def test_size_is_asked_for_inside_only(result) -> None:
     assert all(pixel(figure, place) != [255, 255, 255] for place in kept)
 
 
-def test_boundary_cells_are_reported_apart(result, tmp_path) -> None:
+def test_boundary_cells_are_reported_separately(result, tmp_path) -> None:
     pytest.importorskip("matplotlib")
     from clvoro.mesh.summary import boundary_line, summary
     from clvoro.plotting import write_report
@@ -642,12 +642,12 @@ def pair(ctx):
     return [adapter.diagram(bay(), scattered(bay(), n, seed)) for n, seed in ((60, 1), (45, 5))]
 
 
-def test_parts_are_those_of_the_cells(pair) -> None:
+def test_overlaps_sum_to_the_cells(pair) -> None:
     old, new = pair
     before, after = cells_of(old), cells_of(new)
     got = old.transfer(np.eye(60), new)
     expected = np.array([[new_.intersection(old_).area for old_ in before] for new_ in after])
-    # Areas of sums of products of numbers up to 4; the mass that rounding leaves over is divided among all.
+    # Round-off of areas of numbers up to 4; the rest of the mass is distributed over all cells.
     assert np.abs(got * new.volumes[:, None] - expected).max() < 1e-13
     assert (expected > 0).sum() > 60
 
@@ -675,7 +675,7 @@ def test_transfer_is_conservative_and_exact(ctx, name: str) -> None:
             assert (got[:, 2] == np.pi).all()
             assert got[:, 0].min() >= rough.min()
             assert got[:, 0].max() <= rough.max()
-    # Exact where every old cell beneath has neighbors in two directions: nearly everywhere.
+    # Exact where every overlapped old cell has neighbors in two directions: nearly everywhere.
     error = np.abs(got[:, 1] - linear(new))
     assert np.median(error) < 1e-14
     assert name == "comb" or error.max() < 1e-13
@@ -695,7 +695,7 @@ def test_transfer_between_domains_is_refused(pair, ctx) -> None:
 def test_slopes_are_those_of_the_device(ctx) -> None:
     from clvoro.remapping.host_transfer import fit_slopes
 
-    # In a box, described as a polygon.
+    # A box as a polygon.
     box, points = clvoro.Box((0, 0), (1, 1)), np.random.default_rng(9).random((80, 2))
     values = np.random.default_rng(10).standard_normal((80, 1))
     adapter = clvoro.Adapter(ctx)
@@ -707,7 +707,7 @@ def test_slopes_are_those_of_the_device(ctx) -> None:
             )
             for domain in (box, Polygon(SQUARE))
         )
-        # Where the fit is ill-conditioned, as between neighbors nearly in a row, rounding grows.
+        # Round-off grows where the fit is ill-conditioned, as for neighbors nearly on a line.
         assert np.abs(flat - ring_).max() < 1e-10
     slopes, least, most = fit_slopes(adapter.diagram(Polygon(SQUARE), points), values, True)
     assert (least <= values).all()

@@ -49,7 +49,7 @@ def loops_of(diagram):
 
 
 def decode(stream, ends):
-    """The faces of every cell from VTK's stream, one number after the other."""
+    """The faces of every cell from VTK's stream of numbers."""
     cells, place = [], 0
     for end in ends:
         faces = []
@@ -65,7 +65,7 @@ def decode(stream, ends):
 
 
 def enclosed_volume(vertices, faces):
-    """Volume within a closed surface of plane polygons, counter-clockwise as seen from outside."""
+    """Volume inside a closed surface of plane polygons, counter-clockwise as seen from outside."""
     return sum(vertices[f[0]] @ solids.loop_area(vertices[f]) for f in faces) / 3
 
 
@@ -78,7 +78,7 @@ def test_polyhedra_are_the_cells(diagram, lattice):
         corners = np.split(arrays["connectivity"], arrays["offsets"][:-1])
         for faces, listed, volume in zip(cells, corners, d.volumes, strict=True):
             assert listed.tolist() == sorted({v for face in faces for v in face})
-            # Sums of some 15 products of coordinates up to 4.
+            # Round-off of sums of 15 products of coordinates up to 4.
             assert enclosed_volume(d.vertices, faces) == pytest.approx(volume, abs=1e-12)
 
 
@@ -107,7 +107,7 @@ def test_take_rows_forwards_and_backwards():
     assert found.tolist() == [13, 16, 15, 14, 10, 11, 12]
 
 
-def test_every_face_once(diagram):
+def test_faces_once_has_each_face_once(diagram):
     faces, owner = face_topology(diagram), face_owners(diagram)
     pairs = {
         (min(i, j), max(i, j)) if j >= 0 else (i, j)
@@ -122,7 +122,7 @@ def test_every_face_once(diagram):
     )
 
 
-def test_a_face_that_one_cell_alone_describes_is_turned(diagram):
+def test_a_face_of_one_cell_only_is_reversed(diagram):
     owner, neighbor = face_owners(diagram), diagram.neighbors
     lost = np.flatnonzero((owner < neighbor) & (owner == 20))[0]
     kept = np.arange(len(owner)) != lost
@@ -145,7 +145,7 @@ def test_a_face_that_one_cell_alone_describes_is_turned(diagram):
 
 
 def appended_arrays(path):
-    """The arrays of a .vtu file by name, from the description of VTK's format."""
+    """The arrays of a .vtu file by name, read by the documentation of the format."""
     head, data = path.read_bytes().split(b'<AppendedData encoding="raw">\n_', 1)
     root = ElementTree.fromstring(head.decode() + "</VTKFile>")
     kinds = {"Float64": "f8", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
@@ -226,7 +226,7 @@ def test_vtu_as_vtk_reads_it(result, tmp_path):
         surface.SetPolys(polygons)
         triangles.SetInputData(surface)
         mass.SetInputConnection(triangles.GetOutputPort())
-        # As for the enclosed volume above. (VTK's filter for cell sizes is off for some polyhedra.)
+        # Tolerance as for the volume above. VTK's filter for cell sizes is wrong for some polyhedra.
         assert mass.GetVolume() == pytest.approx(volume, abs=1e-12)
 
 
