@@ -67,8 +67,7 @@ def plot_mesh(
     through : 3 floats, optional
         For 3D: a point of the planes or of the cut.
     cut, angles
-        For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; `cut` and `view` of
-        `plot_cutaway`.
+        For "cutaway": the removed part, and azimuth and elevation of the viewer in degrees; see `plot_cutaway`.
 
     Returns
     -------
@@ -101,7 +100,7 @@ def plot_mesh(
             raise InputError(
                 f"{name} is for {', '.join(known)}, and this picture is {kind}; leave it out"
             )
-        options["view" if name == "angles" else name] = value
+        options[name] = value
     return draw(mesh, color, label=label, limits=limits, title=title, **options)
 
 
@@ -112,7 +111,7 @@ def plot_cutaway(
     *,
     cut: str | ArrayLike | None = "octant",
     through: ArrayLike | None = None,
-    view: tuple[float, float] = VIEW,
+    angles: tuple[float, float] = VIEW,
     label: str | None = None,
     limits: tuple[float, float] | None = None,
     edges: bool = True,
@@ -133,7 +132,7 @@ def plot_cutaway(
         marked as kept; or nothing.
     through : 3 floats, optional
         The point; by default among the smallest cells.
-    view : (azimuth, elevation), degrees
+    angles : (azimuth, elevation), degrees
         Direction of the viewer.
     label, limits, edges, key, title
         As for `plot_cells`.
@@ -151,14 +150,14 @@ def plot_cutaway(
     require_space(result.diagram)
     scheme = coloring_of(result, color, label)
     point = focus(result) if through is None else np.asarray(through, float)
-    what = _cut(cut, len(result.points), view)
+    what = _cut(cut, len(result.points), angles)
     values = scheme.values(result)
     ends = scheme.limits(values) if limits is None else limits
     with styled():
         if ax is None:
-            ax = interactive_figure(WIDTH, cutaway_height(result, view)).add_subplot()
+            ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()
         shown = draw_cutaway(
-            ax, result, values, scheme, ends, through=point, cut=what, view=view, edges=edges
+            ax, result, values, scheme, ends, through=point, cut=what, view=angles, edges=edges
         )  # fmt: skip
         if title is not None:
             ax.set_title(title)
@@ -167,14 +166,14 @@ def plot_cutaway(
     return ax.figure
 
 
-def cutaway_height(result: Result, view: tuple[float, float] = VIEW) -> float:
+def cutaway_height(result: Result, angles: tuple[float, float] = VIEW) -> float:
     """Height in inches that suits `plot_cutaway`."""
-    right, up, _ = view_axes(view)
+    right, up, _ = view_axes(angles)
     width, height = (np.abs(axis) @ result.diagram.domain.extent for axis in (right, up))
     return min(float((WIDTH - 0.9) * height / width), 1.1 * WIDTH) + 0.4
 
 
-def _cut(cut: Any, n: int, view: tuple[float, float]) -> Any:
+def _cut(cut: Any, n: int, angles: tuple[float, float]) -> Any:
     """Return `cut` as `draw_cutaway` takes it, or raise InputError."""
     if cut is None or (isinstance(cut, str) and cut == "octant"):
         return cut
@@ -186,7 +185,7 @@ def _cut(cut: Any, n: int, view: tuple[float, float]) -> Any:
             return marks
     elif cut in "xyz" and len(cut) == 1:
         normal = as_normal(cut)
-        return normal if view_axes(view)[2] @ normal >= 0 else -normal
+        return normal if view_axes(angles)[2] @ normal >= 0 else -normal
     try:
         return as_normal(cut)
     except InputError as error:

@@ -181,7 +181,7 @@ def test_cutaway_takes_marks_and_directions(result):
     widest = max(path.vertices[:, 0].max() for path in faces.get_paths())
     assert widest < np.array([1.0, 1.0, 0.0]) @ right
     for cut in ("x", "y", "z", (1, 1, 0), None):
-        assert has_color_bar(plot_cutaway(result, cut=cut, view=(30, 40)))
+        assert has_color_bar(plot_cutaway(result, cut=cut, angles=(30, 40)))
 
 
 @pytest.mark.parametrize(
