@@ -26,10 +26,10 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import (
     Circle,
+    ClosedPolyline,
     Distance,
     Expression,
     Graded,
-    Polygon,
     Raster,
     Sizing,
     Sphere,
@@ -326,7 +326,7 @@ def copy(adapter: clvoro.Adapter) -> None:
 def fields(adapter: clvoro.Adapter) -> None:
     """Every kind of size field at some places, with its gradient; runs with some of them, and with a callable."""
     turn = np.linspace(0, 6.2, 150)
-    many = Polygon(0.75 + 0.4 * np.stack([np.cos(turn), np.sin(turn)], 1))
+    many = ClosedPolyline(0.75 + 0.4 * np.stack([np.cos(turn), np.sin(turn)], 1))
     raster = Raster(0.2 + 0.1 * points(12).reshape(4, 6), BOX.lower, BOX.upper)
     few = Distance([Circle((0.5, 0.5), 0.2)], 0.1, growth=1.3, h_max=0.4)
     corners = 0.5 + 0.3 * (x := points(14, 3) - 0.5) / np.linalg.norm(x, axis=1)[:, None]

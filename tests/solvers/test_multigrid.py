@@ -588,7 +588,7 @@ def test_updated_cycle_is_positive_definite(make, amount):
 
 def test_coarse_levels_are_reused_while_they_converge(make):
     """Cells that move a little: a few more iterations. If they move a lot it is made anew at the next solve."""
-    engine, n = make(), 4000
+    engine, n = make(), 6000
     first, second = neighboring_weights(n, 0.05)
     scattered = neighboring_weights(n, 1.5)[1]
     poisson, cells = Poisson(engine), object()
