@@ -75,21 +75,7 @@ class Layers:
         if self.spacing is not None:
             check_number("Layers spacing", self.spacing, above=0)
         if self.edges is not None:
-            one = isinstance(self.edges, str | int | np.integer)
-            if not one and (
-                isinstance(self.edges, Mapping) or not isinstance(self.edges, Iterable)
-            ):
-                raise InputTypeError(
-                    f"Layers edges is {self.edges!r}, expected numbers or names of edges"
-                )
-            edges = [self.edges] if one else self.edges
-            object.__setattr__(
-                self,
-                "edges",
-                tuple(
-                    e if isinstance(e, str) else check_integer("Layers edges", e, 0) for e in edges
-                ),
-            )
+            object.__setattr__(self, "edges", _numbers_or_names(self.edges))
 
     @property
     def heights(self) -> np.ndarray:
@@ -120,6 +106,14 @@ class Layers:
         tops = np.cumsum(self.heights)
         rows = tops - self.heights * (1 - 1 / (1 + self.growth))
         return np.append(rows, 2 * tops[-1] - rows[-1])
+
+
+def _numbers_or_names(edges: object) -> tuple[int | str, ...]:
+    """Return `edges` of `Layers` as a tuple."""
+    items = [edges] if isinstance(edges, str | int | np.integer) else edges
+    if isinstance(items, Mapping) or not isinstance(items, Iterable):
+        raise InputTypeError(f"Layers edges is {edges!r}, expected numbers or names of edges")
+    return tuple(e if isinstance(e, str) else check_integer("Layers edges", e, 0) for e in items)
 
 
 def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
@@ -167,7 +161,7 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     points = points[~gone]
     if not len(points):
         raise InputError(
-            f"layers of {[layer.thickness for layer in layers]} do not fit between the walls of the domain; "
+            f"layers of thickness {[layer.thickness for layer in layers]} do not fit between the walls of the domain; "
             "make them thinner"
         )
     return points

@@ -30,7 +30,7 @@ class BoundaryNames:
     index : (k,) int32
         Index in `names` of the part that each wall belongs to; -1 for a side of a box that is periodic.
     kind : str
-        What errors call one wall: "edge" or "side".
+        Name of one wall in error messages: "edge" or "side".
     """
 
     names: tuple[str, ...]
@@ -46,7 +46,7 @@ class BoundaryNames:
         Parameters
         ----------
         what : str
-            What errors call the selection.
+            Name of the selection in error messages.
         walls : int, str, sequence of both, (k,) bool or None
             Numbers, names of parts, or a mask over all walls. None selects every wall.
 

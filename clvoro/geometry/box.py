@@ -281,7 +281,7 @@ class Box(Domain):
             sides = whole.triangles.reshape(6, 2, 3)[[4, 5, 2, 3, 0, 1]]
             return Surface(whole.vertices, sides[chosen].reshape(-1, 3), "boundary")
         corners = np.array([(0, 1), (0, 0), (1, 0), (1, 1)])  # counter-clockwise, side 0 first
-        order = np.array([0, 2, 1, 3])[chosen]  # where each side stands on that way
+        order = np.array([0, 2, 1, 3])[chosen]  # place of each side in this order
         x = np.where(corners, upper, lower)
         return Edges(x[order], x[(order + 1) % 4])
 

@@ -284,7 +284,7 @@ class Polygon(Region):
         Parameters
         ----------
         what : str
-            What errors call the selection.
+            Name of the selection in error messages.
         walls : int, str, sequence of both, (k,) bool or None
             Numbers or names of edges; None selects all.
 

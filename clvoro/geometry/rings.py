@@ -89,10 +89,10 @@ class OrientedRings:
         places = np.full(given[-1], -1, np.int32)
         places[numbers] = np.arange(len(numbers))
         vertices = np.concatenate([ring.vertices for ring in rings])
-        arrays = vertices, *(a.astype(np.int32) for a in (starts, following, numbers)), places
-        for array in arrays:
+        starts, following, numbers = (a.astype(np.int32) for a in (starts, following, numbers))
+        for array in (vertices, starts, following, numbers, places):
             array.setflags(write=False)
-        return cls(*arrays)
+        return cls(vertices, starts, following, numbers, places)
 
     @property
     def rings(self) -> list[np.ndarray]:

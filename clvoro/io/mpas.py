@@ -209,7 +209,7 @@ def _walk_around(halves: HalfEdges) -> _Around:
     joined = np.flatnonzero(onward >= 0)
     graph = coo_array((np.ones(len(joined), np.int8), (joined, onward[joined])), shape=(h, h))
     label = connected_components(graph, directed=False)[1]
-    # Vertices are numbered by their lowest half-edge. At the boundary the round begins with the edge on it.
+    # Vertices are numbered by their lowest half-edge. At the boundary the first edge is the one on it.
     rank = np.lexsort((np.arange(h), halves.twin >= 0, label))
     begins = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]
     least = np.full(len(begins), h)

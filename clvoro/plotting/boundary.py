@@ -12,6 +12,7 @@ from matplotlib.path import Path
 from ..errors import InputError
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
+from ..geometry.shapes import Edges
 from .style import METHOD_COLORS, WIDTH, frame_domain, interactive_figure, single_height, styled
 
 _LINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8, "facecolor": "none", "joinstyle": "round"}
@@ -47,10 +48,11 @@ def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) ->
             ax = interactive_figure(WIDTH, height).add_subplot()
             frame_part(ax, domain, domain.lower, domain.upper)
         for k, name in enumerate(domain.boundary_names):
-            walls = np.flatnonzero(domain.boundary_index == k)
+            walls = np.flatnonzero(domain.boundary_index == k).tolist()
             if isinstance(domain, Polygon):  # edges without length cannot be drawn
-                walls = walls[domain.oriented.places[walls] >= 0]
-            segments = [np.concatenate(domain.boundary(wall).items()[:2]) for wall in walls]
+                walls = [wall for wall in walls if domain.oriented.places[wall] >= 0]
+            curves = [domain.boundary(wall) for wall in walls]
+            segments = [np.vstack([c.begin, c.end]) for c in curves if isinstance(c, Edges)]
             color = METHOD_COLORS[k % len(METHOD_COLORS)]
             style = _DASHES[k // len(METHOD_COLORS) % len(_DASHES)]
             lines = LineCollection(
