@@ -118,7 +118,7 @@ QUICK = ("coupled", "multigrid"), ("adaptive", "jacobi"), ("weighted in 3D", "mu
         for case in product(LONG_LIVED, ("multigrid", "jacobi"))
     ],
 )
-def test_resumed_runs_go_on_with_the_same_solver(ctx, tmp_path, monkeypatch, kind, solver):
+def test_resumed_runs_continue_with_the_same_solver(ctx, tmp_path, monkeypatch, kind, solver):
     """Multigrid's levels last for several steps: here also on meshes for which Jacobi's method is faster."""
     monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 1.5 - (solver == "multigrid")))
     box, size, options = LONG_LIVED[kind]
@@ -177,7 +177,7 @@ def test_own_points_and_callables(ctx, tmp_path):
     )
 
 
-def test_far_fewer_cells_than_at_the_start(ctx, tmp_path):
+def test_resume_with_far_fewer_cells_than_at_the_start(ctx, tmp_path):
     """Rows keep the room that the first mesh took."""
     points, path = np.random.default_rng(12).random((3000, 2)), tmp_path / "state"
     square, options = clvoro.Box((0, 0), (1, 1)), {"points": points, "effort": "fast"}
@@ -202,7 +202,7 @@ def test_stopped_before_the_first_step(ctx, tmp_path, kind):
     assert_same(resumed, clvoro.Adapter(ctx).run(box, size, **options))
 
 
-def test_stopped_just_where_the_run_would_have_ended(ctx, tmp_path):
+def test_resume_at_the_end_of_the_run(ctx, tmp_path):
     """By the callback, in the row that ends a run whose error no longer improves: it ends there, resumed, too."""
     path, options = (
         tmp_path / "state",
@@ -262,7 +262,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", list(OTHERS))
-def test_other_settings_are_refused_by_name(ctx, saved, name):
+def test_other_settings_are_rejected(ctx, saved, name):
     path, options = saved
     with pytest.raises(InputError, match=rf"cannot resume.*{name} = "):
         clvoro.Adapter(ctx).run(
@@ -270,7 +270,7 @@ def test_other_settings_are_refused_by_name(ctx, saved, name):
         )
 
 
-def test_other_domains_precisions_and_fields_are_refused(ctx, saved):
+def test_other_domains_precisions_and_fields_are_rejected(ctx, saved):
     path, options = saved
     with pytest.raises(InputError, match="domain = "):
         clvoro.Adapter(ctx).run(
@@ -305,7 +305,7 @@ ALIKE = {
 }
 
 
-def test_domains_of_the_same_extent_are_told_apart(saved):
+def test_domains_of_the_same_extent_have_different_fingerprints(saved):
     """By what files hold of them."""
     told = {name: domain_fingerprint(domain) for name, domain in ALIKE.items()}
     assert len({json.dumps(t, sort_keys=True) for t in told.values()}) == len(ALIKE)
@@ -315,7 +315,7 @@ def test_domains_of_the_same_extent_are_told_apart(saved):
             Saved(saved[0]).check_fingerprint({**Saved(saved[0]).fingerprint, "domain": told[name]})
 
 
-def test_checkpoints_of_other_versions_are_refused(saved, tmp_path):
+def test_checkpoints_of_other_versions_are_rejected(saved, tmp_path):
     def older(name, array):
         return np.array(checkpoint.VERSION - 1) if name == "version" else array
 
@@ -386,7 +386,7 @@ DAMAGED_LEVELS = {
 
 
 @pytest.mark.parametrize("name", list(DAMAGED_LEVELS))
-def test_damaged_levels_are_refused(ctx, tmp_path, monkeypatch, name):
+def test_damaged_levels_are_rejected(ctx, tmp_path, monkeypatch, name):
     monkeypatch.setattr(poisson, "expected_costs", lambda *_: (1.0, 0.0))
     options = {"method": "coupled", "max_steps": 6, "seed": 5}
     path, bad = tmp_path / "state", tmp_path / "bad"
@@ -397,7 +397,7 @@ def test_damaged_levels_are_refused(ctx, tmp_path, monkeypatch, name):
 
 
 @pytest.mark.parametrize("name", list(DAMAGED))
-def test_damaged_checkpoints_are_refused(ctx, saved, tmp_path, name):
+def test_damaged_checkpoints_are_rejected(ctx, saved, tmp_path, name):
     path, options = saved
     rewrite(path, tmp_path / "state", DAMAGED[name])
     with pytest.raises(InputError, match="cannot resume"):
@@ -412,7 +412,7 @@ def flipped(data):
     return data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :]
 
 
-def test_cut_off_and_foreign_files_are_refused(saved, tmp_path):
+def test_truncated_and_foreign_files_are_rejected(saved, tmp_path):
     data = saved[0].read_bytes()
     for content in (
         data[:-100],

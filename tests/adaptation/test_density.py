@@ -96,7 +96,7 @@ def test_gradient_in_three_dimensions(ctx):
         np.stack([np.linspace(0.1, 0.7, 9)] * 2, axis=1),
     ],
 )
-def test_gradient_that_the_neighbors_do_not_tell(engine, points):
+def test_gradient_without_enough_neighbors_is_zero(engine, points):
     """One cell, two cells, collinear ones: none is taken, rather than one of any size."""
     points = np.array(points)
     w = Density(engine).lloyd_weights(

@@ -78,7 +78,7 @@ FIELDS = {
 
 
 @pytest.mark.parametrize("name", list(FIELDS))
-def test_fields_that_hardly_meet_the_domain(name):
+def test_warnings_of_fields(name):
     domain, wrong, message, right = FIELDS[name]
     (found,) = wrong.warnings(domain)
     assert message in found
@@ -89,7 +89,7 @@ def test_fields_that_hardly_meet_the_domain(name):
         assert np.ptp(wrong(x)) == 0 < np.ptp(right(x))
 
 
-def test_far_shapes_are_so_by_a_bound():
+def test_far_shapes_are_detected_safely():
     """Never farther than they are: of random shapes none is said to change nothing where it does."""
     rng = np.random.default_rng(11)
     said = 0
@@ -108,7 +108,7 @@ def test_far_shapes_are_so_by_a_bound():
     assert 20 < said < 280
 
 
-def test_data_beside_their_box_are_refused():
+def test_data_outside_of_their_box_are_rejected():
     with pytest.raises(InputError, match="all outside of the box"):
         sizing.Scattered(SPREAD * 1000 + 5, SPREAD[:, 0] + 1, BOX.lower, BOX.upper)
 
@@ -126,7 +126,7 @@ def test_data_beside_their_box_are_refused():
     ],
 )
 @pytest.mark.parametrize("domain", [BOX, SHORE], ids=["box", "polygon"])
-def test_layers_of_other_sizes_than_the_field(layer, size, message, domain):
+def test_warnings_of_layers(layer, size, message, domain):
     # The field is coarse far away: what counts is beside the layers.
     field = sizing.Distance(sizing.Segment((0, 0), (2, 0)), h_min=size, slope=0.05)
     edges = (2,) if domain is BOX else (0,)
@@ -170,7 +170,7 @@ def test_longitudes_and_latitudes(tmp_path, crs):
     ("latitude", "crs"),
     [(46.2, None), (46.2, "urn:ogc:def:crs:EPSG::25832"), (460.2, "EPSG:4326"), (3.0, "EPSG:4326")],
 )
-def test_what_is_not_longitudes_and_latitudes(latitude, crs):
+def test_no_warning_for_projected_coordinates(latitude, crs):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         clvoro.Polygon.from_geojson(lake(latitude, crs))
@@ -220,7 +220,7 @@ JUMP = sizing.Expression("x < 0.95 ? 0.05 : 0.01")
         (0.1, None, None, None),
     ],
 )
-def test_sizes_near_or_above_that_of_the_domain(ctx, size, n_cells, category, advice):
+def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
     """Nothing grows there: a bound of the growth would not help, and it is not advised."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -236,7 +236,7 @@ def test_sizes_near_or_above_that_of_the_domain(ctx, size, n_cells, category, ad
     ("method", "effort"),
     [("adaptive", "fast"), pytest.param("exact", "default", marks=pytest.mark.slow)],
 )
-def test_mesh_that_does_not_meet_its_sizes(ctx, method, effort):
+def test_warning_of_size_errors(ctx, method, effort):
     """It ends (the count that "exact" wants to have exactly would swing for ever there), and says where it is worst."""
     square, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)
     with pytest.warns(SizeErrorWarning, match="mean .e. is .*sizing.Graded") as told:

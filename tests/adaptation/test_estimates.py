@@ -64,7 +64,7 @@ def bench(monkeypatch):
 @needs_bench
 @pytest.mark.parametrize("real", [np.dtype("float64"), np.dtype("float32")], ids=str)
 @pytest.mark.parametrize(("dim", "field", "n"), CASES)
-def test_figures_are_what_runs_hold(bench, dim, field, n, real):
+def test_figures_match_measured_buffers(bench, dim, field, n, real):
     options = Namespace(device=None, dtype=real.name)
     found = bench.measure(options, field, n, "adaptive", "default")
     reals, integers = PEAK[dim]
@@ -145,7 +145,7 @@ KINDS = {
 @pytest.mark.parametrize(
     "name", [pytest.param(k, marks=() if k == "polygon" else pytest.mark.slow) for k in KINDS]
 )
-def test_any_kind_of_run_holds_what_it_is_told(bench, name, real):
+def test_estimate_of_any_kind_of_run(bench, name, real):
     domain, size, more = KINDS[name]
     given = more(domain, size)
     steps = {"max_steps": 15} if name == "coupled" else {}
@@ -173,7 +173,7 @@ GOING_ON = {
     "name",
     [pytest.param(k, marks=() if k == "square" else pytest.mark.slow) for k in GOING_ON],
 )
-def test_runs_that_go_on_hold_what_they_are_told(bench, name, tmp_path):
+def test_estimate_of_resumed_runs(bench, name, tmp_path):
     """From a checkpoint on the finest level: what was saved goes where the next step has it."""
     domain, size = GOING_ON[name]
     real = "float32" if "single" in name else "float64"
@@ -208,7 +208,7 @@ DIAGRAMS = {
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", DIAGRAMS)
-def test_one_diagram_holds_what_is_told(bench, ctx, name, real):
+def test_estimate_of_one_diagram(bench, ctx, name, real):
     """Of random generators, all arrays read."""
     domain = DIAGRAMS[name]
     points = np.random.default_rng(1).random((5000, domain.dim)) * domain.extent + domain.lower
@@ -286,7 +286,7 @@ def test_few_cells_hold_what_is_told(bench, n, real):
 @pytest.mark.slow
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
-def test_jumps_at_seams_hold_what_is_told(bench, real):
+def test_estimate_with_jumps_at_periodic_boundaries(bench, real):
     """The diagram that a run ends with is made anew, when nothing is left of the one before."""
     box = clvoro.Box((0, 0), (1, 1), periodic=True)
     size = sizing.Expression("x < 0.5 ? 0.011 : 0.11")
@@ -315,7 +315,7 @@ STRIPS = {
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", STRIPS)
-def test_strips_hold_what_is_told(bench, name, real):
+def test_estimate_with_strips(bench, name, real):
     """Of what is told beside jumps a part is not taken, most where few cells lie between them."""
     domain, formula = STRIPS[name]
     held, told = held_and_told(bench, domain, sizing.Expression(formula), real, effort="fast")
@@ -324,7 +324,7 @@ def test_strips_hold_what_is_told(bench, name, real):
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_is_told_does_not_depend_on_the_unit_of_length():
+def test_estimate_does_not_depend_on_the_unit_of_length():
     """Squares of lengths leave the range of single precision long before domains are too large."""
     found = []
     for scale in (1.0, 2.0**80, 2.0**-80):
@@ -334,7 +334,7 @@ def test_what_is_told_does_not_depend_on_the_unit_of_length():
     assert found == [found[0]] * 3
 
 
-def test_what_is_told_does_not_depend_on_where_seams_are():
+def test_estimate_does_not_depend_on_the_position_of_the_periodic_boundary():
     """Images by balls alone where cells are alike; of a strip all cells wherever it meets a seam."""
     for box in (TORUS, clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)):
         d, n = box.dim, 20000
@@ -367,7 +367,7 @@ def test_what_is_told_does_not_depend_on_where_seams_are():
         pytest.param(3, "sin(20 * x) > 0.9 ? 1.0 : 8.0", 1500, marks=pytest.mark.slow),
     ],
 )
-def test_jumps_take_no_more_than_the_surplus(ctx, dim, formula, n):
+def test_surplus_bounds_the_cells_at_jumps(ctx, dim, formula, n):
     """Cells beside a jump ask for others there, which ask for more; two levels, of which each has its bound."""
     domain = clvoro.Box((0,) * dim, (1,) * dim)
     plain = sizing.Expression(formula)
@@ -385,7 +385,7 @@ def test_jumps_take_no_more_than_the_surplus(ctx, dim, formula, n):
 
 @pytest.mark.slow
 @needs_bench
-def test_sizes_on_the_device_are_allowed_for(bench):
+def test_estimate_includes_the_size_field(bench):
     """Also those that are a part of what the host evaluates, and those that others are computed from."""
     values = np.random.default_rng(1).random((400, 400))
     raster = sizing.Raster(0.02 + 0.02 * values, (0, 0), (1, 1))
@@ -491,7 +491,7 @@ PERIODIC = {
         for name, case in PERIODIC.items()
     ],
 )
-def test_periodic_boxes_hold_images_and_folded_graphs(bench, monkeypatch, ctx, dim, n, field):
+def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
     """As many images as are expected from the size field; output may take a quarter less."""
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=True)
     monkeypatch.setattr(bench, "domain_of", lambda _: box)

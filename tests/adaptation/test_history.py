@@ -24,7 +24,7 @@ def adapter(ctx):
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_diagram_that_is_made_anew_at_the_end(ctx, dtype):
+def test_diagram_is_computed_again_at_the_end(ctx, dtype):
     """In a periodic box: four cells meet at each corner but for rounding, and which two of them share a face is one of
     the things that the last step and the end decide each for itself. Quality counts the sides."""
     eps = float(np.finfo(dtype).eps)
@@ -48,7 +48,7 @@ def test_diagram_that_is_made_anew_at_the_end(ctx, dtype):
     ("kind", "levels", "stopped"),
     [(kind, 0, 0) for kind in DOMAINS] + [("flat", 0, 1), ("flat", 1, 0), ("flat", 1, 1)],
 )
-def test_sizes_that_are_scaled_to_a_count_after_the_last_row(adapter, kind, levels, stopped):
+def test_sizes_are_scaled_after_the_last_row(adapter, kind, levels, stopped):
     """Before the first step, and on coarser levels, they are not yet."""
     count = 600 if kind == "solid" else 300
     by_callback = {"callback": lambda row: row["step"] == stopped}
@@ -71,7 +71,7 @@ def test_sizes_that_are_scaled_to_a_count_after_the_last_row(adapter, kind, leve
             assert h["mean_error"][0] != h["mean_error"][1]
 
 
-def test_numbers_that_come_and_go_are_those_of_labels(adapter):
+def test_insertions_and_deletions_match_the_labels(adapter):
     """What is inserted and deleted between two rows adds up to the cells of both, and to the generators at the end."""
     result = adapter.run(FLAT, SIZE, options=clvoro.MultilevelOptions(levels=1), seed=5)
     h, origin = result.history, result.origin

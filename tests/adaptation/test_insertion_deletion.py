@@ -165,7 +165,7 @@ A = 0.05
 H = A * np.sqrt(np.sqrt(3) / 2)
 
 
-def test_stretched_pair_is_split_at_the_seven(engine):
+def test_seven_sided_cell_is_split_under_tension(engine):
     """Into two across the pair: the extra half row grows."""
     sweep = Sweep(engine, dislocated(A, 0.06), H, 1.0, climb_strain=QUIET)
     five, seven = the_pair(sweep)
@@ -179,7 +179,7 @@ def test_stretched_pair_is_split_at_the_seven(engine):
     assert (sweep.born[0] + sweep.moved_to[0]) / 2 == pytest.approx(sweep.points[seven])
 
 
-def test_compressed_pair_goes_at_the_five(engine):
+def test_five_sided_cell_is_deleted_under_compression(engine):
     sweep = Sweep(engine, dislocated(A, -0.06), H, -1.0, climb_strain=QUIET)
     five, _ = the_pair(sweep)
     assert (sweep.new.inserted, sweep.new.deleted) == (0, 1)
@@ -228,7 +228,7 @@ def test_two_pairs_of_opposite_strain_both_climb(engine):
 
 
 @pytest.mark.parametrize("total", [-30.0, -9.4, -1.0, 1.0, 6.0, 30.0])
-def test_count_to_the_last(engine, total):
+def test_number_is_corrected_exactly(engine, total):
     """Without climbing: exactly so many, the strongest first, far enough apart, at most a share in one call."""
     n = 500
     points = patch.relaxed_points(n, 61, steps=2)
@@ -247,7 +247,7 @@ def test_count_to_the_last(engine, total):
     assert score.argmax() in sites
 
 
-def test_split_cells_part_along_their_longest_axis(engine):
+def test_cells_are_split_along_their_longest_axis(engine):
     points = patch.relaxed_points(300, 67, steps=1)
     sweep = Sweep(engine, points, 0.04, 5.0, climb=False)
     assert len(sweep.moved) == 5
@@ -310,7 +310,7 @@ def strained(a=0.04, stretch=0.15):
     return points[patch.BOX.contains(points)]
 
 
-def test_pairs_are_made_where_the_lattice_is_strained(engine):
+def test_dislocations_nucleate_under_strain(engine):
     """In turn: a generator in the longest edge, and two merged in their middle."""
     h = 0.04 * H / A
     sweep = Sweep(engine, strained(), h, 0.0, nuclei=2, climb_strain=QUIET)
@@ -349,7 +349,7 @@ def test_pairs_are_made_where_the_lattice_is_strained(engine):
         assert np.linalg.norm(sweep.moved_to - sweep.points[i], axis=1).min() < 0.04
 
 
-def test_no_pairs_in_an_unstrained_lattice(engine):
+def test_no_nucleation_without_strain(engine):
     assert (
         Sweep(engine, strained(stretch=0.0), 0.04 * H / A, 0.0, nuclei=5, climb_strain=QUIET).new
         is None
@@ -357,7 +357,7 @@ def test_no_pairs_in_an_unstrained_lattice(engine):
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
-def test_repeats_bit_by_bit(ctx, real):
+def test_repeated_runs_give_the_same_bits(ctx, real):
     engine = patch.make_engine(ctx, real)
     points = patch.random_points(700, 12).astype(real).astype(float)
     used = InsertionDeletion(engine)
@@ -391,7 +391,7 @@ class TestMend:
         return points, quality, sites
 
     @pytest.mark.parametrize("split", [False, True])
-    def test_those_below_the_bound_are_mended(self, engine, split):
+    def test_bad_cells_are_repaired(self, engine, split):
         points, quality, sites = self.lattice(SPOTS)
         sweep = Sweep(
             engine, points, 0.02, 0.0, quality=quality, deficit=0.06, split=split, share=0.1
@@ -405,7 +405,7 @@ class TestMend:
             assert np.linalg.norm(there - centroid) == pytest.approx(part, rel=1e-6)
 
     @pytest.mark.parametrize("split", [False, True])
-    def test_five_go_and_seven_are_split_either_way(self, engine, split):
+    def test_repair_depends_on_the_number_of_sides(self, engine, split):
         points, quality, _ = self.lattice({})
         five, seven = the_pair(Sweep(engine, points, 0.02, 0.0, climb_strain=QUIET))
         for i in (five, seven):
@@ -418,7 +418,7 @@ class TestMend:
                 ([five], []) if i == five else ([], [seven])
             )
 
-    def test_the_worst_come_first_and_no_more_than_a_share(self, engine):
+    def test_repair_takes_a_share_of_the_worst_cells(self, engine):
         points, quality, sites = self.lattice(SPOTS)
         n = len(points)
         for most in (1, 2):
@@ -432,7 +432,7 @@ class TestMend:
             is None
         )
 
-    def test_good_meshes_and_walls_are_left_alone(self, engine):
+    def test_good_cells_and_cells_at_walls_are_not_repaired(self, engine):
         points, quality, _ = self.lattice({})
         assert (
             Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
@@ -443,7 +443,7 @@ class TestMend:
             Sweep(engine, points, 0.02, 0.0, quality=quality, deficit=0.06, share=1.0).new is None
         )
 
-    def test_four_sides_go_and_eight_are_split_whatever_their_quality(self, engine):
+    def test_four_and_eight_sided_cells_are_always_repaired(self, engine):
         """Those that are far from all others; every other one has such a one within a few rings."""
         points = patch.relaxed_points(600, 71, steps=1)
         sweep = Sweep(engine, points, 0.04, 0.0, quality=np.ones(600), deficit=0.5, share=1.0)

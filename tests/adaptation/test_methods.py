@@ -139,7 +139,7 @@ def test_weighted_moves_at_most_k(stages, poisson, cautious):
 
 
 @pytest.mark.parametrize("name", [*PUBLISHED, "glide", "polish"])
-def test_a_mesh_that_is_right_stays(stages, name):
+def test_perfect_mesh_does_not_change(stages, name):
     """Squares of the size asked for: centroids, sizes and shapes leave nothing to do, walls included."""
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     points = (xy + 0.5) / 8
@@ -185,7 +185,7 @@ def test_projected_displacements(stages):
     assert np.abs(r).max() > 0.1
 
 
-def test_penalty_is_steered_to_the_error_aimed_at(stages):
+def test_penalty_is_controlled_to_the_error_target(stages):
     """Lower while the error is above the aim, higher below it, by a bounded factor, within bounds."""
     mesh, host = make_mesh(stages)
     h = FIELD(host.points)
@@ -210,7 +210,7 @@ def test_penalty_is_steered_to_the_error_aimed_at(stages):
         assert method.penalty == pytest.approx({True: 3.0, False: 1e-3}[aim > error])
 
 
-def test_mean_log_error_of_cells_that_are_right(stages):
+def test_mean_log_ratio_error_of_perfect_cells(stages):
     """No division by an error of nothing."""
     mesh, _ = make_mesh(stages, np.array([[0.5, 0.375]]), sizing.Constant(np.sqrt(0.75)))
     method = ProjectedMethod("quality", error_target=0.002)
@@ -220,7 +220,7 @@ def test_mean_log_error_of_cells_that_are_right(stages):
 
 
 @pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
-def test_a_bad_size_is_named_as_the_field_has_it(stages, value):
+def test_invalid_size_is_reported_as_in_the_field(stages, value):
     """Also on a coarse level, where h is a multiple of the field's."""
     field = sizing.Expression(f"x > 0.7 && y > 0.5 ? {value} : 0.05")
     points = np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]])
@@ -236,7 +236,7 @@ def test_a_bad_size_is_named_as_the_field_has_it(stages, value):
         )
 
 
-def test_a_bad_size_that_no_update_looked_at_is_found_by_the_next_assessment(stages):
+def test_read_summaries_checks_sizes(stages):
     engine, good = stages.engine, np.array([[0.2, 0.3], [0.6, 0.6], [0.5, 0.1]])
     size = Sizing(engine, patch.BOX, sizing.Expression("x > 0.7 ? 0.0/0.0 : 0.05"))
     mesh = MeshState.create(stages, patch.BOX, size, engine.upload(good), size_factor=4)

@@ -141,7 +141,7 @@ def test_compare_neighbors(ctx):
         before = after
 
 
-def test_order_and_numbering_are_no_change(ctx):
+def test_neighbor_changes_ignore_order_and_numbering(ctx):
     """The same cells in another order, and so with other indices, keep their names and so their neighbors."""
     engine = patch.make_engine(ctx)
     metric, order = Metric(engine), np.random.default_rng(3).permutation(N)

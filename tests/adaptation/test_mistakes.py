@@ -99,7 +99,7 @@ BAD_SIZES = {
 
 @pytest.mark.parametrize("edges", [(1e6, 1e6, 1e6), (1e6, 1), (2e-3, 3e-3)])
 @pytest.mark.parametrize("what", list(BAD_SIZES))
-def test_bounds_that_errors_propose_fit_the_domain(adapter, what, edges):
+def test_bounds_in_errors_suit_the_domain(adapter, what, edges):
     box, field = clvoro.Box((0,) * len(edges), edges), sizing.Function(BAD_SIZES[what])
     by_run = partial(adapter.run, box, field)
     for call in (by_run,) if what == "huge" else (by_run, partial(DensityTree, field, box)):
@@ -133,7 +133,7 @@ def test_arguments_in_the_wrong_order(adapter):
     refused(lambda: clvoro.Box((0, 2.5), (0, 1.5)), "Box((0, 0), (2.5, 1.5))")
 
 
-def test_errors_of_size_functions_are_told_with_their_cause(adapter):
+def test_errors_of_size_functions_have_their_cause(adapter):
     with pytest.raises(InputTypeError) as caught:
         adapter.run(BOX, lambda p: float(p[:, 0]))
     assert isinstance(caught.value.__cause__, TypeError)
@@ -158,7 +158,7 @@ def test_a_size_function_may_change_its_argument(adapter):
     assert np.array_equal(spoilt.points, clean.points)
 
 
-def test_functions_of_other_kinds_are_taken(adapter):
+def test_accepted_size_functions(adapter):
     def given(points, scale=0.2):
         return scale + 0 * points[:, 0]
 
@@ -177,7 +177,7 @@ def test_functions_of_other_kinds_are_taken(adapter):
         (lambda f: np.array([0.1]) - f, "no -"),
     ],
 )  # fmt: skip
-def test_arithmetic_that_size_fields_do_not_have(combine, part):
+def test_unsupported_arithmetic_of_size_fields(combine, part):
     for field in (sizing.Constant(0.1), sizing.Expression("0.1 + x"), sizing.Function(np.sum)):
         refused(lambda f=field: combine(f), repr(field), part, kind=InputTypeError)
 
@@ -216,7 +216,7 @@ def test_meshes_in_the_place_of_points(adapter, result):
 
 
 @pytest.mark.parametrize("make", [np.ndarray.tolist, Foreign, np.asfortranarray, np.ma.array])
-def test_points_of_other_kinds_are_taken(adapter, make):
+def test_accepted_points(adapter, make):
     assert np.array_equal(adapter.diagram(BOX, make(POINTS)).points, POINTS)
 
 
@@ -272,7 +272,7 @@ def test_places_in_domains(domain):
     refused(lambda: domain.contains("in"), "points is a str", kind=InputTypeError)
 
 
-def test_polygons_of_other_kinds_are_taken(tmp_path):
+def test_accepted_polygons(tmp_path):
     square = clvoro.Polygon(SQUARE)
     assert clvoro.Polygon.from_geojson(Geographic()) == square
     assert clvoro.Polygon.from_geojson(shapely.Polygon(SQUARE)) == square
@@ -407,7 +407,7 @@ def test_no_method(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
-def test_generators_that_are_too_close_are_named_by_their_place(ctx, periodic, real):
+def test_coincident_generators_are_reported_with_their_place(ctx, periodic, real):
     """In the domain's units; two roundings apart they have the same bisector with those far away. In the plane they are
     told apart all the same."""
     box = clvoro.Box((0,) * 3, (4,) * 3, periodic=periodic)
@@ -426,7 +426,7 @@ def test_generators_that_are_too_close_are_named_by_their_place(ctx, periodic, r
     assert ("or use dtype='float64'" in said) == (real == "float32")
 
 
-def test_the_closest_generators_are_named_whichever_cell_shows_it(ctx):
+def test_closest_generators_are_reported(ctx):
     """In space a cell far from a lattice of some roundings' width may be the first that cannot be cut by it."""
     lattice = np.stack(np.meshgrid(*[range(5)] * 3), axis=-1).reshape(-1, 3)
     cluster = 0.6875 + 2.0**-52 * lattice
@@ -437,7 +437,7 @@ def test_the_closest_generators_are_named_whichever_cell_shows_it(ctx):
     assert f", {least:.3g} apart" in str(refused.value)
 
 
-def test_slab_too_thin_for_the_precision_is_said_to_be_thin(ctx):
+def test_slab_too_thin_for_the_precision(ctx):
     """Its generators are far from each other, seen from outside: they were told to be too close."""
     slab = clvoro.Box((0, 0, 0), (1e-6, 1, 1))
     points = np.random.default_rng(1).random((200, 3)) * slab.extent

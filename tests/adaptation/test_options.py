@@ -94,7 +94,7 @@ def test_options_are_used_or_warned_of(adapter, method):
             assert w.filename == __file__
 
 
-def test_what_is_done_anyway_is_not_warned_of(adapter):
+def test_values_without_effect_cause_no_warning(adapter):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         adapter.run(BOX, 0.4, effort="fast", options=PaperOptions(tol=0))
@@ -190,7 +190,7 @@ def demand_use(case):
 
 
 @pytest.mark.parametrize("name", builtin_cases())
-def test_built_in_cases_give_what_is_used(name):
+def test_built_in_cases_have_no_unused_options(name):
     case = load_case(name)
     for chosen in (case, *(case.with_run(method=method) for method in METHODS)):
         demand_use(chosen)

@@ -27,13 +27,13 @@ def stage(ctx, real, size, box=BOX):
     return Sizing(engine, box, size)
 
 
-def test_the_mean_is_that_over_the_points(ctx, real):
+def test_mean_ratio_of_spacing_to_h(ctx, real):
     points = BOX.lower + np.random.default_rng(5).random((50, 2)) * BOX.extent
     found = diagnostics.check_precision(stage(ctx, real, lambda x: 0.1 * x[:, 0]), BOX, points, 0.5)
     assert found == pytest.approx((SPACING[real] / (0.05 * points[:, 0])).mean(), rel=1e-5)
 
 
-def test_warns_and_refuses_at_the_bounds(ctx, real):
+def test_warnings_and_errors_at_the_bounds(ctx, real):
     """Warns from a mean of 1e-3 / 0.1 and a least of 1 / 16 spacings, refuses from 1; silent below."""
     unit, points = SPACING[real], np.array([[1.5, 0.5]] * 99 + [[2.5, 0.5]])
 
@@ -87,7 +87,7 @@ def test_runs_say_it_before_they_begin(ctx):
         double.run(box, field, method="weighted", max_steps=0, seed=5)
 
 
-def test_single_precision_meets_a_thousandfold_grading(ctx):
+def test_single_precision_with_sizes_1_to_1000(ctx):
     """As well as double precision, to 1e-3 in the mean, and silently; `bench/diagnostics.py` has it for 1e6 cells."""
     box = clvoro.Box((0, 0), (2.5, 1.5))
     field = Distance([Circle((0.9, 0.75), 0.0)], 1.5e-4, slope=999 * 1.5e-4 / 1.767)

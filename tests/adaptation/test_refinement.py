@@ -111,7 +111,7 @@ def test_children_in_polygons(ctx, name, fixed):
 
 
 @pytest.mark.parametrize(("side", "count"), [(1, 2), (2, 12), (4, 52)])
-def test_equally_long_walls_bring_one_child(ctx, side, count):
+def test_equal_boundary_edges_bring_one_generator(ctx, side, count):
     """Squares at the edges of a square; those at its corners have two walls there."""
     domain = POLYGONS["square"]()
     engine, n = patch.make_engine(ctx, box=domain), side**2
@@ -158,7 +158,7 @@ def test_squares_get_no_point_twice(ctx):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("share", [0, 1e-4, 0.99, 1.01])
-def test_no_child_is_close_to_a_generator_at_a_wall(ctx, real, share):
+def test_new_generators_keep_a_distance_at_walls(ctx, real, share):
     """Between a generator and the wall that it all but stands on there is no room, in thin boxes neither."""
     h = 0.08
     for thin in (0.75, 0.0625):
@@ -188,7 +188,7 @@ def test_no_child_beyond_a_cell(ctx, real, count):
     assert apart[:, 1].min() > 0.2 * step  # half a gap, or half of that beyond it
 
 
-def test_repeats_bit_by_bit(ctx):
+def test_repeated_runs_give_the_same_bits(ctx):
     engine, points = patch.make_engine(ctx), patch.random_points(500, 3)
     first = refine(engine, points, np.full(500, 0.02))[1]
     assert np.array_equal(first, refine(engine, points, np.full(500, 0.02))[1])

@@ -75,7 +75,7 @@ def test_same_field_again_keeps_the_mesh(adapter, first):
     assert np.abs(result.size_error).mean() <= 0.004
 
 
-def test_other_points_take_the_whole_way(adapter, first):
+def test_other_points_take_the_full_schedule(adapter, first):
     """Random ones, and a good mesh of another count."""
     n = len(first[2].points)
     box = BOXES[2]

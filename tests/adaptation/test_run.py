@@ -19,6 +19,7 @@ from clvoro.errors import (
     SizeFieldError,
 )
 from tests.reference import diagrams as reference
+from tests.reference import runs
 
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
 F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)
@@ -26,74 +27,12 @@ F1 = sizing.Distance(sizing.Circle((0.9, 0.75), 0.3), 0.02, slope=0.3)
 REPEATING = ("lloyd", "poisson", "coupled", "weighted-lloyd", "weighted")
 
 
-@pytest.fixture(scope="module")
-def adapter():
-    return clvoro.Adapter()
-
-
-@pytest.fixture(scope="module")
-def adapter32():
-    return clvoro.Adapter(dtype="float32")
-
-
 def random_points(n, seed, box=BOX):
-    return np.random.default_rng(seed).random((n, 2)) * box.extent + box.lower
-
-
-def polygons(diagram):
-    corners = diagram.vertices[diagram.cell_vertices]
-    return np.split(corners, diagram.cell_vertex_starts[1:-1])
+    return runs.random_points(n, seed, box)
 
 
 def check(result, field, box=BOX, real="float64"):
-    """A mesh, whatever led to it: it tiles the box, its numbers are those of its cells, the history ends with it."""
-    n, eps = len(result.points), float(np.finfo(real).eps)
-    d, h = result.diagram, result.history
-    assert np.isfinite(result.points).all()
-    assert box.contains(result.points).all()
-    assert np.array_equal(d.points, result.points)
-    assert (d.volumes > 0).all()
-    assert d.volumes.sum() == pytest.approx(box.measure, rel=64 * eps)
-    assert [len(a) for a in (result.target_size, result.size_error, result.quality, d.volumes)] == [
-        n
-    ] * 4
-    size = field(result.points) * result.size_factor
-    if field.on_device:  # a jump of h may lie within a rounding of a generator
-        close = np.isclose(result.target_size, size, rtol=1e4 * eps)
-        assert close.mean() > 0.99
-    length = np.sqrt(d.volumes)
-    error = (length - result.target_size) / np.minimum(length, result.target_size)
-    assert np.abs(result.size_error - error).max() <= 1e4 * eps * max(1, np.abs(error).max())
-    areas, perimeters = np.empty(n), np.empty(n)
-    for i, polygon in enumerate(polygons(d)):
-        areas[i], _ = reference.measures(polygon)
-        perimeters[i] = np.hypot(*(np.roll(polygon, -1, axis=0) - polygon).T).sum()
-    sides = np.diff(d.neighbor_starts)
-    quality = 4 * areas * sides * np.tan(np.pi / sides) / perimeters**2
-    # Corners round by eps of the domain, areas of cells of length L so by about eps / L.
-    assert np.abs(result.quality - quality).max() < 2e3 * eps * box.extent.max() / length.min()
-    assert ((result.quality > 0) & (result.quality < 1 + 16 * eps)).all()
-    # The history: nothing is lost, and its last row is the mesh.
-    assert np.array_equal(np.diff(h["cells"]), (h["inserted"] - h["deleted"])[1:])
-    assert h["inserted"][0] == h["deleted"][0] == 0
-    assert (h["cells"][-1], h["level"][-1]) == (n, 0)
-    assert h["mean_error"][-1] == pytest.approx(
-        np.abs(result.size_error).mean(), rel=1e4 * eps, abs=eps
-    )
-    assert h["max_error"][-1] == pytest.approx(
-        np.abs(result.size_error).max(), rel=1e4 * eps, abs=eps
-    )
-    # On the way the lengths of faces are in single precision.
-    close = {"rel": 2 * float(np.finfo(np.float32).eps)}
-    assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), **close)
-    assert h["min_quality"][-1] == pytest.approx(result.quality.min(), **close)
-    assert set(np.diff(h["step"])) <= {0, 1}
-    assert h["step"][0] == 0
-    assert (np.diff(h["level"]) <= 0).all()
-    assert (np.diff(h["seconds"]) >= 0).all()
-    assert (np.diff(h["progress"]) >= 0).all()
-    for name in h.dtype.names:
-        assert np.isfinite(h[name]).all(), name
+    runs.check(result, field, box, real)
 
 
 # What the rows mean.
@@ -196,7 +135,7 @@ def test_threads_take_turns(adapter):
         {"method": "exact", "effort": "fast", "n_cells": 1400},
     ],
 )
-def test_repeats_bit_by_bit(adapter, options):
+def test_repeated_runs_give_the_same_bits(adapter, options):
     """By the same adapter, whatever it did before, and by a new one."""
     first = adapter.run(BOX, F1, seed=2718, **options)
     for other in (adapter, clvoro.Adapter()):
@@ -259,7 +198,7 @@ def test_history_of_the_published_method(adapter):
     check(result, F1)
     assert len(h) == 16
     # Energy, the paper's 2.3, in physical units.
-    energy = sum(map(second_moment, polygons(result.diagram), result.points))
+    energy = sum(map(second_moment, runs.polygons(result.diagram), result.points))
     assert h["energy"][-1] == pytest.approx(energy, rel=1e-9)
     # A row's displacements are those that led to it.
     size = F1(result.initial.points)
@@ -283,7 +222,7 @@ def test_history_of_the_published_method(adapter):
 # How a run ends.
 
 
-def test_stops_when_it_no_longer_improves(adapter):
+def test_run_stops_without_progress(adapter):
     result = adapter.run(
         BOX, F1, method="coupled", seed=4, max_steps=400, options=clvoro.PaperOptions(tol=0.02)
     )
@@ -302,7 +241,7 @@ def test_default_number_of_steps(adapter):
     assert (result.converged, result.stop_reason) == (False, "max_steps reached")
 
 
-def test_plan_is_the_end_of_adaptive_runs(adapter):
+def test_adaptive_runs_end_with_the_schedule(adapter):
     result = adapter.run(BOX, F1, effort="fast", seed=9)
     assert (result.converged, result.stop_reason) == (True, "plan completed")
     assert result.history["progress"][-1] == 1
@@ -350,7 +289,7 @@ def test_other_values_of_the_callback_do_not_stop(adapter):
     ("options", "rows"),
     [({"method": "coupled"}, 1), ({"method": "coupled"}, 5), (LEVELS, 3), ({"effort": "fast"}, 50)],
 )
-def test_interruption_keeps_what_there_is(adapter, options, rows):
+def test_interruption_keeps_the_mesh(adapter, options, rows):
     seen = []
 
     def callback(row):
@@ -367,7 +306,7 @@ def test_interruption_keeps_what_there_is(adapter, options, rows):
     check(result, F1)
 
 
-def test_values_of_the_callback_that_are_neither_true_nor_false_are_refused(adapter):
+def test_invalid_values_of_the_callback_are_rejected(adapter):
     with pytest.raises(InputTypeError, match=r"callback returned array.*expected True to stop"):
         adapter.run(BOX, F1, callback=lambda row: np.ones(2))
 
@@ -441,7 +380,7 @@ def test_n_cells_is_held_when_stopped(adapter):
     check(result, F1)
 
 
-def test_count_comes_from_the_size_field(adapter):
+def test_number_of_cells_is_that_of_the_size_field(adapter):
     for method in ("coupled", "adaptive"):
         result = adapter.run(BOX, 0.1, method=method, effort="fast")
         assert len(result.points) == pytest.approx(375, rel=0.03)
@@ -555,7 +494,7 @@ def test_figures_of_adaptive_runs(
     assert q_min >= least
 
 
-def test_last_displacements_of_a_plan_are_those_of_its_last_step(adapter):
+def test_final_displacements_are_those_of_the_last_step(adapter):
     """And of the step that would come next, where the run was stopped before."""
     whole = adapter.run(BOX, F1, seed=9, effort="fast")
     steps = whole.history["step"][-1]
@@ -571,7 +510,7 @@ def test_last_displacements_of_a_plan_are_those_of_its_last_step(adapter):
     assert (np.linalg.norm(whole.points - stopped.points, axis=1) > 0).all()
 
 
-def test_error_target_moves_along_the_front(adapter):
+def test_error_target_trades_sizes_for_quality(adapter):
     """The larger the error that is allowed, the better the cells."""
     tight, loose = (
         figures(
@@ -740,7 +679,7 @@ def test_bad_dtype(dtype):
         clvoro.Adapter(dtype=dtype)
 
 
-def test_a_field_that_fails_on_the_way_is_named(adapter):
+def test_errors_of_the_field_during_a_run(adapter):
     """The start avoids the hole; a step leads into it."""
     seen = []
 

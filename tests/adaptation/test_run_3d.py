@@ -8,6 +8,7 @@ from clvoro import sizing
 from clvoro.adaptation.options import METHODS
 from clvoro.errors import InputError, MemoryLimitError, SizeFieldError
 from tests.reference import diagrams3d as reference3d
+from tests.reference import runs
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 1))
 S1 = sizing.Distance(sizing.Circle((0.5, 0.5, 0.4), 0.25), 0.04, slope=0.3)
@@ -17,59 +18,12 @@ SMALL = S1 * 2
 LONG = clvoro.Box((-3, 1, 0.2), (5, 1.5, 0.6))
 
 
-@pytest.fixture(scope="module")
-def adapter():
-    return clvoro.Adapter()
-
-
-@pytest.fixture(scope="module")
-def adapter32():
-    return clvoro.Adapter(dtype="float32")
-
-
 def random_points(n, seed, box=BOX):
-    return np.random.default_rng(seed).random((n, 3)) * box.extent + box.lower
+    return runs.random_points(n, seed, box)
 
 
 def check(result, field, box=BOX, real="float64"):
-    """A mesh, whatever led to it: it fills the box, its numbers are those of its cells, the history ends with it."""
-    n, eps = len(result.points), float(np.finfo(real).eps)
-    d, h = result.diagram, result.history
-    assert np.isfinite(result.points).all()
-    assert box.contains(result.points).all()
-    assert np.array_equal(d.points, result.points)
-    assert (d.volumes > 0).all()
-    # Each volume is a sum over faces, rounded; with n of them the roundings partly cancel.
-    assert d.volumes.sum() == pytest.approx(box.measure, rel=64 * eps)
-    if field.on_device:  # a jump of h may lie within a rounding of a generator
-        size = field(result.points) * result.size_factor
-        assert np.isclose(result.target_size, size, rtol=1e4 * eps).mean() > 0.99
-    length = np.cbrt(d.volumes)
-    error = (length - result.target_size) / np.minimum(length, result.target_size)
-    assert np.abs(result.size_error - error).max() <= 1e4 * eps * max(1, np.abs(error).max())
-    surfaces = np.add.reduceat(d.face_measures, d.neighbor_starts[:-1])
-    quality = 36 * np.pi * d.volumes**2 / surfaces**3
-    # Faces and volumes are the device's numbers, rounded to its precision when they were fetched.
-    assert result.quality == pytest.approx(quality, rel=64 * eps)
-    assert ((result.quality > 0) & (result.quality < 1)).all(), "only a ball has Q = 1"
-    # Rows of the history: nothing is lost, and the last one is the mesh.
-    assert np.array_equal(np.diff(h["cells"]), (h["inserted"] - h["deleted"])[1:])
-    assert (h["cells"][-1], h["level"][-1]) == (n, 0)
-    assert h["mean_error"][-1] == pytest.approx(
-        np.abs(result.size_error).mean(), rel=1e4 * eps, abs=eps
-    )
-    assert h["max_error"][-1] == pytest.approx(
-        np.abs(result.size_error).max(), rel=1e4 * eps, abs=eps
-    )
-    assert h["mean_quality"][-1] == pytest.approx(result.quality.mean(), rel=64 * eps)
-    assert h["min_quality"][-1] == pytest.approx(result.quality.min(), rel=64 * eps)
-    assert set(np.diff(h["step"])) <= {0, 1}
-    assert (np.diff(h["level"]) <= 0).all()
-    assert (np.diff(h["progress"]) >= 0).all()
-    for name in h.dtype.names:
-        assert np.isfinite(h[name]).all(), name
-    # Cells rebuilt from their corners, and the diagram's defining property at every one of them.
-    result.check().demand()
+    runs.check(result, field, box, real)
 
 
 def figures(result):
@@ -228,7 +182,7 @@ def test_origin_names_the_callers_generators(adapter):
         ),
     ],
 )
-def test_repeats_bit_by_bit(adapter, adapter32, dtype, options):
+def test_repeated_runs_give_the_same_bits(adapter, adapter32, dtype, options):
     """By the same adapter, whatever it did before, and by a new one."""
     used = adapter if dtype == "float64" else adapter32
     first = used.run(BOX, SMALL, seed=2718, **options)
@@ -330,7 +284,7 @@ def test_levels_from_the_callers_points(adapter):
         check(result, S1)
 
 
-def test_refinement_meets_the_count_ahead(adapter):
+def test_refinement_gives_the_number_of_the_next_level(adapter):
     """Few generators are left for the finest level to insert or delete."""
     result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=1), seed=3)
     h = result.history

@@ -238,7 +238,7 @@ def test_cells_too_large_or_too_small_are_sites(mesh, sign):
     assert min((magnitudes == 0).sum(), (magnitudes == 4).sum()) > N / 8
 
 
-def test_flaws_are_inner_cells_above_the_bound(mesh):
+def test_bad_cells_are_inner_cells_above_the_bound(mesh):
     """The bound itself is none; cells of four sides, or eight, are flaws of any quality, and come first."""
     flaw, keys = 0.25, mesh.engine.empty(N, np.uint64)
     quality = mesh.rng.choice([0.5, 0.74, 0.75, 0.76, 1.0], N)
@@ -250,7 +250,7 @@ def test_flaws_are_inner_cells_above_the_bound(mesh):
     assert min((sites >= 1).sum(), ((sites > 0) & (sites < 1)).sum()) > 20
 
 
-def test_sites_at_generators_that_stay_are_struck_out(mesh):
+def test_sites_at_fixed_generators_are_removed(mesh):
     labels = mesh.rng.permutation(N)
     fixed, first = 40, keys_of(np.ones(N), np.arange(N))
     held = labels < fixed

@@ -181,7 +181,7 @@ def excess_of(points):
     return np.log(volumes) - 3 * (np.log(0.1) + points @ SLOPE)
 
 
-def test_projection_knows_the_derivative_of_the_volumes(double):
+def test_projection_uses_the_derivative_of_the_volumes(double):
     """With next to no penalty one step takes small excesses away: what is left is of second order."""
     points = relaxed_points(60, 606)
     h, left = 0.1 * np.exp(points @ SLOPE), []
@@ -221,7 +221,7 @@ def test_children(engine, n):
     assert BOX.contains(finer).all()
 
 
-def test_body_centered_lattice_is_carried_over(double):
+def test_refined_body_centered_lattice(double):
     """Middles of its edges make the lattice of half the spacing, all cells truncated octahedra."""
     a, box = 1 / 6, Box((0, 0, 0), (1, 1, 1))
     line = np.arange(6)
@@ -277,7 +277,7 @@ class Sweep:
 
 
 @pytest.mark.parametrize("total", [-7.0, -1.0, 1.0, 7.0, 500.0, -500.0])
-def test_count_to_the_last(engine, total):
+def test_number_is_corrected_exactly(engine, total):
     n = 600
     points = random_points(n, 61, engine.real)
     sweep = Sweep(engine, points, np.cbrt(0.675 / n), total)
@@ -293,7 +293,7 @@ def test_count_to_the_last(engine, total):
     assert np.median(rank[sites]) < n / 10
 
 
-def test_split_cells_part_along_their_longest_axis(double):
+def test_cells_are_split_along_their_longest_axis(double):
     points = random_points(300, 67)
     sweep = Sweep(double, points, 0.13, 4.0)
     assert len(sweep.moved) == sweep.new.inserted >= 2

@@ -17,18 +17,6 @@ from clvoro.opencl.host_memory import host_memory
 from clvoro.sizing.gradation import Gradation
 
 
-@pytest.fixture(scope="module")
-def queue(ctx):
-    import pyopencl as cl
-
-    return cl.CommandQueue(ctx)
-
-
-@pytest.fixture(params=["float64", "float32"])
-def make_engine(request, queue):
-    return lambda dim: Engine(queue.context, queue, dim, np.dtype(request.param))
-
-
 def jacobi(values, spacing, slope):
     """The fixed point of Godunov's scheme, all nodes at once, again and again; axes (y, x)."""
     u = values.copy()

@@ -100,18 +100,6 @@ CASES = [
 ]
 
 
-@pytest.fixture(scope="module")
-def queue(ctx):
-    import pyopencl as cl
-
-    return cl.CommandQueue(ctx)
-
-
-@pytest.fixture(params=["float64", "float32"])
-def make_engine(request, queue):
-    return lambda dim: Engine(queue.context, queue, dim, np.dtype(request.param))
-
-
 @pytest.fixture
 def double(queue):
     return lambda dim: Engine(queue.context, queue, dim, np.dtype("float64"))

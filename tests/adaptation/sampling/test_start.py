@@ -76,7 +76,7 @@ def test_count_of_known_integrals(case):
     assert count_cells(field, domain) == pytest.approx(expected, rel=relative)
 
 
-def test_small_spot_of_a_raster_is_found():
+def test_small_minimum_of_a_raster_is_found():
     """Nine low values among 1000 x 600: their landmark shows them."""
     values = np.full((601, 1001), 0.1)
     values[232:235, 776:779] = 1e-3
@@ -106,7 +106,7 @@ def test_tolerance_is_met():
         "0.001 + 10*fabs(hypot(x-0.9, y-0.75)-0.3)",
     ],
 )
-def test_hard_fields_end_in_bounded_work(text):
+def test_work_is_bounded_for_hard_fields(text):
     samples = 0
 
     def counting(points):
@@ -131,7 +131,7 @@ def test_hard_fields_end_in_bounded_work(text):
         ("1e-200", "overflows"),
     ],
 )
-def test_bad_fields_are_refused_with_the_place(text, place):
+def test_invalid_fields_are_reported_with_the_place(text, place):
     with pytest.raises(SizeFieldError, match=place):
         count_cells(sizing.Expression(text), BOX)
     with pytest.raises(SizeFieldError, match=place):
@@ -297,7 +297,7 @@ def test_points_are_distinct_and_inside(real, start):
     assert (points < domain.upper).all()
 
 
-def test_more_points_than_the_precision_can_tell_apart():
+def test_more_points_than_the_precision_has():
     """Of h = 1e-10 + 0.3 r two fifths of the cells lie within one float32 rounding of the tip."""
     field = sizing.Distance(sizing.Circle((0.7, 0.7), 0), 1e-10, slope=0.3)
     box = Box((0, 0), (1, 1))

@@ -151,14 +151,14 @@ def test_few_points_still_reach_every_piece() -> None:
             sample()
 
 
-def test_bad_sizes_are_named_inside_only() -> None:
+def test_sizes_are_checked_inside_only() -> None:
     field = sizing.Expression("x < 1.5 && y < 1.5 && x > 1.05 && y > 1.05 ? -1.0 : 0.1")
     assert count_cells(field, clvoro.Polygon(SQUARE, [HOLE])) == pytest.approx(1100, rel=1e-3)
     with pytest.raises(InputError, match="is -1 at"):
         count_cells(field, clvoro.Polygon(SQUARE))
 
 
-def test_cells_that_meet_twice_bring_two_middles(ctx) -> None:
+def test_two_common_faces_bring_two_generators(ctx) -> None:
     """The common face of two cells is cut by an obstacle, beside which both generators see their middle."""
     from clvoro.tessellation.tessellator import Tessellator
 
@@ -180,7 +180,7 @@ def test_cells_that_meet_twice_bring_two_middles(ctx) -> None:
 
 
 @pytest.mark.parametrize("method", ["coupled", "adaptive"])
-def test_pieces_are_meshed_each_with_its_own_balance(ctx, method: str) -> None:
+def test_sources_are_balanced_per_component(ctx, method: str) -> None:
     """The Poisson equation of a graph in two parts has a solution only if each part's sources sum up to 0."""
     corner = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
     domain = clvoro.Polygon.from_pieces([[corner], [corner * 2 + np.array([3, 0])]])
