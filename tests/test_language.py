@@ -34,7 +34,7 @@ PLAIN = (
     "bench/", "cl_kernels/adaptation/", "cl_kernels/geometry/", "cl_kernels/opencl/", "cl_kernels/remapping/",
     "cl_kernels/simd/", "cl_kernels/sizing/", "cl_kernels/solvers/", "clvoro/adaptation/", "clvoro/cli/",
     "clvoro/geometry/", "clvoro/io/", "clvoro/mesh/", "clvoro/opencl/", "clvoro/plotting/", "clvoro/remapping/",
-    "clvoro/sizing/", "clvoro/solvers/", "clvoro/tessellation/", "docs/", "tests/cli/", "tests/geometry/",
+    "clvoro/sizing/", "clvoro/solvers/", "clvoro/tessellation/", "docs/", "tests/adaptation/", "tests/cli/", "tests/geometry/",
     "tests/io/", "tests/mesh/", "tests/opencl/", "tests/plotting/", "tests/reference/", "tests/remapping/",
     "tests/robustness/", "tests/sizing/", "tests/solvers/", "tests/tessellation/", "README.md", "CONTRIBUTING.md",
     "CHANGELOG.md", "CITATION.cff", ".pre-commit-config.yaml",

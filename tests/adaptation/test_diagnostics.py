@@ -1,4 +1,4 @@
-"""Units and places that do not agree are told of, and what is right beside them is not."""
+"""Warnings for units and places that do not fit together, and none for correct input."""
 
 import json
 import re
@@ -249,7 +249,7 @@ def test_warning_of_size_errors(ctx, method, effort):
     with warnings.catch_warnings():
         warnings.simplefilter("error", SizeErrorWarning)
         adapter.run(square, sizing.Graded(JUMP, growth=1.2), method=method, effort=effort, seed=1)
-        # Of what is not finished, and of methods that do not promise it, one is not told.
+        # No warning for unfinished runs, or for methods that do not promise to meet the sizes.
         adapter.run(
             square,
             JUMP,

@@ -48,7 +48,7 @@ CASES = [(2, "F2", 8000), (3, "S1", 4000)]
 SQUARE = clvoro.Box((0, 0), (1, 1))
 TORUS = clvoro.Box((0, 0), (1, 1), periodic=True)
 LEAST_HELD = 0.6
-"""Share of what is told that is taken at least, where sizes jump."""
+"""Smallest share of the estimate that is used where sizes jump."""
 needs_bench = pytest.mark.skipif(not BENCH.is_dir(), reason="the tests lie outside a source tree")
 
 
@@ -76,7 +76,7 @@ def test_figures_match_measured_buffers(bench, dim, field, n, real):
         assert 0.9 <= found[name] / bytes_ <= 1.1, (
             f"{name} in {dim}D, {real}: {found[name]:.0f} bytes per cell, expected {bytes_}"
         )
-    # What is told is for the cells that are asked for, of which there are some more or less in the end.
+    # The estimate is for the requested number of cells; the mesh has a few more or less.
     assert 0.85 <= found["held"] <= 1.1
 
 
@@ -94,7 +94,7 @@ def test_figures_match_measured_buffers(bench, dim, field, n, real):
     ],
 )  # fmt: skip
 def test_steep_sizes_are_allowed_for(bench, name, real):
-    """Generators beyond those that are asked for are told beforehand; see `LEAST_HELD`."""
+    """The estimate covers the additional generators; see `LEAST_HELD`."""
     found = bench.measure(Namespace(device=None, dtype=real), name, 6000, "adaptive", "default")
     assert LEAST_HELD <= found["held"] <= 1.1, found
 
@@ -102,7 +102,7 @@ def test_steep_sizes_are_allowed_for(bench, name, real):
 @needs_bench
 @pytest.mark.parametrize("extent", [(1, 1e-5), (1, 1, 1e-5)], ids=["thread", "sheet"])
 def test_thin_boxes_take_no_more(bench, extent):
-    """Bins of a sheet were squares as thin as it is, once: a quarter more than was told."""
+    """Bins of a sheet were squares as thin as it is, once: a quarter more than the estimate."""
     box = clvoro.Box((0,) * len(extent), extent)
     size = (box.measure / 5000) ** (1 / box.dim)
     options = Namespace(device=None, dtype="float64")
@@ -153,8 +153,8 @@ def test_estimate_of_any_kind_of_run(bench, name, real):
         Namespace(device=None, dtype=real),
         lambda adapter: adapter.run(domain, size, seed=1, **given, **steps).diagram,
     )
-    told = clvoro.Adapter(dtype=real).memory_needed(domain, size, **given)
-    held = max(sum(run.values()), output) / told
+    estimate = clvoro.Adapter(dtype=real).memory_needed(domain, size, **given)
+    held = max(sum(run.values()), output) / estimate
     assert 0.85 <= held <= 1.1, (held, len(diagram), run)
 
 
@@ -182,17 +182,17 @@ def test_estimate_of_resumed_runs(bench, name, tmp_path):
         domain, size, checkpoint=clvoro.Checkpoint(file, every=1e9), **given,
         callback=lambda row: row["level"] == 0 and row["progress"] > 0.5,
     )  # fmt: skip
-    ledger, told = bench.Ledger(), []
+    ledger, estimate = bench.Ledger(), []
     with bench.counted_buffers(ledger):
         adapter = clvoro.Adapter(dtype=real)
-        adapter.on_memory = told.append
+        adapter.on_memory = estimate.append
         adapter.run(
             domain,
             size,
             checkpoint=clvoro.Checkpoint(tmp_path / "next", every=0, resume=file),
             **given,
         )
-    assert 0 < ledger.peak / told[0] <= 1.1
+    assert 0 < ledger.peak / estimate[0] <= 1.1
 
 
 DIAGRAMS = {
@@ -216,8 +216,8 @@ def test_estimate_of_one_diagram(bench, ctx, name, real):
     options = Namespace(device=None, dtype=real)
     _, run, output = bench.peaks(options, lambda a: a.diagram(domain, points))
     engine = Engine(ctx, cl.CommandQueue(ctx), domain.dim, np.dtype(real))
-    told = estimate_memory(engine, len(points), domain, run=False)
-    held = max(sum(run.values()), output) / told
+    estimate = estimate_memory(engine, len(points), domain, run=False)
+    held = max(sum(run.values()), output) / estimate
     # Places of the surface are dearer than others, and more where generators are few.
     assert 0.85 <= held <= 1.1
 
@@ -249,22 +249,22 @@ def test_boundaries_are_allowed_for(bench, name):
     if slope:
         size = sizing.Distance(domain.boundary(), h_min=0.002, slope=slope)
         size = size * (count_cells(size, domain) / n) ** 0.5
-    held, told = held_and_told(bench, domain, size, effort="fast")
-    assert 0.75 <= held / told <= 1.1
+    held, estimate = held_and_estimate(bench, domain, size, effort="fast")
+    assert 0.75 <= held / estimate <= 1.1
     # As if the boundary took nothing:
     reals, integers = TRIMMED_PEAK
     assert held > 1.3 * n * (8 * reals + 4 * integers)
 
 
-def held_and_told(bench, domain, size, real="float64", **given):
-    """Run, and read what takes most; return what was held at most, preparations included, and told, in bytes."""
-    ledger, told = bench.Ledger(), []
+def held_and_estimate(bench, domain, size, real="float64", **given):
+    """Run, and read all arrays; return the peak with preparations, and the estimate, in bytes."""
+    ledger, estimate = bench.Ledger(), []
     with bench.counted_buffers(ledger):
         adapter = clvoro.Adapter(dtype=real)
-        adapter.on_memory = told.append
+        adapter.on_memory = estimate.append
         result = adapter.run(domain, size, seed=1, **given)
         _ = result.diagram.vertices
-    return ledger.peak, told[0]
+    return ledger.peak, estimate[0]
 
 
 @pytest.mark.sparse
@@ -273,14 +273,14 @@ def held_and_told(bench, domain, size, real="float64", **given):
 @pytest.mark.parametrize("n", [1, 30, 1000])
 def test_few_cells_hold_what_is_told(bench, n, real):
     """What there is for any number of cells, and what counting them has taken."""
-    held, told = held_and_told(bench, SQUARE, n**-0.5, real, effort="fast")
-    assert 0.85 <= held / told <= 1.1
+    held, estimate = held_and_estimate(bench, SQUARE, n**-0.5, real, effort="fast")
+    assert 0.85 <= held / estimate <= 1.1
     # From points nothing is counted: all is the run's.
     points = np.random.default_rng(1).random((n, 2))
     given = {"points": points, "method": "coupled", "max_steps": 3}
-    held, told = held_and_told(bench, SQUARE, n**-0.5, real, **given)
-    # Fewer stages than another method takes; some kibibytes are not worth to be told apart.
-    assert min(0.85 * told, told - 32 * 2**10) <= held <= 1.1 * told
+    held, estimate = held_and_estimate(bench, SQUARE, n**-0.5, real, **given)
+    # Fewer stages than another method; some kibibytes more or less do not count.
+    assert min(0.85 * estimate, estimate - 32 * 2**10) <= held <= 1.1 * estimate
 
 
 @pytest.mark.slow
@@ -290,8 +290,8 @@ def test_estimate_with_jumps_at_periodic_boundaries(bench, real):
     """The diagram that a run ends with is made anew, when nothing is left of the one before."""
     box = clvoro.Box((0, 0), (1, 1), periodic=True)
     size = sizing.Expression("x < 0.5 ? 0.011 : 0.11")
-    held, told = held_and_told(bench, box, size, real, effort="fast")
-    assert LEAST_HELD <= held / told <= 1.1
+    held, estimate = held_and_estimate(bench, box, size, real, effort="fast")
+    assert LEAST_HELD <= held / estimate <= 1.1
 
 
 STRIPS = {
@@ -316,11 +316,13 @@ STRIPS = {
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("name", STRIPS)
 def test_estimate_with_strips(bench, name, real):
-    """Of what is told beside jumps a part is not taken, most where few cells lie between them."""
+    """Beside jumps a part of the estimate is not used, most where few cells lie between them."""
     domain, formula = STRIPS[name]
-    held, told = held_and_told(bench, domain, sizing.Expression(formula), real, effort="fast")
+    held, estimate = held_and_estimate(
+        bench, domain, sizing.Expression(formula), real, effort="fast"
+    )
     # What balls reach beyond two seams depends on where single coarse cells come to lie.
-    assert (0.4 if name == "corner of seams" else LEAST_HELD) <= held / told <= 1.1
+    assert (0.4 if name == "corner of seams" else LEAST_HELD) <= held / estimate <= 1.1
 
 
 @pytest.mark.filterwarnings("error")
@@ -393,9 +395,9 @@ def test_estimate_includes_the_size_field(bench):
         sizing.minimum(raster, lambda p: np.full(len(p), 0.03)),
         sizing.Graded(raster, 1.2, resolution=40),
     ):
-        held, told = held_and_told(bench, SQUARE, size, effort="fast")
+        held, estimate = held_and_estimate(bench, SQUARE, size, effort="fast")
         assert 8 * values.size < held
-        assert 0.85 <= held / told <= 1.1
+        assert 0.85 <= held / estimate <= 1.1
 
 
 @needs_bench

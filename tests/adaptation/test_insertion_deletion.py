@@ -1,4 +1,4 @@
-"""Insertion and deletion: who is chosen, what becomes of it, and that nothing is lost, on lattices made by hand."""
+"""Insertion and deletion: who is chosen, what becomes of it, and that nothing is lost, on small lattices."""
 
 import itertools
 

@@ -86,7 +86,7 @@ def test_alpha_is_the_dimension_by_default(stages):
     free.displace(mesh)
     one = mesh.correction.get()
     make_method("poisson", Relaxation(k=1e9)).displace(mesh)
-    # The second solve starts from the first one's potential.
+    # The second solve starts from the potential of the first.
     assert mesh.correction.get() == pytest.approx(2 * one, rel=1e-2, abs=1e-3 * np.abs(one).max())
 
 
@@ -140,7 +140,7 @@ def test_weighted_moves_at_most_k(stages, poisson, cautious):
 
 @pytest.mark.parametrize("name", [*PUBLISHED, "glide", "polish"])
 def test_perfect_mesh_does_not_change(stages, name):
-    """Squares of the size asked for: centroids, sizes and shapes leave nothing to do, walls included."""
+    """Squares of the target size: centroids, sizes and shapes leave nothing to do, walls included."""
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     points = (xy + 0.5) / 8
     mesh, host = make_mesh(stages, points, sizing.Constant(0.125))

@@ -77,7 +77,7 @@ def test_squares(engine):
 
 
 def test_three_dimensions(ctx):
-    """Cuboids made by hand: kernels of one code base serve both dimensions."""
+    """A few cuboids: kernels of one code base serve both dimensions."""
     engine = patch.make_engine(ctx, dim=3)
     rng = np.random.default_rng(12)
     sides = rng.uniform(0.1, 0.4, (5, 3))

@@ -409,7 +409,7 @@ def test_no_method(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
 def test_coincident_generators_are_reported_with_their_place(ctx, periodic, real):
     """In the domain's units; two roundings apart they have the same bisector with those far away. In the plane they are
-    told apart all the same."""
+    distinct all the same."""
     box = clvoro.Box((0,) * 3, (4,) * 3, periodic=periodic)
     points = np.random.default_rng(4).random((300, 3)) * 4
     step = 2 * float(np.spacing(np.asarray(2.75, real)))
@@ -438,7 +438,7 @@ def test_closest_generators_are_reported(ctx):
 
 
 def test_slab_too_thin_for_the_precision(ctx):
-    """Its generators are far from each other, seen from outside: they were told to be too close."""
+    """Its generators are far from each other, seen from outside: an old message said that they were too close."""
     slab = clvoro.Box((0, 0, 0), (1e-6, 1, 1))
     points = np.random.default_rng(1).random((200, 3)) * slab.extent
     with pytest.raises(

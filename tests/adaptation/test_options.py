@@ -1,4 +1,4 @@
-"""Options of a run: which of them which method uses, and what is told of those that it does not."""
+"""Options of a run: which method uses which, and the warnings for the others."""
 
 import inspect
 import warnings
@@ -69,7 +69,7 @@ def test_adapt_has_the_defaults_of_a_run():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_options_are_used_or_warned_of(adapter, method):
-    """What is told is so: an option changes the result, its history or neither."""
+    """Warnings are right: an option changes the result, its history, or neither."""
 
     def made(**options):
         # From start to end: some options are for the last steps, and a tolerance is looked at after twenty.
@@ -87,9 +87,9 @@ def test_options_are_used_or_warned_of(adapter, method):
             run, found = made(**{name: value})
         assert (found != plain) == uses(method, name), name
         assert (name in run.settings) == uses(method, name)
-        told = [w for w in caught if w.category is UnusedOptionWarning]
-        assert len(told) == (not uses(method, name)), name
-        for w in told:
+        warned = [w for w in caught if w.category is UnusedOptionWarning]
+        assert len(warned) == (not uses(method, name)), name
+        for w in warned:
             assert f"{name} is {value!r}, which the method {method} does not use" in str(w.message)
             assert w.filename == __file__
 
@@ -158,7 +158,7 @@ def run(folder, text, *options):
 
 
 @pytest.mark.parametrize(
-    ("run_table", "options", "told"),
+    ("run_table", "options", "warned"),
     [
         ('method = "lloyd"\neffort = "fast"\nlevels = 1', [], ["effort", "levels"]),
         ("k = 0.7\nalpha = 1", [], ["k", "alpha"]),
@@ -171,15 +171,15 @@ def run(folder, text, *options):
         ('methods = ["lloyd", "coupled"]\nk = 0.7\ntol = 0.1', ["--method", "adaptive"], []),
     ],
 )  # fmt: skip
-def test_cases(tmp_path, capsys, run_table, options, told):
+def test_cases(tmp_path, capsys, run_table, options, warned):
     assert run(tmp_path, CASE + run_table, *options) == cli.OK
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == len(told), lines
-    for name, line in zip(told, lines, strict=True):
+    assert len(lines) == len(warned), lines
+    for name, line in zip(warned, lines, strict=True):
         assert line.startswith(f"clvoro: warning: {name} is ")
     # What is written has only what is of use.
     written = Case.from_toml((tmp_path / "out" / "case.toml").read_text(), "written")
-    assert not set(told) & set(written.run)
+    assert not set(warned) & set(written.run)
     demand_use(written)
 
 

@@ -219,7 +219,7 @@ def test_units_do_not_matter(adapter):
 )
 @pytest.mark.parametrize("how", ["returns True", "is interrupted", "max_steps"])
 def test_stopped(adapter, options, rows, how):
-    """On whatever level: the mesh has the size that was asked for."""
+    """On whatever level: the mesh has the target size."""
     seen = []
 
     def callback(row):

@@ -129,7 +129,7 @@ def change_of(pull, minus, plus, shift):
 
 
 def test_pairs_are_split_or_deleted(mesh):
-    """At every shift of the threshold, with pulls on either side of all bounds; who acts is told."""
+    """At every shift of the threshold, with pulls on either side of all bounds."""
     engine = mesh.engine
     partners = scored(mesh, True)[0].get()
     chosen, taken = np.zeros(N, bool), set()

@@ -1,4 +1,4 @@
-"""Count and start in polygonal domains: h is asked for inside only, shares are exact, pieces are not empty."""
+"""Count and start in polygonal domains: h is evaluated inside only, shares are exact, pieces are not empty."""
 
 import numpy as np
 import pytest
