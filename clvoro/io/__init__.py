@@ -102,7 +102,8 @@ def save(
         cell data to the wrong blocks of polyhedra.
     ``.../constant/polyMesh`` or ``CASE/name.foam``
         A folder for OpenFOAM, alone or within a case that ParaView opens, too. In 2D one layer of prisms between
-        patches of type `empty`. Each periodic direction is one pair of cyclic patches.
+        patches of type `empty`. Each periodic direction is one pair of cyclic patches;
+        with several of them, these are for OpenFOAM of openfoam.com.
     ``.nc``
         Meshes in 2D as netCDF, for models of oceans and atmospheres, QGIS, ParaView and xarray.
     ``.vtk``, ``.ply``, ``.obj``

@@ -2,8 +2,9 @@
 
 There is one pair of patches for each periodic direction. Cells are not cut at the seams, so some faces lie between a
 cell and an image that is shifted in two or three directions. They are in the pair of the first of these directions.
-The vector from a face to the one across then differs within a patch. OpenFOAM accepts that from a patch with the
-transform `noOrdering`, whose faces it takes in the order of the file; `translational` demands one vector for all.
+The vector from a face to the one across then differs within a patch. OpenFOAM of openfoam.com (tested: v1912) accepts
+that from a patch with the transform `noOrdering`, whose faces it takes in the order of the file; `translational`
+demands one vector for all.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ def some_case(rng: np.random.Generator, folder: Path, real: str, wild: bool) -> 
         extra = {"growth": 1.3, "spacing": 0.1, "edges": [0, 1]}
         case["layers"] = [layer | {k: v for k, v in extra.items() if rng.random() < 0.4}]
         if "lower" not in domain and "edges" not in case["layers"][0]:
-            case["layers"][0]["rings"] = [0]
+            case["layers"][0]["edges"] = 0
     if rng.random() < 0.1:
         case["sequence"] = {"frames": 2}
     if wild:
