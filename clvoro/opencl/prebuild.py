@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pyopencl as cl
 
-from .program import POCL, program_text, shortened
+from .program import POCL, has_short_declarations, program_text, shorten
 from .runtimes import cache_home
 
 if TYPE_CHECKING:
@@ -95,8 +95,10 @@ def _work(engine: Engine, recorded: dict) -> Work:
     programs = []
     for stage, defines in recorded["programs"]:
         text, options = program_text(f"{stage}.cl", engine.all_defines(stage, defines), "")
-        text, more = shortened(text)
-        programs.append((text, (*options, *more)))
+        if has_short_declarations(engine.ctx):
+            text, more = shorten(text)
+            options = (*options, *more)
+        programs.append((text, options))
     return Work(programs, [Launch(*launch) for launch in recorded["launches"]])
 
 

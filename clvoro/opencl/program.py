@@ -89,17 +89,23 @@ def program_text(
 def compile_text(
     ctx: cl.Context, text: str, options: tuple[str, ...], short: bool = True
 ) -> cl.Program:
-    """Build `text`; if `short`, PoCL reads our declarations of built-in functions instead of its own."""
+    """Build `text`; if `short`, with the declarations of `shorten`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", cl.CompilerWarning)
-        if short and ctx.devices[0].platform.name.strip() == POCL:
-            with contextlib.suppress(cl.Error):  # another PoCL may need its own declarations
-                text_of_pocl, more = shortened(text)
-                return cl.Program(ctx, text_of_pocl).build(options=[*options, *more])
+        if short and has_short_declarations(ctx):
+            with contextlib.suppress(cl.Error):  # a function that they lack
+                short_text, more = shorten(text)
+                return cl.Program(ctx, short_text).build(options=[*options, *more])
         return cl.Program(ctx, text).build(options=list(options))
 
 
-def shortened(text: str) -> tuple[str, tuple[str, ...]]:
+def has_short_declarations(ctx: cl.Context) -> bool:
+    """Return whether the driver is a version of PoCL for which `shorten` has been tested."""
+    platform = ctx.devices[0].platform
+    return platform.name.strip() == POCL and "PoCL 3." in platform.version
+
+
+def shorten(text: str) -> tuple[str, tuple[str, ...]]:
     """Return `text` with our declarations of built-in functions, and the options for PoCL to leave out its own."""
     return f"{source_text('opencl/pocl_builtins.h')}\n{text}", ("-D_OPENCL_H_",)
 

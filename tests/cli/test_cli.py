@@ -397,6 +397,17 @@ def test_terminal_without_rich_gets_one_changing_line(monkeypatch):
     assert text.count("\r") == 5
 
 
+def test_terminal_shows_how_many_kernels_are_built(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rich", None)
+    stream = Terminal()
+    with progress.Progress("x", 5, stream) as shown:
+        shown.show_builds(3, 50)
+    assert "\rx: building kernels, once for this device: 3 of 50" in stream.getvalue()
+    silent = io.StringIO()
+    progress.Progress("x", 5, silent).show_builds(3, 50)
+    assert silent.getvalue() == ""
+
+
 def test_terminal_with_rich(monkeypatch):
     pytest.importorskip("rich")
     monkeypatch.setattr(progress, "REFRESH", 0.0)

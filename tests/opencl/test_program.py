@@ -25,8 +25,8 @@ def test_a_program_is_built_for_its_first_kernel(engine, monkeypatch):
 
 
 def test_pocl_reads_short_declarations(ctx, monkeypatch):
-    if ctx.devices[0].platform.name.strip() != program.POCL:
-        pytest.skip("for PoCL only")
+    if not program.has_short_declarations(ctx):
+        pytest.skip("for some versions of PoCL only")
     texts = []
     plain = cl.Program
 
@@ -50,8 +50,8 @@ def test_pocl_reads_short_declarations(ctx, monkeypatch):
 def test_short_declarations_are_enough_for_all_programs(ctx, dtype, monkeypatch):
     from tests.robustness.test_portability import programs_of_all_kinds
 
-    if ctx.devices[0].platform.name.strip() != program.POCL:
-        pytest.skip("for PoCL only")
+    if not program.has_short_declarations(ctx):
+        pytest.skip("for some versions of PoCL only")
     built, plain = [], cl.Program
     monkeypatch.setattr(program.cl, "Program", lambda *a: built.append(a[1]) or plain(*a))
     programs_of_all_kinds(ctx, dtype, monkeypatch)
