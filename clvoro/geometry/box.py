@@ -106,10 +106,10 @@ class Domain(ABC):
     def boundary(self, walls: Walls | None = None) -> Edges | Surface:
         """Return walls as a shape for `clvoro.sizing.Distance`: numbers, names, or by default all."""
 
-    def _described_names(self) -> dict[str, Any]:
-        """Return the caller's names for `describe`, with lists of numbers; empty without names."""
+    def _checked_names(self) -> dict[str, list[int]] | None:
+        """Check the caller's names, and return them with the numbers of their walls; None without names."""
         parts = self.boundaries
-        return {"names": {n: parts.select(n, n).tolist() for n in self.names}} if self.names else {}
+        return {n: parts.select(n, n).tolist() for n in self.names} if self.names else None
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
@@ -244,7 +244,7 @@ class Box(Domain):
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))
         object.__setattr__(self, "periodic", _directions(self.periodic, lower.size))
-        _ = self.boundaries  # which checks the names
+        object.__setattr__(self, "names", self._checked_names())
 
     def __repr__(self) -> str:
         periodic = f", periodic={self.periodic}" if any(self.periodic) else ""
@@ -293,7 +293,7 @@ class Box(Domain):
     def describe(self) -> dict[str, Any]:
         """Return the arguments of this box as plain values."""
         corners = {"lower": self.lower, "upper": self.upper, "periodic": self.periodic}
-        return corners | self._described_names()
+        return corners | ({"names": dict(self.names)} if self.names else {})
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) whether it lies in the box, walls included; (n,) bool.

@@ -187,7 +187,7 @@ class Polygon(Region):
         self.upper = tuple(self.vertices.max(axis=0).tolist())
         self._measure = math.fsum(signed_area(ring.vertices) for ring in rings)
         self.names = names
-        _ = self.boundaries  # which checks the names
+        self.names = self._checked_names()
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.vertices, self.ring_starts, self.piece_of_ring
@@ -226,7 +226,7 @@ class Polygon(Region):
             "vertices": self.vertices.tolist(),
             "ring_starts": self.ring_starts.tolist(),
             "piece_of_ring": self.piece_of_ring.tolist(),
-            **self._described_names(),
+            **({"names": dict(self.names)} if self.names else {}),
         }
 
     @classmethod

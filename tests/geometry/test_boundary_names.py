@@ -13,6 +13,8 @@ from clvoro import sizing
 from clvoro.cli.cases import Case
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.boundary_layers import chosen_segments, place_layers
+from clvoro.io.contents import Contents
+from clvoro.io.vtu import cell_data
 from tests.io import test_foam
 from tests.io.test_netcdf import read as read_netcdf
 
@@ -165,11 +167,30 @@ def test_files_keep_walls_and_names(meshed, tmp_path, suffix) -> None:
     assert np.array_equal(again.neighbors, result.diagram.neighbors)
 
 
+def test_cell_data_have_the_boundary_of_the_largest_face(meshed) -> None:
+    _, edges, result = meshed
+    d = result.diagram
+    found = cell_data(Contents.of(result))["boundary"]
+    ends = d.vertices[d.face_vertices.reshape(-1, 2)]
+    touching = 0
+    for i, (a, b) in enumerate(itertools.pairwise(d.neighbor_starts.tolist())):
+        faces = [shapely.LineString(e) for e in ends[a:b]]
+        lengths = {}
+        for name in d.domain.boundary_names:
+            shape = shapely.union_all([edges[k] for k in d.domain.boundaries.select("", name)])
+            lengths |= {f.length: name for f in faces if f.centroid.distance(shape) < 1e-12}
+        expected = d.domain.boundary_names.index(lengths[max(lengths)]) if lengths else -1
+        assert found[i] == expected
+        touching += bool(lengths)
+    assert 50 < touching < len(d)
+
+
 def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
     names = {"inlet": "xMin", "walls": ["yMin", 3]}
     box = clvoro.Box((0, 0), (2, 1), names=names)
     assert box.boundary_names == ("inlet", "walls", "xMax")
     assert box.boundary_index.tolist() == [0, 2, 1, 1]
+    assert box.names == {"inlet": [0], "walls": [2, 3]}
     assert box == clvoro.Box((0, 0), (2, 1))
     for copy in (
         pickle.loads(pickle.dumps(box)),
