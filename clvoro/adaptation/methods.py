@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -182,7 +182,7 @@ class ProjectedMethod:
         Steps done.
     """
 
-    descent: str = "lloyd"
+    descent: Literal["lloyd", "quality"] = "lloyd"
     relaxation: float = 1.0
     momentum: float = 0.7
     penalty: float = 0.1

@@ -49,9 +49,11 @@ class CellArrays:
     ) -> CellArrays:
         """Return new arrays for `n` cells. Only the potential is read before it is written, and starts from 0."""
         return cls(
-            engine.empty(n) if h is None else h,
-            *(engine.empty(n) for _ in range(3)),
-            engine.zeros(n) if potential is None else potential,
+            h=engine.empty(n) if h is None else h,
+            error=engine.empty(n),
+            quality=engine.empty(n),
+            local_length=engine.empty(n),
+            potential=engine.zeros(n) if potential is None else potential,
         )
 
 

@@ -134,7 +134,7 @@ def test_few_views_are_kept(engine):
 
 
 @pytest.mark.parametrize(
-    "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("shape", 0.3)]
+    "method", [WeightedMethod(tolerance=1e-2), ProjectedMethod(), ProjectedMethod("quality", 0.3)]
 )
 def test_steps_allocate_nothing(engine, made, method):
     """After two similar steps, a step of displacement, motion, update of the diagram and quality allocates nothing."""

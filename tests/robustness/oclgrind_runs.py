@@ -29,7 +29,7 @@ from clvoro.tessellation import incremental as repair
 Work = Callable[[clvoro.Adapter], None]
 
 SHARE = 0.1
-"""Of the cells, so many may be mended, and be where pairs are made: plans take shares of which few cells have none."""
+"""Share of the cells that may be repaired or nucleate dislocations. Default shares of few cells are less than one."""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def large(work: Work) -> Work:
 
 def polishing(dim: int) -> list[Action]:
     """Return the steps that end a run: descent with a penalty, then sizes alone."""
-    descent = "shape" if dim == 2 else "lloyd"
+    descent = "quality" if dim == 2 else "lloyd"
     exact = ProjectedMethod(
         descent, penalty=1e-3, k=0.3, gradient_from_field=True, correct_mean=True
     )
@@ -66,7 +66,7 @@ def polishing(dim: int) -> list[Action]:
 
 
 def every_action(dim: int, levels: int) -> list[Action]:
-    """Return a plan over one coarser level, or none."""
+    """Return a schedule with one coarser level, or none."""
     plan: list[Action] = [
         Step(PublishedMethod(Relaxation(), lloyd=True, poisson=True)),
         Step(WeightedMethod(cautious=True)),
@@ -96,10 +96,10 @@ def every_step(
 
     def work(adapter: clvoro.Adapter) -> None:
         def run(plan: list[Action], levels: int, points: np.ndarray | None) -> clvoro.Result:
-            mended = partialmethod(InsertionDeletion.mend, share=SHARE)
+            repair_cells = partialmethod(InsertionDeletion.repair_cells, share=SHARE)
             with (
                 mock.patch.object(preparation, "adaptive_schedule", return_value=plan),
-                mock.patch.object(InsertionDeletion, "mend", mended),
+                mock.patch.object(InsertionDeletion, "repair_cells", repair_cells),
             ):
                 result = adapter.run(
                     domain,
