@@ -30,7 +30,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
 from .arrays import EXPANSION, LEAST
 from .vtu import NAMES
-from .vtu_more import check_repeated
+from .vtu_checks import check_repeated
 
 _LONGEST_HEAD = 1 << 22
 _MARK = b'<AppendedData encoding="raw">\n_'
