@@ -16,6 +16,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -75,7 +76,9 @@ def build_ahead(engine: Engine) -> int:
     if not _waiting:
         _start(device)
     for index, worker in enumerate(_waiting):
-        _send(worker, Work(work.programs, _share(work.launches, index, len(_waiting))))
+        mine = Work(work.programs, _share(work.launches, index, len(_waiting)))
+        # A worker reads once it has loaded the compiler, and a pipe holds less than the work.
+        threading.Thread(target=_send, args=(worker, mine), daemon=True).start()
     _waiting.clear()
     return len(work.launches)
 
@@ -156,7 +159,7 @@ def _index_of(device: cl.Device) -> tuple[int, int]:
 def _send(worker: subprocess.Popen[bytes], work: Work) -> None:
     """Send `worker` its work, unless it has ended."""
     assert worker.stdin is not None
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):
         pickle.dump((work.programs, [tuple(launch) for launch in work.launches]), worker.stdin)
         worker.stdin.close()
 
@@ -168,5 +171,5 @@ def _stop_workers() -> None:
             worker.kill()
         worker.wait()
         if worker.stdin is not None:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):
                 worker.stdin.close()
