@@ -95,7 +95,7 @@ def channel(adapter: clvoro.Adapter, dim: int, n: int) -> dict:
     tessellator = Tessellator(stages, box)
     for _ in range(2):  # the second has margins by what the first needed
         tessellator.tessellate(x, n, exact=True)
-    images = tessellator.unfolded.images  # type: ignore[union-attr]
+    images = tessellator.extended.images  # type: ignore[union-attr]
     wide = (images.box.upper - images.box.lower - 1) / 2
     one = 0
     for step in itertools.product((-1, 0, 1), repeat=dim):
@@ -133,7 +133,7 @@ def measure(
         "cold": clock(adapter, repeat, lambda: tessellator.tessellate(x, n)),
         "whole": clock(adapter, repeat, lambda: tessellator.tessellate(x, n, exact=True)),
     }
-    latest, images = tessellator.unfolded, 0.0
+    latest, images = tessellator.extended, 0.0
     if latest is not None:
         images = latest.images.count / n - 1
     state = [tessellator.tessellate(moves[0], n), 0]

@@ -37,7 +37,7 @@ from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, noticed_builds
 from .opencl.engine import Engine
 from .opencl.probe import check_process
-from .tessellation.readback.fetch import fetch_diagram
+from .tessellation.readback.diagram import fetch_diagram
 from .tessellation.tessellator import Tessellator
 
 if TYPE_CHECKING:
@@ -233,8 +233,8 @@ class Adapter:
             tessellator = Tessellator(stages, domain)
             stages.bins.renumber(binned, n)
             t = tessellator.tessellate(sorted_points, n, exact=True, binned=binned)
-            t, unfolded = tessellator.final(t)
-        return fetch_diagram(engine, domain, t, labels, unfolded=unfolded)
+            t, extended = tessellator.final(t)
+        return fetch_diagram(engine, domain, t, labels, extended=extended)
 
     def run(
         self,

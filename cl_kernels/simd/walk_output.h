@@ -16,15 +16,15 @@ typedef struct {
     global float *reach;
     global int *row_places, *row_counts, *labels, *report;
     global double *measures, *centroids, *volumes, *offsets, *covariances;
-#ifdef SEAMS
-    seams_t seams;
+#ifdef HALO
+    halo_t halo;
 #endif
 } output_t;
 
-#ifdef SEAMS
+#ifdef HALO
 /* Test the ball around vertex v of the cell of one lane, of generator i at x. */
-inline void look_at_corner(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
-                           const output_t *out)
+inline void check_corner_ball(const cells_t *cells, const walk_t *walk, int v, int lane, int i, const double *x,
+                              const output_t *out)
 {
     const uchar4 corner = walk->lanes[lane].corner_faces[v];
     const int faces[3] = {corner.s0, corner.s1, corner.s2};
@@ -37,32 +37,32 @@ inline void look_at_corner(const cells_t *cells, const walk_t *walk, int v, int 
                   (double4)(PLANE_LANE(cells->planes, faces[k], 0, lane), PLANE_LANE(cells->planes, faces[k], 1, lane),
                             PLANE_LANE(cells->planes, faces[k], 2, lane), 0);
     }
-    look_at_vertex(x, i, corner_at(walk, v, lane), ways, labels, &out->seams);
+    check_vertex_ball(x, i, corner_at(walk, v, lane), ways, labels, &out->halo);
 }
 
 /* Test the balls around the vertices of the cells of some lanes, for generators in the box. */
-inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
-                           global const double *binned, const output_t *out)
+inline void check_walked_balls(const cells_t *cells, const walk_t *walk, long8 some, const int *places,
+                               global const double *binned, const output_t *out)
 {
-    const seams_t *seams = &out->seams;
+    const halo_t *halo = &out->halo;
     double x[LANES][3];
     long own[LANES];
     int most = 0;
     vstore8(some, 0, own);
     for (int lane = 0; lane < LANES; ++lane) {
-        own[lane] = own[lane] && out->items[places[lane]] < seams->own ? -1 : 0;
+        own[lane] = own[lane] && out->items[places[lane]] < halo->own ? -1 : 0;
         most = own[lane] ? max(most, cells->corners[lane]) : most;
         /* Lanes without a cell have no item. */
         for (int a = 0; a < 3; ++a)
             x[lane][a] = own[lane] ? binned[3 * places[lane] + a] : 0;
     }
 #define ACROSS_LANES(a) (double8)(x[0][a], x[1][a], x[2][a], x[3][a], x[4][a], x[5][a], x[6][a], x[7][a])
-    const double8 low_x = seams->limits[0] + ACROSS_LANES(0), low_y = seams->limits[2] + ACROSS_LANES(1);
-    const double8 low_z = seams->limits[4] + ACROSS_LANES(2);
-    const double8 high_x = seams->limits[1] + seams->period.s0 - ACROSS_LANES(0);
-    const double8 high_y = seams->limits[3] + seams->period.s1 - ACROSS_LANES(1);
-    const double8 high_z = seams->limits[5] + seams->period.s2 - ACROSS_LANES(2);
-    const double widest = widest_of(seams);
+    const double8 low_x = halo->limits[0] + ACROSS_LANES(0), low_y = halo->limits[2] + ACROSS_LANES(1);
+    const double8 low_z = halo->limits[4] + ACROSS_LANES(2);
+    const double8 high_x = halo->limits[1] + halo->period.s0 - ACROSS_LANES(0);
+    const double8 high_y = halo->limits[3] + halo->period.s1 - ACROSS_LANES(1);
+    const double8 high_z = halo->limits[5] + halo->period.s2 - ACROSS_LANES(2);
+    const double widest = widest_ball(halo);
     const long8 mine = vload8(0, own), counts = convert_long8(vload8(0, cells->corners));
     for (int v = 0; v < most; ++v) {
         const planes_t *at = &walk->corners[v];
@@ -76,7 +76,7 @@ inline void look_at_walked(const cells_t *cells, const walk_t *walk, long8 some,
         vstore8(beyond, 0, lanes);
         for (int lane = 0; lane < LANES; ++lane)
             if (lanes[lane])
-                look_at_corner(cells, walk, v, lane, out->items[places[lane]], x[lane], out);
+                check_corner_ball(cells, walk, v, lane, out->items[places[lane]], x[lane], out);
     }
 }
 #endif
@@ -97,8 +97,8 @@ inline int write_cells(const cells_t *cells, const walk_t *walk, const moments_t
     }
     if (made == 0)
         return 0;
-#ifdef SEAMS
-    look_at_walked(cells, walk, done, places, binned, out);
+#ifdef HALO
+    check_walked_balls(cells, walk, done, places, binned, out);
 #endif
     int place = take_places(out->report, total);
     const bool fits = place + total <= out->room;

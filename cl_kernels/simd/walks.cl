@@ -89,14 +89,14 @@ kernel void walk_all_cells(const int size, const int rows, global const int *ord
                            const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
                            global int *row_places, global int *row_counts, global int *labels, global double *measures,
                            global double *centroids, global double *volumes, global double *offsets,
-                           global double *covariances, global int *report SEAM_ARGS)
+                           global double *covariances, global int *report HALO_ARGS)
 {
     WORK_ITEM(stretch);
     output_t out = {room,   items,    reach,     row_places, row_counts, labels,
                     report, measures, centroids, volumes,    offsets,    covariances};
-#ifdef SEAMS
-    SEAMS_GIVEN;
-    out.seams = seams;
+#ifdef HALO
+    MAKE_HALO;
+    out.halo = halo;
 #endif
     const search_t in = {binned, bins, grid_frames, grid_shapes, box_lower, box_upper};
     runs_t runs;

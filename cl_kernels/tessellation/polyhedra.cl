@@ -29,18 +29,18 @@ inline REAL4 cross3(REAL4 a, REAL4 b)
     return a.yzxw * b.zxyw - a.zxyw * b.yzxw;
 }
 
-#ifdef SEAMS
+#ifdef HALO
 /* Test the balls around the vertices of the cell of generator i. */
-inline void look_at_cell(const cell_t *cell, int i, REAL4 place, const seams_t *seams)
+inline void check_cell_balls(const cell_t *cell, int i, REAL4 place, const halo_t *halo)
 {
     const REAL x[3] = {place.s0, place.s1, place.s2};
     const REAL reach = sqrt(cell->reach2);
-    const int count = reaches_beyond(x, reach + widest_of(seams) * reach, seams) ? cell->n : 0;
+    const int count = reaches_beyond(x, reach + widest_ball(halo) * reach, halo) ? cell->n : 0;
     for (int v = 0; v < count; ++v) {
         const INDEX4 f = cell->faces[v];
         const REAL4 ways[3] = {cell->planes[f.s0], cell->planes[f.s1], cell->planes[f.s2]};
         const int labels[3] = {cell->labels[f.s0], cell->labels[f.s1], cell->labels[f.s2]};
-        look_at_vertex(x, i, vertex_at(cell, v), ways, labels, seams);
+        check_vertex_ball(x, i, vertex_at(cell, v), ways, labels, halo);
     }
 }
 #endif
@@ -67,7 +67,7 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
                            global const int *old_neighbors, const int again, const int room, const REAL share,
                            global int *row_places, global int *row_counts, global int *labels, global REAL *measures,
                            global REAL *centroids, global REAL *volumes, global REAL *offsets, global REAL *covariances,
-                           global int *report SEAM_ARGS)
+                           global int *report HALO_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];
@@ -98,10 +98,10 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
     }
 
     reach[p] = (float)(2 * sqrt(cell.reach2) * (1 + 8 * REAL_EPS));
-#ifdef SEAMS
-    SEAMS_GIVEN;
-    if (i < seams.own)
-        look_at_cell(&cell, i, x, &seams);
+#ifdef HALO
+    MAKE_HALO;
+    if (i < halo.own)
+        check_cell_balls(&cell, i, x, &halo);
 #endif
 
     /* A vertex of every face. */

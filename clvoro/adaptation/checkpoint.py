@@ -102,10 +102,10 @@ class Checkpointer:
             arrays[f"diagram.{name}"] = (array[:m] if name in PER_FACE else array).get()
         for name, array in mesh.stages.poisson.save(mesh.labels).items():
             arrays[f"multigrid.{name}"] = array
-        torus = mesh.tessellator.torus
-        if torus is not None:
+        periodic = mesh.tessellator.periodic
+        if periodic is not None:
             # The depth of the halo: in 3D the last bits of a cell depend on it.
-            arrays["seam.needed"] = torus.margins.needed.get()
+            arrays["seam.needed"] = periodic.halo.required.get()
         for part in ("initial", "final"):
             if getattr(loop, part) is not None:
                 for field in dataclasses.fields(Displacements):
@@ -118,7 +118,7 @@ class Checkpointer:
             "elapsed": time.perf_counter() - loop.began,
             "methods": [state_of(method) for method in methods_of(loop.schedule)],
             "capacities": capacities_of(mesh.stages), "levels": loop.levels,
-            "seam_cells": 0 if torus is None else torus.margins.cells,
+            "seam_cells": 0 if periodic is None else periodic.halo.cells,
         }  # fmt: skip
         about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
         arrays["about"] = np.array(json.dumps(about))

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..geometry.polygon import Polygon
 from ..mesh.results import HISTORY_DTYPE, Displacements
 from ..tessellation.cells import Cells
-from ..tessellation.periodic.ghost_images import block_count
+from ..tessellation.periodic.halo import block_count
 from .checkpoint import (
     DIAGRAM,
     FORMAT,
@@ -204,10 +204,10 @@ class Saved:
         diagram = {name: a[f"diagram.{name}"] for name in DIAGRAM}
         mesh.tessellation = mesh.tessellator.restore(points, diagram, state["spare"])
         mesh.next_label = state["next_label"]
-        torus = mesh.tessellator.torus
-        if torus is not None:
-            torus.margins.needed.set(a["seam.needed"])
-            torus.margins.cells = state["seam_cells"]
+        periodic = mesh.tessellator.periodic
+        if periodic is not None:
+            periodic.halo.required.set(a["seam.needed"])
+            periodic.halo.cells = state["seam_cells"]
         mesh.evaluate_metric()
         mesh.summaries.values.set(a["summaries"])
         levels = {

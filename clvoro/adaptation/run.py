@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry.box import Domain
 from ..mesh.results import Result
-from ..tessellation.periodic.torus import FewCellsError
+from ..tessellation.periodic.periodic_tessellator import FewCellsError
 from .checkpoint import Checkpointer
 from .fingerprint import run_fingerprint
 from .loop import Loop

@@ -17,7 +17,7 @@ from ..opencl.primitives import Summaries, Summary
 from ..sizing import Sizing
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
-from ..tessellation.readback.fetch import fetch_diagram
+from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights, LloydWeights
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
@@ -466,13 +466,13 @@ class MeshState:
         """
         self.stages.clear("poisson")
         self.engine.workspace.clear()
-        whole = self.tessellator.is_whole(self.t)
+        whole = self.tessellator.has_extended(self.t)
         if not whole:
             # Free the present diagram before the new one is computed.
             self.tessellation = None
-            self.stages.clear("folded")
-            self.tessellation = self.tessellator.make_whole(self.points, self.n)
-        self.tessellation, self._unfolded = self.tessellator.final(self.t)
+            self.stages.clear("folded_cells")
+            self.tessellation = self.tessellator.extend(self.points, self.n)
+        self.tessellation, self._extended = self.tessellator.final(self.t)
         self.evaluate_metric()
         return not whole
 
@@ -480,7 +480,7 @@ class MeshState:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
         self.stages.release()
         return fetch_diagram(
-            self.engine, self.domain, self.t, self.labels, copy=False, unfolded=self._unfolded
+            self.engine, self.domain, self.t, self.labels, copy=False, extended=self._extended
         )
 
 

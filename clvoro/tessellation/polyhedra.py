@@ -29,7 +29,7 @@ from .device_diagram import (
     Tessellation,
     restored,
 )
-from .periodic.halo import seam_defines
+from .periodic.halo import halo_defines
 
 HARMLESS = DOUBT | NARROW | UNEVEN
 """Flags of a diagram that is not rejected."""
@@ -88,7 +88,7 @@ class Polyhedra:
         self._wrap = None
         if engine.group_size == 1 and engine.real == np.float64:
             defines = {
-                "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **seam_defines(engine),
+                "STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine),
             }  # fmt: skip
             self._walks = engine.kernels("simd/walks", defines)
             self._wrap = self._walks.walk_all_cells
@@ -98,7 +98,7 @@ class Polyhedra:
     def _kernels(self, capacity: int) -> SimpleNamespace:
         if capacity not in self._programs:
             defines = {
-                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **seam_defines(self.engine),
+                "FACE_CAPACITY": capacity, "MAX_DEPTH": MAX_LEVELS, **halo_defines(self.engine),
             }  # fmt: skip
             self._programs[capacity] = self.engine.kernels("tessellation/polyhedra", defines)
         return self._programs[capacity]
@@ -161,7 +161,7 @@ class Polyhedra:
         previous: Tessellation | None = None,
         exact: bool = True,
         rows: int | None = None,
-        seams: tuple[object, ...] = (),
+        halo_args: tuple[object, ...] = (),
     ) -> Tessellation:
         """Tessellate `box` by the first `n` of `points` (n, 3), which lie in `binned`.
 
@@ -174,8 +174,8 @@ class Polyhedra:
             of a cell; otherwise by more than `ROUGH_SHARE`.
         rows : int, optional
             Number of cells to build, those of the first generators. Their faces with other cells are not matched.
-        seams : tuple, optional
-            In a periodic box the SEAM_ARGS of kernels, which test the balls around vertices
+        halo_args : tuple, optional
+            In a periodic box the HALO_ARGS of kernels, which test the balls around vertices
             (tessellation/periodic/halo.h).
 
         Raises
@@ -193,7 +193,7 @@ class Polyhedra:
         first = engine.scratch(n, np.float32)
         cl.enqueue_copy(engine.queue, buffer_of(first), buffer_of(binned.reach), byte_count=4 * n)
         with engine.workspace.frame():
-            cut = self._cut(box, points, n, binned, first, previous, rows, share, seams)
+            cut = self._cut(box, points, n, binned, first, previous, rows, share, halo_args)
             t = None if cut is None else self._match(cut, points, share)
         if t is None:
             raise CloseError(points, n)
@@ -215,7 +215,7 @@ class Polyhedra:
         previous: Tessellation | None,
         rows: int,
         share: np.floating,
-        seams: tuple[object, ...],
+        halo_args: tuple[object, ...],
     ) -> _CutCells | None:
         """Clip the first `rows` cells; repeat with larger capacities if needed. None if a cell collapses.
 
@@ -247,12 +247,12 @@ class Polyhedra:
                     engine.run_each(
                         walk, -(-rows // STRETCH), np.int32(rows), order, binned.points,
                         binned.items, binned.spacing, *search, lower, upper, first_reach, room,
-                        *written, *seams, group=1,
+                        *written, *halo_args, group=1,
                     )  # fmt: skip
             some = np.int32(again or walk is not None)
             engine.run_each(
                 self._kernels(capacity).clip_polyhedra, n, np.int32(rows), binned.points, binned.items,
-                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *seams,
+                *search, points, lower, upper, np.int32(warm), *old, some, room, share, *written, *halo_args,
                 # On a CPU the private arrays of a whole group lie on the stack of one thread.
                 group=1 if again else None,
             )  # fmt: skip

@@ -15,7 +15,7 @@ from .clipped.trim import Trim
 from .device_diagram import Tessellation
 from .incremental import IncrementalUpdate
 from .periodic.folded import FoldedCells
-from .periodic.ghost_images import Seam
+from .periodic.ghost_images import GhostImages
 from .polyhedra import Polyhedra
 
 
@@ -25,14 +25,14 @@ class TessellationStages:
     bins: Bins
     cells: Cells | Polyhedra
     incremental: IncrementalUpdate
-    seam: Seam
-    folded: FoldedCells
+    ghost_images: GhostImages
+    folded_cells: FoldedCells
     trim: Trim
     gather: Gather
 
     CLASSES: ClassVar[dict[str, type]] = {
-        "bins": Bins, "cells": Cells, "incremental": IncrementalUpdate, "seam": Seam, "folded": FoldedCells,
-        "trim": Trim, "gather": Gather,
+        "bins": Bins, "cells": Cells, "incremental": IncrementalUpdate, "ghost_images": GhostImages,
+        "folded_cells": FoldedCells, "trim": Trim, "gather": Gather,
     }  # fmt: skip
 
     def __init__(self, engine: Engine) -> None:

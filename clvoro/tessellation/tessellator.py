@@ -14,7 +14,7 @@ from ..geometry.polygon import Polygon
 from .bins import BinnedPoints
 from .clipped.polygonal import PolygonTessellator
 from .device_diagram import CloseError, Tessellation
-from .periodic.torus import Torus, Unfolded
+from .periodic.periodic_tessellator import ExtendedDiagram, PeriodicTessellator
 from .polyhedra import Polyhedra
 from .stages import TessellationStages, tessellate_box
 
@@ -40,37 +40,37 @@ class Tessellator:
         coarser: Tessellator | None = None,
     ) -> None:
         self.stages, self.domain = stages, domain
-        self.torus: Torus | None = None
+        self.periodic: PeriodicTessellator | None = None
         if isinstance(domain, Box) and any(domain.periodic):
-            known = None if coarser is None or coarser.torus is None else coarser.torus.margins
-            self.torus = Torus(stages, domain, known)
+            known = None if coarser is None or coarser.periodic is None else coarser.periodic.halo
+            self.periodic = PeriodicTessellator(stages, domain, known)
         self._polygon = (
             PolygonTessellator(stages, domain, spacing) if isinstance(domain, Polygon) else None
         )
 
     @property
-    def unfolded(self) -> Unfolded | None:
+    def extended(self) -> ExtendedDiagram | None:
         """The extended diagram that the latest one was folded from, in a periodic box."""
-        return None if self.torus is None else self.torus.latest
+        return None if self.periodic is None else self.periodic.latest
 
-    def is_whole(self, t: Tessellation) -> bool:
+    def has_extended(self, t: Tessellation) -> bool:
         """Return whether the complete extended diagram of `t`, the latest diagram, is known."""
-        latest = self.unfolded
-        return self.torus is None or (latest is not None and latest.folded.tessellation is t)
+        latest = self.extended
+        return self.periodic is None or (latest is not None and latest.folded.tessellation is t)
 
-    def make_whole(self, points: cla.Array, n: int) -> Tessellation:
+    def extend(self, points: cla.Array, n: int) -> Tessellation:
         """Tessellate a periodic box from scratch, with a complete extended diagram."""
-        assert self.torus is not None
+        assert self.periodic is not None
         with self._in_units():
-            return self.torus.tessellate(points, n, whole=True)
+            return self.periodic.tessellate(points, n, keep_extended=True)
 
-    def final(self, t: Tessellation) -> tuple[Tessellation, Unfolded | None]:
+    def final(self, t: Tessellation) -> tuple[Tessellation, ExtendedDiagram | None]:
         """Return `t`, the latest diagram, with faces in full precision, and its extended diagram in a periodic box.
 
-        `t` must be whole (`is_whole`).
+        The extended diagram of `t` must be known (`has_extended`).
         """
-        if self.torus is not None:
-            return self.torus.measure_faces(), self.unfolded
+        if self.periodic is not None:
+            return self.periodic.measure_faces(), self.extended
         if self._polygon is None and not isinstance(self.stages.cells, Polyhedra):
             t = self.stages.cells.measure_faces(self.domain, t)
         return t, None
@@ -88,10 +88,10 @@ class Tessellator:
             t = self.tessellate(points, len(points))
             stages.bins.clear()
             return t
-        if self.torus is not None and stages.engine.dim == 2:
-            return stages.folded.restore(points, saved, spare)
+        if self.periodic is not None and stages.engine.dim == 2:
+            return stages.folded_cells.restore(points, saved, spare)
         t = stages.cells.restore(points, saved, spare)
-        if self.torus is not None:
+        if self.periodic is not None:
             # The next diagram may take several attempts that all start from this graph.
             t = replace(t, starts=t.starts.copy(), neighbors=t.neighbors.copy())
         return t
@@ -121,8 +121,10 @@ class Tessellator:
             If generators are too close to each other to be distinguished.
         """
         with self._in_units():
-            if self.torus is not None:
-                return self.torus.tessellate(points, n, previous, exact, not exact, whole=exact)
+            if self.periodic is not None:
+                return self.periodic.tessellate(
+                    points, n, previous, exact, not exact, keep_extended=exact
+                )
             if self._polygon is not None:
                 return self._polygon.tessellate(points, n, previous, exact, binned)
             return tessellate_box(self.stages, self.domain, points, n, previous, exact, binned)

@@ -211,7 +211,10 @@ def huge_array():
         ({"size_error": np.zeros(40, int)}, "size_error has dtype"),
         ({"history": np.zeros(3)}, "history has shape"),
         ({"about": np.array("{not json")}, "description is damaged"),
-        ({"about": np.array('{"domain": {"kind": "Torus"}}')}, "'Torus'"),
+        (
+            {"about": np.array('{"domain": {"kind": "PeriodicTessellator"}}')},
+            "'PeriodicTessellator'",
+        ),
         ({"about": np.array("7")}, "description is damaged"),
         ({"about": np.array("[" * 100000)}, "description is damaged"),
         ({"diagram.neighbors": None}, "lacks diagram.neighbors"),

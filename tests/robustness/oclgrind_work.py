@@ -152,16 +152,16 @@ def repaired(adapter: clvoro.Adapter) -> None:
 
 def drop_faces(adapter: clvoro.Adapter) -> None:
     """Close rows that have lost faces, which roundings hardly ever bring about."""
-    from clvoro.tessellation.periodic.torus import Torus
+    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     for dim in (2, 3):
         which, n = (True, *(dim == 2,) * (dim - 1)), 30 if dim == 2 else 12
         box = clvoro.Box((0,) * dim, (1,) * dim, periodic=which)
         stages = adapter._stages_for(box)
         engine = stages.engine
-        torus = Torus(stages, box)
+        periodic = PeriodicTessellator(stages, box)
         x = engine.upload(box.place(points(n, dim), adapter.dtype))
-        t = torus.tessellate(x, n, nearest=False, whole=True)
+        t = periodic.tessellate(x, n, nearest=False, keep_extended=True)
         m = int(t.starts.get()[-1])
         kept = np.ones(m, np.uint8)
         kept[::7] = 0
@@ -171,8 +171,8 @@ def drop_faces(adapter: clvoro.Adapter) -> None:
         left = int(starts[-1])
         ints = [engine.empty(left, np.int32) for _ in range(3)]
         engine.run_each(
-            stages.seam._kernels.close_rows, n, t.starts, engine.upload(kept, np.uint8),
-            engine.upload(starts, np.int32), t.neighbors, torus.latest.folded.codes, t.face_measures,
+            stages.ghost_images._kernels.close_rows, n, t.starts, engine.upload(kept, np.uint8),
+            engine.upload(starts, np.int32), t.neighbors, periodic.latest.folded.codes, t.face_measures,
             t.face_centroids, ints[0], ints[1], engine.empty(left, engine.face),
             engine.empty((left, dim), engine.face), ints[2],
         )  # fmt: skip

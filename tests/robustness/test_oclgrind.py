@@ -76,7 +76,7 @@ NOT_FOR = {
     | AT_LAYERS
     | {"incremental.wrap_marked", "ghost_images.unfold_rows"},
     "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images"},
-    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images.measure_margins"},
+    "periodic space": IN_PLANE | AT_POLYGONS | AT_LAYERS | {"ghost_images.measure_required_depths"},
 }
 """Files and kernels that a kind of domain does not take; all others but those `ALIKE` run in it, in every variant."""
 PATIENCE = 20

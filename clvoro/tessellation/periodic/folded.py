@@ -1,6 +1,6 @@
-"""Cells of a folded diagram (see `seam.py`) in 2D, whose neighbors are the nearest images of their generators.
+"""Cells of a folded diagram in 2D, in which each neighbor is the nearest image of its generator.
 
-Their kernels have the periods built in: all that is said of corners takes differences of positions.
+The periods are built into the kernels, which compute corners from differences of positions.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from ..cells import Cells
 
 
 class FoldedCells(Cells):
-    """The rows and measures of such cells: what `IncrementalUpdate` works on in a periodic box."""
+    """Rows and measures of folded cells, on which `IncrementalUpdate` works in a periodic box."""
 
     searches = False
 
@@ -20,7 +20,7 @@ class FoldedCells(Cells):
 
     @property
     def defines(self) -> dict[str, object]:
-        """The capacities and the periods, as kernels that work on the rows must be built with."""
+        """The capacities and the periods: defines of all kernels that read the rows."""
         return {**super().defines, **self._folds}
 
     def reserve(self, n: int) -> None:
@@ -28,6 +28,6 @@ class FoldedCells(Cells):
         self._reserve(n)
 
     def clear(self) -> None:
-        """Let go of all buffers of cells and faces."""
+        """Free all buffers of cells and faces."""
         self._of_cells, self._of_faces, self._views = {}, {}, {}
         self._capacity, self._room, self._n = 0, 0, -1

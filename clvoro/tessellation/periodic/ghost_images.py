@@ -1,4 +1,4 @@
-"""Periodic boxes: generators with their images beyond the seams, and the diagram folded back (`seam.cl`)."""
+"""Ghost images of generators beyond periodic boundaries, and the diagram folded back (`ghost_images.cl`)."""
 
 from __future__ import annotations
 
@@ -12,71 +12,69 @@ from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
 from ..device_diagram import Tessellation
-from .halo import Margins, block_count, block_counts, seam_defines
+from .halo import Halo, block_count, block_counts, halo_defines
 
 DROPPED, FAR, COLLAPSED = 1, 2, 4
-"""Bits of a report: see `seam.cl`."""
+"""Bits of the report of `ghost_images.cl`."""
 SIDEWAYS, OUTWARDS = 0.7, 0.2
-"""What the next margins have room for, in ways between the generators about a vertex: that the ball around it moves
-along the seam, or outwards until the generator on it is at the seam; and what it grows beyond that. With less, diagrams
-have to be made again more often."""
-KEPT, KEPT_GUESS = {2: 0.9, 3: 0.97}, {2: 0.9, 3: 0.7}
-"""Share that margins keep, from diagram to diagram, of what they were, and of what was a guess, by dimension. In 3D,
-where nothing is repaired, diagrams follow each other closely; the more is kept, the fewer balls have a wish."""
+"""Room of the next halo, as shares of the shortest distance between the generators about a vertex: for motion of the
+ball around the vertex along the boundary or outwards, and for its growth. With less room more diagrams
+are made twice."""
+KEPT, KEPT_ESTIMATE = {2: 0.9, 3: 0.97}, {2: 0.9, 3: 0.7}
+"""Share of its depth, or of an estimated depth, that a halo keeps from one diagram to the next, by dimension. In 3D
+diagrams change little from one to the next, and a larger share leaves fewer balls to test."""
 OTHER_CELLS = 0.1
-"""Share by which the spacing of generators changes where cells are others than before."""
+"""Relative change of the spacing of generators from which on the depths of near blocks are taken into account."""
 
 
 @dataclass(frozen=True)
 class ExtendedBox:
-    """A periodic box in the device's coordinates, with margins beyond its seams.
+    """A periodic box with its halo, in the device's coordinates.
 
     Attributes
     ----------
     lower, upper : (d,) float
-        In the device's coordinates.
     """
 
     lower: np.ndarray
     upper: np.ndarray
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-        """Corners, padded to four numbers."""
+        """Return the corners, padded to four numbers."""
         corners = np.zeros((2, 4), real)
         corners[:, : len(self.lower)] = self.lower, self.upper
         return corners[0], corners[1]
 
 
 @dataclass(frozen=True)
-class Images:
-    """Generators of a periodic box and their images in an extended one, on the device.
+class ExtendedPoints:
+    """Generators of a periodic box and their ghost images, on the device.
 
     Attributes
     ----------
     n, count : int
-        Generators; generators and images.
+        Number of generators; number of generators and images.
     box : ExtendedBox
-    margins : Margins
-        Within which images were taken.
+    halo : Halo
     kept : float32
-        Share that they keep at least, whatever the cells need.
-    seams : tuple
-        The SEAM_ARGS of kernels that test the balls around vertices (tessellation/periodic/halo.h).
+        Least share of its depth that the halo keeps.
+    halo_args : tuple
+        HALO_ARGS of kernels that test the balls around vertices (tessellation/periodic/halo.h).
     points : (>= count, d) real
-        Generators first, then images in the order of owners and codes.
+        Generators first, then images, ordered by owner and code.
     firsts : (n + 1,) int32
-        Images of generator i are those from ``firsts[i]`` on.
+        The images of generator i begin at ``firsts[i]``.
     owners, codes : (>= count - n,) int32
-        Of each image: its generator, and which image of it, sum over the axes of (c + 1) 3^a where it lies c periods
-        away, c = -1, 0 or 1.
+        Generator of each image, and its code: the sum over the axes a of (c + 1) 3^a, where the image is shifted by c
+        periods, c = -1, 0 or 1.
     """
 
     n: int
     count: int
     box: ExtendedBox
-    margins: Margins
+    halo: Halo
     kept: np.float32
-    seams: tuple[object, ...]
+    halo_args: tuple[object, ...]
     points: cla.Array
     firsts: cla.Array
     owners: cla.Array
@@ -84,8 +82,8 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Rows of neighbors of `n` generators on the device, to begin their cells with; -1 for none.
+class NeighborRows:
+    """Neighbors that the cells of `n` generators start from, on the device; -1 for none.
 
     Attributes
     ----------
@@ -99,17 +97,17 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Folded:
-    """The rows of a diagram of generators and images that belong to generators, images replaced by their owners.
+class FoldedDiagram:
+    """The rows of the generators in an extended diagram, with images replaced by their owners.
 
     Attributes
     ----------
     tessellation : Tessellation
-        Of the n generators. The face's neighbor lies at that generator's place, or at an image of it.
+        Of the n generators. The neighbor across a face is a generator or an image of it.
     codes : (>= m,) int32
-        Of each face's neighbor, as those of `Images`.
+        Code of the image across each face, as in `ExtendedPoints`.
     places : (m,) int32 or None
-        Where each face stands in the extended diagram; None: where it stands here.
+        Index of each face in the extended diagram; None if it is the same.
     """
 
     tessellation: Tessellation
@@ -117,48 +115,48 @@ class Folded:
     places: cla.Array | None
 
 
-class Seam:
-    """The kernels of `seam.cl`. Buffers are kept from call to call, those of a folded graph for two calls."""
+class GhostImages:
+    """Make ghost images and fold diagrams. Buffers are reused: those of a folded graph in every second call."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._scan = Scan(engine)
         self._room = NamedArrays(engine, spare=1 / 16)  # sizes change a little from step to step
-        self._kernels = engine.kernels("tessellation/periodic/ghost_images", seam_defines(engine))
+        self._kernels = engine.kernels("tessellation/periodic/ghost_images", halo_defines(engine))
         self._report = engine.empty(3, np.int32)
         self._turn = 0
 
     def extend(
-        self, domain: Box, points: cla.Array, n: int, margins: Margins, factor: float, grow: bool
-    ) -> Images:
-        """Return the first `n` of `points` (n, d) with their images beyond the seams.
+        self, domain: Box, points: cla.Array, n: int, halo: Halo, factor: float, grow: bool
+    ) -> ExtendedPoints:
+        """Return the first `n` of `points` (n, d) with their images in the halo.
 
         Parameters
         ----------
-        margins : Margins
-            They become what was needed, times `factor`.
+        halo : Halo
+            Its depths are set to those required, times `factor`.
         grow : bool
-            But nowhere less than they were.
+            Let no depth become smaller.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
         corners = np.array(domain.device_corners(engine.real))
         counts = block_counts(corners[1, :d] - corners[0, :d], n)
-        was = block_counts(corners[1, :d] - corners[0, :d], margins.cells)
+        was = block_counts(corners[1, :d] - corners[0, :d], halo.cells)
         lengths = np.maximum((corners[1] - corners[0]) / counts, 1e-30).astype(engine.real)
         blocks = corners[0], lengths, counts
         others = abs(factor - 1) > OTHER_CELLS or bool((was != counts).any())
-        kept = np.float32((KEPT_GUESS if others or margins.guessed else KEPT)[d])
-        margins.extremes.fill(0)
+        kept = np.float32((KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
+        halo.extremes.fill(0)
         engine.run_each(
-            k.next_margins, block_count(d), margins.needed, was, np.float32(factor),
-            np.int32(others), np.int32(grow), *blocks, margins.widths, margins.extremes, margins.wishes,
+            k.predict_halo_depths, block_count(d), halo.required, was, np.float32(factor),
+            np.int32(others), np.int32(grow), *blocks, halo.depths, halo.extremes, halo.requests,
             *engine.period_args,
         )  # fmt: skip
         self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
         engine.run_each(
-            k.count_images, n, points, margins.widths, margins.extremes, *blocks, firsts,
+            k.count_images, n, points, halo.depths, halo.extremes, *blocks, firsts,
             *engine.period_args,
         )  # fmt: skip
         self._scan.exclusive(firsts, firsts, n)
@@ -168,71 +166,74 @@ class Seam:
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
         engine.run_each(
-            k.place_images, n, points, margins.widths, margins.extremes, *blocks, firsts, extended,
+            k.place_images, n, points, halo.depths, halo.extremes, *blocks, firsts, extended,
             owners, codes, *engine.period_args,
         )  # fmt: skip
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
-        # On a coarse grid, so that the corners of the extended box are exact.
-        widest = np.ceil(margins.extremes.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
+        # Round up to a coarse grid, so that the corners of the extended box are exact.
+        widest = np.ceil(halo.extremes.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
         wide = np.minimum(periods, widest).astype(engine.real)
         box = ExtendedBox(lower - wide, upper + wide)
-        seams = (
+        halo_args = (
             np.int32(n), np.append(periods, np.zeros(4 - d)).astype(engine.real), *blocks,
             engine.real.type(SIDEWAYS), engine.real.type(OUTWARDS), kept,
-            margins.widths, margins.extremes, margins.wishes, self._report,
+            halo.depths, halo.extremes, halo.requests, self._report,
         )  # fmt: skip
-        return Images(n, count, box, margins, kept, seams, extended, firsts, owners, codes)
+        return ExtendedPoints(n, count, box, halo, kept, halo_args, extended, firsts, owners, codes)
 
-    def unfold(self, images: Images, previous: Tessellation) -> Rows:
-        """Return rows of the extended graph for the generators, from `previous`: the same ones at earlier positions."""
+    def unfold(self, images: ExtendedPoints, previous: Tessellation) -> NeighborRows:
+        """Return rows of the extended graph from `previous`, the diagram of the generators at earlier positions."""
         m = int(previous.starts[images.n].get())
         neighbors = self._room("unfolded", size=m, dtype=np.int32)
         self.engine.run_each(
             self._kernels.unfold_rows, images.n, previous.starts, previous.neighbors,
             images.points, images.firsts, images.codes, neighbors, *self.engine.period_args,
         )  # fmt: skip
-        return Rows(images.n, previous.starts, neighbors)
+        return NeighborRows(images.n, previous.starts, neighbors)
 
     def fold(
         self,
-        images: Images,
+        images: ExtendedPoints,
         binned: BinnedPoints,
         t: Tessellation,
         points: cla.Array,
         share: float,
         nearest: bool,
-    ) -> tuple[Folded, bool, int, int]:
-        """Fold `t`, the diagram of `images`, which lie in `binned`.
+    ) -> tuple[FoldedDiagram, bool, int, int]:
+        """Fold `t`, the diagram of `images`.
 
         Parameters
         ----------
+        binned : BinnedPoints
+            The generators and images.
         points : (n, d) real
             The generators.
         share : float
-            Of a cell, that a face may make which only one of its cells sees.
+            Largest share of a cell behind a face that only one of its two cells has. Such faces are dropped.
         nearest : bool
-            Whether to look for faces whose neighbor is not the nearest image of its generator.
+            Report faces whose neighbor is not the nearest image of its generator (`FAR`).
 
         Returns
         -------
-        folded : Folded
+        folded : FoldedDiagram
         enough : bool
-            Whether the margins were wide enough for all cells: else the diagram is not right. What they need is noted.
+            Whether the halo was deep enough for all cells. If not, the diagram is wrong, and the halo's required
+            depths are up to date.
         flags, generator : int
-            `FAR` and `COLLAPSED` where that is so, and the first generator concerned.
+            `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
         engine, k, n = self.engine, self._kernels, images.n
-        margins = images.margins
-        if engine.dim == 2:  # in 3D cells are looked at where they are made
+        halo = images.halo
+        if engine.dim == 2:  # in 3D the kernels that clip cells do this
             engine.run_each(
-                k.measure_margins, images.count, binned.items, binned.reach, images.points, t.starts,
-                t.neighbors, *images.box.device_corners(engine.real), *images.seams,
+                k.measure_required_depths, images.count, binned.items, binned.reach, images.points, t.starts,
+                t.neighbors, *images.box.device_corners(engine.real), *images.halo_args,
             )  # fmt: skip
         engine.run_each(
-            k.note_margins, block_count(engine.dim), margins.widths, images.kept, margins.wishes,
-            margins.needed, *engine.period_args,
+            k.store_required_depths, block_count(engine.dim), halo.depths, images.kept, halo.requests,
+            halo.required, *engine.period_args,
         )  # fmt: skip
-        margins.cells, margins.guessed = n, False
+        halo.cells, halo.estimated = n, False
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
         graph = [
@@ -265,6 +266,6 @@ class Seam:
         )  # fmt: skip
         enough = not words[0]
         if not enough:
-            # The next attempt takes the place of this one: the graph from before is where that begins, too.
+            # The next attempt writes to the same buffers, since it starts from the previous graph as well.
             self._turn = 1 - self._turn
-        return Folded(folded, graph[1], places), enough, flags & ~DROPPED, int(words[2])
+        return FoldedDiagram(folded, graph[1], places), enough, flags & ~DROPPED, int(words[2])

@@ -1,4 +1,4 @@
-"""Margins beyond the seams of periodic boxes, within which images of generators are taken."""
+"""The halo of a periodic box: how deep beyond each periodic boundary ghost images of generators are taken."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 from ...opencl.engine import Engine
 
 BLOCKS = {2: 128, 3: 32}
-"""Blocks per axis along a seam by dimension, at most."""
+"""Most blocks per axis along a periodic boundary, by dimension."""
 FEWEST_BLOCKS = 4
-"""The same, at least."""
+"""Fewest blocks per axis in 3D."""
 FINENESS = 2.0
-"""Blocks in 3D to a cell, each way: every ball is held against all blocks that it meets."""
+"""Blocks per cell and axis in 3D. More blocks fit the halo better, but each ball is tested against more of them."""
 
 
-def seam_defines(engine: Engine) -> dict[str, object]:
-    """Return the defines of kernels that take SEAM_ARGS (see halo.h): none where there are no seams."""
+def halo_defines(engine: Engine) -> dict[str, object]:
+    """Return the defines of kernels that take HALO_ARGS (see halo.h); empty for domains that are not periodic."""
     if not engine.domain_kind.periodic:
         return {}
-    return {"SEAMS": 1, "BLOCKS": BLOCKS[engine.dim]}
+    return {"HALO": 1, "BLOCKS": BLOCKS[engine.dim]}
 
 
 def block_count(dim: int) -> int:
-    """Return the number of blocks that all seams have room for, those across axes with walls included."""
+    """Return the length of arrays over all blocks of all boundaries, walls included."""
     return 2 * dim * BLOCKS[dim] ** (dim - 1)
 
 
@@ -38,36 +38,36 @@ def block_counts(edges: np.ndarray, n: float) -> np.ndarray:
     return counts
 
 
-class Margins:
-    """How far beyond the seams of a periodic box images are taken, block by block; see `seam.cl`.
+class Halo:
+    """Depth of the halo, block by block; see `ghost_images.cl`.
 
-    Blocks are in the order of axes, ends (lower, upper) and places along the seam.
+    Arrays over blocks run over axes, ends (lower, upper) and positions along the boundary, in this order.
 
     Attributes
     ----------
-    needed : (blocks,) float32, device
-        How deep balls around the vertices of the latest diagram go that are a little wider than they need be.
+    required : (blocks,) float32, device
+        Depth that the balls around the vertices of the latest diagram reach, with some room.
     cells : int
         Generators of that diagram; 0 before the first one.
-    guessed : bool
-        Whether that diagram is still to be made.
-    widths : (blocks,) float32, device
-        Within which its images were taken, if it had any.
-    wishes : (blocks,) int32, device
-        What cells of a diagram need, while it is made: bits of floats.
+    estimated : bool
+        Whether `required` is an estimate, as before the first diagram.
+    depths : (blocks,) float32, device
+        Depth within which the images of that diagram were taken.
+    requests : (blocks,) int32, device
+        Depths that the cells of a diagram require, while it is made: bits of floats.
     extremes : (10,) int32, device
-        The largest and the least of `widths`; see tessellation/periodic/halo.h.
+        Largest and least of `depths`; see tessellation/periodic/halo.h.
     """
 
     def __init__(self, engine: Engine) -> None:
         count = block_count(engine.dim)
-        self.needed = engine.zeros(count, np.float32)
-        self.cells, self.guessed = 0, False
-        self.widths = engine.zeros(count, np.float32)
-        self.wishes = engine.zeros(count, np.int32)
+        self.required = engine.zeros(count, np.float32)
+        self.cells, self.estimated = 0, False
+        self.depths = engine.zeros(count, np.float32)
+        self.requests = engine.zeros(count, np.int32)
         self.extremes = engine.empty(10, np.int32)
 
-    def fill(self, margin: float, cells: int) -> None:
-        """Have `margin` needed everywhere by the diagram of `cells` generators."""
-        self.needed.fill(margin)
-        self.cells, self.guessed = cells, True
+    def fill(self, depth: float, cells: int) -> None:
+        """Estimate that the diagram of `cells` generators requires `depth` everywhere."""
+        self.required.fill(depth)
+        self.cells, self.estimated = cells, True

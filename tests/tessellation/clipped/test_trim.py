@@ -8,7 +8,7 @@ import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.errors import InputError
 from clvoro.opencl.engine import Engine
-from clvoro.tessellation.readback.fetch import fetch_diagram
+from clvoro.tessellation.readback.diagram import fetch_diagram
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.polygon_diagrams import euler_excess, faults, polygon_voronoi
 from tests.reference.shores import (

@@ -7,7 +7,7 @@ import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import incremental as repair
-from clvoro.tessellation.periodic.torus import Torus
+from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 from tests.reference import patch
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
@@ -27,8 +27,11 @@ class Carried:
 
     def __init__(self, stages, box, points):
         self.stages, self.box, self.n = stages, box, len(points)
-        self.torus, self.fresh = Torus(stages, box), Torus(stages, box)
-        self.t = self.torus.tessellate(self.place(points), self.n)
+        self.periodic, self.fresh = (
+            PeriodicTessellator(stages, box),
+            PeriodicTessellator(stages, box),
+        )
+        self.t = self.periodic.tessellate(self.place(points), self.n)
 
     def place(self, points):
         return self.stages.engine.upload(self.box.place(points, self.stages.engine.real))
@@ -36,8 +39,8 @@ class Carried:
     def move(self, points):
         """Carry the diagram over to `points`; return it as NumPy arrays, None where it was not."""
         x = self.place(points)
-        t = self.torus._repaired(x, self.n, self.t)
-        self.t = self.torus.tessellate(x, self.n) if t is None else t
+        t = self.periodic._updated(x, self.n, self.t)
+        self.t = self.periodic.tessellate(x, self.n) if t is None else t
         return None if t is None else patch.fetch(t)
 
     def reference(self, points):
@@ -66,7 +69,7 @@ def test_lanes_have_the_bits_of_one_by_one(ctx, box, monkeypatch):
     both = [make_stages(ctx, box, one_by_one=alone) for alone in (False, True)]
     if both[0].engine.group_size > 1:
         pytest.skip("lanes are for CPUs")
-    assert [stages.folded.lanes for stages in both] == [8, 1]
+    assert [stages.folded_cells.lanes for stages in both] == [8, 1]
     rng, points = np.random.default_rng(50101), some_points(box, 500, 50102)
     runs = [Carried(stages, box, points) for stages in both]
     changed = 0
@@ -93,8 +96,10 @@ def test_cells_that_cover_the_torus_twice(ctx, real):
     apart = 0.25 / m * np.exp(2j * np.pi * points[:, 0])
     run = Carried(stages, UNIT, points + 0.001)
     twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])
-    stages.folded.reserve(run.n)
-    covered = stages.incremental.update(stages.folded, run.torus._wide, run.place(twice), run.t)
+    stages.folded_cells.reserve(run.n)
+    covered = stages.incremental.update(
+        stages.folded_cells, run.periodic._wide, run.place(twice), run.t
+    )
     assert patch.fetch(covered).volumes.sum() == pytest.approx(2, rel=1e-5)
     run = Carried(stages, UNIT, points + 0.001)
     assert run.move(twice) is None

@@ -9,11 +9,11 @@ import clvoro
 from clvoro.tessellation.periodic.ghost_images import COLLAPSED, FAR
 from clvoro.tessellation.periodic.halo import (
     BLOCKS,
-    Margins,
+    Halo,
     block_count,
     block_counts,
 )
-from clvoro.tessellation.periodic.torus import Torus
+from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
 BOXES = {
     "torus": clvoro.Box((0, 0), (1, 0.7), periodic=True),
@@ -43,7 +43,7 @@ class Given:
         box, rng = BOXES[name], np.random.default_rng(2301)
         self.box, self.n, self.dim = box, n, box.dim
         self.stages = adapter._stages_for(box)
-        self.engine, self.seam = self.stages.engine, self.stages.seam
+        self.engine, self.ghost_images = self.stages.engine, self.stages.ghost_images
         self.real = self.engine.real
         points = np.array(box.lower) + box.extent * rng.random((n, box.dim))
         if n > 20:
@@ -57,16 +57,16 @@ class Given:
         self.periods = box.periods(self.real).astype(self.real)
         self.edges = box.device_corners(self.real)[1][: self.dim]
         self.counts = block_counts(self.edges, n)[: self.dim]
-        self.margins = Margins(self.engine)
+        self.halo = Halo(self.engine)
         wide[rng.random(len(wide)) < 0.1] = WHOLE
-        self.margins.needed.set(wide)
-        self.margins.cells = n
+        self.halo.required.set(wide)
+        self.halo.cells = n
         self.wide = wide.reshape(self.dim, 2, -1)
         self.extend()
 
     def extend(self):
         """Take the images, into buffers that the next call uses again."""
-        self.images = self.seam.extend(self.box, self.x, self.n, self.margins, 1.0, False)
+        self.images = self.ghost_images.extend(self.box, self.x, self.n, self.halo, 1.0, False)
 
     def steps(self, code):
         return [code // 3**a % 3 - 1 for a in range(self.dim)]
@@ -119,7 +119,7 @@ def test_images_are_those_within_the_margins(adapter, name):
     points = images.points.get()[: images.count]
     assert np.array_equal(points, np.concatenate([given.points, [p for *_, p in expected]]))
     # Extremes are those of the blocks that there are.
-    extremes = given.margins.extremes.get()
+    extremes = given.halo.extremes.get()
     used = [given.wide_of(a, end) for a in range(given.dim) for end in (0, 1)]
     walls = np.repeat(given.periods == 0, 2)
     widest = [0 if wall else wide.max() for wall, wide in zip(walls, used, strict=True)]
@@ -139,9 +139,9 @@ def test_images_are_those_within_the_margins(adapter, name):
 def test_unfolded_rows_name_the_nearest_images(adapter, name):
     """Where images are not taken, nobody; each row by all images, whatever the code that it had."""
     given = Given(adapter, name, 60)
-    t = Torus(given.stages, given.box).tessellate(given.x, 60, nearest=False)
+    t = PeriodicTessellator(given.stages, given.box).tessellate(given.x, 60, nearest=False)
     given.extend()
-    rows = given.seam.unfold(given.images, t)
+    rows = given.ghost_images.unfold(given.images, t)
     places = {key[:2]: 60 + g for g, key in enumerate(given.expected())}
     starts, neighbors, x = t.starts.get(), t.neighbors.get(), given.points
     found, absent, across = rows.neighbors.get(), 0, 0
@@ -165,13 +165,13 @@ class Folding:
 
     def __init__(self, adapter, name, n):
         self.given = given = Given(adapter, name, n)
-        given.margins.needed.fill(WHOLE)
+        given.halo.required.fill(WHOLE)
         given.extend()
         self.images = images = given.images
         self.binned = given.stages.bins.build(images.box, images.points, images.count)
         args = images.box, images.points, images.count, self.binned
         if given.dim == 3:
-            self.t = given.stages.cells.tessellate(*args, None, False, n, images.seams)
+            self.t = given.stages.cells.tessellate(*args, None, False, n, images.halo_args)
         else:
             self.t = given.stages.cells.tessellate(*args, False, n)
         self.n, self.starts = n, self.t.starts.get()
@@ -210,11 +210,11 @@ class Folding:
         changed = replace(
             t, neighbors=upload(neighbors, np.int32), face_measures=upload(measures, face), volumes=upload(volumes)
         )  # fmt: skip
-        seam = self.given.seam
-        seam._report.set(
+        ghost_images = self.given.ghost_images
+        ghost_images._report.set(
             np.array([0, 0, 2**31 - 1], np.int32)
         )  # of the images, of which there is one diagram
-        return seam.fold(self.images, self.binned, changed, self.given.x, share, nearest)
+        return ghost_images.fold(self.images, self.binned, changed, self.given.x, share, nearest)
 
     def far(self, neighbors):
         """Return who has a neighbor that is not the nearest image, in these rows."""

@@ -1,4 +1,4 @@
-"""Margins of periodic boxes: what cells tell of them against all balls around the vertices of all images."""
+"""Halo of periodic boxes: what cells tell of them against all balls around the vertices of all images."""
 
 import itertools
 
@@ -7,15 +7,15 @@ import pytest
 from scipy.spatial import Delaunay
 
 import clvoro
-from clvoro.tessellation.periodic.ghost_images import KEPT, OUTWARDS, SIDEWAYS, Seam
+from clvoro.tessellation.periodic.ghost_images import KEPT, OUTWARDS, SIDEWAYS, GhostImages
 from clvoro.tessellation.periodic.halo import (
     BLOCKS,
     FEWEST_BLOCKS,
     FINENESS,
-    Margins,
+    Halo,
     block_counts,
 )
-from clvoro.tessellation.periodic.torus import Torus
+from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
 BOXES = {
     2: clvoro.Box((0, 0), (1, 0.7), periodic=True),
@@ -140,16 +140,16 @@ def check_margins(adapter, box, points, walks):
             pytest.skip("cells are made in one way only")
         stages.cells._wrap = None
     x = stages.engine.upload(box.place(points, real))
-    torus = Torus(stages, box)
+    periodic = PeriodicTessellator(stages, box)
     for _ in range(5):  # margins come near to what is needed
-        torus.tessellate(x, n)
+        periodic.tessellate(x, n)
     stages.release()
     periods, place = box.periods(real), x.get().astype(float)
     edges = box.device_corners(real)[1][:dim].astype(float)
     counts = block_counts(edges, n)[:dim]
     noise = NOISE[real.name]
-    needed = blocks_of(torus.margins.needed, dim, counts)
-    widths = blocks_of(torus.margins.widths, dim, counts)
+    needed = blocks_of(periodic.halo.required, dim, counts)
+    widths = blocks_of(periodic.halo.depths, dim, counts)
     wished = needs(place, edges, periods, counts, SIDEWAYS, OUTWARDS, noise)
     least = needs(place, edges, periods, counts, 0, 0, 0)
     spacing, told = (np.prod(edges) / n) ** (1 / dim), 0
@@ -169,14 +169,14 @@ def test_margins_that_are_too_narrow_are_found_out(adapter, short):
     box, rng = BOXES[3], np.random.default_rng(2207)
     points, real = lattice(box, 4, rng), adapter.dtype
     n, stages = len(points), adapter._stages_for(box)
-    x, seam = stages.engine.upload(box.place(points, real)), stages.seam
+    x, ghost_images = stages.engine.upload(box.place(points, real)), stages.ghost_images
     periods = box.periods(real)
     counts = block_counts(periods, n)[:3]
     least = needs(x.get().astype(float), periods, periods, counts, 0, 0, 0)
     found = []
     for factor in (1.001, short):
         for axis, end in itertools.product(range(3), (0, 1)):
-            margins, widths = Margins(stages.engine), {}
+            halo, widths = Halo(stages.engine), {}
             whole = np.zeros((3, 2, BLOCKS[3], BLOCKS[3]), np.float32)
             for (a, e), need in least.items():
                 widths[a, e] = 1.001 * need
@@ -184,22 +184,22 @@ def test_margins_that_are_too_narrow_are_found_out(adapter, short):
                     worst = np.unravel_index(need.argmax(), need.shape)
                     widths[a, e][worst] = factor * need.max()
                 whole[a, e, : need.shape[0], : need.shape[1]] = widths[a, e]
-            margins.needed.set(whole.ravel())
-            margins.cells = n
-            found.append(is_enough(stages, seam, box, x, n, margins))
+            halo.required.set(whole.ravel())
+            halo.cells = n
+            found.append(is_enough(stages, ghost_images, box, x, n, halo))
     assert found == [True] * 6 + [False] * 6
 
 
-def is_enough(stages, seam: Seam, box, x, n, margins):
+def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
     """Whether a diagram within these margins is said to be right."""
-    images = seam.extend(box, x, n, margins, 1.0, False)
+    images = ghost_images.extend(box, x, n, halo, 1.0, False)
     binned = stages.bins.build(images.box, images.points, images.count)
     args = images.box, images.points, images.count, binned
     if box.dim == 3:
-        t = stages.cells.tessellate(*args, None, False, n, images.seams)
+        t = stages.cells.tessellate(*args, None, False, n, images.halo_args)
     else:
         t = stages.cells.tessellate(*args, False, n)
-    return seam.fold(images, binned, t, x, 0.5, True)[1]
+    return ghost_images.fold(images, binned, t, x, 0.5, True)[1]
 
 
 @pytest.mark.parametrize(("dim", "count"), [(2, 60), (3, 100)])
@@ -216,13 +216,13 @@ def test_numbers_of_generators_do_not_matter(adapter, dim, count):
         whole[(*seam, *map(slice, need.shape))] = 1.0001 * need + noise / 10
     found, beside = [], np.minimum(place, periods - place).min(axis=1).argsort()
     for first in (n - 1, *beside[:24]):
-        margins, order = Margins(stages.engine), np.arange(n)
+        halo, order = Halo(stages.engine), np.arange(n)
         order[[0, first]] = first, 0
-        margins.needed.set(whole.ravel())
-        margins.cells = n
+        halo.required.set(whole.ravel())
+        halo.cells = n
         x = stages.engine.upload(box.place(points[order], real))
-        assert is_enough(stages, stages.seam, box, x, n, margins)
-        found.append(margins.needed.get())
+        assert is_enough(stages, stages.ghost_images, box, x, n, halo)
+        found.append(halo.required.get())
     assert (found[0] > whole.ravel()).mean() > 0.3 * (found[0] > 0).mean()
     # Vertices round.
     assert np.abs(found - found[0]).max() < noise
@@ -235,13 +235,13 @@ def test_nearly_a_period_is_all_of_it(adapter):
     x = stages.engine.upload(box.place(box.extent * rng.random((n, 2)), adapter.dtype))
     counts = block_counts(box.periods(adapter.dtype), n)[:2]
     for share in (0.98, 0.995):
-        margins, periods = Margins(stages.engine), box.periods(adapter.dtype)
+        halo, periods = Halo(stages.engine), box.periods(adapter.dtype)
         whole = np.zeros((2, 2, BLOCKS[2]), np.float32)
         whole[:] = share * periods[:2, None, None]
-        margins.needed.set(whole.ravel())
-        margins.cells = n
-        stages.seam.extend(box, x, n, margins, 1.0, False)
-        for (axis, _), found in blocks_of(margins.widths, 2, counts).items():
+        halo.required.set(whole.ravel())
+        halo.cells = n
+        stages.ghost_images.extend(box, x, n, halo, 1.0, False)
+        for (axis, _), found in blocks_of(halo.depths, 2, counts).items():
             wide = (
                 share * periods[axis] if share < 0.99 else 4.0
             )  # WHOLE_PERIOD of tessellation/periodic/halo.h
@@ -266,7 +266,7 @@ def test_margins_of_other_blocks(adapter, dim, before, after):
     """Where blocks or cells are others than before, margins are those of all that lie within their own depth."""
     box, rng = BOXES[dim], np.random.default_rng(2208)
     stages = adapter._stages_for(box)
-    margins, periods = Margins(stages.engine), box.periods(adapter.dtype)
+    halo, periods = Halo(stages.engine), box.periods(adapter.dtype)
     was, counts = (block_counts(periods, n)[:dim] for n in (before, after))
     assert dim == 2 or (was != counts).any()
     old = np.zeros((dim, 2, *(BLOCKS[dim],) * (dim - 1)), np.float32)
@@ -274,13 +274,13 @@ def test_margins_of_other_blocks(adapter, dim, before, after):
         along = tuple(slice(was[a]) for a in range(dim) if a != axis)
         shape = [2, *(k.stop for k in along)]
         old[(axis, slice(None), *along)] = 0.02 * (1 + rng.random(shape))
-    margins.needed.set(old.ravel())
-    margins.cells = before
+    halo.required.set(old.ravel())
+    halo.cells = before
     factor = (before / after) ** (1 / dim)
     points = np.array(box.lower) + box.extent * rng.random((after, dim))
     x = stages.engine.upload(box.place(points, adapter.dtype))
-    stages.seam.extend(box, x, after, margins, factor, False)
-    found = blocks_of(margins.widths, dim, counts)
+    stages.ghost_images.extend(box, x, after, halo, factor, False)
+    found = blocks_of(halo.depths, dim, counts)
     for axis, end in itertools.product(range(dim), (0, 1)):
         across = [a for a in range(dim) if a != axis]
         depths = factor * old[(axis, end, *(slice(was[a]) for a in across))]

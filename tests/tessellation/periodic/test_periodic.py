@@ -13,8 +13,8 @@ from clvoro.io.vtu_read import load_vtu
 from clvoro.mesh.connectivity import face_owners
 from clvoro.mesh.quality import measure_mesh
 from clvoro.opencl import program as _program
-from clvoro.tessellation.periodic.ghost_images import Seam
-from clvoro.tessellation.periodic.torus import FewCellsError
+from clvoro.tessellation.periodic.ghost_images import GhostImages
+from clvoro.tessellation.periodic.periodic_tessellator import FewCellsError
 
 UNIT = clvoro.Box((0, 0), (1, 1), periodic=True)
 CHANNEL = clvoro.Box((3, -2), (5.5, -0.5), periodic=(True, False))
@@ -209,7 +209,7 @@ def test_clusters_need_wide_margins(adapter):
 @pytest.mark.parametrize("box", [CHANNEL, SLAB], ids=["channel", "slab"])
 def test_images_are_all_that_cells_need(adapter, box):
     """All that lie on the balls around the corners of cells, in which none lies; few where cells are small."""
-    from clvoro.tessellation.periodic.torus import Torus
+    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     rng = np.random.default_rng(11)
     n = {2: 600, 3: 1200}[box.dim]
@@ -217,9 +217,9 @@ def test_images_are_all_that_cells_need(adapter, box):
     points = np.array(box.lower) + box.extent * unit
     stages = adapter._stages_for(box)
     x = stages.engine.upload(box.place(points, adapter.dtype))
-    torus = Torus(stages, box)
-    torus.tessellate(x, n, whole=True)
-    latest = torus.latest
+    periodic = PeriodicTessellator(stages, box)
+    periodic.tessellate(x, n, keep_extended=True)
+    latest = periodic.latest
     taken = latest.images.points.get()[: latest.images.count].astype(float)
     diagram, scale = adapter.diagram(box, points), box.frame[1]
     owner = face_owners(diagram)
@@ -346,19 +346,19 @@ def test_the_same_bits_from_run_to_run(adapter):
 
 def test_repair_across_seams(adapter):
     """Diagrams repaired from step to step are those that are made anew."""
-    from clvoro.tessellation.periodic.torus import Torus
+    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     stages = adapter._stages_for(UNIT)
     engine, n = stages.engine, 800
     rng = np.random.default_rng(11)
     points = rng.random((n, 2))
-    torus, fresh = Torus(stages, UNIT), Torus(stages, UNIT)
+    periodic, fresh = PeriodicTessellator(stages, UNIT), PeriodicTessellator(stages, UNIT)
     x = engine.upload(UNIT.place(points, adapter.dtype))
-    t = torus.tessellate(x, n)
+    t = periodic.tessellate(x, n)
     for _ in range(4):
         points = points + 0.0003 * rng.standard_normal((n, 2))
         x = engine.upload(UNIT.place(points, adapter.dtype))
-        t = torus._repaired(x, n, t)
+        t = periodic._updated(x, n, t)
         assert t is not None
         rows = [set(row) for row in np.split(*rows_of(t))]
         volumes = t.volumes.get()
@@ -374,7 +374,7 @@ def rows_of(t):
 
 def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
     """The generators' rows are the same whether or not their images get cells, also in lattices a rounding off."""
-    from clvoro.tessellation.periodic.torus import Torus
+    from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     eps = np.finfo(adapter.dtype).eps
     for box, lattice in ((UNIT, square(12)[0]), (CUBE, bcc(4)[0])):
@@ -384,7 +384,7 @@ def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
             x = stages.engine.upload(box.place(moved, adapter.dtype))
             found = []
             for whole in (True, False):
-                t = Torus(stages, box).tessellate(x, n, whole=whole)
+                t = PeriodicTessellator(stages, box).tessellate(x, n, keep_extended=whole)
                 starts = t.starts.get()
                 i = np.repeat(np.arange(n), np.diff(starts))
                 j = t.neighbors.get()[: starts[-1]]
@@ -403,14 +403,14 @@ def test_faces_that_one_side_does_not_see_are_dropped(adapter):
 @pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
 def test_face_that_one_side_does_not_see_ends_in_one_vertex(adapter, box, monkeypatch):
     """Four cells meet in each corner but for rounding, and those beyond a seam are cut in another order."""
-    eps, fold, dropped = float(np.finfo(adapter.dtype).eps), Seam.fold, []
+    eps, fold, dropped = float(np.finfo(adapter.dtype).eps), GhostImages.fold, []
 
     def folded(self, *arguments):
         found = fold(self, *arguments)
         dropped.append(found[0].places is not None)
         return found
 
-    monkeypatch.setattr(Seam, "fold", folded)
+    monkeypatch.setattr(GhostImages, "fold", folded)
     for n in (12, 13):
         middles = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), -1).reshape(-1, 2) + 0.5) / n
         for seed in range(25):
@@ -643,23 +643,23 @@ def test_each_attempt_begins_with_the_graph_from_before(adapter, monkeypatch, re
         }
         previous = tessellator.restore(x, saved, 0)
     rows = previous.starts.get(), previous.neighbors.get()[: previous.starts.get()[-1]]
-    extend, unfold = Seam.extend, Seam.unfold
+    extend, unfold = GhostImages.extend, GhostImages.unfold
 
-    def narrow(seam, domain, points, n, margins, factor, grow):
+    def narrow(ghost_images, domain, points, n, halo, factor, grow):
         short = len(begun) < 3
         return extend(
-            seam, domain, points, n, margins, 0.4 if short else factor, grow and not short
+            ghost_images, domain, points, n, halo, 0.4 if short else factor, grow and not short
         )
 
-    def seen(seam, images, graph):
+    def seen(ghost_images, images, graph):
         begun.append((graph.starts.get(), graph.neighbors.get()[: len(rows[1])]))
         assert all(
             map(np.array_equal, begun[-1], rows)
         )  # before they are read: there would be other labels
-        return unfold(seam, images, graph)
+        return unfold(ghost_images, images, graph)
 
-    monkeypatch.setattr(Seam, "extend", narrow)
-    monkeypatch.setattr(Seam, "unfold", seen)
+    monkeypatch.setattr(GhostImages, "extend", narrow)
+    monkeypatch.setattr(GhostImages, "unfold", seen)
     again = tessellator.tessellate(x, n, previous)
     assert len(begun) > 3
     volumes = again.volumes.get() * SLAB.frame[1] ** 3

@@ -1,4 +1,4 @@
-"""From the trimmed tessellation of a polygonal domain to a `Diagram` on the host."""
+"""Read the trimmed tessellation of a polygonal domain into a `Diagram`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ...opencl.engine import Engine
 from ..clipped.boundary_crossings import UNTOUCHED
 from ..device_diagram import Tessellation
 from ..vertices import VertexNumbering, Vertices
-from .fetch import _Fetched, kept_faces
+from .diagram import _DiagramReader, kept_faces
 
 
-class _FetchedPolygon(_Fetched):
-    """A trimmed tessellation.
+class _PolygonReader(_DiagramReader):
+    """Read a trimmed tessellation.
 
-    Its vertices are corners of convex cells, corners of the polygon, and places where its edges cross faces of cells.
-    Each face knows both its ends, as a cell may be bounded by several loops.
+    Its vertices are corners of convex cells, corners of the polygon, and crossings of its edges with faces. Both ends of
+    each face are stored, as several loops may bound a cell.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class _FetchedPolygon(_Fetched):
         self.m = len(self.t.neighbors)
         convex = made.convex
         self.convex = kept_faces(convex, int(convex.starts[convex.n].get()), copy)
-        # Little beside the faces: only what the boundary passes through.
+        # These arrays are small: they cover only cells that the boundary crosses.
         self.slots_of_cells = made.chords.slots.get()[: t.n]
         self.touched = made.chords.touched.get()[: made.chords.touched_count]
         self.shift = made.chords.shift * domain.frame[1]
@@ -49,21 +49,21 @@ class _FetchedPolygon(_Fetched):
 
     def points(self) -> np.ndarray:
         positions = super().points()
-        # A rounding may not carry a generator on the boundary out of the domain.
+        # Round-off must not move a generator on the boundary out of the domain.
         near = np.arange(len(positions)) if self.shift.any() else self.ranks[self.touched]
         positions[near] = self.domain.nearest(positions[near])
         return positions
 
     @cached_property
     def shared(self) -> Vertices:
-        """Corners of the convex cells."""
+        """Vertices of the convex diagram."""
         return VertexNumbering(self.engine).number(self.domain, self.convex)
 
     @cached_property
     def crossings(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (k, 2) of the polygon's corners and of crossings, each once, and the number of each chord's end.
+        """Positions (k, 2) of the polygon's corners and of crossings, each once, and the index of each chord's end.
 
-        Those are the same that are the same on the device, where segments between them are left out.
+        Positions that are equal on the device count as one. The device has no segments between them.
         """
         found = []
         # Measures are those of where the boundary was.
@@ -78,7 +78,7 @@ class _FetchedPolygon(_Fetched):
 
     @cached_property
     def face_ends(self) -> np.ndarray:
-        """First and last vertex of each of the device's faces, (m, 2); corners of cells first, then `crossings`."""
+        """First and last vertex of each face on the device, (m, 2). Vertices of the convex diagram precede `crossings`."""
         starts, corners = self.convex.starts.get(), self.shared.cell_vertices.get()
         count = self.shared.count
         ends = np.empty((self.m, 2), np.int64)
@@ -89,7 +89,7 @@ class _FetchedPolygon(_Fetched):
         sides = starts[i + 1] - starts[i]
         ends[whole, 0] = corners[starts[i] + k]
         ends[whole, 1] = corners[starts[i] + (k + 1) % sides]
-        # Of trimmed cells by segments, which may come from another cell.
+        # Faces of trimmed cells are segments, which may lie in another convex cell.
         s = self.face_segments[~whole]
         home, on_boundary = self.segment_cells[s], self.segment_labels[s] < 0
         n_corners, number = len(self.domain.oriented.vertices), self.crossings[1] + count
@@ -117,13 +117,13 @@ class _FetchedPolygon(_Fetched):
 
     @cached_property
     def slots(self) -> np.ndarray:
-        """Place in the device's arrays of each face of the result, (m,): along the loops of each cell."""
+        """Index on the device of each face of the result, (m,), ordered along the loops of each cell."""
         order, _ = self._chained
         return order
 
     @cached_property
     def _chained(self) -> tuple[np.ndarray, dict[int, list[int]]]:
-        """The places of faces, and the lengths of loops of those cells (rows of the result) that have several."""
+        """Indices of faces, and the lengths of the loops of those rows of the result that have several loops."""
         default = super().slots
         ends, starts = self.face_ends[default], self.neighbor_starts()
         row = np.repeat(np.arange(self.n), np.diff(starts))
@@ -140,7 +140,7 @@ class _FetchedPolygon(_Fetched):
 
     @cached_property
     def _numbered(self) -> tuple[np.ndarray, np.ndarray]:
-        """The vertices that are ends of faces, and the number of each end, (m, 2)."""
+        """The vertices that are ends of faces, and the index of each end, (m, 2)."""
         used, numbers = np.unique(self.face_ends[self.slots], return_inverse=True)
         return used, numbers.reshape(-1, 2).astype(np.int32)
 
@@ -157,7 +157,7 @@ class _FetchedPolygon(_Fetched):
 
     @cached_property
     def _outlines(self) -> tuple[np.ndarray, np.ndarray]:
-        """One closed chain of corners per cell: several loops are joined by a bridge there and back."""
+        """One closed chain of corners per cell. A bridge, passed in both directions, connects several loops."""
         corners, starts = self._numbered[1][:, 0], self.neighbor_starts()
         several = self._chained[1]
         if not several:
@@ -179,7 +179,7 @@ class _FetchedPolygon(_Fetched):
 
 
 def _loops(ends: np.ndarray) -> list[list[int]]:
-    """Chain faces, which run from ends[:, 0] to ends[:, 1], to loops, the longest first."""
+    """Chain faces from ends[:, 0] to ends[:, 1] into loops, the longest first."""
     left = dict.fromkeys(range(len(ends)))
     by_begin: dict[int, list[int]] = {}
     for k, begin in enumerate(ends[:, 0].tolist()):

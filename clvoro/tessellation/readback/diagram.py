@@ -1,4 +1,4 @@
-"""From a tessellation on the device to a `Diagram` on the host: physical units, the caller's order."""
+"""Read a tessellation from the device into a `Diagram`: physical units, the caller's order of rows."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from ...geometry.polygon import Polygon
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ..device_diagram import UNEVEN, CloseError, Tessellation
-from ..periodic.torus import Unfolded
+from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
 
 LEFT_OUT = 1e-5
-"""Share of a cell: if faces that are left out, as they are no wider than round-off, make up more, the diagram is
-checked."""
+"""Largest share of a cell behind faces below round-off that may be left out without a check of the diagram."""
 
 
 def fetch_diagram(
@@ -28,39 +27,43 @@ def fetch_diagram(
     t: Tessellation,
     labels: cla.Array,
     copy: bool = True,
-    unfolded: Unfolded | None = None,
+    extended: ExtendedDiagram | None = None,
 ) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
-    Without `copy`, nobody may use the buffers of `t` any more. `unfolded` is what `t` was folded from, in a periodic
-    box.
+    Parameters
+    ----------
+    copy : bool
+        Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
+    extended : ExtendedDiagram, optional
+        In a periodic box, the diagram that `t` was folded from.
 
     Raises
     ------
     InputError
         If round-off has made cells wrong.
     """
-    from .fetch_polygon import _FetchedPolygon
-    from .fetch_torus import _FetchedTorus
+    from .periodic import _PeriodicReader
+    from .polygon import _PolygonReader
 
     others = ["face_vert" if engine.dim == 2 else "cell_vert"]
-    if unfolded is None:
+    if extended is None:
         others.append("shifts")
     if isinstance(domain, Polygon):
-        fetched: _Fetched = _FetchedPolygon(engine, domain, t, labels, copy)
+        reader: _DiagramReader = _PolygonReader(engine, domain, t, labels, copy)
         others.remove("face_vert")
-    elif unfolded is not None and isinstance(domain, Box):
-        fetched = _FetchedTorus(engine, domain, t, labels, copy, unfolded)
+    elif extended is not None and isinstance(domain, Box):
+        reader = _PeriodicReader(engine, domain, t, labels, copy, extended)
     else:
-        fetched = _Fetched(engine, domain, t, labels, copy)
-    fetched.names = [name for name in Diagram._NAMES if not name.startswith(tuple(others))]
-    if fetched.whole.round_off & UNEVEN:
-        assert fetched.faces
-    return fetched.diagram()
+        reader = _DiagramReader(engine, domain, t, labels, copy)
+    reader.names = [name for name in Diagram._NAMES if not name.startswith(tuple(others))]
+    if reader.whole.round_off & UNEVEN:
+        assert reader.faces
+    return reader.diagram()
 
 
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
-    """Return `t`, which has `m` faces, or a copy; what lies behind the last face has never been written."""
+    """Return `t`, or a copy of it, with arrays cut to its `m` faces."""
 
     def kept(array: cla.Array) -> cla.Array:
         return array.copy() if copy else array
@@ -79,8 +82,11 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
     )
 
 
-class _Fetched:
-    """A tessellation, by default a copy since the stages reuse their buffers, and how to read it."""
+class _DiagramReader:
+    """Read the arrays of a `Diagram` from a tessellation, each when first used.
+
+    With `copy` the reader owns its arrays, since the stages reuse theirs.
+    """
 
     def __init__(
         self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool
@@ -95,16 +101,16 @@ class _Fetched:
 
     @cached_property
     def places(self) -> np.ndarray:
-        """Place in `whole` of each of the device's faces, (m,)."""
+        """Index in `whole` of each face on the device, (m,)."""
         return np.arange(len(self.t.neighbors))
 
     @cached_property
     def order(self) -> np.ndarray:
-        """Device row of each row of the result, (n,)."""
+        """Row on the device of each row of the result, (n,)."""
         return np.argsort(self.labels, kind="stable")
 
     def diagram(self) -> Diagram:
-        """Return the result, of which `names` say what it has."""
+        """Return the result, with the arrays that `names` lists."""
         return Diagram(
             self.domain, {name: (lambda name=name: getattr(self, name)()) for name in self.names}
         )
@@ -121,7 +127,7 @@ class _Fetched:
         try:
             faces = share_faces(self.engine, self.box, self.whole)
             trial = shallow_copy(self)
-            vars(trial)["faces"] = faces
+            trial.faces = faces
             if trial.needs_check() and not trial.diagram().check():
                 raise CloseError(self.t.points, self.n)
         except CloseError as error:
@@ -137,28 +143,28 @@ class _Fetched:
 
     @cached_property
     def kept(self) -> np.ndarray | None:
-        """Which of the device's faces are in the result, (m,) bool; None if all are.
+        """Mask (m,) of the faces on the device that are in the result; None if all are.
 
         In 3D faces no wider than round-off are left out.
         """
         return self.polygons() if self.whole.round_off else None
 
     def polygons(self) -> np.ndarray:
-        """Which of the device's faces are polygons, (m,) bool."""
+        """Return the mask (m,) of the faces on the device that have a loop of vertices."""
         return np.diff(self.loop_starts) > 0
 
     def _gaps(self, kept: np.ndarray) -> np.ndarray:
-        """Volumes that cones of the faces make up which are not `kept`, of each cell of `whole`."""
+        """Return, for each cell of `whole`, the volume of the cones over faces that are not `kept`."""
         t, faces = self.whole, self.places[~kept]
         cell = np.searchsorted(t.starts.get(), faces, side="right") - 1
         other, points = t.neighbors.get()[faces], t.points.get().astype(float)
-        inner = other >= 0  # in 3D walls are wide
+        inner = other >= 0  # faces on walls are never below round-off
         way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
         return np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """Device `starts` (n + 1,), of the faces that are kept."""
+        """`starts` on the device (n + 1,), counting kept faces only."""
         starts = self.t.starts.get()
         if self.kept is None:
             return starts
@@ -166,12 +172,12 @@ class _Fetched:
 
     @cached_property
     def owners(self) -> np.ndarray:
-        """Device row that each face of the result belongs to, (m,)."""
+        """Row on the device of the cell of each face of the result, (m,)."""
         return np.repeat(self.order, np.diff(self.starts)[self.order])
 
     @cached_property
     def slots(self) -> np.ndarray:
-        """Place in the device's arrays of each face of the result, (m,)."""
+        """Index on the device of each face of the result, (m,)."""
         m = len(self.owners)
         places = (
             self.starts[self.owners]
@@ -182,29 +188,29 @@ class _Fetched:
 
     @cached_property
     def ranks(self) -> np.ndarray:
-        """Row of the result of each device row, (n,)."""
+        """Row of the result of each row on the device, (n,)."""
         inverse = np.empty(self.n, np.int32)
         inverse[self.order] = np.arange(self.n, dtype=np.int32)
         return inverse
 
     @cached_property
     def shared(self) -> Vertices:
-        """Vertices, each once, in 2D."""
+        """Shared vertices in 2D."""
         return VertexNumbering(self.engine).number(self.domain, self.t)
 
     @cached_property
     def loop_starts(self) -> np.ndarray:
-        """Device `starts` of the loops, (m + 1,)."""
+        """`starts` of the vertex loops of faces on the device, (m + 1,)."""
         return self.faces.starts.get()
 
     def _read(self, array: cla.Array, rows: np.ndarray, power: int) -> np.ndarray:
         return array.get().astype(np.float64)[rows] * self.scale**power
 
-    # One method for each of Diagram's arrays.
+    # One method per array of `Diagram`.
 
     def points(self) -> np.ndarray:
         positions = self._read(self.t.points, self.order, 1) + self.origin
-        # A rounding may not carry a generator on a wall out of the domain.
+        # Round-off must not move a generator on a wall out of the domain.
         return np.clip(positions, self.domain.lower, self.domain.upper)
 
     def volumes(self) -> np.ndarray:
@@ -230,7 +236,7 @@ class _Fetched:
     def vertices(self) -> np.ndarray:
         shared = self.shared if self.engine.dim == 2 else self.faces
         positions = shared.positions.get().astype(np.float64) * self.scale + self.origin
-        # A rounding may not carry a corner out of the domain.
+        # Round-off must not move a vertex out of the domain.
         return np.clip(positions, self.domain.lower, self.domain.upper)
 
     def cell_vertex_starts(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The diagram of a periodic box: that of the generators and their images near the seams, folded back (`seam.py`)."""
+"""The diagram of a periodic box: extend the generators by ghost images, tessellate, fold the diagram back."""
 
 from __future__ import annotations
 
@@ -13,51 +13,48 @@ from ...geometry.box import Box
 from ...opencl.primitives import Summaries
 from ..device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, Tessellation, domain_position
 from ..polyhedra import Polyhedra
-from .ghost_images import COLLAPSED, FAR, ExtendedBox, Folded, Images
-from .halo import Margins
+from .ghost_images import COLLAPSED, FAR, ExtendedBox, ExtendedPoints, FoldedDiagram
+from .halo import Halo
 
 if TYPE_CHECKING:
     from ..stages import TessellationStages
 
-FIRST_MARGIN = 2.7
-"""What cells are thought to need before the first diagram, in mean spacings."""
+FIRST_DEPTH = 2.7
+"""Estimated depth of the halo for the first diagram, in mean spacings."""
 
 
 class FewCellsError(InputError):
-    """A cell of a run in a periodic box reaches a neighbor that is not the nearest image of its generator."""
+    """A periodic box has too few cells: a neighbor is not the nearest image of its generator."""
 
 
 @dataclass(frozen=True)
-class Unfolded:
-    """The diagram that a folded one was made of, on the device: its rows are plain cells in the plane, or in space.
+class ExtendedDiagram:
+    """The diagram of generators and images that a folded diagram was made from, on the device.
 
     Attributes
     ----------
-    images : Images
+    images : ExtendedPoints
     tessellation : Tessellation
-        Of the generators, which come first, and their images.
-    folded : Folded
+        Generators first, then images.
+    folded : FoldedDiagram
     """
 
-    images: Images
+    images: ExtendedPoints
     tessellation: Tessellation
-    folded: Folded
+    folded: FoldedDiagram
 
 
-class Torus:
-    """Tessellate one periodic box again and again.
+class PeriodicTessellator:
+    """Tessellate one periodic box repeatedly.
 
     Attributes
     ----------
-    margins : Margins
-        From the seams, within which images are taken.
-    latest : Unfolded or None
-        Of the latest diagram, if that was a whole one.
+    halo : Halo
+    latest : ExtendedDiagram or None
+        Of the latest diagram, if it was kept.
     """
 
-    def __init__(
-        self, stages: TessellationStages, domain: Box, margins: Margins | None = None
-    ) -> None:
+    def __init__(self, stages: TessellationStages, domain: Box, halo: Halo | None = None) -> None:
         self.stages, self.domain = stages, domain
         self.periods = domain.periods(stages.engine.real)
         lower, upper = (
@@ -65,11 +62,11 @@ class Torus:
             for corner in domain.device_corners(stages.engine.real)
         )
         self._edges = upper - lower
-        # Wide enough for every cell, from wherever its generator is.
+        # Contains every cell, wherever its generator is.
         self._wide = ExtendedBox(lower - self.periods, upper + self.periods)
         self._sums = Summaries(stages.engine, ("volumes",))
-        self.margins = Margins(stages.engine) if margins is None else margins
-        self.latest: Unfolded | None = None
+        self.halo = Halo(stages.engine) if halo is None else halo
+        self.latest: ExtendedDiagram | None = None
 
     def tessellate(
         self,
@@ -78,50 +75,55 @@ class Torus:
         previous: Tessellation | None = None,
         exact: bool = False,
         nearest: bool = True,
-        whole: bool = False,
+        keep_extended: bool = False,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points`; see `Tessellator.tessellate`.
 
         Parameters
         ----------
         nearest : bool
-            Refuse cells whose neighbors are not the nearest images of their generators: whoever reads positions of
-            neighbors off the graph takes these.
-        whole : bool
-            Make the cells of images, too, which vertices take, and keep it all as `latest`.
+            Reject cells with a neighbor that is not the nearest image of its generator. Code that computes the position
+            of a neighbor from the graph takes the nearest image.
+        keep_extended : bool
+            Make the cells of images as well, which vertices need, and keep the extended diagram as `latest`.
 
         Raises
         ------
         InputError
             If generators coincide up to round-off.
         FewCellsError
+            If a neighbor is not the nearest image of its generator.
         """
-        stages, margins, dim = self.stages, self.margins, self.domain.dim
-        seam, cells = stages.seam, stages.cells
+        stages, halo, dim = self.stages, self.halo, self.domain.dim
+        ghost_images, cells = stages.ghost_images, stages.cells
         if previous is not None and not exact and not isinstance(cells, Polyhedra):
-            t = self._repaired(points, n, previous)
+            t = self._updated(points, n, previous)
             if t is not None:
                 self.latest = None
                 return t
-            # What steps have worked on is of no use here, where images and their bins need room.
+            # Free scratch memory: images and their bins need room.
             stages.engine.workspace.clear()
-        if margins.cells == 0:
+        if halo.cells == 0:
             volume = self.domain.measure / self.domain.frame[1] ** dim
-            margins.fill(FIRST_MARGIN * (volume / n) ** (1 / dim), n)
-        factor, grow = (margins.cells / n) ** (1 / dim), False
+            halo.fill(FIRST_DEPTH * (volume / n) ** (1 / dim), n)
+        factor, grow = (halo.cells / n) ** (1 / dim), False
         while True:
-            images = seam.extend(self.domain, points, n, margins, factor, grow)
+            images = ghost_images.extend(self.domain, points, n, halo, factor, grow)
             binned = stages.bins.build(images.box, images.points, images.count)
             if dim == 2:
                 stages.bins.clear_work()
             args = images.box, images.points, images.count, binned
             if isinstance(cells, Polyhedra):
-                rows = None if previous is None else seam.unfold(images, previous)
-                t = cells.tessellate(*args, rows, exact, None if whole else n, images.seams)  # type: ignore[arg-type]
+                rows = None if previous is None else ghost_images.unfold(images, previous)
+                t = cells.tessellate(
+                    *args, rows, exact, None if keep_extended else n, images.halo_args
+                )  # type: ignore[arg-type]
             else:
-                t = cells.tessellate(*args, exact, None if whole else n)
+                t = cells.tessellate(*args, exact, None if keep_extended else n)
             share = EXACT_SHARE if exact else ROUGH_SHARE
-            folded, enough, flags, generator = seam.fold(images, binned, t, points, share, nearest)
+            folded, enough, flags, generator = ghost_images.fold(
+                images, binned, t, points, share, nearest
+            )
             if enough:
                 break
             factor, grow = 1.0, True
@@ -136,30 +138,30 @@ class Torus:
                 f"least four or five cells across each period of {self.domain}; use a smaller size, more cells "
                 "(n_cells) or fewer levels"
             )
-        self.latest = Unfolded(images, t, folded) if whole else None
+        self.latest = ExtendedDiagram(images, t, folded) if keep_extended else None
         return folded.tessellation
 
     def measure_faces(self) -> Tessellation:
-        """Return the `latest` diagram with what is known of faces in full precision."""
+        """Return the `latest` diagram with measures of faces in full precision."""
         latest, stages = self.latest, self.stages
         assert latest is not None
         t, places = latest.folded.tessellation, latest.folded.places
         if isinstance(stages.cells, Polyhedra) or t.face_measures.dtype == stages.engine.real:
             return t
-        whole = stages.cells.measure_faces(latest.images.box, latest.tessellation)
-        faces = whole.face_measures, whole.face_centroids
+        extended = stages.cells.measure_faces(latest.images.box, latest.tessellation)
+        faces = extended.face_measures, extended.face_centroids
         if places is not None:
             faces = tuple(stages.gather.rows(places, array) for array in faces)
         return replace(t, face_measures=faces[0], face_centroids=faces[1])
 
-    def _repaired(self, points: cla.Array, n: int, previous: Tessellation) -> Tessellation | None:
-        """Return `previous` carried over to `points`, in 2D; None where too much has changed."""
+    def _updated(self, points: cla.Array, n: int, previous: Tessellation) -> Tessellation | None:
+        """Update `previous` incrementally to `points`, in 2D; None if too much has changed."""
         stages = self.stages
-        stages.folded.reserve(n)
-        t = stages.incremental.update(stages.folded, self._wide, points, previous)
+        stages.folded_cells.reserve(n)
+        t = stages.incremental.update(stages.folded_cells, self._wide, points, previous)
         if t is None:
             return None
-        # Cells without gap could still lie twice around the torus.
+        # Cells without gaps may cover the box more than once.
         self._sums.collect("volumes", t.volumes, n)
         total, measure = self._sums.read_one("volumes").sum, float(np.prod(self._edges))
         return t if abs(total - measure) < measure / 2 else None

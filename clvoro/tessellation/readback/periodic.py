@@ -1,4 +1,4 @@
-"""From a tessellation of a periodic box to a `Diagram` on the host."""
+"""Read the tessellation of a periodic box into a `Diagram`."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import pyopencl.array as cla
 from ...geometry.box import Box
 from ...opencl.engine import Engine
 from ..device_diagram import Tessellation
-from ..periodic.torus import Unfolded
+from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..vertices import VertexNumbering, Vertices
-from .fetch import _Fetched, kept_faces
+from .diagram import _DiagramReader, kept_faces
 
 
-class _FetchedTorus(_Fetched):
-    """A tessellation of a periodic box.
+class _PeriodicReader(_DiagramReader):
+    """Read a folded tessellation.
 
-    Vertices come from the diagram that it was folded from, where cells beyond the seams are cells like all others: a
-    cell at a seam has its corners around its generator, in one piece, and of a vertex at a seam there is one for each
-    image that some cell of the box has for a corner.
+    Vertices come from the extended diagram, where cells beyond the periodic boundaries are ordinary cells. The corners
+    of a cell therefore surround its generator. A vertex near a periodic boundary appears once for each of its images
+    that is a corner of a cell in the box.
     """
 
     def __init__(
@@ -30,24 +30,24 @@ class _FetchedTorus(_Fetched):
         t: Tessellation,
         labels: cla.Array,
         copy: bool,
-        unfolded: Unfolded,
+        extended: ExtendedDiagram,
     ) -> None:
         super().__init__(engine, domain, t, labels, copy)
         m = len(self.t.neighbors)
-        whole, places = unfolded.tessellation, unfolded.folded.places
-        self.box = unfolded.images.box
-        self.codes = unfolded.folded.codes[:m].get()
+        whole, places = extended.tessellation, extended.folded.places
+        self.box = extended.images.box
+        self.codes = extended.folded.codes[:m].get()
         self.places = np.arange(m) if places is None else places.get()
         self.whole = kept_faces(whole, int(whole.starts[whole.n].get()), copy)
 
     @cached_property
     def shared(self) -> Vertices:
-        """Vertices of the extended diagram, in 2D."""
+        """Vertices of the extended diagram in 2D."""
         return VertexNumbering(self.engine).number(self.box, self.whole)
 
     def polygons(self) -> np.ndarray:
         """Which of the folded faces are polygons, (m,) bool."""
-        # Of both sides of a seam each has a loop of its own.
+        # The two half-faces at a periodic boundary have loops of their own.
         seen = np.diff(self.loop_starts)[self.places] > 0
         i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbors.get()
         inner, last = np.flatnonzero(j >= 0), 3**self.engine.dim - 1
@@ -59,10 +59,9 @@ class _FetchedTorus(_Fetched):
 
     @cached_property
     def merged(self) -> np.ndarray:
-        """Vertex that stands for each one of the extended diagram, in 2D.
+        """Representative of each vertex of the extended diagram, in 2D.
 
-        A face that was dropped, as its other cell does not see it, ends in one vertex: whoever has kept a face beside
-        it has one or the other.
+        The two ends of a dropped face become one vertex.
         """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
@@ -81,16 +80,16 @@ class _FetchedTorus(_Fetched):
 
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices of the extended diagram that are corners of the box's cells, and the number of each corner's."""
+        """Vertices of the extended diagram that are corners of cells in the box, and the index of each corner among them."""
         return np.unique(self.extended_corners(), return_inverse=True)
 
     @cached_property
     def extended_places(self) -> np.ndarray:
-        """Place in the extended diagram of each face of the result, (m,)."""
+        """Index in the extended diagram of each face of the result, (m,)."""
         return self.places[self.slots]
 
     def extended_corners(self) -> np.ndarray:
-        """Corners of the result, as vertices of the extended diagram."""
+        """Return the corners of the result as vertices of the extended diagram."""
         if self.engine.dim == 2:
             return self.merged[self.shared.cell_vertices.get()[self.extended_places]]
         starts = self.face_vertex_starts()
