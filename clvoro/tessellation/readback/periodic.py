@@ -80,7 +80,7 @@ class _PeriodicReader(_DiagramReader):
 
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices of the extended diagram that are corners of cells in the box, and the index of each corner among them."""
+        """Vertices of the extended diagram that are corners of cells in the box, and the index of each corner."""
         return np.unique(self.extended_corners(), return_inverse=True)
 
     @cached_property

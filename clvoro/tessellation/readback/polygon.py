@@ -18,8 +18,8 @@ from .diagram import _DiagramReader, kept_faces
 class _PolygonReader(_DiagramReader):
     """Read a trimmed tessellation.
 
-    Its vertices are corners of convex cells, corners of the polygon, and crossings of its edges with faces. Both ends of
-    each face are stored, as several loops may bound a cell.
+    Its vertices are corners of convex cells, corners of the polygon, and crossings of its edges with faces. Both ends
+    of each face are stored, as several loops may bound a cell.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class _PolygonReader(_DiagramReader):
 
     @cached_property
     def face_ends(self) -> np.ndarray:
-        """First and last vertex of each face on the device, (m, 2). Vertices of the convex diagram precede `crossings`."""
+        """First and last vertex of each face on the device, (m, 2). `crossings` follow the other vertices."""
         starts, corners = self.convex.starts.get(), self.shared.cell_vertices.get()
         count = self.shared.count
         ends = np.empty((self.m, 2), np.int64)
