@@ -25,7 +25,7 @@ SHAPES = [7, (7,), (7, 2), (3, 4, 5), (), (0,), (0, 2), (1,)]
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("shape", SHAPES)
-def test_an_array_is_as_pyopencls(queue, shape):
+def test_arrays_agree_with_pyopencl(queue, shape):
     dtype = np.dtype(np.int32)
     mine, plain = make_array(queue, shape, dtype), cla.Array(queue, shape, dtype)
     for name in (
@@ -58,7 +58,7 @@ INDICES = [
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("shape", [(7,), (7, 2)])
 @pytest.mark.parametrize("index", INDICES, ids=str)
-def test_a_view_is_as_numpys(queue, shape, index):
+def test_views_agree_with_numpy(queue, shape, index):
     host = np.arange(np.prod(shape), dtype=np.int64).reshape(shape)
     array = make_array(queue, shape, host.dtype)
     array.set(host)
@@ -77,13 +77,13 @@ def test_a_view_is_as_numpys(queue, shape, index):
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("index", [7, -8])
-def test_an_index_outside_is_refused(queue, index):
+def test_index_out_of_range_raises(queue, index):
     with pytest.raises(IndexError):
         make_array(queue, 7, np.dtype(np.int32))[index]
 
 
 @pytest.mark.usefixtures("quick")
-def test_an_index_too_deep_is_refused(queue):
+def test_too_many_indices_raise(queue):
     with pytest.raises((IndexError, TypeError)):
         make_array(queue, (), np.dtype(np.int32))[0]
 
@@ -91,7 +91,7 @@ def test_an_index_too_deep_is_refused(queue):
 @pytest.mark.parametrize("dtype", [np.int32, np.uint64, np.float32, np.float64, np.uint8])
 @pytest.mark.parametrize("size", [1, 2, 3, 16, 33, 1000, 1024])
 @pytest.mark.parametrize("value", [0, 5])
-def test_a_fill_reaches_all_and_no_more(queue, dtype, size, value):
+def test_fill_sets_exactly_the_array(queue, dtype, size, value):
     """A whole array, its first items, and items from an odd offset on have different largest patterns."""
     array = make_array(queue, size + 40, np.dtype(dtype))
     for begin in (0, 1, 8):
@@ -104,7 +104,7 @@ def test_a_fill_reaches_all_and_no_more(queue, dtype, size, value):
 
 
 @pytest.mark.usefixtures("quick")
-def test_what_is_written_must_fit(queue):
+def test_writing_another_shape_raises(queue):
     array = make_array(queue, 4, np.dtype(np.int32))
     for wrong in (np.zeros(3, np.int32), np.zeros(4, np.float32), np.zeros((4, 1), np.int32)):
         with pytest.raises((RuntimeError, AssertionError)):
@@ -115,7 +115,7 @@ def test_what_is_written_must_fit(queue):
 
 
 @pytest.mark.usefixtures("quick")
-def test_one_number_is_read_as_by_a_view(queue):
+def test_read_number_agrees_with_a_view(queue):
     host = np.array([3, -1, 2**31 - 1, 7], np.int32)
     array = make_array(queue, 4, host.dtype)
     array.set(host)
@@ -126,7 +126,7 @@ def test_one_number_is_read_as_by_a_view(queue):
             read_number(array, outside)
 
 
-def test_marks_tell_what_begins_where(queue):
+def test_marks_distinguish_arrays(queue):
     array = make_array(queue, 8, np.dtype(np.int32))
     assert array[:3].mark == array.mark == array[:0].mark or array[:0].base_data is None
     others = [array[2:], array[2], make_array(queue, 8, array.dtype), array.copy(), array + array]

@@ -76,7 +76,7 @@ ON_INTEL = FakeDevice(
 
 
 @pytest.mark.parametrize("query", ["intel", "Intel(R)", " INTEL "])
-def test_runtime_comes_before_the_name_of_a_processor(machine, query):
+def test_platform_matches_before_the_device_name(machine, query):
     machine(ON_INTEL, INTEL)
     assert device.create_context(query) == [INTEL]
     assert device.create_context("pocl") == device.create_context("xeon") == [ON_INTEL]
@@ -133,7 +133,7 @@ def test_choice_by_name_kind_and_index(machine, query, expected):
         ([SMALL_GPU, INTEL, POCL], "pocl", f"use {INTEL.platform.name} / "),  # the GPU has no float64
     ],
 )  # fmt: skip
-def test_remedies_name_what_there_is(machine, monkeypatch, devices, query, remedy):
+def test_messages_suggest_an_existing_device(machine, monkeypatch, devices, query, remedy):
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
     machine(*devices, broken=[POCL] if query == "pocl" else [])
     with pytest.raises(DeviceError) as caught:
@@ -143,7 +143,7 @@ def test_remedies_name_what_there_is(machine, monkeypatch, devices, query, remed
     assert ("install a CPU runtime" in told) == ("pocl-opencl-icd" in remedy)
 
 
-def test_float64_passes_over_devices_without_it(machine):
+def test_float64_skips_devices_without_double_precision(machine):
     machine(SMALL_GPU, POCL)
     assert device.create_context() == [SMALL_GPU]
     assert device.create_context(fp64=True) == [POCL]
@@ -155,7 +155,7 @@ def test_float64_passes_over_devices_without_it(machine):
     device.require_fp64(POCL, np.float64)
 
 
-def test_messages_name_what_was_found_and_what_to_install(machine):
+def test_messages_list_devices_and_what_to_install(machine):
     machine(INTEL, BIG_GPU, broken=[BIG_GPU])
     with pytest.raises(DeviceError) as caught:
         device.create_context("vendor")
@@ -207,7 +207,7 @@ def test_real_devices_are_listed_with_their_verdict(ctx):
         ("sqrt(x * x)", "0 * sqrt(x * x)", "wrong results"),
     ],
 )
-def test_probe_sees_what_is_broken(ctx, monkeypatch, good, bad, verdict):
+def test_probe_detects_broken_runtimes(ctx, monkeypatch, good, bad, verdict):
     assert _probe.probe(ctx.devices[0]) == ""
     assert good in _probe._PROBE
     monkeypatch.setattr(_probe, "_PROBE", _probe._PROBE.replace(good, bad))
@@ -271,7 +271,7 @@ def pip_runtime(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
-def test_pip_runtime_is_added_to_what_was_there(pip_runtime, tmp_path):
+def test_pip_runtime_is_added_to_the_others(pip_runtime, tmp_path):
     before = Path(os.environ["PYOPENCL_HOME"])
     assert _runtimes.register_runtime() == pip_runtime
     icds = Path(os.environ["PYOPENCL_HOME"], ".libs").glob("*.icd")
@@ -288,14 +288,14 @@ def test_pip_runtime_is_added_to_what_was_there(pip_runtime, tmp_path):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the runtime is for Linux")
-def test_runtime_that_the_system_knows_is_not_added_twice(pip_runtime, tmp_path):
+def test_registered_runtime_is_not_added_again(pip_runtime, tmp_path):
     (tmp_path / "vendors" / "intel.icd").write_text("/removed/libintelocl.so\n")
     assert _runtimes.register_runtime() == pip_runtime  # its library is gone
     (tmp_path / "vendors" / "intel.icd").write_text(f"{pip_runtime}\n")
     assert _runtimes.register_runtime() is None
 
 
-def test_nothing_is_touched_without_a_pip_runtime(monkeypatch):
+def test_environment_is_unchanged_without_a_pip_runtime(monkeypatch):
     def missing(name):
         raise metadata.PackageNotFoundError(name)
 
@@ -306,7 +306,7 @@ def test_nothing_is_touched_without_a_pip_runtime(monkeypatch):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the cache folder is Linux's")
-def test_unwritable_cache_is_replaced_for_the_process(tmp_path):
+def test_process_gets_a_cache_if_the_users_is_read_only(tmp_path):
     # A file where the folder should be stops root, too.
     (tmp_path / "file").write_text("")
     code = (
@@ -327,7 +327,7 @@ def test_unwritable_cache_is_replaced_for_the_process(tmp_path):
     assert not folder.exists()  # gone with the process
 
 
-def test_pip_runtime_works_on_its_own(tmp_path):
+def test_pip_runtime_works_without_others(tmp_path):
     try:
         metadata.distribution("intel-opencl-rt")
     except metadata.PackageNotFoundError:

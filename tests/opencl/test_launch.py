@@ -47,7 +47,7 @@ def put(engine, kernel, source, to, x=0.0, shift=(0, 0), n=4):
     engine.run_each(kernel, n, *arguments)
 
 
-def test_what_has_changed_is_set(engine, kernel, settings):
+def test_changed_arguments_are_set(engine, kernel, settings):
     """Each argument changes in turn: numbers, the sign of zero, vectors, arrays, views."""
     source = engine.upload(np.arange(8.0))
     first, second = engine.zeros(8), engine.zeros(8)
@@ -65,7 +65,7 @@ def test_what_has_changed_is_set(engine, kernel, settings):
     assert len(settings) >= 5 * len(cases) - 4
 
 
-def test_what_has_not_is_not(engine, kernel, settings):
+def test_unchanged_arguments_are_not_set(engine, kernel, settings):
     source, to = engine.upload(np.arange(8.0)), engine.zeros(8)
     for turn in range(9):
         to.fill(0)
@@ -80,7 +80,7 @@ def test_what_has_not_is_not(engine, kernel, settings):
     assert len(settings) == 2
 
 
-def test_memory_is_let_go_of(engine, kernel):
+def test_arguments_do_not_keep_arrays(engine, kernel):
     """A new array, probably at the address of one that was freed, is another argument."""
     for turn in range(20):
         source, to = engine.upload(np.full(8, float(turn))), engine.zeros(8)
@@ -90,7 +90,7 @@ def test_memory_is_let_go_of(engine, kernel):
         assert (to.get()[:4] == turn).all()
 
 
-def test_a_launch_and_others_may_take_turns(engine):
+def test_launch_alternates_with_other_launches(engine):
     text = "kernel void put(const int k, global int *to) { to[get_global_id(0)] = k; }"
     kernel = cl.Kernel(cl.Program(engine.ctx, text).build(), "put")
     to = engine.zeros(engine.groups * engine.group_size, np.int32)

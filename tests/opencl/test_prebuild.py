@@ -48,7 +48,7 @@ def engine(ctx):
         *(pytest.param(k, marks=pytest.mark.slow) for k in first_run.RECORDED if k != "2D box"),
     ],
 )
-def test_the_record_is_what_a_run_launches(engine, kind):
+def test_record_has_the_kernels_of_a_run(engine, kind):
     """If this fails: `python bench/first_run.py --record`."""
     name, found = first_run.record_kind(kind)
     recorded = prebuild._record()[name]
@@ -100,7 +100,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_the_line_appears_after_a_while_and_is_cleared(monkeypatch):
+def test_line_appears_after_a_while_and_is_cleared(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     notice = BuildNotice(3)
     notice.show(1)
@@ -117,7 +117,7 @@ def test_the_line_appears_after_a_while_and_is_cleared(monkeypatch):
 
 
 @pytest.mark.parametrize(("new", "terminal", "lines"), [(5, True, 1), (5, False, 0), (0, True, 0)])
-def test_a_line_is_for_first_runs_on_terminals(engine, monkeypatch, new, terminal, lines):
+def test_only_first_runs_on_terminals_show_a_line(engine, monkeypatch, new, terminal, lines):
     monkeypatch.setattr(build_notice, "build_ahead", lambda _: new)
     monkeypatch.setattr(build_notice, "PATIENCE", 0)
     monkeypatch.setattr(sys, "stderr", Terminal() if terminal else io.StringIO())
@@ -127,7 +127,7 @@ def test_a_line_is_for_first_runs_on_terminals(engine, monkeypatch, new, termina
     assert not sys.stderr.getvalue() or sys.stderr.getvalue().endswith("\r\x1b[K")
 
 
-def test_a_callback_takes_the_place_of_the_line(engine, monkeypatch):
+def test_callback_replaces_the_line(engine, monkeypatch):
     monkeypatch.setattr(build_notice, "build_ahead", lambda _: 2)
     monkeypatch.setattr(sys, "stderr", Terminal())
     told = []

@@ -65,7 +65,7 @@ def test_summaries(engine, n):
 
 
 @pytest.mark.parametrize("count", [2, 7, 8])
-def test_summaries_together_are_those_alone(engine, count):
+def test_summaries_of_many_arrays_agree_with_single_ones(engine, count):
     n, rng = 3001, np.random.default_rng(count)
     arrays = {str(k): engine.upload(rng.normal(k, 1 + k, n + k)) for k in range(count)}
     together, alone = Summaries(engine, "76543210"), Summaries(engine, "01234567")
@@ -121,7 +121,7 @@ def test_summaries_repeat_bit_by_bit(engine):
     assert summaries.read()["a"] == summaries.read()["b"]
 
 
-def test_summary_shows_what_is_not_finite(engine):
+def test_summary_shows_nan_and_infinity(engine):
     values = np.ones(1000)
     values[613] = np.nan
     summaries = Summaries(engine, ("a",))

@@ -83,7 +83,7 @@ def test_steps_are_those_of_the_history(run):
         )
 
 
-def test_launches_of_every_kind_are_seen(run):
+def test_all_kinds_of_commands_are_counted(run):
     taken, result = run
     calls = {key: cost.calls for key, cost in taken.costs.items()}
     tessellations = len(result.history)
@@ -97,7 +97,7 @@ def test_launches_of_every_kind_are_seen(run):
     assert calls[_hooks.MEMORY, "fill"] > 0
 
 
-def test_launches_bound_once_are_seen(engine):
+def test_repeated_launches_are_counted(engine):
     n = 900  # a ring, large enough for two levels
     place = np.arange(n)
     columns = np.column_stack([(place - 1) % n, (place + 1) % n]).ravel()
@@ -181,7 +181,7 @@ def test_few_events_are_kept(engine, monkeypatch):
     assert taken.launches == 57
 
 
-def test_other_queues_are_left_alone(ctx, engine):
+def test_other_queues_are_not_profiled(ctx, engine):
     other = cl.CommandQueue(ctx)
     with Profile(engine.queue) as taken:
         cla.zeros(other, 100, np.float32).fill(2)
@@ -189,7 +189,7 @@ def test_other_queues_are_left_alone(ctx, engine):
     assert taken.table()
 
 
-def test_unprofiled_runs_keep_nothing(adapter, run, monkeypatch):
+def test_runs_without_a_profile_keep_no_events(adapter, run, monkeypatch):
     taken, result = run
     assert not adapter.queue.properties & cl.command_queue_properties.PROFILING_ENABLE
     before = taken.launches, originals()
@@ -200,7 +200,7 @@ def test_unprofiled_runs_keep_nothing(adapter, run, monkeypatch):
     assert (taken.launches, originals()) == before
 
 
-def test_everything_is_put_back_after_an_error(adapter):
+def test_hooks_are_removed_after_an_error(adapter):
     before = originals(), adapter.queue, adapter._stages
     with pytest.raises(InputError), Profile(adapter) as outer, Profile(adapter):
         adapter.run(BOX, -1.0)
@@ -215,7 +215,7 @@ def test_callback_still_stops_the_run(adapter):
     assert [s.step for s in taken.spans] == [0, 1, 2, None]
 
 
-def test_queue_without_profiling_is_refused(ctx):
+def test_queue_without_profiling_raises(ctx):
     with pytest.raises(InputError, match="profiled_queue"):
         Profile(cl.CommandQueue(ctx))
 
@@ -234,7 +234,7 @@ def test_bandwidth_is_plausible(ctx, monkeypatch):
     assert 1e8 < copy_bandwidth(ctx, repeat=2) < 1e15
 
 
-def test_table_says_what_the_profile_knows(run):
+def test_table_agrees_with_the_profile(run):
     taken, _ = run
     stages, kernels, notes = taken.table().split("\n\n")
     rows = {line.split()[0]: line.split()[1:] for line in stages.splitlines()}

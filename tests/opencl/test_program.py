@@ -14,7 +14,7 @@ def engine(ctx):
     return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
 
 
-def test_a_program_is_built_for_its_first_kernel(engine, monkeypatch):
+def test_program_is_built_for_its_first_kernel(engine, monkeypatch):
     built = []
     build = program.build_program
     monkeypatch.setattr(program, "build_program", lambda *a: built.append(a[1]) or build(*a))

@@ -87,7 +87,7 @@ def test_frames_take_the_same_memory_in_turn(engine, made):
     assert 2 * once <= made[-1] <= 2 * once + 2 * len(SHAPES) * unit
 
 
-def test_a_frame_that_fails_gives_back_what_it_took(engine, made):
+def test_failing_frame_frees_its_arrays(engine, made):
     def fail():
         with engine.workspace.frame():
             take(engine)
@@ -102,7 +102,7 @@ def test_a_frame_that_fails_gives_back_what_it_took(engine, made):
     assert len(made) == count
 
 
-def test_outside_of_frames_arrays_have_memory_of_their_own(engine):
+def test_arrays_outside_frames_have_their_own_memory(engine):
     arrays = take(engine)
     with engine.workspace.frame():
         take(engine)
@@ -110,7 +110,7 @@ def test_outside_of_frames_arrays_have_memory_of_their_own(engine):
     check(arrays)
 
 
-def test_clearing_lets_go_of_the_memory_but_not_within_a_frame(engine, made):
+def test_clear_frees_memory_only_outside_frames(engine, made):
     with engine.workspace.frame():
         outer = take(engine)
         engine.workspace.clear()
@@ -154,7 +154,7 @@ def test_steps_allocate_nothing(engine, made, method):
     assert counts[3:] == counts[3:4] * 4
 
 
-def test_nothing_to_mend_leaves_no_memory(engine, made):
+def test_search_for_flaws_frees_its_memory(engine, made):
     """Memory of the search is freed before the next diagram."""
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
     points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
@@ -165,7 +165,7 @@ def test_nothing_to_mend_leaves_no_memory(engine, made):
     assert not mesh.stages.insertion_deletion._room._arrays
 
 
-def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
+def test_released_stages_leave_no_memory(engine, monkeypatch):
     """Memory is freed at once, without the collection of reference cycles."""
     alive, plain = weakref.WeakSet(), cl.Buffer
 
@@ -204,7 +204,7 @@ def test_stages_that_are_let_go_of_leave_no_memory(engine, monkeypatch):
         gc.enable()
 
 
-def test_a_kernel_is_in_one_hand_until_all_are_taken_back(engine):
+def test_kernels_are_not_shared_until_released(engine):
     first, second = engine.kernels("opencl/primitives"), engine.kernels("opencl/primitives")
     held = {kernels.scan_few.int_ptr for kernels in (first, second)}
     assert first.scan_few is first.scan_few
