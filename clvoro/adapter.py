@@ -146,7 +146,7 @@ class Adapter:
     def watched(self, queue: cl.CommandQueue, watch: Callable[[np.void], None]) -> Iterator[None]:
         """Use `queue`, and call `watch` with each new row of a history before the caller's callback (see `profile`).
 
-        A queue other than the adapter's own has buffers of its own.
+        A queue other than the adapter's has separate buffers.
         """
         with self._alone():
             kept = self.queue, self._stages, self._watch
@@ -320,7 +320,7 @@ class Adapter:
             If a checkpoint cannot be written, for example on a full disk. The run continues, and the previous
             checkpoint is kept.
         MismatchWarning, CoarseSizeWarning
-            If a part of the input hardly meets the domain, for example in another unit of length.
+            If a part of the input barely overlaps the domain, for example because it has another unit of length.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.
         SizeErrorWarning
@@ -481,7 +481,7 @@ def adapt(
         "adaptive" for good cells of the right size, "exact" for cells that have it to about 1e-4; for the others see
         `Adapter.run`.
     n_cells : int, optional
-        Number of cells; by default what the size field asks for.
+        Number of cells; by default the number that the size field requires.
     layers : Layers or sequence of Layers
         Boundary layers, in 2D.
     seed : int

@@ -62,7 +62,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
     InputTypeError
         If it holds anything but real numbers.
     InputError
-        If its shape is another one, or numbers are masked.
+        If it has another shape, or numbers are masked.
     """
     if np.ma.is_masked(value):
         raise InputError(
@@ -74,7 +74,7 @@ def check_rows(name: str, value: object, d: int) -> np.ndarray:
         array = np.asarray(value)
     except Exception as error:  # arrays of other libraries raise anything
         kind = InputError if isinstance(error, ValueError) else InputTypeError
-        raise kind(f"{name} is no array ({error}); {expected}") from error
+        raise kind(f"{name} is not an array ({error}); {expected}") from error
     if array.ndim == 0:
         inner = getattr(value, "points", None)
         hint = f"; pass its points, {name}.points" if isinstance(inner, np.ndarray) else ""
@@ -127,7 +127,7 @@ def check_path(name: str, value: object) -> str:
 
 
 def check_callable(name: str, value: Callable[..., object], argument: str, hint: str) -> None:
-    """Reject a callable that does not take one argument, as far as its signature is known."""
+    """Reject a callable whose signature does not accept one argument. Callables without a signature pass."""
     try:
         signature = inspect.signature(value)
     except (TypeError, ValueError):  # many built-in functions have no signature
@@ -155,7 +155,7 @@ def coincident_pair(points: np.ndarray) -> tuple[int, int] | None:
 def check_integer(
     name: str, value: object, least: int, most: float = 2**63 - 1, beside: str = ""
 ) -> int:
-    """Return `value` as an int from `least` to `most`; errors name what is allowed `beside` integers."""
+    """Return `value` as an int from `least` to `most`; errors name the values that are allowed `beside` integers."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         expected = f"an integer or {beside}" if beside else "an integer"
         raise InputTypeError(

@@ -1,4 +1,4 @@
-"""Errors that clvoro raises; all derive from `ClvoroError`, but for `Interrupted`, and warnings."""
+"""Errors and warnings of clvoro. All errors except `Interrupted` derive from `ClvoroError`."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class CoarseSizeWarning(UserWarning):
 
 
 class MismatchWarning(UserWarning):
-    """A part of the input hardly fits the domain or the sizes: probably units or positions differ."""
+    """A part of the input does not match the domain or the sizes: units or positions probably differ."""
 
 
 class PrecisionWarning(UserWarning):

@@ -45,8 +45,8 @@ kernel void measure_strain(const int size, global const int *starts, global cons
         s += 2 / (LATTICE_2 * h[i] * h[j]) * (REAL4)(d.s0 * d.s0, d.s0 * d.s1, d.s1 * d.s1, 0);
     }
 #ifdef POLYGON
-    /* Half a neighbor more or less is no charge. A cell between two boundaries, or at a sharp corner, counts as one in
-       a corner. */
+    /* The charge is rounded to the nearest integer, and halves towards 0. A cell between two boundaries, or at a sharp
+       corner, counts as one in a corner. */
     const REAL charge = n - walls - outlines[i].s1;
     kinds[i] = (int2)((int)(charge > 0 ? ceil(charge - R(0.5)) : floor(charge + R(0.5))),
                       walls == 0 ? 0 : (outlines[i].s1 < R(3.2) ? 2 : 1));
@@ -296,7 +296,7 @@ kernel void mark_split_delete(const int size, global const ulong *chosen, const 
 
 #if DIM == 2
 /* Sites to repair: inner cells with 1 - Q above `deficit`. Cells of at most four or at least eight sides come first,
-   whatever their Q: they have a generator too many or too few around them. */
+   at any Q: they have a generator too many or too few around them. */
 kernel void score_bad_cells(const int size, global const int *starts, global const int *neighbors,
                             global const REAL *quality, const REAL deficit, global ulong *keys)
 {

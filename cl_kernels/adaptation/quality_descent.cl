@@ -72,8 +72,8 @@ inline bool ends_at(REAL2 r, int k, REAL2 tangent, global const FACE *face_measu
 /* lloyd = -rate h^2 dE/dx_i, at most max_displacement h. One work-item per generator.
 
    The vertex v between the faces to j and q moves by (x_j - x_i).dv = (x_q - x_i).dv = (v - x_i).dx_i; on a wall it
-   moves along the wall. The force on it is the sum of the tensions of its faces, along them, each of the two cells at
-   the face. */
+   moves along the wall. Each cell at a face pulls its two vertices along the face, with its tension. The force on v is
+   the sum over its faces and their two cells. */
 kernel void descend_quality(const int size, global const int *starts, global const int *neighbors,
                             global const FACE *face_measures, global const FACE *face_centroids,
                             global const REAL *points, global const REAL *tension, global const REAL *pressure,

@@ -3,8 +3,8 @@
    counter-clockwise seen from outside. */
 #include "simd/walk_state.h"
 
-/* Bisectors are moved outwards by this share of the distance of the generator, so that those of an edge do not end it.
-   Faces missed by this are smaller than the limit of certainty. */
+/* Bisectors are moved outwards by this share of the distance of the generator, so that the two of an edge do not
+   cut it. Faces missed by this are smaller than the limit of certainty. */
 #define BIAS 1e-14
 /* Least squared volume spanned by the normals of the three faces at a certain vertex. */
 #define CERTAIN_SINE2 1e-10

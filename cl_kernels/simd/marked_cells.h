@@ -4,7 +4,7 @@
 
 #define WRAPPED_CAPACITY 32 /* candidates */
 #if WRAPPED_CAPACITY > LIST_CAPACITY || SLOT < HULL_CAPACITY
-#error "there is no room for the candidates, or for what becomes of them"
+#error "a list must hold all candidates, and a slot all faces of a hull"
 #endif
 
 inline bool is_found(const int *found, int j)

@@ -1,4 +1,4 @@
-/* Hierarchical bins. Grid 0 covers the domain. A bin with many generators is divided by a grid of its own, and so on:
+/* Hierarchical bins. Grid 0 covers the domain. A bin with many generators is divided by a finer grid, and so on:
    a leaf holds a few generators, however graded the set is. The bins of a grid are stored row by row, and the
    generators of a divided bin stay in its range. So the generators in neighboring bins of a row are contiguous.
 

@@ -157,7 +157,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
    offsets (n, 2)            centroid - x_i, the Lloyd displacement (the paper's 2.2)
    covariances (n, 3)        xx, xy, yy of the second moments about the centroid, per unit area
 
-   In LANES a work-item takes so many generators, and there are so many fewer work-items. */
+   With IN_LANES, each work-item takes LANES generators. */
 kernel void measure_cells(const int size, global const int *places, global const int *slots,
                           global const int *slot_counts, global const int *old_starts, global const int *old_neighbors,
                           global const uint *keep, global const int *starts, global const REAL *points,

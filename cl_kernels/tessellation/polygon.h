@@ -1,6 +1,6 @@
 /* A convex polygon around its generator, and its clipping by the bisector with a neighbor.
-   Coordinates are relative to the generator: differences of close positions are exact, so cells stay accurate
-   whatever their size. */
+   Coordinates are relative to the generator: differences of close positions are exact, so cells of any size are
+   accurate. */
 #include "tessellation/half_planes.h"
 #include "opencl/real.h"
 

@@ -1,5 +1,5 @@
 /* A convex polyhedron around its generator. Coordinates are relative to the generator: differences of close positions
-   are exact, so cells stay accurate whatever their size.
+   are exact, so cells of any size are accurate.
 
    The polyhedron is simple: three faces meet in every vertex (where more do, vertices coincide). Its dual is a
    triangulated sphere: a vertex is the triangle of its three faces, counter-clockwise seen from outside. */

@@ -34,8 +34,8 @@ inline bool walk_on(const int size, global const int *starts, global const int *
     return walk(size, starts, neighbors, cell, at, true);
 }
 
-/* Whether the walk around one end of face k of cell i passes its other end. This never happens in a diagram, but for
-   two crossing faces: with round-off, both pairs of four nearly cocircular generators may become neighbors. */
+/* Whether the walk around one end of face k of cell i passes its other end. In a diagram this happens only if two faces
+   cross: with round-off, both pairs of four nearly cocircular generators may become neighbors. */
 inline bool is_loop(const int size, global const int *starts, global const int *neighbors, int i, int k)
 {
     const int other = k + 1 < starts[i + 1] ? k + 1 : starts[i];

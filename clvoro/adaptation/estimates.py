@@ -71,7 +71,7 @@ class Extras:
 
 
 def fixed_bytes(engine: Engine, n: float) -> float:
-    """Return the bytes of a run that hardly depend on its number of cells `n`."""
+    """Return the bytes of a run that are almost independent of its number of cells `n`."""
     real = engine.real.itemsize
     records = 8 * real * max_jacobi_iterations(int(min(n, FEW)))
     return records + PARTIAL_SUMS * engine.groups * real + workspace_bytes(engine)
@@ -154,24 +154,24 @@ def available_memory(device: cl.Device) -> float:
 
 
 def check_memory(engine: Engine, n: float, needed: float) -> float:
-    """Return `needed`, the bytes for `n` cells (see `estimate_memory`), if the device has them.
+    """Check that the device has `needed` bytes for `n` cells (see `estimate_memory`), and return `needed`.
 
     Raises
     ------
     MemoryLimitError
-        If it has not. The message has the number of cells and both sizes.
+        If `n` or `needed` is too large. The message has the number of cells, and the bytes needed and available.
     """
     available = available_memory(engine.queue.device)
     if n > MAX_CELLS:
         raise MemoryLimitError(
             f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "
-            f"{in_bytes(needed)} of {in_bytes(available)}). Do h and the domain have the same unit of length? "
-            "Otherwise use a larger size or n_cells"
+            f"{in_bytes(needed)}, and the device has {in_bytes(available)}). Do h and the domain have the same unit "
+            "of length? If so, use a larger size or a smaller n_cells"
         )
     if needed > available:
         raise MemoryLimitError(
             f"the size field requires {n:.3g} cells, which need {in_bytes(needed)} on the device; "
             f"{engine.queue.device.name.strip()} has {in_bytes(available)}. Do h and the domain have the same "
-            "unit of length? Otherwise use a larger size, n_cells, dtype='float32' or another device"
+            "unit of length? If so, use a larger size, n_cells, dtype='float32' or another device"
         )
     return needed

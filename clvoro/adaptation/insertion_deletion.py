@@ -141,7 +141,7 @@ class InsertionDeletion:
             None if nothing changes.
         """
         n = t.n
-        # Less than 0.7 of a generator is left to strain. A large change takes several calls.
+        # A remainder of less than 0.7 generators only changes the sizes of cells. A large change takes several calls.
         need = math.trunc(change.missing + math.copysign(0.3, change.missing))
         most = max(4, int(MAX_CHANGE * n))
         need = max(-most, min(most, need))

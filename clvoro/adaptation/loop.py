@@ -245,7 +245,7 @@ class Loop:
         """
         mesh = self.mesh
         factor = 2.0**mesh.engine.dim
-        # The number of this level by the integral.
+        # The number of cells on this level according to the integral.
         exact = self.required / factor**self.level
         bias = min((mesh.n + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
         lack = factor * mesh.n / mesh.refined_count() - 1

@@ -35,7 +35,7 @@ _USERS = {
 }
 """Options that only some methods use, and these methods."""
 _WITHOUT_EFFECT = {"tol": 0, "levels": 0}
-"""Values that ask the other methods for what they do anyway: take all steps, begin on no coarser level."""
+"""Values that change nothing in the other methods: these take all steps, and have no coarser levels."""
 
 _NUMBERS: dict[str, Callable[[str, object], float]] = {
     "levels": partial(check_integer, least=0, beside="'auto'"),
@@ -75,7 +75,7 @@ class MultilevelOptions:
     Raises
     ------
     InputError, InputTypeError
-        If `levels` is no integer >= 0, or `error_target` is not positive and finite.
+        If `levels` is not an integer >= 0, or `error_target` is not positive and finite.
 
     Examples
     --------
@@ -110,7 +110,7 @@ class PaperOptions:
     Raises
     ------
     InputError, InputTypeError
-        If `tol` is negative, `alpha` or `k` is not positive, or one of them is no finite number.
+        If `tol` is negative, `alpha` or `k` is not positive, or one of them is not a finite number.
 
     Examples
     --------
@@ -139,7 +139,7 @@ class Checkpoint:
     Parameters
     ----------
     path : path, optional
-        File that the run writes every so often, and when its callback stops it. With None nothing is written.
+        File that the run writes at intervals, and when its callback stops it. With None nothing is written.
     every : float
         Seconds between two checkpoints; 0 writes one after every step.
     resume : path or True, optional
@@ -258,10 +258,9 @@ def special(options: object) -> dict[str, Any]:
 
 
 def arguments_of_run(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings, as a case gives them one by one, as arguments of `Adapter.run`.
+    """Return the arguments of `Adapter.run` for the `settings` of a case.
 
-    The settings of one method's options become its `options`, and those of checkpoints its `checkpoint`. A start that
-    is given by its name goes where points would go.
+    The fields of `MultilevelOptions` or `PaperOptions` become `options`. The name of a start becomes `points`.
     """
     given = dict(settings)
     start = given.pop("start", None)

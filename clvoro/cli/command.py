@@ -195,7 +195,7 @@ def _mesh_formats(text: str) -> tuple[str, ...]:
     for name in formats:
         if name not in MESH_FILES:
             raise argparse.ArgumentTypeError(
-                f"{name!r} is no mesh format, expected some of {', '.join(MESH_FILES)}"
+                f"{name!r} is not a mesh format, expected one or more of {', '.join(MESH_FILES)}"
             )
     return formats
 

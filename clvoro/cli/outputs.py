@@ -76,5 +76,5 @@ def require_plots() -> None:
         ) from error
     except Exception as error:  # for example broken settings
         raise ClvoroError(
-            f"the report needs Matplotlib, which cannot be used ({error}); mend that, or run with --no-report"
+            f"the report needs Matplotlib, which cannot be used ({error}); repair it, or run with --no-report"
         ) from error

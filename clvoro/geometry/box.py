@@ -26,7 +26,7 @@ LARGEST_EDGE = 1e50
 
 
 class ClipBox(Protocol):
-    """The box that clips cells. It is all that stages know of a domain: a `Domain`, or a box of a stage."""
+    """The box that clips cells: a `Domain`, or a box that a stage makes. Stages use nothing else of a domain."""
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Corners in the device's coordinates, padded to four numbers as kernels take them."""

@@ -147,7 +147,7 @@ class Polygon(Region):
         source : path, str or dict
             A file, a text that begins with ``{``, or the object that `json.loads` returns: a Polygon, MultiPolygon,
             Feature or collection of these. Coordinates are used as plane coordinates: project longitudes and latitudes
-            before. A Feature may name its boundaries in its properties, by the numbers of its own edges:
+            before. A Feature may name its boundaries in its properties, by the numbers of the Feature's edges:
             ``"boundaries": {"island": [4, 5, 6]}``.
         names : mapping, optional
             Names of boundaries, in place of those in `source`.
@@ -231,12 +231,12 @@ class Polygon(Region):
 
     @classmethod
     def described(cls, **values: Any) -> Polygon:
-        """Make the domain that `describe` describes.
+        """Return the domain from the values that `describe` returns.
 
         Raises
         ------
         InputError, InputTypeError
-            If values are damaged.
+            If the values do not describe a domain.
         """
         if "edge_numbers" in values:
             raise InputError(
@@ -258,7 +258,7 @@ class Polygon(Region):
             and pieces[0] == 0
             and vertices.shape == (starts[-1], 2)
         ):
-            raise InputError("the description of a Polygon is damaged: its arrays do not fit")
+            raise InputError("the description of a Polygon is damaged: its arrays do not match")
         # Close the rings: a last vertex equal to the first one would be dropped as the closing one.
         rings = [np.concatenate([vertices[a:b], vertices[a : a + 1]]) for a, b in pairwise(starts)]
         firsts = [*np.flatnonzero(steps), len(rings)]

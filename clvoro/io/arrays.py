@@ -43,11 +43,11 @@ def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
         ) from error
     except (zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError) as error:
         raise InputError(
-            f"cannot load {name}: it is damaged or of another program ({error})"
+            f"cannot load {name}: it is damaged or not from clvoro ({error})"
         ) from error
     except (KeyError, IndexError, TypeError, MemoryError) as error:
         raise InputError(
-            f"cannot load {name}: it is damaged or of another program ({error!r:.200})"
+            f"cannot load {name}: it is damaged or not from clvoro ({error!r:.200})"
         ) from error
     except OSError as error:
         raise InputError(f"cannot load {name}: {error.strerror or error}") from error

@@ -104,7 +104,7 @@ def _add_connectivity(
         columns = ("mesh_faces", "mesh_most_corners")
         file.add_rows(f"mesh_{name}s", columns, counts, items, -1, **_role(name), _FillValue=_NONE)
     pairs = ("mesh_edges", "two")
-    # Every edge has two ends, so the conventions want no fill value here.
+    # Every edge has two ends, so the conventions require no fill value here.
     file.add("mesh_edge_nodes", pairs, ends, **_role("edge_node"))
     beside = np.stack([halves.cell, across], axis=1)[halves.first]
     file.add("mesh_edge_faces", pairs, beside, **_role("edge_face"), _FillValue=_NONE)

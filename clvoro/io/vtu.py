@@ -151,7 +151,7 @@ def polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
     index = np.int32 if len(ends) == 0 or ends[-1] < 2**31 else np.int64
     stream = np.empty(ends[-1] if n else 0, index)
     counts = np.concatenate([[0], ends[:-1]])
-    # A face follows all faces of earlier cells and of its own cell, and the counts of these cells.
+    # Before a face come its cell's count, the counts of all earlier cells, and all earlier faces.
     headers = np.cumsum(sides + 1) - (sides + 1) + owner + 1
     rest = np.ones(len(stream), bool)
     rest[counts] = rest[headers] = False
@@ -192,7 +192,9 @@ def largest_boundary(diagram: Diagram) -> np.ndarray:
     """Return the index in `boundary_names` of the boundary with the largest face of each cell, (n,) int32; -1: none."""
     found = np.full(len(diagram), -1, np.int32)
     walls = np.flatnonzero(diagram.neighbors < 0)
-    walls = walls[np.argsort(diagram.face_measures[walls], kind="stable")]  # the last one stays
+    walls = walls[
+        np.argsort(diagram.face_measures[walls], kind="stable")
+    ]  # the largest comes last and stays
     found[face_owners(diagram)[walls]] = diagram.domain.boundary_index[
         -1 - diagram.neighbors[walls]
     ]

@@ -62,7 +62,7 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
     Raises
     ------
     InputError
-        If the file is missing, damaged, truncated or of another program; names the file and the fault.
+        If the file is missing, damaged, truncated or not from clvoro; names the file and the fault.
     """
     name = fspath(path)
     try:
@@ -92,7 +92,7 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
         expat.ExpatError,
     ) as error:
         raise InputError(
-            f"cannot read {name}: it is damaged or of another program ({error})"
+            f"cannot read {name}: it is damaged or not from clvoro ({error})"
         ) from error
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from error
@@ -292,7 +292,7 @@ def _periodic_box(
     corners = arrays["FieldData.box_corners"].reshape(2, 3)[:, :dim].astype(float)
     axes = arrays["FieldData.box_periodic"]
     if axes.shape != (dim,):
-        raise _FileError("box_periodic has another number of directions")
+        raise _FileError(f"box_periodic has shape {axes.shape}, expected ({dim},)")
     return Box(*corners.tolist(), periodic=tuple(bool(a) for a in axes), names=names)
 
 

@@ -53,7 +53,7 @@ def make_cell(diagram: Diagram, i: int) -> Cell:
     Raises
     ------
     InputError, InputTypeError
-        If `i` is no integer, or there is no such cell.
+        If `i` is not an integer, or there is no such cell.
     """
     n = len(diagram)
     i = check_integer("i", i, -n)

@@ -74,8 +74,8 @@ class Diagram:
         Centroids of the faces.
     vertices : (v, d) float64
         Voronoi vertices, each once. In a periodic box cells are not cut at the seams: their faces and corners lie
-        around their generators, partly outside of the box. Each image of a vertex that is a corner of a cell is a
-        vertex of its own.
+        around their generators, partly outside of the box. Each image of a vertex that is a corner of a cell is listed
+        as a separate vertex.
     cell_vertex_starts : (n + 1,) int32, 2D only
     cell_vertices : (c,) int32, 2D only
         Corners of cell i, ``cell_vertices[cell_vertex_starts[i]:cell_vertex_starts[i + 1]]``, counter-clockwise. In a
@@ -139,11 +139,11 @@ class Diagram:
             )
         if name not in self._arrays:
             raise AttributeError(
-                f"{name}: a diagram in {self.domain.dim}D has none; it has {', '.join(self._there())}"
+                f"a diagram in {self.domain.dim}D has no {name}; it has {', '.join(self._there())}"
             )
         value = self._arrays[name]
         if callable(value):
-            check_process()  # it may be on a device still
+            check_process()  # it may still be on a device
             value = self._arrays[name] = read_only(value())
         return value
 
@@ -221,7 +221,7 @@ class Diagram:
         Raises
         ------
         InputError, InputTypeError
-            If `i` is no integer, or there is no such cell.
+            If `i` is not an integer, or there is no such cell.
 
         Examples
         --------
@@ -252,7 +252,7 @@ class Diagram:
         Raises
         ------
         InputError, InputTypeError
-            If `points` is no array of real numbers of this shape.
+            If `points` is not an array of real numbers of this shape.
 
         Examples
         --------

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Locator:
     """Finds the cells that hold points.
 
-    In a box the cell is that of the nearest generator, across seams, too. In a polygonal domain it can be another one,
-    as a cell ends where the boundary cuts it off; there the shape of the cell decides.
+    In a box the cell is that of the nearest generator, also across seams. In a polygonal domain the boundary cuts cells
+    off, so the point may be in the cell of another generator. There the shape of the cell decides.
     """
 
     def __init__(self, diagram: Diagram) -> None:
@@ -52,7 +52,7 @@ class Locator:
         rest = np.flatnonzero(~shapely.intersects_xy(shapes[cells], x[:, 0], x[:, 1]))
         if rest.size:
             places = shapely.points(x[rest])
-            # In a crack between two shapes, as wide as round-off, the nearest shape counts.
+            # Between two shapes there may be a gap as wide as round-off. There the nearest shape counts.
             row, cell = shapely.STRtree(shapes).query_nearest(places, all_matches=False)
             cells = cells.copy()
             cells[rest[row]] = cell

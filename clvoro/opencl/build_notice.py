@@ -44,7 +44,7 @@ class BuildNotice:
             self.clear()
 
     def clear(self, row: object = None) -> None:
-        """Clear the line; `row`, of the history, is ignored."""
+        """Clear the line. `row`, a row of the history, is ignored."""
         if self._shown:
             self._write("\r\x1b[K")
             self._shown = False

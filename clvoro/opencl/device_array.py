@@ -31,9 +31,9 @@ class DeviceArray(cla.Array):
 
     @cached_property
     def mark(self) -> int:
-        """A number for this array and its views of the first rows. No array before had the same.
+        """Number that identifies this array and its views of the first rows. No other array has it.
 
-        An address cannot tell arrays apart, because freed memory is used again.
+        An address does not identify an array, because freed memory is used again.
         """
         return next(_marks)
 

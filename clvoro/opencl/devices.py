@@ -404,6 +404,8 @@ def _complaint(
     if left:
         best = min(left, key=lambda c: c.rank)
         how = f"use device={best.index!r}" if chosen else "leave the device out"
-        remedy = f"{how} to use {best.title}, or install the OpenCL driver of the one that you want"
+        remedy = (
+            f"{how} to use {best.title}, or install the OpenCL driver of the device that you want"
+        )
     lines.append(f"  remedy: {remedy}; `clvoro devices` tests each device")
     return "\n".join(lines)

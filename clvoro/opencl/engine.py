@@ -157,7 +157,7 @@ class Engine:
             OpenCL C before the file.
         """
         name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
-        # By the module: tests replace the function.
+        # Called through the module, because tests replace the function.
         return Kernels(
             lambda: program.build_program(self.ctx, name, full, prelude), stage, self.pool
         )

@@ -45,7 +45,7 @@ class KernelPool:
         return kernel
 
     def release(self) -> None:
-        """Make all kernels free. Who has one must not rely on its arguments any more."""
+        """Return all kernels to the pool. Callers that hold one must set its arguments again."""
         for key, kernel in self._taken:
             self._free[key].append(kernel)
         self._taken.clear()
@@ -54,7 +54,7 @@ class KernelPool:
 class Kernels(SimpleNamespace):
     """The kernels of a program as attributes. The program is built when the first of them is used.
 
-    Each kernel has arguments of its own. Its attribute `stage` is the name of the program, for profiles.
+    Each kernel keeps its own arguments. Its attribute `stage` is the name of the program, for profiles.
     """
 
     def __init__(self, build: Callable[[], cl.Program], stage: str, pool: KernelPool) -> None:

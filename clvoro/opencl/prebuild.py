@@ -153,7 +153,7 @@ def _index_of(device: cl.Device) -> tuple[int, int]:
     for p, platform in enumerate(cl.get_platforms()):
         if platform == device.platform:
             return p, platform.get_devices().index(device)
-    raise ValueError("the device is of no platform")
+    raise ValueError(f"device {device.name.strip()!r} is not in the list of any OpenCL platform")
 
 
 def _send(worker: subprocess.Popen[bytes], work: Work) -> None:

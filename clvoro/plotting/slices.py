@@ -31,7 +31,7 @@ def require_space(diagram: Diagram) -> None:
 
 
 def focus(result: Result) -> np.ndarray:
-    """Return the point of view of a 3D mesh: among its smallest cells, well inside of the domain."""
+    """Return the point that pictures of a 3D mesh show: among its smallest cells, well inside the domain."""
     box = result.diagram.domain
     smallest = result.points[result.target_size <= 1.1 * result.target_size.min()]
     lower, extent = np.array(box.lower), box.extent

@@ -242,7 +242,7 @@ class ConservativeTransfer:
         failed = np.flatnonzero(status == FAILED)
         if failed.size:
             raise InputError(
-                f"cell {failed[0]} ({failed.size} in all) cannot be made from its neighbors, expected Voronoi "
+                f"cell {failed[0]} ({failed.size} in all) cannot be rebuilt from its neighbors, expected Voronoi "
                 f"diagrams of distinct generators: call diagram.check() on {what}"
             )
         return np.flatnonzero(status == PIECE_LARGE)

@@ -115,7 +115,7 @@ def generate_code(
     Raises
     ------
     InputError
-        If the field is of another dimension than the domain, or has no device form.
+        If the dimensions of field and domain differ, or the field has no device form.
     """
     field.check_dim(domain.dim)
     writer = CodeWriter(domain, np.dtype(real), engine)

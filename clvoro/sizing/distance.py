@@ -85,7 +85,7 @@ class Distance(Field):
             if not isinstance(shape, Shape):
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
-                    "Sphere, Segment, Polyline, Polygon, Edges, Surface, Box or clvoro.Polygon"
+                    "Sphere, Segment, Polyline, ClosedPolyline, Edges, Surface, Box or clvoro.Polygon"
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")

@@ -59,7 +59,7 @@ class Sizing:
     Raises
     ------
     InputError
-        If the field is of another dimension than the domain.
+        If the dimensions of field and domain differ.
     """
 
     def __init__(

@@ -227,7 +227,7 @@ class Function(Field):
             ) from error
         try:
             sizes = np.asarray(given)
-        except Exception as error:  # arrays of other libraries raise errors of their own
+        except Exception as error:  # arrays of other libraries may raise any error
             raise InputTypeError(
                 f"{self!r} returned a {type(given).__name__} that is not an array ({error}), expected real numbers of "
                 f"shape ({n},)"

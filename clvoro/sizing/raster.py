@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from .codegen import CodeWriter
 
 _MANY, _WITHIN = 8, 0.1
-# A raster of at least _MANY values along each axis is meant for domains of more than _WITHIN of their spacing.
-_ENOUGH = 16  # scattered points from which on their bounding box tells where values are known
+# Warn if a raster of at least _MANY values along each axis has a spacing of more than 1 / _WITHIN domains.
+_ENOUGH = 16  # least number of scattered points whose bounding box shows where values are known
 _ROUNDINGS = 16  # ulps by which a point may lie outside of a raster
 
 
@@ -126,7 +126,7 @@ class Raster(Field):
         if many.all() and (domain.extent < _WITHIN * spacing).all():
             return [
                 f"the domain, {domain.extent.tolist()} across, lies between two values of {self!r}, which are "
-                f"{spacing.tolist()} apart, so that sizes hardly vary; do raster and domain have the same unit?"
+                f"{spacing.tolist()} apart, so that sizes barely vary; do raster and domain have the same unit?"
             ]
         return self._coverage_warnings(domain)
 

@@ -97,7 +97,7 @@ class Cycle:
         return [self._room(depth, name, size=len(self._levels[depth])) for name in "bxt"]
 
     def _add(self, depth: int, name: str, size: int, *args: object, turn: int = 0) -> None:
-        """Add a launch. Each level and `turn` has a kernel object of its own, because it has one set of arguments."""
+        """Add a launch. Each level and `turn` has a separate kernel object, because an object keeps its arguments."""
         key = (depth, name, turn, self._source)
         if key not in self._kernels:
             defines = {"SOURCE": self.engine.name_of(self._source)}

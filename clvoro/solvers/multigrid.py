@@ -73,7 +73,7 @@ def _factor_size(n: int) -> int:
 
 def _require(condition: bool) -> None:
     if not condition:
-        raise ValueError("multigrid")
+        raise ValueError("the arrays do not describe a multigrid hierarchy")
 
 
 def _is_within(array: np.ndarray, length: int, end: int) -> bool:

@@ -117,7 +117,7 @@ class Poisson:
         self._first_iterations = self._last_iterations = 0
 
     def clear(self) -> None:
-        """Free all buffers and forget what the next solve could reuse."""
+        """Free all buffers, and discard the data that the next solve could reuse."""
         self._multigrid_of = self._ordering = None
         if self._multigrid is not None:
             self._multigrid.clear()

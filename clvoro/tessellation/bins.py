@@ -17,8 +17,7 @@ from ..opencl.primitives import Scan
 OCCUPANCY = 2
 """Mean number of generators per bin: a compromise between bins to open and generators to test."""
 SPLIT_COUNT = {2: 10, 3: 18}
-"""A bin with more generators is divided by a grid of its own. Uniform random sets (Poisson, mean 2) stay on one
-level."""
+"""A bin with more generators is divided by a finer grid. Uniform random sets (Poisson, mean 2) stay on one level."""
 SPACING_COUNT = 8
 """Least number of generators from which the spacing around a leaf is estimated."""
 _ZERO = np.zeros(1, np.int32)

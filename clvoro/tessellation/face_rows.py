@@ -28,10 +28,10 @@ class FaceRows:
     places : (n,) int32
         First slot of each row, or -1 if it is as before.
     starts : (n + 1,) int32
-        Where rows begin in the graph to be.
+        Starts of the rows in the new graph.
     flags : (6,) int32
         What went wrong, whether any cell is doubtful, the faces of all rows, the next spare slot, the number of slots,
-        and whether faces of no length stay.
+        and whether faces of zero length stay.
     """
 
     slots: cla.Array

@@ -77,7 +77,7 @@ def tessellate_box(
         t = stages.incremental.update(stages.cells, domain, points, previous)
         if t is not None:
             return t
-        # What steps have worked on is of no use here, where bins need room.
+        # Free the work arrays of the steps, because the bins need memory.
         stages.engine.workspace.clear()
     if binned is None:
         binned = stages.bins.build(domain, points, n)

@@ -77,7 +77,7 @@ def test_formats_that_are_refused(here, capsys):
     with pytest.raises(SystemExit) as left:
         call("run", "small.toml", "--format", "foam,stl")
     assert left.value.code == cli.BAD_INPUT
-    assert "'stl' is no mesh format, expected some of foam, nc" in capsys.readouterr().err
+    assert "'stl' is not a mesh format, expected one or more of foam, nc" in capsys.readouterr().err
     assert call("run", "sphere", "--format", "nc", "--out", "b") == cli.BAD_INPUT
     assert "format nc is for meshes in 2D" in capsys.readouterr().err
     assert not (here / "b").exists()

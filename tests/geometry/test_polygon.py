@@ -194,7 +194,7 @@ PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])
         (ONE((0, 0), (0.5 / LARGEST_EDGE, 0), (0, 0.5 / LARGEST_EDGE)), "choose another unit"),
         (ONE((1e12, 0), (1e12 + 0.5, 0), (1e12, 0.5)), "move it to the origin"),
         (ONE((0, 0, 0), (1, 0, 0), (1, 1, 0)), r"outer ring has shape \(3, 3\), expected \(n, 2\)"),
-        (ONE((0, 0), (1, 0), (1,)), "outer ring is no array"),
+        (ONE((0, 0), (1, 0), (1,)), "outer ring is not an array"),
         (ONE(("a", "b"), ("c", "d"), ("e", "f")), "outer ring has dtype"),
         (ONE(), "outer ring has 0 distinct vertices"),
         (SQUARE_HOLES(HOLE + 9), r"Hole lies outside shell at \(10, 10\), edge 0 of the hole 0"),

@@ -235,7 +235,7 @@ def test_npz_returns_what_was_saved(result, tmp_path):
     back = io.load(tmp_path / "mesh.npz")
     assert_equal_results(result, back)
     assert_same_array(back.diagram.face_vertices, result.diagram.face_vertices)
-    with pytest.raises(AttributeError, match="cell_vertices: a diagram in 3D has none"):
+    with pytest.raises(AttributeError, match="a diagram in 3D has no cell_vertices"):
         _ = back.diagram.cell_vertices
 
 

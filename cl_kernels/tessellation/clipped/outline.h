@@ -1,9 +1,9 @@
 /* The boundary of cells in a clipped diagram. OUTLINE_ARGS come last in the signature of a kernel and are empty in
    boxes.
 
-   outlines[i]  (quality of the cell by the paper's (4.1), with stretches of the boundary that turn by at most 30
-   degrees as one straight side, see wall_sides.h; number of neighbors of a hexagonal lattice there) tangents[e]  unit
-   vector along edge e of the boundary, the domain on its left: the face with label -1 - e */
+   outlines[i]  .s0: quality of cell i by the paper's (4.1); a stretch of the boundary that turns by at most 30 degrees
+                counts as one straight side, see wall_sides.h. .s1: number of neighbors of a hexagonal lattice there
+   tangents[e]  unit vector along edge e of the boundary, the domain on its left: the face with label -1 - e */
 #include "opencl/real.h"
 
 #ifdef POLYGON

@@ -370,7 +370,7 @@ kernel void write_trimmed(const int size, SEGMENT_ARGS, SHORE_ARGS, global const
         }
     }
     write_moments(&m, i, volumes, offsets, covariances);
-    /* Two sides are no polygon, even if one is bent. */
+    /* Two sides do not form a polygon, even if one is bent. */
     const REAL quality =
         o.sides < 3 ? polygon_quality(3, m.area / 2, perimeter) : polygon_quality(o.sides, o.area / 2, o.perimeter);
     outlines[i] = (REAL2)(fmax(quality, R(0)), 6 - o.missing);

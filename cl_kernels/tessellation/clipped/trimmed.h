@@ -4,7 +4,7 @@
 #include "tessellation/clipped/boundary.h"
 
 #define ON_BOUNDARY (4 * REAL_EPS) /* largest distance of points on it, by round-off */
-#define MUCH (64 * ON_FACE)        /* larger than the error of crossings, but for edges along faces */
+#define MUCH (64 * ON_FACE)        /* larger than the error of crossings, except for edges along faces */
 
 /* A convex cell: its generator, its faces, and its chords in ascending order. */
 typedef struct {
@@ -61,7 +61,7 @@ typedef struct {
 } place_t;
 
 /* The position of the crossing at the end of `chord`, between this cell and that of generator j; the same numbers for
-   both cells, but for the sign. */
+   both cells, except for the sign. */
 inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
 {
     const int edge = c->edges[chord], o = min(cell->i, j), q = max(cell->i, j);

@@ -5,8 +5,8 @@
    stretch counts as one straight side, from its first to its last point; area and quality follow.
 
    A run is a contiguous part of a ring that bounds one cell, chord by chord. Its first stretch begins at its start or,
-   for a ring around a whole cell, at the sharpest corner. A hole inside a cell is no side. The number of neighbors of a
-   hexagonal lattice at the boundary is 6 - the sum of 2 + turning / 60 degrees over the runs. */
+   for a ring around a whole cell, at the sharpest corner. A hole inside a cell is not a side. The number of neighbors
+   of a hexagonal lattice at the boundary is 6 - the sum of 2 + turning / 60 degrees over the runs. */
 typedef struct {
     REAL sides, missing;
     REAL perimeter, area; /* twice the area */

@@ -3,8 +3,8 @@
 
 /* The faces of a diagram in 3D as each cell has them by itself. Each cell is clipped once more, by its neighbors alone.
    Its vertices are the corners, numbered cell by cell. A face that two cells share has a half-face in each. Two corners
-   surely belong to one vertex where the same four generators or walls meet, and where an edge of no length joins them.
-   consistency.cl does the rest.
+   surely belong to one vertex where the same four generators or walls meet, and where an edge of zero length joins
+   them. consistency.cl does the rest.
 
    starts, neighbors           the graph
    half_face_starts (n + 1,)   rows of half-faces: the faces of the graph in its order, then walls that the cell touches
@@ -100,7 +100,7 @@ inline void list_loops(const cell_t *cell, int base, int half_face, int end, glo
 
 /* Per generator i: its corners (c, 3), relative to x_i, how sharp each is, the labels of their faces (c, 3),
    counter-clockwise, their owner, and its half-faces. same[u] is the least corner of the cell that lies where corner u
-   does, joined to it by edges of no length. */
+   does, joined to it by edges of zero length. */
 kernel void list_corners(const int size, global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                          global const int *starts, global const int *neighbors, global const int *corner_starts,
                          global const int *half_face_starts, global REAL *corners, global float *sharpness,

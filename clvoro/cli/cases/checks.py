@@ -76,7 +76,7 @@ def not_negative(value: object, place: str) -> float:
     """Check for a number that is zero or more."""
     checked = number(value, place)
     if checked < 0:
-        raise refuse(place, value, "a number not below 0")
+        raise refuse(place, value, "a number >= 0")
     return checked
 
 

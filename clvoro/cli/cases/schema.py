@@ -269,15 +269,15 @@ def _home(name: object, place: str) -> str:
 
 def case(value: object, place: str) -> dict[str, Any]:
     """Check a whole case."""
-    return _told_home(_CASE, value, place)
+    return _check_table(_CASE, value, place)
 
 
 def run(value: object, place: str) -> dict[str, Any]:
     """Check the settings of a run."""
-    return _told_home(_RUN, value, place)
+    return _check_table(_RUN, value, place)
 
 
-def _told_home(table: Table, value: object, place: str) -> dict[str, Any]:
+def _check_table(table: Table, value: object, place: str) -> dict[str, Any]:
     """Check `value`; errors about a key in the wrong table name the right one."""
     try:
         return table(value, place)

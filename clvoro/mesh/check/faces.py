@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 def check_corners(check: Check) -> None:
     """Check that a face has the same corners from both sides, which finds vertices that are stored twice.
 
-    Polygons need no such check: there the symmetry of the graph depends on the corners. Across a seam each side has
-    vertices of its own.
+    Polygons need no such check: there the symmetry of the graph depends on the corners. The two sides of a seam have
+    different vertices.
     """
     d = check.diagram
     if isinstance(d.domain, Polygon):

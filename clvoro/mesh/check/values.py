@@ -1,4 +1,4 @@
-"""Is what a result says of its cells so? Sizes, error, quality and history, computed anew (beside `check.py`)."""
+"""Check the values of a result: compute sizes, error, quality and history again, and compare."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def borders_on_lost_faces(d: Diagram, g: Rebuilt, cells: np.ndarray) -> np.ndarr
     pair = np.sort(face[order[np.stack([first, first + 1])]], axis=0)
     pair, parts = np.unique(pair, axis=1, return_counts=True)
     split = g.owner[pair[0, parts > 1]]
-    pair = np.where(d.neighbors[pair[0]] >= 0, pair, pair[::-1])  # walls have no faces of their own
+    pair = np.where(d.neighbors[pair[0]] >= 0, pair, pair[::-1])  # a wall has no second half-face
     pair = pair[:, d.neighbors[pair[0]] >= 0]
     across, along = d.neighbors[pair]
     shifts = d.shifts.astype(np.int64)

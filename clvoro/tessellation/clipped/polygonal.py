@@ -77,7 +77,7 @@ class PolygonTessellator:
             except CloseError:
                 if total == n:
                     raise
-                # Ghost generators far away may see generators as too close that are not: try without them.
+                # Round-off at distant ghost generators may make generators appear too close. Try without ghosts.
                 self._ghosts = self._ghosts[:0]
                 continue
             found = self._clip(points, convex, n)
@@ -90,10 +90,10 @@ class PolygonTessellator:
             convex = None
 
     def _clip(self, points: cla.Array, convex: Tessellation, n: int) -> Tessellation | np.ndarray:
-        """Return the diagram of `points` (n, 2): `convex` clipped by the boundary; or the ghost generators to remove.
+        """Clip `convex` by the boundary; return the diagram of `points` (n, 2), or the ghost generators to remove.
 
-        Where many cells share a vertex that lies on a vertex of the boundary, their faces there are round-off, and the
-        tracing may fail. A boundary shifted by a few units of round-off meets one or two of these cells only.
+        Where many cells share a vertex that lies on a vertex of the boundary, their faces there are as short as
+        round-off, and the tracing may fail. A boundary shifted by a few ulps crosses only one or two of these cells.
         """
         eps = float(np.finfo(self.engine.real).eps)
         lost = BoundaryError()

@@ -20,14 +20,14 @@ ROUNDS = 6
 
 @dataclass(frozen=True)
 class Trimmed:
-    """How the cells of a trimmed diagram came to be, on the device: what its vertices are numbered by.
+    """The data that `Trim.trim` made a diagram from, on the device. The numbering of its vertices uses them.
 
     Attributes
     ----------
     convex : Tessellation
     chords : Chords
     segments : tuple of arrays
-        What kernels take as SEGMENT_ARGS.
+        The arguments SEGMENT_ARGS of kernels.
     face_segments : (m,) int32
         Segment of each face of cells that the boundary passes through.
     segment_count : int
