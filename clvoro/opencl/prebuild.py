@@ -35,6 +35,8 @@ _RECORD = Path(__file__).with_name("first_kernels.json")
 _workers: list[subprocess.Popen[bytes]] = []
 _waiting: list[subprocess.Popen[bytes]] = []
 """Workers that have no work yet."""
+_known: set[tuple[str, int]] = set()
+"""Kinds of runs, and devices, of this process."""
 
 
 class Launch(NamedTuple):
@@ -67,12 +69,14 @@ def build_ahead(engine: Engine) -> int:
     int
         Number of recorded kernels of such a run; 0 if it is not the first, or nothing is recorded.
     """
-    kind = kind_of(engine)
+    kind, device = kind_of(engine), engine.queue.device
     recorded = _record().get(kind)
-    device = engine.queue.device
-    if recorded is None or not _is_new(kind, device):
+    if recorded is None or (kind, device.int_ptr) in _known:
         return 0
+    _known.add((kind, device.int_ptr))
     work = _work(engine, recorded)
+    if not _is_new(repr(work.programs), device):
+        return 0
     if not _waiting:
         _start(device)
     for index, worker in enumerate(_waiting):
@@ -118,7 +122,7 @@ def _is_new(what: str, device: cl.Device) -> bool:
         return False
     with contextlib.suppress(OSError, RuntimeError):
         folder = Path(os.environ.get("POCL_CACHE_DIR") or cache_home() / "pocl" / "kcache")
-        version = _RECORD.read_bytes(), device.version, device.driver_version, device.name, what
+        version = device.version, device.driver_version, device.name, what
         name = hashlib.sha256(repr(version).encode()).hexdigest()[:16]
         marker = folder / "clvoro" / name
         marker.parent.mkdir(parents=True, exist_ok=True)
