@@ -1,4 +1,4 @@
-"""A run goes on from a checkpoint to the same end, bit for bit; what is not its checkpoint is refused by name."""
+"""A run resumed from a checkpoint gives the same bits; other files are rejected with the reason."""
 
 import json
 import os
@@ -306,7 +306,7 @@ ALIKE = {
 
 
 def test_domains_of_the_same_extent_have_different_fingerprints(saved):
-    """By what files hold of them."""
+    """By their fingerprints."""
     told = {name: domain_fingerprint(domain) for name, domain in ALIKE.items()}
     assert len({json.dumps(t, sort_keys=True) for t in told.values()}) == len(ALIKE)
     assert domain_fingerprint(clvoro.Polygon(RECTANGLE)) == told["polygon"]

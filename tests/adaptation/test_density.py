@@ -37,7 +37,7 @@ def test_excess(engine):
 
 
 def test_gradient_of_an_exponential(engine):
-    """log h linear is fitted exactly, at walls and in corners too, wherever there are two neighbors to tell."""
+    """A linear log h is fitted exactly, also at walls and in corners, with at least two neighbors."""
     points = patch.random_points(N, 112)
     slope = np.array([-1.1, 2.3])
     h = 0.03 * np.exp(points @ slope)
@@ -97,7 +97,7 @@ def test_gradient_in_three_dimensions(ctx):
     ],
 )
 def test_gradient_without_enough_neighbors_is_zero(engine, points):
-    """One cell, two cells, collinear ones: none is taken, rather than one of any size."""
+    """One cell, two cells and collinear cells give the gradient 0."""
     points = np.array(points)
     w = Density(engine).lloyd_weights(
         patch.tessellate(engine, points), engine.upload(0.1 + 0.3 * points[:, 0])

@@ -1,4 +1,4 @@
-"""Warnings for units and places that do not fit together, and none for correct input."""
+"""Warnings for mismatched units and positions, and none for correct input."""
 
 import json
 import re
@@ -90,7 +90,7 @@ def test_warnings_of_fields(name):
 
 
 def test_far_shapes_are_detected_safely():
-    """Never farther than they are: of random shapes none is said to change nothing where it does."""
+    """The distance is a lower bound: random shapes with an effect cause no warning."""
     rng = np.random.default_rng(11)
     said = 0
     for _ in range(300):
@@ -237,7 +237,7 @@ def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
     [("adaptive", "fast"), pytest.param("exact", "default", marks=pytest.mark.slow)],
 )
 def test_warning_of_size_errors(ctx, method, effort):
-    """It ends (the count that "exact" wants to have exactly would swing for ever there), and says where it is worst."""
+    """The run ends, although the number of cells oscillates, and the warning has the worst cell."""
     square, adapter = clvoro.Box((0, 0), (1, 1)), clvoro.Adapter(ctx)
     with pytest.warns(SizeErrorWarning, match="mean .e. is .*sizing.Graded") as told:
         result = adapter.run(square, JUMP, method=method, effort=effort, seed=1)

@@ -1,4 +1,4 @@
-"""What a run is refused by, the figures of `clvoro.adaptation.estimates`, is what runs hold on the device."""
+"""The estimates of `clvoro.adaptation.estimates` match the memory that runs use on the device."""
 
 import importlib
 import json
@@ -174,7 +174,7 @@ GOING_ON = {
     [pytest.param(k, marks=() if k == "square" else pytest.mark.slow) for k in GOING_ON],
 )
 def test_estimate_of_resumed_runs(bench, name, tmp_path):
-    """From a checkpoint on the finest level: what was saved goes where the next step has it."""
+    """From a checkpoint on the finest level."""
     domain, size = GOING_ON[name]
     real = "float32" if "single" in name else "float64"
     file, given = tmp_path / "state", {"seed": 1, "effort": "fast"}
@@ -287,7 +287,7 @@ def test_few_cells_hold_what_is_told(bench, n, real):
 @needs_bench
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_estimate_with_jumps_at_periodic_boundaries(bench, real):
-    """The diagram that a run ends with is made anew, when nothing is left of the one before."""
+    """The final diagram is computed again, after the previous one has been freed."""
     box = clvoro.Box((0, 0), (1, 1), periodic=True)
     size = sizing.Expression("x < 0.5 ? 0.011 : 0.11")
     held, estimate = held_and_estimate(bench, box, size, real, effort="fast")
@@ -468,7 +468,7 @@ def test_what_is_told_before_a_run(ctx, tmp_path, monkeypatch, capsys):
 
 
 def test_a_run_tells_what_it_takes(ctx):
-    """Once, before its first row, and what `memory_needed` says."""
+    """It is called once, before the first row, with the value of `memory_needed`."""
     adapter, calls = clvoro.Adapter(ctx), []
     adapter.on_memory = calls.append
     adapter.run(SQUARE, 0.1, max_steps=2, callback=lambda row: calls.append(None))
@@ -521,7 +521,7 @@ def test_estimate_of_periodic_boxes(bench, monkeypatch, ctx, dim, n, field):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_what_does_not_fit_is_refused(ctx, dim, real):
-    """Of the run and what comes after it, the larger counts."""
+    """The larger one of the run and of reading the diagram."""
     engine = Engine(ctx, cl.CommandQueue(ctx), dim, np.dtype(real))
     room = available_memory(ctx.devices[0])
     size = engine.real.itemsize

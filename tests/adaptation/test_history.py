@@ -1,4 +1,4 @@
-"""The history of a run ends with the mesh that is handed back, whatever kind of run that is, and however it ended."""
+"""The last row of the history describes the returned mesh, for any kind of run and any end."""
 
 import contextlib
 import dataclasses

@@ -1,4 +1,4 @@
-"""Insertion and deletion: who is chosen, what becomes of it, and that nothing is lost, on small lattices."""
+"""Insertion and deletion on small lattices: choice of sites, changes, and conservation of the generators."""
 
 import itertools
 
@@ -200,7 +200,7 @@ def test_count_overrules_strain(engine):
 
 
 def test_two_pairs_of_opposite_strain_both_climb(engine):
-    """The left half is stretched along x, the right half compressed; the count stays."""
+    """The left half is stretched along x, the right half compressed; the number of generators does not change."""
     a = 0.03
     points = patch.hexagons(a, Box((0, 0), (1.6, 1.35))) - 0.3
     shift = np.zeros_like(points)
@@ -276,7 +276,7 @@ def test_few_cells(engine, n, total, climb):
 
 
 def test_alike_cells_are_told_apart(engine):
-    """Cells of a lattice have the same excess, far beyond all scores: still as many are split as asked."""
+    """All cells of a lattice have the same large log ratio: the required number is still split."""
     xy = np.stack(np.meshgrid(np.arange(16), np.arange(12), indexing="ij"), -1).reshape(-1, 2)
     sweep = Sweep(engine, (xy + 0.5) / 16, 1e-3, 3.0, climb=False)
     assert sweep.new.inserted == 3

@@ -1,4 +1,4 @@
-"""What a newcomer may pass by mistake: each ends right, or in an error that says what to write instead."""
+"""Plausible input mistakes: each works, or gives an error with a remedy."""
 
 import copy
 import dataclasses
@@ -27,7 +27,7 @@ POINTS = np.random.default_rng(5).random((30, 2))
 
 
 class Foreign:
-    """An array of another library: it can be converted, or says why not."""
+    """An array of another library that can or cannot be converted."""
 
     def __init__(self, values, refuses=False):
         self.values, self.refuses = np.asarray(values), refuses
@@ -112,7 +112,7 @@ def test_bounds_in_errors_suit_the_domain(adapter, what, edges):
 
 
 def test_sizes_that_are_no_numbers(adapter):
-    """Of which the larger and the smaller one with a bound are none."""
+    """Bounds of fields are not comparisons."""
     for field, remedy in (
         (lambda p: np.nan * p[:, 0], "numpy.nan_to_num"),
         (sizing.Expression("sqrt(x - 1)"), "fmax(x, 0)"),
@@ -438,7 +438,7 @@ def test_closest_generators_are_reported(ctx):
 
 
 def test_slab_too_thin_for_the_precision(ctx):
-    """Its generators are far from each other, seen from outside: an old message said that they were too close."""
+    """Its generators are far apart in the physical domain, so the message must not call them too close."""
     slab = clvoro.Box((0, 0, 0), (1e-6, 1, 1))
     points = np.random.default_rng(1).random((200, 3)) * slab.extent
     with pytest.raises(

@@ -69,7 +69,7 @@ def test_adapt_has_the_defaults_of_a_run():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_options_are_used_or_warned_of(adapter, method):
-    """Warnings are right: an option changes the result, its history, or neither."""
+    """An option changes the result, its history, or causes a warning."""
 
     def made(**options):
         # From start to end: some options are for the last steps, and a tolerance is looked at after twenty.

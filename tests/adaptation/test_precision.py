@@ -1,4 +1,4 @@
-"""What a precision cannot resolve is said before a run begins; what it can is met as well as in double diagnostics."""
+"""Sizes below the resolution of a precision cause an error or warning; others are met as in double precision."""
 
 import warnings
 
@@ -60,7 +60,7 @@ def test_warnings_and_errors_at_the_bounds(ctx, real):
     ("box", "h"), [(clvoro.Box((0, 0), (1, 1)), 0.05), (clvoro.Box((0,) * 3, (1,) * 3), 0.15)]
 )
 def test_what_rounding_adds(ctx, box, h, noise):
-    """Generators off by up to half a spacing: `ROUND_OFF_ERROR` holds for uniform meshes, to a third."""
+    """Changes of up to half a spacing cost `ROUND_OFF_ERROR` on uniform meshes, to a third."""
     adapter = clvoro.Adapter(ctx)
     result = adapter.run(box, h, effort="fast", seed=1)
     by = np.random.default_rng(3).uniform(-noise, noise, result.points.shape) * h

@@ -175,7 +175,7 @@ def test_longest(ctx):
 
 
 def test_a_regular_mesh_stays(ctx):
-    """Squares are at rest, though four meet in each corner; at walls that corner has a kink and no gradient."""
+    """Squares do not move, although four cells share each vertex; at walls the energy has a kink there."""
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     u = descend(patch.make_engine(ctx), (xy + 0.5) / 8, np.full(48, 0.125), 5.0)
     inside = ((xy > 0) & (xy < [7, 5])).all(axis=1)

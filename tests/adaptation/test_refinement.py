@@ -46,7 +46,7 @@ def children_in(shape, tangents, host, h, labels, fixed):
     """
 
     def leaves(x, y):
-        """When the way from x to y leaves the domain; 1 if it does not."""
+        """Parameter at which the segment from x to y leaves the domain; 1 if it does not."""
         inside = shapely.LineString([x, y]).intersection(shape)
         if inside.geom_type == "MultiLineString":
             inside = min(inside.geoms, key=shapely.Point(x).distance)
@@ -148,7 +148,7 @@ def test_a_lattice_is_carried_over(ctx):
 
 
 def test_squares_get_no_point_twice(ctx):
-    """Four cells meet in a point: neither diagonal has a face, so no middle is made for it."""
+    """Four cells share a vertex: diagonals without a face bring no new generator."""
     xy = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     points = (xy + 0.5) / 8
     _, finer = refine(patch.make_engine(ctx), points, np.full(48, 1 / 16))
@@ -177,7 +177,7 @@ def test_new_generators_keep_a_distance_at_walls(ctx, real, share):
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("count", [4, 15, 40])
 def test_no_child_beyond_a_cell(ctx, real, count):
-    """Cells much flatter than h, stacked in a thin strip: what comes from a wall stays in the cell there."""
+    """Cells much flatter than h in a thin strip: new generators at walls stay in their cells."""
     box = patch.Box((0, 0), (0.125, 1))
     engine = patch.make_engine(ctx, real, box=box)
     step = 0.125 / (count + 1)

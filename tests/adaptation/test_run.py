@@ -78,7 +78,7 @@ def test_warm_start(adapter, method):
 
 
 def test_origin_names_the_callers_generators(adapter):
-    """Those that stay come first, in their order and near their places; inserted ones are -1."""
+    """Kept generators come first, in their order and near their positions; inserted ones have -1."""
     first = adapter.run(BOX, F1, seed=31, effort="fast")
     result = adapter.run(BOX, F1, first.points, effort="fast", n_cells=len(first.points) + 9)
     origin = result.origin
@@ -136,7 +136,7 @@ def test_threads_take_turns(adapter):
     ],
 )
 def test_repeated_runs_give_the_same_bits(adapter, options):
-    """By the same adapter, whatever it did before, and by a new one."""
+    """By the same adapter after other work, and by a new one."""
     first = adapter.run(BOX, F1, seed=2718, **options)
     for other in (adapter, clvoro.Adapter()):
         again = other.run(BOX, F1, seed=2718, **options)
@@ -260,7 +260,7 @@ LEVELS = {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
     ],
 )
 def test_callback(adapter, options, rows):
-    """It sees the rows of the history as they come, and stops the run, also in its last step or on a coarse level."""
+    """The callback gets all rows of the history and stops the run, also in the last step or on a coarse level."""
     seen = []
 
     def callback(row):
@@ -495,7 +495,7 @@ def test_figures_of_adaptive_runs(
 
 
 def test_final_displacements_are_those_of_the_last_step(adapter):
-    """And of the step that would come next, where the run was stopped before."""
+    """Those of the next step, if the run was stopped."""
     whole = adapter.run(BOX, F1, seed=9, effort="fast")
     steps = whole.history["step"][-1]
     stopped = adapter.run(
@@ -663,7 +663,7 @@ def test_bad_context(given):
 
 
 def test_sizes_in_another_unit(adapter):
-    """Meters for kilometers make one cell, with a warning at the caller's line; what fits has none."""
+    """Meters instead of kilometers give one cell and a warning at the caller's line."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", CoarseSizeWarning)
         adapter.run(BOX, 2.7, effort="fast")  # 0.51 cells

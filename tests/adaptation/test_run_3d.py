@@ -153,7 +153,7 @@ def test_warm_start(adapter, method):
 
 
 def test_origin_names_the_callers_generators(adapter):
-    """Those that stay come first, in their order and near their places; inserted ones are -1."""
+    """Kept generators come first, in their order and near their positions; inserted ones have -1."""
     first = adapter.run(BOX, SMALL, seed=31, effort="fast")
     result = adapter.run(BOX, SMALL, first.points, effort="fast", n_cells=len(first.points) + 9)
     origin = result.origin
@@ -183,7 +183,7 @@ def test_origin_names_the_callers_generators(adapter):
     ],
 )
 def test_repeated_runs_give_the_same_bits(adapter, adapter32, dtype, options):
-    """By the same adapter, whatever it did before, and by a new one."""
+    """By the same adapter after other work, and by a new one."""
     used = adapter if dtype == "float64" else adapter32
     first = used.run(BOX, SMALL, seed=2718, **options)
     for other in (used, clvoro.Adapter(dtype=dtype)):
@@ -219,7 +219,7 @@ def test_units_do_not_matter(adapter):
 )
 @pytest.mark.parametrize("how", ["returns True", "is interrupted", "max_steps"])
 def test_stopped(adapter, options, rows, how):
-    """On whatever level: the mesh has the target size."""
+    """On any level the mesh has the target size."""
     seen = []
 
     def callback(row):
@@ -285,7 +285,7 @@ def test_levels_from_the_callers_points(adapter):
 
 
 def test_refinement_gives_the_number_of_the_next_level(adapter):
-    """Few generators are left for the finest level to insert or delete."""
+    """Few generators are inserted or deleted on the finest level."""
     result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=1), seed=3)
     h = result.history
     first = int(np.argmax(h["level"] == 0))
@@ -411,7 +411,7 @@ def bcc(m):
 
 
 def test_a_lattice_keeps_its_quality(adapter):
-    """The truncated octahedron's quotient is .753; no random start comes near it."""
+    """The quotient of the truncated octahedron is 0.753, far above that of random starts."""
     start = bcc(5)
     size = float((1 / len(start)) ** (1 / 3))
     lattice = adapter.run(BOX, size, start)

@@ -179,7 +179,7 @@ def test_pairs_are_split_or_deleted(mesh):
 
 
 def test_nuclei_are_sites_in_a_strained_lattice(mesh):
-    """Of regular cells among regular cells, none at a wall; in turn an edge is halved and two are merged."""
+    """Sites are regular cells among regular cells, not at walls; edges are halved and cells merged in turn."""
     engine = mesh.engine
     kinds = np.where(mesh.rng.random((N, 2)) < 0.95, 0, mesh.rng.integers(-1, 3, (N, 2)))
     kinds[mesh.walled, 1] = 1
@@ -239,7 +239,7 @@ def test_cells_too_large_or_too_small_are_sites(mesh, sign):
 
 
 def test_bad_cells_are_inner_cells_above_the_bound(mesh):
-    """The bound itself is none; cells of four sides, or eight, are flaws of any quality, and come first."""
+    """The bound itself is excluded; cells of four or eight sides are sites for any quality, and come first."""
     flaw, keys = 0.25, mesh.engine.empty(N, np.uint64)
     quality = mesh.rng.choice([0.5, 0.74, 0.75, 0.76, 1.0], N)
     mesh.run("score_bad_cells", *mesh.graph, mesh.upload(quality, mesh.engine.real), flaw, keys)

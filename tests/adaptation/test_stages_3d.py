@@ -182,7 +182,7 @@ def excess_of(points):
 
 
 def test_projection_uses_the_derivative_of_the_volumes(double):
-    """With next to no penalty one step takes small excesses away: what is left is of second order."""
+    """With a tiny penalty one step removes small log ratios up to second order."""
     points = relaxed_points(60, 606)
     h, left = 0.1 * np.exp(points @ SLOPE), []
     base = excess_of(points)

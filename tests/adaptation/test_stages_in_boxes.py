@@ -111,7 +111,7 @@ def test_moves(engine, box, clip):
 
 
 def test_moves_longer_than_the_domain(engine, box):
-    """Sizes may be far above it; generators met in its corners once."""
+    """The thickness may be far below h; generators must not coincide in corners."""
     points = box.place(patch.random_points(N, 5608, box), engine.real)
     way = np.random.default_rng(5609).normal(0, 1e7, (N, box.dim))
     on_device, none = engine.upload(points), engine.upload(np.zeros_like(way))
@@ -135,7 +135,7 @@ def test_sizes_that_are_held(engine, box, t):
 
 @pytest.mark.parametrize("fixed", [0, 90])
 def test_children(engine, box, t, fixed):
-    """In the middles of ways across faces of some size, and before walls; none of those who are held."""
+    """New generators are at midpoints across large faces and at walls, but not at fixed generators."""
     rng = np.random.default_rng(5607)
     labels, h = rng.permutation(N), rng.uniform(0.02, 0.1, N)
     given = [engine.upload(labels, np.int32), fixed] if fixed else []

@@ -92,7 +92,7 @@ def test_gaps_outside_of_the_domain_are_ignored() -> None:
 def reference(
     domain: clvoro.Polygon, x: np.ndarray, across: float, slope: float, facing: float
 ) -> np.ndarray:
-    """The same size from the Delaunay triangles of a dense sample of the boundary, whose circles hold no sample."""
+    """The same size from the empty circumcircles of the Delaunay triangles of a dense sample of the boundary."""
     start, end = domain.oriented.vertices, domain.oriented.vertices[domain.oriented.next_vertex]
     t = (np.arange(120) + 0.5)[:, None, None] / 120
     apart = np.hypot(*(end - start).T).max() / 120
@@ -215,7 +215,7 @@ def test_bad_input(options: dict, says: str) -> None:
 
 
 def test_graded_fields_are_evaluated_inside_only() -> None:
-    """A jump becomes a ramp, and what the field says outside is never heard."""
+    """A jump becomes a ramp, and values of the field outside are not used."""
     domain = clvoro.Polygon(ragged(60), [ragged(20, 5, (0.05, 0.0), 0.2)])
 
     def jump(x: np.ndarray) -> np.ndarray:

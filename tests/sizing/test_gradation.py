@@ -100,7 +100,7 @@ def test_minima_of_tiles(make_engine, shape):
 @pytest.mark.parametrize("shape", [(61, 41), (17, 13, 15)])
 @pytest.mark.parametrize("seeds", [1, 5, 400])
 def test_result_is_close_to_the_smallest_cone(make_engine, shape, seeds):
-    """Against the definition. The scheme errs to the larger side, but where fronts meet."""
+    """Against the definition. The error of the scheme is towards larger values, except where fronts meet."""
     engine = make_engine(len(shape))
     rng = np.random.default_rng(seeds + 29)
     spacing = np.array([0.02, 0.03, 0.025])[: len(shape)]
@@ -208,7 +208,7 @@ def test_slopes_are_bounded(make_engine):
 
 
 def test_minima_between_nodes_are_included(make_engine):
-    """A point source that no node meets: the nodes around it know of it."""
+    """A point source between nodes lowers the nodes around it."""
     engine = make_engine(2)
     source = np.array([0.3071, 3.4567])
     field = sizing.Graded(

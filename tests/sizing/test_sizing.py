@@ -537,7 +537,7 @@ def test_invalid_sizes_are_reported_with_their_place(make_engine, case, gradient
 
 
 def test_sizes_beyond_the_domain_and_the_precision(make_engine):
-    """A size larger than the domain is no error; one that the precision cannot hold, or an error by it, is."""
+    """A size larger than the domain is valid; one outside the range of the precision is not."""
     engine = make_engine(2)
     domain = Box((0, 0), (2, 1))
     points = np.array([(0.5, 0.5), (0.0, 1.0)])

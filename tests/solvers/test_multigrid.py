@@ -1,4 +1,4 @@
-"""The multigrid preconditioner against dense NumPy, and how many iterations it leaves."""
+"""The multigrid preconditioner against dense NumPy, and the iterations that it takes."""
 
 import functools
 
@@ -170,7 +170,7 @@ def reference_cycle(multigrid, depth, b):
 
 @pytest.mark.parametrize("n", [30, 900])
 def test_cycle_in_place(make, n):
-    """On vectors in float32 themselves: the same to the last bit, whatever is in them before; r stays."""
+    """Work in place on float32 vectors gives the same bits for any previous content, and keeps r."""
     engine = make(real=np.float32)
     multigrid = Multigrid(engine)
     multigrid.set_up(*upload(engine, random_weights(n)))
@@ -288,7 +288,7 @@ def weighted_weights(name, n, mesh="random"):
 
 
 def refine(points, n, rng):
-    """About the midpoints of Delaunay edges, as a refinement puts them: cells next to ones twice as large."""
+    """Add points near midpoints of Delaunay edges, as refinement does: cells beside others twice as large."""
     while len(points) < n:
         triangles = Delaunay(points).simplices
         edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0)
@@ -426,7 +426,7 @@ def test_iterations_with_strongly_varying_weights(make, name, most, mesh, real):
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 @pytest.mark.parametrize("scale", [1e-25, 1e20])
 def test_weights_of_any_unit(make, real, scale):
-    """In float64 beyond what the cycle's float32 could hold."""
+    """Weights in float64 outside the range of the cycle's float32."""
     scale = scale if real is np.float32 else scale**4
     W = weighted_weights("jump", 3000)
     solution, _ = solve(make(real=real), W * scale, tolerance=1e-4)
@@ -587,7 +587,7 @@ def test_updated_cycle_is_positive_definite(make, amount):
 
 
 def test_coarse_levels_are_reused_while_they_converge(make):
-    """Cells that move a little: a few more iterations. If they move a lot it is made anew at the next solve."""
+    """Small motions cost a few iterations. After large ones the next solve builds a new multigrid."""
     engine, n = make(), 6000
     first, second = neighboring_weights(n, 0.05)
     scattered = neighboring_weights(n, 1.5)[1]

@@ -19,7 +19,7 @@ REALS = [np.float64, np.float32]
 
 @pytest.fixture(scope="module", params=[0, 3000], ids=["launches", "alone"])
 def make(request):
-    """Engines of the default device, by dimension and precision; one group solves alone, or none does."""
+    """Engines of the default device by dimension and precision; one work-group solves, or all."""
     ctx = create_context()
     queue = cl.CommandQueue(ctx)
     with pytest.MonkeyPatch.context() as patched:
@@ -110,7 +110,7 @@ def test_matrix(make, dim, real, weighted):
 @pytest.mark.parametrize("start", ["zero", "near"])
 @pytest.mark.parametrize("preconditioner", ["jacobi", "multigrid"])
 def test_large_tolerances_use_single_precision(make, preconditioner, start):
-    """The operator is rounded and what the recurrence says is true, at many cells, too."""
+    """The operator is rounded, and the residual of the recurrence is correct, also for many cells."""
     engine, n = make(), 20000
     graph = graphs.random_graph(n, seed=916)
     poisson, laplacian = assembled(engine, graph, density_of(graph[0]), tolerance=1e-3)
@@ -259,7 +259,7 @@ def test_mean_of_the_source_is_subtracted(make):
 
 @pytest.mark.parametrize("b", [np.zeros(50), np.full(50, 0.1)])
 def test_zero_right_side(make, b):
-    """Zero, and zero once its mean is gone: the start is forgotten."""
+    """Right sides of zero, also after their mean is subtracted, give zero for any start."""
     engine = make()
     poisson, laplacian = assembled(engine, graphs.random_graph(50, seed=4))
     phi = engine.upload(np.arange(50.0))
@@ -317,7 +317,7 @@ def test_warm_start(make):
 
 
 def test_start_far_from_the_solution(make):
-    """A start may be worse than none: its residual is a thousand times the right side."""
+    """The residual of the start is a thousand times the right side."""
     engine, graph = make(), graphs.random_graph(900, seed=61)
     poisson, laplacian = assembled(engine, graph)
     rng, A = np.random.default_rng(62), as_matrix(laplacian)
@@ -501,7 +501,7 @@ def test_bad_input(make):
 
 
 def test_from_zero_and_unverified(make):
-    """The start's content does not matter; a rough solve tells the recurrence's residual, which is the true one."""
+    """The content of the start does not matter; the residual of the recurrence equals the true one."""
     engine = make()
     graph = graphs.random_graph(900, seed=363)
     poisson, laplacian = assembled(engine, graph)

@@ -1,4 +1,4 @@
-"""The projection by dense algebra on the faces of diagrams: in the plane and in space, across seams, cells held."""
+"""The projection against dense algebra in 2D and 3D, in periodic boxes, and with fixed generators."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ EPS, QUALITY_SCALE, LOG_RATIO_SCALE = 0.2, 0.3, 0.4
 
 
 class Given:
-    """A diagram, and what is asked of its generators: random numbers, so that nothing cancels by chance."""
+    """A diagram with random targets, so that nothing cancels."""
 
     def __init__(self, engine, box, share):
         self.box, self.n = box, 250 if box.dim == 3 and any(box.periodic) else 70
@@ -29,7 +29,7 @@ class Given:
         self.displacement[self.held] = 0
 
     def project(self, tolerance, max_iterations):
-        """Return the solution, its correction, what it leaves as the next start, and the iteration's arrays."""
+        """Return the solution, the correction, the next start, and the arrays of the iteration."""
         u, start = self.engine.empty((self.n, self.box.dim)), self.engine.empty(self.n, np.float32)
         names = ("h", "gradient", "log_ratio", "quality", "displacement")
         *targets, displacement = (self.engine.upload(getattr(self, name)) for name in names)

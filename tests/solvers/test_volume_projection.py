@@ -42,7 +42,7 @@ def log_ratios(points, h=None):
 
 
 class Assembled:
-    """The operators of a projection in NumPy, from the arrays that its assembly leaves."""
+    """The operators of a projection in NumPy, from the assembled arrays."""
 
     def __init__(self, engine, points, h, gradient, r=None, displacement=None, **options):
         n = len(points)
@@ -96,7 +96,7 @@ def assembled(engine, points):
 
 @pytest.fixture(scope="module")
 def differences(points):
-    """dr/dx by central differences of diagrams made anew, (n, n, 2)."""
+    """dr/dx by central differences of new diagrams, (n, n, 2)."""
     step, J = 1e-6, np.zeros((N, N, 2))
     for j in range(N):
         for a in range(2):
@@ -115,7 +115,7 @@ def test_derivative(assembled, differences):
 
 
 def test_transpose(assembled):
-    """What a cell knows of its neighbors' volumes is what they know of it, to single precision."""
+    """B^T by rows equals the transpose of B, to single precision."""
     B = assembled.B
     assert pytest.approx(B.transpose(1, 0, 2), abs=1e-6 * np.abs(B).max()) == assembled.C
 
@@ -182,7 +182,7 @@ def test_projection(engine, points, log_ratio_scale):
 @pytest.mark.sparse
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-2, 1e-3, 1e-5])
 def test_tolerance(engine, points, tolerance):
-    """The residual, by dense algebra, is what the recurrence says; vectors in single precision down to 1e-4."""
+    """The residual by dense algebra equals that of the recurrence; vectors are in single precision down to 1e-4."""
     r, h, gradient = log_ratios(points), sizes(points), np.tile(SLOPE, (N, 1))
     made = Assembled(engine, points, h, gradient, r, eps=0.05)
     u, solution = project(
@@ -205,7 +205,7 @@ def test_max_iterations(engine, points):
 
 
 def test_unwritten_rows_of_the_record_cause_no_warning(ctx, points, monkeypatch):
-    """The host reads more rows of the record than there are: fresh memory may hold NaNs that signal, as this does."""
+    """The host may read unwritten rows of the record, and new memory can contain signaling NaNs."""
     engine, plain = patch.make_engine(ctx, "float32"), Engine.empty
 
     def full_of_nan(self, shape, dtype=None):
@@ -241,7 +241,7 @@ def test_result_does_not_depend_on_the_lookahead(engine, points):
 
 @pytest.mark.parametrize("of", ["solution", "scaled", "turned", "other", "zero"])
 def test_start(engine, points, of):
-    """From any start the solution is the same, and what it leaves is the next start; a good one saves iterations."""
+    """The solution does not depend on the start, and becomes the next start; a good start saves iterations."""
     given = (points, sizes(points), np.tile(SLOPE, (N, 1)), log_ratios(points), np.zeros((N, 2)))
     made = Assembled(engine, *given, eps=0.05)
     B = made.B.reshape(N, -1)

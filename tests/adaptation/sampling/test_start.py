@@ -215,7 +215,7 @@ def test_neighbors_differ_by_one_level(tree):
 
 
 def test_known_sizes_are_bounds(tree):
-    """The least and greatest known h of a box hold those of its landmarks, wherever these went."""
+    """The bounds of h of a box include those at its landmarks after any refinement."""
     box = tree.boxes.find(tree._landmarks)
     assert np.array_equal(box, tree._landmark_box)
     assert (tree._low[box] <= tree._landmark_sizes).all()
@@ -224,7 +224,7 @@ def test_known_sizes_are_bounds(tree):
 
 @pytest.mark.parametrize(("n", "seed"), [(1, 11), (7, 12), (588, 13), (22972, 14)])
 def test_each_box_gets_its_share(tree, n, seed):
-    """Every box of the tree holds its expectation rounded up or down."""
+    """Every box of the tree has its expected number of points, rounded up or down."""
     field, boxes = tree.field, tree.boxes
     domain = BOX if boxes.dim == 2 else CUBE
     points = sample_density(field, domain, n, seed)
@@ -249,7 +249,7 @@ def test_samples_follow_the_density_along_an_axis():
 
 
 def test_position_inside_a_box_follows_the_slope():
-    """One point per sampling: its box is the whole domain, and only the slope in it can tell."""
+    """With one point per sample its box is the whole domain, and the slope determines the distribution."""
     domain = Box((0, 0), (1, 1))
     field = sizing.Expression("exp(-x)")
     x = np.array([sample_density(field, domain, 1, seed)[0, 0] for seed in range(100, 250)])

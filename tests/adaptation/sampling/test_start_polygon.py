@@ -193,7 +193,7 @@ def test_sources_are_balanced_per_component(ctx, method: str) -> None:
 
 
 def test_coarse_levels_reach_every_piece(ctx) -> None:
-    """A run from coarse to fine begins with fewer cells than there are pieces, if nobody counts; none loses all."""
+    """Each piece of the domain has a cell on coarse levels, too, where there would be fewer cells than pieces."""
     corner = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
     pieces = [[corner + np.array([2 * i, 3 * (i % 2)])] for i in range(9)]
     domain = clvoro.Polygon.from_pieces(pieces)
