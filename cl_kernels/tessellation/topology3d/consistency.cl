@@ -215,47 +215,6 @@ inline REAL tolerance_at(REAL distance, int doublings)
     return ldexp(4 * noise_length(distance), doublings);
 }
 
-/* Per half-face that agrees, the lesser of two: it counts as one that differs if it is no wider than the tolerance. */
-kernel void mark_slits(const int size, VERTEX_ARGS, global const int *loop_starts, global const int *loops,
-                       global const int *twins, global const int *reduced, global const int *reduced_counts,
-                       const int doublings, global uchar *differs, global int *any)
-{
-    WORK_ITEM(h);
-    const int n = reduced_counts[h];
-    if (n == 0 || twins[h] < h)
-        return;
-    global const int *loop = reduced + loop_starts[h];
-    const vertices_t in = VERTICES_FROM(owners[loops[loop_starts[h]]]);
-    /* Its two ends: what is farthest from any vertex, and what is farthest from that. */
-    REAL4 ends[2];
-    ends[1] = vertex_position(loop[0], &in);
-    REAL reach2 = 0;
-    for (int e = 0; e < 2; ++e) {
-        REAL most = -1;
-        const REAL4 from = ends[1 - e];
-        for (int s = 0; s < n; ++s) {
-            const REAL4 p = vertex_position(loop[s], &in);
-            reach2 = fmax(reach2, inner_product(p, p));
-            if (inner_product(p - from, p - from) > most) {
-                most = inner_product(p - from, p - from);
-                ends[e] = p;
-            }
-        }
-    }
-    const REAL4 way = ends[1] - ends[0];
-    const REAL tolerance = tolerance_at(sqrt(reach2), doublings), inverse = 1 / inner_product(way, way);
-    bool narrow = true;
-    for (int s = 0; s < n; ++s) {
-        const REAL4 d = vertex_position(loop[s], &in) - ends[0];
-        const REAL4 off = d - way * (inner_product(d, way) * inverse);
-        narrow &= inner_product(off, off) < tolerance * tolerance;
-    }
-    if (narrow) {
-        differs[h] = 1;
-        atomic_or(any, 1);
-    }
-}
-
 /* Per half-face that differs, the lesser of two: for each vertex of either the nearest one that it may be merged into.
    The first pass finds least squared distances, which begin as UINT_MAX; the second the first vertex at that distance,
    in targets[label], which begin as INT_MAX. */

@@ -17,6 +17,8 @@ from ..periodic.periodic_tessellator import ExtendedDiagram
 from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
 
+SMALL_FACE = 1e-3
+"""Share of the mean face: areas of smaller ones are compared with those of their vertices, where these were merged."""
 LEFT_OUT = 1e-5
 """Largest share of a cell behind faces below round-off that may be left out without a check of the diagram."""
 
@@ -227,7 +229,23 @@ class _DiagramReader:
         return np.where(j >= 0, self.ranks[np.maximum(j, 0)], j).astype(np.int32)
 
     def face_measures(self) -> np.ndarray:
-        return self._read(self.t.face_measures, self.slots, self.engine.dim - 1)
+        measures = self._read(self.t.face_measures, self.slots, self.engine.dim - 1)
+        if self.kept is not None and self.faces.merged:
+            # Of a small face the vertices may have been merged along a line.
+            small = measures < SMALL_FACE * measures.mean()
+            areas = self._loop_areas(small) if small.any() else 0
+            measures[small] = np.where(areas < measures[small] / 2, areas, measures[small])
+        return measures
+
+    def _loop_areas(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the areas of `chosen` faces (m,) bool in 3D by their vertices."""
+        lengths = np.diff(self.face_vertex_starts())
+        x = self.vertices()[self.face_vertices()[np.repeat(chosen, lengths)]]
+        lengths = lengths[chosen]
+        starts = np.cumsum(lengths) - lengths
+        x -= np.repeat(x[starts], lengths, axis=0)
+        triangles = np.append(np.cross(x[:-1], x[1:]), np.zeros((1, 3)), axis=0)
+        return np.linalg.norm(np.add.reduceat(triangles, starts), axis=1) / 2
 
     def face_centroids(self) -> np.ndarray:
         own = self._read(self.t.points, self.owners, 1) + self.origin

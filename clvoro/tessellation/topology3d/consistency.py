@@ -41,6 +41,8 @@ class SharedFaces:
         reversed in the row of the neighbor. Both are empty where the face is no wider than round-off: the other faces
         close both cells without it.
     vertices : (l,) int32
+    merged : bool
+        Whether vertices have been merged: some faces may then have no area.
     needs_check : bool
         Whether the tolerance was so large that the diagram has to be checked.
     """
@@ -48,7 +50,8 @@ class SharedFaces:
     positions: cla.Array
     starts: cla.Array
     vertices: cla.Array
-    needs_check: bool = False
+    merged: bool
+    needs_check: bool
 
 
 def share_faces(engine: Engine, box: ClipBox, t: Tessellation) -> SharedFaces:
@@ -77,6 +80,8 @@ class FaceSharing:
     reduced, counts : (3 c,), (h,) int32
         The loops of half-faces as vertices, without repetitions and spurs, and their lengths.
     differs : (h,) uint8
+    merged : bool
+        Whether any vertices have been merged.
     """
 
     def __init__(self, engine: Engine, box: ClipBox, t: Tessellation) -> None:
@@ -90,25 +95,19 @@ class FaceSharing:
         engine.run_each(self._kernels.find_twins, t.n, t.starts, f.starts, f.labels, self.twins)
         self.differs = engine.empty(self.h, np.uint8)
         self.reduced = engine.empty(len(f.loops), np.int32)
+        self.merged = False
         self.labels = f.same.copy()
         self.name_vertices(f.same.copy())
 
     def run(self) -> SharedFaces:
         """Return the faces once their half-faces are identical."""
-        doublings, merged = 0, False
-        while True:
-            differ = self.compare()
-            if not differ and not (merged and self.mark_slits(doublings)):
-                break
-            if self.merge(doublings):
-                merged = True
-            elif doublings < MOST_DOUBLINGS:
+        doublings = 0
+        while self.compare():
+            if not self.merge(doublings):
                 doublings += 1
-            elif differ:
+            if doublings > MOST_DOUBLINGS:
                 raise CloseError(self.t.points, self.t.n)
-            else:
-                break  # the slits that are left agree
-        return self._write(needs_check=doublings > SAFE_DOUBLINGS)
+        return self._write(doublings)
 
     def name_vertices(self, labels: cla.Array) -> None:
         """Find the labels and best corners of vertices, where `labels` (c,) holds lesser ones of some corners."""
@@ -146,15 +145,6 @@ class FaceSharing:
             self.t.points, f.corners, f.owners, f.corner_faces, self.labels, self.best_corners, *self._corners
         )  # fmt: skip
 
-    def mark_slits(self, doublings: int) -> bool:
-        """Let faces count as differing that are no wider than the tolerance; tell whether there are any."""
-        f, any_ = self.half_faces, self.engine.zeros(1, np.int32)
-        self.engine.run_each(
-            self._kernels.mark_slits, self.h, *self._vertices, f.loop_starts, f.loops, self.twins, self.reduced,
-            self.counts, np.int32(doublings), self.differs, any_,
-        )  # fmt: skip
-        return bool(any_[0].get())
-
     def merge(self, doublings: int) -> bool:
         """Merge vertices of half-faces that differ, within a tolerance; tell whether there were any to merge."""
         engine, f, k, c = self.engine, self.half_faces, self._kernels, self.c
@@ -173,10 +163,11 @@ class FaceSharing:
         engine.run_each(k.merge_vertices, c, self.labels, targets, rejected, labels, any_)
         if not int(any_[0].get()):
             return False
+        self.merged = True
         self.name_vertices(labels)
         return True
 
-    def _write(self, needs_check: bool) -> SharedFaces:
+    def _write(self, doublings: int) -> SharedFaces:
         engine, t, f, k, c = self.engine, self.t, self.half_faces, self._kernels, self.c
         n, m, scan = t.n, int(t.starts[t.n].get()), Scan(engine)
         starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
@@ -191,4 +182,4 @@ class FaceSharing:
             k.write_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, ids, starts, vertices
         )  # fmt: skip
         engine.run_each(k.write_positions, c, *self._vertices, ids, positions)
-        return SharedFaces(positions, starts, vertices, needs_check)
+        return SharedFaces(positions, starts, vertices, self.merged, doublings > SAFE_DOUBLINGS)

@@ -156,38 +156,6 @@ def test_the_first_of_the_sharpest_corners(engine, kernels):
         assert chosen[label] == expected
 
 
-def test_slits(engine, kernels):
-    """All vertices of a loop lie within the tolerance of a line."""
-    rng, level = np.random.default_rng(61205), 3
-    points = engine.upload(rng.random((1, 3)))
-    eps = float(np.finfo(float).eps)
-    loops, narrow = [], []
-    for wide in rng.choice([0.3, 3], 200):
-        n, way, any_way = int(rng.integers(4, 7)), *rng.standard_normal((2, 3))
-        way *= 0.3 / np.linalg.norm(way)
-        side = np.cross(way, any_way)
-        off = rng.uniform(-1, 1, n)
-        off[:2], off[2] = 0, 1  # its ends, and what is farthest from the line
-        # 16 roundings of a vertex's distance and of positions, as far as these are from the generator.
-        off *= wide * 2**level * 16 * eps * (0.3 + 1) / np.linalg.norm(side)
-        along = np.array([0, 1, *rng.random(n - 2)])
-        loops.append(np.outer(along, way) + np.outer(off, side))
-        narrow.append(wide < 1)
-    v, c = len(loops), sum(map(len, loops))
-    starts = np.cumsum([0] + [len(loop) for loop in loops])
-    own, each = engine.upload(np.arange(c), np.int32), engine.upload(np.arange(v), np.int32)
-    differs, any_ = engine.zeros(v, np.uint8), engine.zeros(1, np.int32)
-    corners, unused = engine.upload(np.concatenate(loops)), np.zeros(4, engine.real)
-    engine.run_each(
-        kernels.mark_slits, v, points, corners, engine.zeros(c, np.int32), own, own, own, unused, unused,
-        engine.upload(starts, np.int32), own, each, own, engine.upload(np.diff(starts), np.int32), np.int32(level),
-        differs, any_,
-    )  # fmt: skip
-    assert differs.get().tolist() == narrow
-    assert int(any_[0].get()) == 1
-    assert 20 < sum(narrow) < v - 20
-
-
 def ring(n):
     """Generators on a circle whose axis is parallel to no wall: all cells meet along it."""
     turn = 2 * np.pi * np.arange(n) / n
@@ -224,7 +192,7 @@ def test_vertices_are_merged_into_better_ones_on_their_planes(engine):
         assert sharp[chosen[after[u]]] >= sharp[best[before[u]]]
         assert off_planes(sharing, u, at[chosen[after[u]]]) < 64 * np.finfo(float).eps
     # The ends of the axis stay apart.
-    while sharing.compare() or sharing.mark_slits(0):
+    while sharing.compare():
         if not sharing.merge(0):
             break
     ends = {i for i, label in enumerate(f.corner_faces.get().tolist()) if min(label) < 0}

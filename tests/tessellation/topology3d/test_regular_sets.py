@@ -129,6 +129,13 @@ def test_regular_sets_in_a_periodic_box(adapter, name):
     check(adapter, TORUS, points)
 
 
+@pytest.mark.parametrize("units", [50, 200, 800])
+def test_lattices_that_are_off_by_units_of_round_off(adapter, units):
+    """Faces along all edges, as narrow as round-off: one that is merged must not merge all others."""
+    noise = np.random.default_rng(1).standard_normal((729, 3))
+    check(adapter, CUBE, cubic(9) + units * np.finfo(adapter.dtype).eps * noise)
+
+
 def near_each_other(gap, seed=0):
     """Generators of which some are `gap` apart, by the kind of the set."""
     rng = np.random.default_rng(seed)
