@@ -1,4 +1,4 @@
-"""Rows of faces while a diagram in the plane is made (`tessellation/face_rows.h`)."""
+"""Rows of faces of a 2D diagram under construction (`tessellation/face_rows.h`)."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from dataclasses import dataclass
 import pyopencl.array as cla
 
 SLOT = 20
-"""Faces that there is room for in a slot; rows of more take several."""
+"""Faces per slot. A longer row takes several slots."""
 SPARE_SHARE, SPARE_LEAST = 32, 64
-"""Of how many cells one such slot is to spare at first, and how many are in any case."""
+"""One spare slot per so many cells, and the least number of spare slots, at first."""
 CROWDED = 1 << 16
-"""Among the flags, but on the host alone: there were too few slots to spare."""
+"""A flag of the host: there were too few spare slots."""
 
 
 @dataclass
 class FaceRows:
-    """Lists of faces while a diagram is made, on the device and of the workspace; see `tessellation/face_rows.h`.
+    """Rows of faces of a diagram under construction, in scratch memory of the device; see `tessellation/face_rows.h`.
 
     Attributes
     ----------
     slots : (s * SLOT,) int32
     counts : (s,) int32
-        Faces from each slot on; negative where rounding leaves a doubt.
+        Number of faces of the row that begins in each slot; negative if the cell is doubtful due to round-off.
     keep : (s,) uint32
-        Bits of the faces that both cells see.
+        Bits of the faces that both cells have.
     places : (n,) int32
-        First slot of each row, or -1 if it is as before.
+        First slot of each row; -1 for a row of the previous graph.
     starts : (n + 1,) int32
-        Starts of the rows in the new graph.
+        Beginning of each row in the new graph.
     flags : (6,) int32
-        What went wrong, whether any cell is doubtful, the faces of all rows, the next spare slot, the number of slots,
-        and whether faces of zero length stay.
+        Error bits, whether any cell is doubtful, number of faces, next spare slot, number of slots, and whether faces
+        below round-off are kept.
     """
 
     slots: cla.Array
@@ -43,5 +43,5 @@ class FaceRows:
 
 
 def spare_slots(n: int) -> int:
-    """Return how many slots there are at first for the rows of `n` cells that are longer than one."""
+    """Return the initial number of spare slots, for the long rows of `n` cells."""
     return n // SPARE_SHARE + SPARE_LEAST

@@ -1,4 +1,4 @@
-"""Voronoi vertices, each once, for output (`vertices.cl`)."""
+"""Numbering of the shared Voronoi vertices in 2D (`vertices.cl`)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,15 @@ from .device_diagram import Tessellation
 
 @dataclass(frozen=True)
 class Vertices:
-    """Shared vertices on the device: `positions` (v, d) real, `cell_vertices` (m,) int32 parallel to the graph's faces.
+    """Shared vertices, on the device.
 
-    Face k of a cell runs from its vertex k to its vertex k + 1, counter-clockwise.
+    Attributes
+    ----------
+    count : int
+    positions : (count, 2) real
+        In normalized coordinates.
+    cell_vertices : (m,) int32
+        Vertex at the beginning of each face of the graph. Faces of a cell run counter-clockwise.
     """
 
     count: int
@@ -34,7 +40,7 @@ class VertexNumbering:
         self._kernels = engine.kernels("tessellation/vertices")
 
     def number(self, box: ClipBox, t: Tessellation) -> Vertices:
-        """Return the vertices of `t`, numbered in the order of their least corner."""
+        """Return the vertices of `t`, ordered by the least index of their corners."""
         engine, k = self.engine, self._kernels
         m = int(t.starts[t.n].get())
         owners, ids = engine.empty(m, np.int32), engine.empty(m + 1, np.int32)

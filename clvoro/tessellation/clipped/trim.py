@@ -1,4 +1,4 @@
-"""The diagram of a polygonal domain: the convex diagram of its generators, cut out by the boundary (`trim.cl`)."""
+"""The diagram of a polygonal domain: the convex diagram of its generators, trimmed by the boundary (`trim.cl`)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
 from .boundary_crossings import LOST, BoundaryError, Chords
 
-ORPHANS = 4  # of the bits in trim.cl
+ORPHANS = 4
+"""Flag of `trim.cl`: a cell has more than one piece."""
 ROUNDS = 6
-"""How many cells away the one may be that takes a piece without a generator."""
+"""Largest distance, in cells, between a piece without generator and the cell that takes it."""
 
 
 @dataclass(frozen=True)
 class Trimmed:
-    """The data that `Trim.trim` made a diagram from, on the device. The numbering of its vertices uses them.
+    """The convex diagram and the segments that a trimmed diagram was made from, on the device.
+
+    Vertices are numbered by these.
 
     Attributes
     ----------
     convex : Tessellation
     chords : Chords
     segments : tuple of arrays
-        The arguments SEGMENT_ARGS of kernels.
+        SEGMENT_ARGS of kernels (tessellation/clipped/segments.h).
     face_segments : (m,) int32
-        Segment of each face of cells that the boundary passes through.
+        Segment of each face, for cells that the boundary crosses.
     segment_count : int
     """
 
@@ -40,12 +43,33 @@ class Trimmed:
     segment_count: int
 
 
+@dataclass(frozen=True)
+class _Pieces:
+    """The pieces into which the boundary cuts convex cells, on the device.
+
+    Attributes
+    ----------
+    segments : tuple of arrays
+        SEGMENT_ARGS of kernels.
+    segment_count : int
+    loop_pieces : (p,) int32
+        Piece of each loop.
+    roots : (p,) int32
+        Generator that owns each piece.
+    """
+
+    segments: tuple[cla.Array, ...]
+    segment_count: int
+    loop_pieces: cla.Array
+    roots: cla.Array
+
+
 class Trim:
     """Trim convex diagrams by a boundary. Buffers are reused from call to call."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        # Counts change a little from step to step.
+        # Sizes change little from step to step.
         self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
         self._kernels = engine.kernels("tessellation/clipped/trim")
         self._flags = engine.empty(1, np.int32)
@@ -53,15 +77,15 @@ class Trim:
     def trim(
         self, domain: Polygon, points: cla.Array, convex: Tessellation, chords: Chords, n: int
     ) -> Tessellation:
-        """Return the diagram of `domain` by `points` (n, 2), the first generators of `convex`, from the `chords`.
+        """Return the diagram of `domain` for `points` (n, 2), the first `n` generators of `convex`.
 
-        A cell is the piece of its Voronoi region within the domain that holds the generator. Pieces that the boundary
-        cuts off from it go to the cell beside them with which they share the longest face.
+        A cell is the piece of its convex cell within the domain that contains the generator. Any other piece goes to
+        the neighboring cell with which it shares the longest face.
 
         Raises
         ------
         BoundaryError
-            If rounding leaves loops of faces open.
+            If loops of faces are not closed due to round-off.
         """
         engine, k, room = self.engine, self._kernels, self._room
         u, places = chords.touched_count, chords.count + chords.touched_count
@@ -92,46 +116,32 @@ class Trim:
         )  # fmt: skip
         self._demand(int(self._flags.get()[0]))
         marks = room.zeros("marks", size=n, dtype=np.int32)
-        orphans, orphan_count = self._adopt(
-            chords, segments, pieces, roots, marks, bool(flags & ORPHANS), places
+        found = _Pieces(segments, count, pieces, roots)
+        orphans, orphan_count = (
+            self._adopt(chords, found, marks) if flags & ORPHANS else (pieces, 0)
         )
-        return self._write(
-            points, convex, chords, segments, count, roots, orphans, orphan_count, marks, n
-        )
+        return self._write(points, convex, chords, found, (orphans, orphan_count), marks)
 
     @staticmethod
     def _demand(flags: int) -> int:
+        """Return the flags; raise BoundaryError if a walk or a loop was lost."""
         if flags & LOST:
             raise BoundaryError
         return flags
 
-    def _adopt(
-        self,
-        chords: Chords,
-        segments: tuple[cla.Array, ...],
-        pieces: cla.Array,
-        roots: cla.Array,
-        marks: cla.Array,
-        some: bool,
-        places: int,
-    ) -> tuple[cla.Array, int]:
-        """Find out which cell each piece goes to; return the places of those that change cells, and their number."""
+    def _adopt(self, chords: Chords, found: _Pieces, marks: cla.Array) -> tuple[cla.Array, int]:
+        """Find the owner of each piece without generator; return the pieces that change cells, and their number."""
         engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
+        pieces, roots = found.loop_pieces, found.roots
+        places = chords.count + u
         orphans = room("orphans", size=places + 1, dtype=np.int32)
-        if not some:
-            return orphans, 0
         other = room("other_roots", size=places, dtype=np.int32)
         ranks = room("orphan_ranks", size=places + 1, dtype=np.int32)
+        cells = *found.segments, chords.touched, chords.slots, chords.list_starts, pieces
         for _ in range(ROUNDS // 2):
             for before, after in ((roots, other), (other, roots)):
-                engine.run_each(
-                    k.adopt_pieces, u, *segments, chords.touched, chords.slots, chords.list_starts,
-                    pieces, before, after,
-                )  # fmt: skip
-        engine.run_each(
-            k.settle_pieces, u, *segments, chords.touched, chords.slots, chords.list_starts, pieces,
-            roots, ranks, marks,
-        )  # fmt: skip
+                engine.run_each(k.adopt_pieces, u, *cells, before, after)
+        engine.run_each(k.settle_pieces, u, *cells, roots, ranks, marks)
         self._scan.exclusive(ranks, ranks, places)
         engine.run_each(k.list_orphans, places, ranks, orphans)
         return orphans, int(ranks[places].get())
@@ -141,23 +151,20 @@ class Trim:
         points: cla.Array,
         convex: Tessellation,
         chords: Chords,
-        segments: tuple[cla.Array, ...],
-        segment_count: int,
-        roots: cla.Array,
-        orphans: cla.Array,
-        orphan_count: int,
+        found: _Pieces,
+        orphans: tuple[cla.Array, int],
         marks: cla.Array,
-        n: int,
     ) -> Tessellation:
-        """Write rows and measures of the diagram."""
+        """Write the rows and measures of the diagram."""
+        n, segments, roots = len(marks), found.segments, found.roots
         engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
         starts = room("starts", size=n + 1, dtype=np.int32)
         owners = chords.touched, chords.slots, roots
         engine.run_each(k.count_whole, n, convex.starts, chords.slots, starts)
         engine.run_each(k.count_trimmed, u, *segments, *owners, starts)
         self._scan.exclusive(starts, starts, n)
-        # Every face of the diagram is one of a convex cell or a segment.
-        m = 7 * n + 8 + segment_count
+        # Every face of the diagram is a face of a convex cell or a segment.
+        m = 7 * n + 8 + found.segment_count
         neighbors = room("neighbors", size=m, dtype=np.int32)
         measures, centroids = room("measures", size=m), room("centroids", size=2 * m)
         face_segments = room("face_segments", size=m, dtype=np.int32)
@@ -175,7 +182,7 @@ class Trim:
         )  # fmt: skip
         engine.run_each(
             k.write_trimmed, u, *segments, *chords.arrays, chord_owners, *chords.turns,
-            convex.points, *owners, orphans, np.int32(orphan_count), place_cells, starts, neighbors,
+            convex.points, *owners, orphans[0], np.int32(orphans[1]), place_cells, starts, neighbors,
             measures, centroids, face_segments, convex.volumes, convex.offsets, convex.covariances,
             outlines,
         )  # fmt: skip
@@ -190,5 +197,5 @@ class Trim:
             offsets=convex.offsets[:n],
             covariances=convex.covariances[:n],
             outlines=(outlines, chords.tangents),
-            trimmed=Trimmed(convex, chords, segments, face_segments, segment_count),
+            trimmed=Trimmed(convex, chords, segments, face_segments, found.segment_count),
         )
