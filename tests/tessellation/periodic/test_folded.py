@@ -1,4 +1,4 @@
-"""Repairs of folded diagrams: in lanes against one by one; what covers the torus twice."""
+"""Incremental updates of folded diagrams: vector lanes against single cells; cells that cover the box twice."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def make_stages(ctx, box, real="float64", one_by_one=False):
 
 
 class Carried:
-    """A folded diagram that is carried along, and how it comes out anew."""
+    """A folded diagram that is updated incrementally, and the same diagram made anew."""
 
     def __init__(self, stages, box, points):
         self.stages, self.box, self.n = stages, box, len(points)
@@ -37,7 +37,7 @@ class Carried:
         return self.stages.engine.upload(self.box.place(points, self.stages.engine.real))
 
     def move(self, points):
-        """Carry the diagram over to `points`; return it as NumPy arrays, None where it was not."""
+        """Update the diagram to `points`; return it as NumPy arrays, or None if it was made anew."""
         x = self.place(points)
         t = self.periodic._updated(x, self.n, self.t)
         self.t = self.periodic.tessellate(x, self.n) if t is None else t
@@ -53,7 +53,7 @@ def some_points(box, n, seed):
 
 
 def moved(points, box, by, rng):
-    """Every generator by up to `by` spacings; walls hold."""
+    """Move every generator by up to `by` spacings, within walls."""
     step = by * (box.measure / len(points)) ** 0.5 * (2 * rng.random(points.shape) - 1)
     held = ~np.array(box.periodic)
     return np.where(held, np.clip(points + step, box.lower, box.upper), points + step)
@@ -63,8 +63,8 @@ def moved(points, box, by, rng):
     "box",
     [pytest.param(UNIT, id="unit", marks=pytest.mark.slow), pytest.param(CHANNEL, id="channel")],
 )
-def test_lanes_have_the_bits_of_one_by_one(ctx, box, monkeypatch):
-    """Rows are checked, clipped and measured eight at a time on CPUs, images found by folding whole vectors."""
+def test_lanes_have_the_bits_of_single_cells(ctx, box, monkeypatch):
+    """On CPUs, vector lanes check, clip and measure eight rows at a time."""
     monkeypatch.setattr(repair, "FEW", 1)
     both = [make_stages(ctx, box, one_by_one=alone) for alone in (False, True)]
     if both[0].engine.group_size > 1:
@@ -87,12 +87,12 @@ def test_lanes_have_the_bits_of_one_by_one(ctx, box, monkeypatch):
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
-def test_cells_that_cover_the_torus_twice(ctx, real):
-    """Twice around in one step: all rows stay right, each of the other sheet's generators unknown to its own."""
+def test_cells_that_cover_the_box_twice(ctx, real):
+    """A motion twice around in one step leaves all rows consistent, in two sheets that do not know each other."""
     m, stages = 8, make_stages(ctx, UNIT, real)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(2 * m), np.arange(m)))
     points = np.column_stack([(i + j % 2 / 2) / (2 * m), j / m])
-    # The two sheets must not lie on each other.
+    # The two sheets must not coincide.
     apart = 0.25 / m * np.exp(2j * np.pi * points[:, 0])
     run = Carried(stages, UNIT, points + 0.001)
     twice = points * [2, 1] + np.column_stack([apart.imag, apart.real])

@@ -1,4 +1,4 @@
-"""Images beyond the seams, rows of them and rows folded back, one by one in NumPy."""
+"""Ghost images, unfolded rows and folded rows: comparison with loops in NumPy."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ BOXES = {
 }
 WHOLE = 4.0  # a margin as wide as a period holds all images
 STEP = 257 / 2**14
-"""Of positions and depths, where some are to be equal: no block begins at a multiple."""
+"""Unit of positions and depths, so that some are equal. No block begins at a multiple of it."""
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -32,12 +32,12 @@ def adapter(ctx, request):
 
 
 def bits(x):
-    """Return a float's bits, as a number."""
+    """Return the bits of a float as an integer."""
     return int(np.float32(x).view(np.int32))
 
 
 class Given:
-    """Generators of a box, some on walls and seams, with their images within random margins; or as deep as these."""
+    """Generators of a box, some on its boundary, with their images in a halo of random depths; some exactly as deep."""
 
     def __init__(self, adapter, name, n, stepped=False):
         box, rng = BOXES[name], np.random.default_rng(2301)
@@ -65,14 +65,14 @@ class Given:
         self.extend()
 
     def extend(self):
-        """Take the images, into buffers that the next call uses again."""
+        """Make the images, in buffers that the next call reuses."""
         self.images = self.ghost_images.extend(self.box, self.x, self.n, self.halo, 1.0, False)
 
     def steps(self, code):
         return [code // 3**a % 3 - 1 for a in range(self.dim)]
 
     def is_within(self, place, steps):
-        """Whether an image is within the margins of all seams that it lies beyond."""
+        """Return whether an image lies in the halo of all boundaries that it lies beyond."""
         for a, step in enumerate(steps):
             if step == 0:
                 continue
@@ -88,13 +88,13 @@ class Given:
         return True
 
     def wide_of(self, axis, end):
-        """Return the margins of the blocks of a seam."""
+        """Return the depths of the blocks of a boundary."""
         along = [self.counts[a] for a in range(self.dim) if a != axis]
         whole = self.wide[axis, end].reshape((BLOCKS[self.dim],) * len(along))
         return whole[tuple(slice(k) for k in along)]
 
     def expected(self):
-        """Return owners, codes and places of all images, in the order of owners and codes."""
+        """Return owners, codes and positions of all images, ordered by owner and code."""
         found = []
         for i, x in enumerate(self.points):
             for code in range(3**self.dim):
@@ -108,7 +108,7 @@ class Given:
 
 
 @pytest.mark.parametrize("name", BOXES)
-def test_images_are_those_within_the_margins(adapter, name):
+def test_images_are_those_in_the_halo(adapter, name):
     given = Given(adapter, name, 60, stepped=True)
     images, expected = given.images, given.expected()
     owners, codes = images.owners.get(), images.codes.get()
@@ -118,7 +118,7 @@ def test_images_are_those_within_the_margins(adapter, name):
     ]
     points = images.points.get()[: images.count]
     assert np.array_equal(points, np.concatenate([given.points, [p for *_, p in expected]]))
-    # Extremes are those of the blocks that there are.
+    # Extremes cover the blocks that exist.
     extremes = given.halo.extremes.get()
     used = [given.wide_of(a, end) for a in range(given.dim) for end in (0, 1)]
     walls = np.repeat(given.periods == 0, 2)
@@ -137,7 +137,7 @@ def test_images_are_those_within_the_margins(adapter, name):
 
 @pytest.mark.parametrize("name", BOXES)
 def test_unfolded_rows_name_the_nearest_images(adapter, name):
-    """Where images are not taken, nobody; each row by all images, whatever the code that it had."""
+    """A neighbor without an image becomes -1; the former code of an image does not matter."""
     given = Given(adapter, name, 60)
     t = PeriodicTessellator(given.stages, given.box).tessellate(given.x, 60, nearest=False)
     given.extend()
@@ -161,7 +161,7 @@ def test_unfolded_rows_name_the_nearest_images(adapter, name):
 
 
 class Folding:
-    """A diagram of generators and images, to be folded: the same in NumPy, with faces that one side has lost."""
+    """A diagram of generators and images with faces missing on one side, and its folding in NumPy."""
 
     def __init__(self, adapter, name, n):
         self.given = given = Given(adapter, name, n)
@@ -188,14 +188,14 @@ class Folding:
         }
 
     def face(self, k):
-        """Return the generator of face k, its neighbor's, and which image of it that is."""
+        """Return the generator of face k, its neighbor, and the code of the neighbor's image."""
         i, label = int(np.searchsorted(self.starts, k, side="right")) - 1, self.neighbors[k]
         if label < self.n:
             return i, label, 3**self.given.dim // 2
         return i, self.owners[label - self.n], self.codes[label - self.n]
 
     def other_side(self, k):
-        """Return where the neighbor's row names the generator of face k."""
+        """Return the index of face k in the neighbor's row."""
         i, j, code = self.face(k)
         seen = self.rows[i, 3**self.given.dim - 1 - code]
         row = self.neighbors[self.starts[j] : self.starts[j + 1]]
@@ -217,7 +217,7 @@ class Folding:
         return ghost_images.fold(self.images, self.binned, changed, self.given.x, share, nearest)
 
     def far(self, neighbors):
-        """Return who has a neighbor that is not the nearest image, in these rows."""
+        """Return the generators with a neighbor that is not the nearest image."""
         found = set()
         for k in np.flatnonzero(neighbors[: self.m] >= 0):
             i, *_ = self.face(k)
@@ -229,8 +229,8 @@ class Folding:
 
 
 @pytest.mark.parametrize("name", BOXES)
-def test_faces_that_one_side_has_lost(adapter, name):
-    """They are dropped if they are as small as rounding and cut no more than a share off either cell."""
+def test_faces_that_are_missing_on_one_side(adapter, name):
+    """Such faces are dropped if they are below round-off and cut at most a share off either cell."""
     folding, rng = Folding(adapter, name, 60), np.random.default_rng(2302)
     n, m, dim, eps = 60, folding.m, folding.given.dim, np.finfo(adapter.dtype).eps
     across = np.flatnonzero(folding.neighbors[:m] >= n)
@@ -277,7 +277,7 @@ def test_faces_that_one_side_has_lost(adapter, name):
 
 @pytest.mark.parametrize(("name", "n"), [("torus", 6), ("channel", 5), ("cube", 12), ("torus", 90)])
 def test_neighbors_that_are_not_the_nearest_images(adapter, name, n):
-    """Whole rows, of all of which both sides are there; the first generator with such a neighbor is named."""
+    """The rows are complete, and the first generator with such a neighbor is reported."""
     folding = Folding(adapter, name, n)
     given = folding.neighbors, folding.measures, folding.volumes, 0.5
     far = folding.far(folding.neighbors)

@@ -1,4 +1,4 @@
-"""Halo of periodic boxes: what cells tell of them against all balls around the vertices of all images."""
+"""The halo of periodic boxes: comparison with the balls around the vertices of all images."""
 
 import itertools
 
@@ -34,7 +34,7 @@ def adapter(ctx, request):
 
 
 def lattice(box, count, rng):
-    """Places of a body-centered lattice, each some way off: no four nearly in a plane, or on a circle."""
+    """Return a perturbed body-centered lattice: no four points nearly in a plane or on a circle."""
     cubes = np.indices((count,) * box.dim).reshape(box.dim, -1).T
     points = np.concatenate([cubes, cubes + 0.5]) / count
     points += 0.12 / count * rng.uniform(-1, 1, points.shape)
@@ -42,9 +42,9 @@ def lattice(box, count, rng):
 
 
 def balls(points, edges, periods):
-    """Centers and radii of balls with generators on them, of which one is in the box, and their shortest distance.
+    """Return centers and radii of empty balls through generators, one in the box, and the generators' least distance.
 
-    Where there are walls, all is mirrored in them: corners of cells on a wall are such centers, too.
+    Generators are mirrored at walls, so that vertices on a wall are centers as well.
     """
     steps = [(-1, 0, 1) if period > 0 else (0,) for period in periods]
     shifts = sorted(itertools.product(*steps), key=any)  # the generators themselves first
@@ -59,36 +59,36 @@ def balls(points, edges, periods):
     simplices = simplices[(simplices < len(points)).any(axis=1)]
     corners = places[simplices]
     spans = corners[:, 1:] - corners[:, :1]
-    # About a corner on a wall lie mirror images of the same generators; some triangles of these have no center.
+    # Around a vertex on a wall some simplices of mirror images are degenerate.
     whole = np.abs(np.linalg.det(spans)) > 1e-12
     corners, spans = corners[whole], spans[whole]
     centers = np.linalg.solve(spans, (spans**2).sum(axis=2)[..., None] / 2)[..., 0]
     middles, radii = corners[:, 0] + centers, np.linalg.norm(centers, axis=1)
-    # Generators are as far from a corner as their mirror images.
+    # A generator and its mirror image have the same distance from a vertex on the wall.
     seen = simplices[whole] % len(images)
     ways = [
         np.where(a == b, np.inf, np.linalg.norm(images[a] - images[b], axis=1))
         for a, b in itertools.combinations(seen.T, 2)
     ]
-    # Centers on a wall are there to rounding; behind it they are those of others, mirrored.
+    # Centers lie on a wall up to round-off. Those behind it are mirror images of others.
     inside = ((periods > 0) | (abs(middles - edges / 2) < edges / 2 + 1e-9)).all(axis=1)
     return middles[inside], radii[inside], np.min(ways, axis=0)[inside]
 
 
 def outside(x, lower, upper):
-    """How far x (k,) are from blocks, (k, blocks); the outermost ones go on for ever."""
+    """Return the distances (k, blocks) of x (k,) from blocks. The outermost blocks are unbounded."""
     below, above = lower - x[:, None], x[:, None] - upper
     below[:, 0] = above[:, -1] = 0
     return np.maximum(np.maximum(below, above), 0)
 
 
 def needs(points, edges, periods, counts, sideways, outwards, noise):
-    """What balls need of each block of each seam, {(axis, end): (blocks, ...)}; balls may move by shares of ways."""
+    """Return the required depth of each block, {(axis, end): (blocks, ...)}, with room for motion of the balls."""
     centers, radii, ways = balls(points, edges, periods)
     radii = radii * (1 + noise)
     found = {}
     for axis, end in itertools.product(np.flatnonzero(periods), (0, 1)):
-        to_seam = periods[axis] - centers[:, axis] if end else centers[:, axis]
+        to_boundary = periods[axis] - centers[:, axis] if end else centers[:, axis]
         aside2 = 0.0
         for a in (a for a in range(len(periods)) if a != axis):
             ends = np.arange(counts[a] + 1) * edges[a] / counts[a]
@@ -100,15 +100,15 @@ def needs(points, edges, periods, counts, sideways, outwards, noise):
             )
         shape = (-1,) + (1,) * (aside2.ndim - 1)
         radius, side = radii.reshape(shape), (sideways * ways).reshape(shape)
-        out = outwards * ways + np.clip(radii + to_seam, 0, sideways * ways)
+        out = outwards * ways + np.clip(radii + to_boundary, 0, sideways * ways)
         deep2 = radius**2 - np.maximum(np.sqrt(aside2) - side, 0) ** 2
-        depth = np.sqrt(np.maximum(deep2, 0)) + (out - to_seam).reshape(shape)
+        depth = np.sqrt(np.maximum(deep2, 0)) + (out - to_boundary).reshape(shape)
         found[axis, end] = np.where(deep2 > 0, depth, 0).max(axis=0).clip(0)
     return found
 
 
 def blocks_of(array, dim, counts):
-    """The same of an array of the device."""
+    """Return an array over blocks on the device in the form of `needs`."""
     whole = array.get().reshape(dim, 2, *(BLOCKS[dim],) * (dim - 1))
     found = {}
     for axis, end in itertools.product(range(dim), (0, 1)):
@@ -121,19 +121,19 @@ def blocks_of(array, dim, counts):
 @pytest.mark.parametrize("walks", [True, False])
 @pytest.mark.parametrize(("dim", "count"), [(2, 7), (3, 4)])
 @pytest.mark.parametrize("walled", [False, True], ids=["", "walls"])
-def test_margins_follow_the_balls_around_vertices(adapter, dim, count, walled, walks):
+def test_required_depths_are_those_of_the_balls_around_vertices(adapter, dim, count, walled, walks):
     box, rng = (WALLED if walled else BOXES)[dim], np.random.default_rng(2206)
-    check_margins(adapter, box, lattice(box, count, rng), walks)
+    check_depths(adapter, box, lattice(box, count, rng), walks)
 
 
 def test_balls_on_walls(adapter):
-    """Among generators at random some of them ask for more than all others."""
+    """Among random generators some balls on walls require more than all others."""
     box, rng = WALLED[2], np.random.default_rng(10)
-    check_margins(adapter, box, np.array(box.lower) + box.extent * rng.random((40, 2)), True)
+    check_depths(adapter, box, np.array(box.lower) + box.extent * rng.random((40, 2)), True)
 
 
-def check_margins(adapter, box, points, walks):
-    """Every block of every seam has what balls need of it, and not much more."""
+def check_depths(adapter, box, points, walks):
+    """Check that every block is as deep as the balls require, and little deeper."""
     n, dim, real, stages = len(points), box.dim, adapter.dtype, adapter._stages_for(box)
     if not walks:
         if dim == 2 or stages.cells._wrap is None:
@@ -141,7 +141,7 @@ def check_margins(adapter, box, points, walks):
         stages.cells._wrap = None
     x = stages.engine.upload(box.place(points, real))
     periodic = PeriodicTessellator(stages, box)
-    for _ in range(5):  # margins come near to what is needed
+    for _ in range(5):  # depths converge to those required
         periodic.tessellate(x, n)
     stages.release()
     periods, place = box.periods(real), x.get().astype(float)
@@ -150,22 +150,22 @@ def check_margins(adapter, box, points, walks):
     noise = NOISE[real.name]
     needed = blocks_of(periodic.halo.required, dim, counts)
     widths = blocks_of(periodic.halo.depths, dim, counts)
-    wished = needs(place, edges, periods, counts, SIDEWAYS, OUTWARDS, noise)
+    expected = needs(place, edges, periods, counts, SIDEWAYS, OUTWARDS, noise)
     least = needs(place, edges, periods, counts, 0, 0, 0)
-    spacing, told = (np.prod(edges) / n) ** (1 / dim), 0
-    for seam, wish in wished.items():
-        kept = KEPT[dim] * np.minimum(widths[seam], periods[seam[0]])
-        excess = needed[seam] - np.maximum(wish, kept)
-        told += (wish > kept).sum()
-        # Vertices round, and a wish is by 1e-5 of itself more than is needed.
-        assert np.abs(excess).max() < 3 * noise * max(spacing, wish.max())
-        assert (widths[seam] >= least[seam] * (1 - noise)).all()
-    assert told > 30
+    spacing, requests = (np.prod(edges) / n) ** (1 / dim), 0
+    for side_of_axis, request in expected.items():
+        kept = KEPT[dim] * np.minimum(widths[side_of_axis], periods[side_of_axis[0]])
+        excess = needed[side_of_axis] - np.maximum(request, kept)
+        requests += (request > kept).sum()
+        # Vertices have round-off, and a request exceeds the required depth by 1e-5 of it.
+        assert np.abs(excess).max() < 3 * noise * max(spacing, request.max())
+        assert (widths[side_of_axis] >= least[side_of_axis] * (1 - noise)).all()
+    assert requests > 30
 
 
 @pytest.mark.parametrize("short", [0.6, 0.9])
-def test_margins_that_are_too_narrow_are_found_out(adapter, short):
-    """Wherever one block of many is narrower than a ball needs it, and only there."""
+def test_too_shallow_blocks_are_detected(adapter, short):
+    """The halo is reported too shallow if one block of many is, and only then."""
     box, rng = BOXES[3], np.random.default_rng(2207)
     points, real = lattice(box, 4, rng), adapter.dtype
     n, stages = len(points), adapter._stages_for(box)
@@ -191,7 +191,7 @@ def test_margins_that_are_too_narrow_are_found_out(adapter, short):
 
 
 def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
-    """Whether a diagram within these margins is said to be right."""
+    """Return whether the halo is reported deep enough."""
     images = ghost_images.extend(box, x, n, halo, 1.0, False)
     binned = stages.bins.build(images.box, images.points, images.count)
     args = images.box, images.points, images.count, binned
@@ -203,8 +203,8 @@ def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
 
 
 @pytest.mark.parametrize(("dim", "count"), [(2, 60), (3, 100)])
-def test_numbers_of_generators_do_not_matter(adapter, dim, count):
-    """To margins: whichever of those beside seams is number 0, the one that is most easily forgotten."""
+def test_depths_do_not_depend_on_the_order_of_generators(adapter, dim, count):
+    """Number 0, which bounds are most easily wrong for, is each generator near the boundary in turn."""
     box, rng = BOXES[dim], np.random.default_rng(2209)
     points, real = np.array(box.lower) + box.extent * rng.random((count, dim)), adapter.dtype
     n, stages = count, adapter._stages_for(box)
@@ -212,8 +212,8 @@ def test_numbers_of_generators_do_not_matter(adapter, dim, count):
     counts, noise = block_counts(periods, n)[:dim], NOISE[real.name]
     place = box.place(points, real).astype(float)
     whole = np.zeros((dim, 2, *(BLOCKS[dim],) * (dim - 1)), np.float32)
-    for seam, need in needs(place, periods, periods, counts, 0, 0, 2 * noise).items():
-        whole[(*seam, *map(slice, need.shape))] = 1.0001 * need + noise / 10
+    for side_of_axis, need in needs(place, periods, periods, counts, 0, 0, 2 * noise).items():
+        whole[(*side_of_axis, *map(slice, need.shape))] = 1.0001 * need + noise / 10
     found, beside = [], np.minimum(place, periods - place).min(axis=1).argsort()
     for first in (n - 1, *beside[:24]):
         halo, order = Halo(stages.engine), np.arange(n)
@@ -224,12 +224,12 @@ def test_numbers_of_generators_do_not_matter(adapter, dim, count):
         assert is_enough(stages, stages.ghost_images, box, x, n, halo)
         found.append(halo.required.get())
     assert (found[0] > whole.ravel()).mean() > 0.3 * (found[0] > 0).mean()
-    # Vertices round.
+    # Vertices have round-off.
     assert np.abs(found - found[0]).max() < noise
 
 
-def test_nearly_a_period_is_all_of_it(adapter):
-    """Images lie within the period, however their places have rounded."""
+def test_nearly_a_period_counts_as_the_whole_period(adapter):
+    """A depth of the whole period includes every image whatever the round-off."""
     box, rng = BOXES[2], np.random.default_rng(2210)
     stages, n = adapter._stages_for(box), 50
     x = stages.engine.upload(box.place(box.extent * rng.random((n, 2)), adapter.dtype))
@@ -248,7 +248,7 @@ def test_nearly_a_period_is_all_of_it(adapter):
             assert found == pytest.approx(np.full(found.shape, wide), rel=1e-6)
 
 
-def test_blocks_are_twice_as_many_as_cells():
+def test_there_are_up_to_two_blocks_per_cell():
     assert (block_counts(np.array([1.0, 0.5]), 10) == BLOCKS[2]).all()
     for n in (1, 700, 5000, 40_000, 10**7):
         counts = block_counts(np.array([1.0, 0.3, 2.0]), n)[:3]
@@ -262,8 +262,8 @@ def test_blocks_are_twice_as_many_as_cells():
     ("dim", "before", "after"),
     [(2, 600, 900), (3, 600, 5000), (3, 5000, 600), (3, 5000, 40_000), (3, 40_000, 5000)],
 )
-def test_margins_of_other_blocks(adapter, dim, before, after):
-    """Where blocks or cells are others than before, margins are those of all that lie within their own depth."""
+def test_depths_after_a_change_of_blocks(adapter, dim, before, after):
+    """Each new block takes the largest depth among old blocks no farther away than their depth."""
     box, rng = BOXES[dim], np.random.default_rng(2208)
     stages = adapter._stages_for(box)
     halo, periods = Halo(stages.engine), box.periods(adapter.dtype)
@@ -284,7 +284,7 @@ def test_margins_of_other_blocks(adapter, dim, before, after):
     for axis, end in itertools.product(range(dim), (0, 1)):
         across = [a for a in range(dim) if a != axis]
         depths = factor * old[(axis, end, *(slice(was[a]) for a in across))]
-        # Of each new block from each old one: how far they are apart along either axis, squared and added.
+        # Squared distance of each new block from each old one.
         apart2 = np.zeros(())
         for a in across:
             one, other = (periods[a] / k[a] for k in (counts, was))
@@ -295,5 +295,5 @@ def test_margins_of_other_blocks(adapter, dim, before, after):
             apart2 = apart2.transpose(0, 2, 1, 3)
         nearby = np.where(apart2 < depths**2, depths, 0)
         expected = nearby.reshape(*found[axis, end].shape, -1).max(axis=-1)
-        # Rounding may decide whether a block is as near as its margin is deep: random depths are not that near.
+        # Random depths avoid ties between distance and depth, which round-off would decide.
         assert np.abs(found[axis, end] - expected).max() < 1e-6

@@ -1,4 +1,4 @@
-"""Periodic boxes: diagrams against Qhull on generators and images, lattices, seams, few generators; runs; files."""
+"""Periodic boxes: comparison of diagrams with Qhull, lattices, few generators; runs; files."""
 
 import itertools
 
@@ -21,7 +21,7 @@ CHANNEL = clvoro.Box((3, -2), (5.5, -0.5), periodic=(True, False))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
 SLAB = clvoro.Box((0, 0, 0), (2, 1, 1.3), periodic=(True, False, True))
 ROUNDING = {"float64": 1e-12, "float32": 2e-5}
-"""Of a volume over the mean volume: about 1e4 roundings, as corners are quotients of differences of squares."""
+"""Tolerance of a volume over the mean volume: about 1e4 eps, since corners are quotients of differences of squares."""
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -98,7 +98,7 @@ def test_against_qhull(adapter, box, n):
     assert np.abs(diagram.volumes - volumes).max() < tolerance * mean
     found = faces_of(diagram)
     size = mean ** (1 - 1 / box.dim)
-    # Faces of no size may be there or not: rounding decides.
+    # Round-off decides whether faces of no size exist.
     for key in found.keys() | faces.keys():
         assert abs(found.get(key, 0) - faces.get(key, 0)) < 10 * tolerance * size
     assert len(found) == len(diagram.neighbors)
@@ -110,7 +110,7 @@ def test_against_qhull(adapter, box, n):
 
 @pytest.mark.parametrize("box", [UNIT, CUBE], ids=["2D", "3D"])
 def test_euler(double, box):
-    # Three cells meet in a vertex of the plane, four in space; all vertices are there, once for each image in use.
+    # Three cells meet at a vertex in 2D, four in 3D. Each vertex exists once per image in use.
     n = 300
     d = double.diagram(box, some_points(box, n, 3))
     wrapped = np.rint(d.vertices * 10**9).astype(np.int64) % 10**9
@@ -123,7 +123,7 @@ def test_euler(double, box):
 
 @pytest.mark.parametrize("box", [UNIT, SLAB], ids=["unit", "slab"])
 def test_translation(adapter, box):
-    """Moved along the periods, by what no rounding changes: the same cells, but for sums in another order."""
+    """An exact translation along the periods gives the same cells, apart from the order of sums."""
     points = np.round(some_points(box, 200), 3)
     points = np.round((points - box.lower) * 1024) / 1024 + box.lower
     points = np.unique(points, axis=0)
@@ -182,7 +182,7 @@ def bcc(n):
     ],
 )
 def test_lattices(adapter, lattice, n, offset):
-    """All cells alike, generators on the seam or not, where four or more cells meet in a point."""
+    """Cells of lattices are equal, with generators on the boundary or not; four or more cells meet at a vertex."""
     points, edges, sides = lattice(n)
     box = clvoro.Box((0,) * len(edges), edges, periodic=True)
     d = adapter.diagram(box, points + offset * np.array(edges))
@@ -194,8 +194,8 @@ def test_lattices(adapter, lattice, n, offset):
     assert d.check()
 
 
-def test_clusters_need_wide_margins(adapter):
-    """A cell that reaches half a period on: images from farther away than a few spacings are needed."""
+def test_clusters_need_a_deep_halo(adapter):
+    """A cell as long as half a period needs images from many spacings away."""
     rng = np.random.default_rng(5)
     for at in ((0.5, 0.5), (0.0, 0.98)):
         points = np.concatenate([np.array(at) + 0.03 * rng.random((200, 2)), rng.random((2, 2))])
@@ -207,8 +207,8 @@ def test_clusters_need_wide_margins(adapter):
 
 @pytest.mark.sparse
 @pytest.mark.parametrize("box", [CHANNEL, SLAB], ids=["channel", "slab"])
-def test_images_are_all_that_cells_need(adapter, box):
-    """All that lie on the balls around the corners of cells, in which none lies; few where cells are small."""
+def test_images_include_all_that_cells_need(adapter, box):
+    """All generators on the balls around vertices have images, none lies inside; small cells need few."""
     from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     rng = np.random.default_rng(11)
@@ -238,7 +238,7 @@ def test_images_are_all_that_cells_need(adapter, box):
             if any(step)
         ]
     )
-    # Where balls are large their centers round, by a share of the radius over the distance of the generators.
+    # Centers of large balls have a round-off of radius / distance of the generators.
     noise = 1e-5 if adapter.dtype == np.float64 else 1e-3
     every = cKDTree(all_images)
     inside = every.query_ball_point(corners, radii * (1 - noise), return_length=True)
@@ -248,7 +248,7 @@ def test_images_are_all_that_cells_need(adapter, box):
     distance, _ = cKDTree(taken).query(all_images[needed])
     assert len(needed) > n / 30
     assert distance.max() < 1e-6
-    # One margin for all seams would take nearly all images: some cells are as long as half the box.
+    # With one depth everywhere nearly all images would be taken: some cells are as long as half the box.
     assert len(taken) - n < 0.7 * len(all_images)
 
 
@@ -260,7 +260,7 @@ def test_cells_lie_around_their_generators(double):
     assert (d.vertices < 0).any()
     assert (d.vertices > 1).any()
     assert ((d.points >= 0) & (d.points < 1)).all()
-    # Each face lies half-way to its neighbor's image.
+    # Each face lies halfway to the image of its neighbor.
     image = d.points[d.neighbors] + d.shifts * UNIT.extent
     away = d.face_centroids - (image + d.points[owner]) / 2
     assert np.abs(np.einsum("ij,ij->i", away, image - d.points[owner])).max() < 1e-14
@@ -306,7 +306,7 @@ def test_arguments(adapter):
 SPOT = sizing.Expression(
     "0.05 + 0.3 * fmax(hypot(x - 0.05 - floor(x + 0.45), y - 0.9 - floor(y - 0.4)) - 0.1, 0)"
 )
-"""A refined spot around (0.05, 0.9), beyond two seams."""
+"""A refined spot around (0.05, 0.9), across two periodic boundaries."""
 
 
 @pytest.mark.sparse
@@ -344,8 +344,8 @@ def test_the_same_bits_from_run_to_run(adapter):
         assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
-def test_repair_across_seams(adapter):
-    """Diagrams repaired from step to step are those that are made anew."""
+def test_incremental_update_across_periodic_boundaries(adapter):
+    """Diagrams updated from step to step equal those made anew."""
     from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     stages = adapter._stages_for(UNIT)
@@ -372,8 +372,8 @@ def rows_of(t):
     return t.neighbors.get()[: starts[-1]], starts[1:-1]
 
 
-def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
-    """The generators' rows are the same whether or not their images get cells, also in lattices a rounding off."""
+def test_rows_do_not_depend_on_cells_of_images(adapter):
+    """Rows of generators are the same whether or not images get cells, even in lattices off by one ulp."""
     from clvoro.tessellation.periodic.periodic_tessellator import PeriodicTessellator
 
     eps = np.finfo(adapter.dtype).eps
@@ -393,7 +393,7 @@ def test_cells_of_images_are_left_out_where_none_looks_at_them(adapter):
             assert np.abs(found[0] - found[1]).max() * n < 100 * n * eps
 
 
-def test_faces_that_one_side_does_not_see_are_dropped(adapter):
+def test_faces_of_one_side_only_are_dropped(adapter):
     from tests.robustness.oclgrind_work import drop_faces
 
     drop_faces(adapter)
@@ -401,8 +401,8 @@ def test_faces_that_one_side_does_not_see_are_dropped(adapter):
 
 @pytest.mark.sparse
 @pytest.mark.parametrize("box", [UNIT, CHANNEL], ids=["unit", "channel"])
-def test_face_that_one_side_does_not_see_ends_in_one_vertex(adapter, box, monkeypatch):
-    """Four cells meet in each corner but for rounding, and those beyond a seam are cut in another order."""
+def test_ends_of_a_dropped_face_become_one_vertex(adapter, box, monkeypatch):
+    """Four cells meet at each vertex up to round-off, and images are cut in another order."""
     eps, fold, dropped = float(np.finfo(adapter.dtype).eps), GhostImages.fold, []
 
     def folded(self, *arguments):
@@ -418,7 +418,7 @@ def test_face_that_one_side_does_not_see_ends_in_one_vertex(adapter, box, monkey
             x = np.array(box.lower) + (middles + 10 * eps * noise) * box.extent
             adapter.diagram(box, x).check().demand()
     assert sum(dropped) < len(dropped)
-    # Single ones of the channel's, if any.
+    # In the channel there may be none.
     assert box is CHANNEL or sum(dropped)
 
 
@@ -433,7 +433,7 @@ def test_coarse_levels_with_too_few_cells_are_left_out(double):
 
 
 def test_resume(double, tmp_path):
-    """On from a checkpoint to the same bits, repaired in 2D, from a margin that the run has come to in 3D."""
+    """A resumed run has the same bits: incremental updates in 2D, the depth of the halo in 3D."""
     for box, size in ((UNIT, SPOT), (CUBE, sizing.Constant(0.17))):
         steps = []
 
@@ -468,7 +468,7 @@ def test_runs_3d(double, box):
 
 @pytest.mark.parametrize(("lattice", "n"), [(hexagonal, 10), (bcc, 5)])
 def test_a_lattice_stays(double, lattice, n):
-    """All forces vanish by symmetry, at the seams as elsewhere: nobody moves but for rounding."""
+    """All forces vanish by symmetry: generators move by round-off only."""
     points, edges, _ = lattice(n)
     box = clvoro.Box((0,) * len(edges), edges, periodic=True)
     size = (box.measure / len(points)) ** (1 / box.dim)
@@ -480,8 +480,8 @@ def test_a_lattice_stays(double, lattice, n):
         assert np.abs(moved - np.rint(moved / box.extent) * box.extent).max() < 1e-12
 
 
-def test_refinement_across_seams(double):
-    """The middles of a hexagonal lattice's edges make the lattice of half the spacing."""
+def test_refinement_across_periodic_boundaries(double):
+    """The midpoints of edges of a hexagonal lattice form the lattice of half the spacing."""
     points, edges, _ = hexagonal(6)
     box = clvoro.Box((0, 0), edges, periodic=True)
     size = (box.measure / 144) ** 0.5
@@ -540,8 +540,8 @@ def test_operations_without_periodic_support_are_rejected(double):
         solid.transfer(solid.volumes, solid)
 
 
-def test_pictures_are_filled_up_to_the_seams(double):
-    """Images of cells cover the window; each place is in one polygon."""
+def test_pictures_are_filled_up_to_the_boundary(double):
+    """Images of cells cover the window; each position lies in one polygon."""
     from matplotlib.collections import PolyCollection
     from matplotlib.path import Path
 
@@ -596,10 +596,10 @@ def test_a_case_with_frames(tmp_path, monkeypatch, capsys):
 @pytest.mark.sparse
 @pytest.mark.parametrize("periodic", [(True, True), (True, False)])
 @pytest.mark.parametrize("order", [1, 2])
-def test_values_are_carried_over_the_seams(adapter, periodic, order):
-    """Conservatively and within bounds; a smooth periodic function to the given order."""
+def test_transfer_across_periodic_boundaries(adapter, periodic, order):
+    """The transfer is conservative and bounded, and has the given order for a smooth periodic function."""
     box = clvoro.Box((0.5, -1.0), (2.5, 0.0), periodic=periodic)
-    # Between float32 meshes volumes are rounded, and their sums with them.
+    # Volumes of float32 meshes have single precision, and so do their sums.
     tight = 1e-12 if adapter.dtype == np.float64 else 1e-5
     rng = np.random.default_rng(2211)
 
@@ -620,13 +620,13 @@ def test_values_are_carried_over_the_seams(adapter, periodic, order):
         assert got.max() <= values.max() + 1e-12
         return float(np.abs(got - field(new.centroids)) @ new.volumes / box.measure)
 
-    # Four times the cells: errors fall by 2 and by 4, limiting and random cells taking something of that.
+    # With four times the cells errors fall by 2 and by 4, less the effect of limiting and of random cells.
     assert mean_error(1200) < mean_error(300) / (1.6 if order == 1 else 2.4)
 
 
 @pytest.mark.parametrize("restored", [False, True])
-def test_each_attempt_begins_with_the_graph_from_before(adapter, monkeypatch, restored):
-    """Where margins are too narrow cells are made again, and what has been made must not have taken its place."""
+def test_each_attempt_begins_with_the_previous_graph(adapter, monkeypatch, restored):
+    """A second attempt, after a halo that is too shallow, must not start from the graph of the first."""
     from clvoro.adaptation.checkpoint import DIAGRAM
     from clvoro.tessellation.tessellator import Tessellator
 
@@ -670,7 +670,7 @@ def test_each_attempt_begins_with_the_graph_from_before(adapter, monkeypatch, re
 
 @pytest.mark.parametrize(("dim", "size"), [(2, "0.15"), (3, "0.3")])
 def test_boxes_of_other_lengths_share_their_kernels(double, dim, size):
-    """Those that work on folded rows in 2D have the periods built in; what is built for each takes a second or so."""
+    """Kernels on folded rows in 2D have the periods built in; building these takes a second or so."""
     size, periodic = sizing.Expression(size), (True, False, True)[:dim]
     built = []
     for length in (1.53, 1.71):
