@@ -236,7 +236,7 @@ def test_a_checkpoint_that_does_not_fit_costs_neither_the_run_nor_the_one_before
     monkeypatch.setattr(
         checkpoint.Checkpointer, "write", in_little_room(checkpoint.Checkpointer.write, 1000)
     )
-    with pytest.warns(CheckpointWarning, match="File too large.* The run goes on"):
+    with pytest.warns(CheckpointWarning, match="File too large.* The run continues"):
         result = adapter.run(BOX, 0.15, **{**options, "checkpoint": both})
     whole = adapter.run(BOX, 0.15, **FEW)
     assert np.array_equal(result.points, whole.points)
@@ -252,7 +252,7 @@ def test_checkpoints_replace_nothing_else(adapter, tmp_path, content):
     else:
         path.write_bytes(content)
     before = path.read_bytes()
-    with pytest.raises(InputError, match="is no checkpoint; choose another name, or remove it"):
+    with pytest.raises(InputError, match="is not a checkpoint; choose another name, or remove it"):
         adapter.run(BOX, 0.15, checkpoint=clvoro.Checkpoint(path, every=0), **FEW)
     assert path.read_bytes() == before
     path.write_bytes(b"")  # as mktemp makes it
