@@ -265,8 +265,8 @@ class Adapter:
         points : (n, d) array of float, "density" or "uniform"
             Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
             the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
-            already (mean |e| up to 0.15, count off by 2 % at most, cells as good as the effort makes them), as after
-            the size field has moved by a few cells; from any other they take the whole way.
+            already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
+            after the size field has moved by a few cells. From any other array they run all levels.
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4. The others repeat one kind of step: "lloyd",
@@ -284,7 +284,7 @@ class Adapter:
         seed : int
             Seed of the random start.
         max_steps : int, optional
-            Largest number of steps, over all levels. By default 100, or all steps of the plan of "adaptive" and
+            Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive" and
             "exact".
         options : MultilevelOptions or PaperOptions, optional
             Further options: `MultilevelOptions` for "adaptive" and "exact", `PaperOptions` for the other methods.

@@ -100,19 +100,19 @@ def names_in(path):
 
 
 def kernels_in(path):
-    return set(re.findall(r"^kernel void (\w+)\(", path.read_text(), re.MULTILINE))
+    return set(re.findall(r"^(?:kernel|inline) \w+ (\w+)\(", path.read_text(), re.MULTILINE))
 
 
 def unknown(cell, folder):
     """Return what a cell of the tables names and is not there: paths, and after each what is in that file."""
     missing, there = [], set()
     for name in re.findall(r"`([^`]+)`", cell):
-        if "/" in name or name.endswith((".py", ".cl")):
+        if "/" in name or name.endswith((".py", ".cl", ".h")):
             path = folder / name
             if not path.exists():
                 missing.append(name)
                 there = set()
-            elif path.suffix in (".py", ".cl"):
+            elif path.suffix in (".py", ".cl", ".h"):
                 there = names_in(path) if path.suffix == ".py" else kernels_in(path)
         elif name not in there:
             missing.append(name)

@@ -1,4 +1,5 @@
-/* Gradient of the cell quality by the generators, in 2D. From the paper's (4.1), up to a constant per number of faces,
+/* Gradient of the cell quality with respect to the generators, in 2D. From the paper's (4.1), up to a constant per
+   number of faces,
 
      E = sum_c omega_c (2 log P_c - log A_c),   dE/dx_i = sum over the vertices and faces of cell i,
 

@@ -11,13 +11,13 @@
    decide. */
 
 #if !IS_DOUBLE
-#error "single precision has too few digits to tell which decisions are certain"
+#error "single precision has too few digits to decide which results are certain"
 #endif
 #define MAX_ROUNDS 20
-/* If hardly any of the first cells of a stretch are certain, as in perturbed lattices, the whole stretch is left. */
+/* If few of the first cells of a stretch are certain, as in perturbed lattices, `clip_polyhedra` makes all of them. */
 #define TRIALS 24
 #ifndef CUBE
-#error "build with -DCUBE=bins each way of the cubes of grid 0 that are gone through one by one, a power of 2"
+#error "build with -DCUBE=edge, in bins, of the cubes of grid 0 that are visited one by one, a power of 2"
 #endif
 #ifndef STRETCH
 #error "build with -DSTRETCH=generators that a work-item makes the cells of, a multiple of 8"

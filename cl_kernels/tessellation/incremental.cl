@@ -10,8 +10,8 @@
    others by all neighbors of their neighbors (`clip_marked`), check these (`check_clipped`), and repeat until all are
    consistent.
 
-   In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbors are nearest images. Cells without gap might
-   cover that more than once; their volumes tell. */
+   In a periodic box, with the periods -DFOLD_0 and -DFOLD_1, neighbors are nearest images. Cells without
+   gaps might cover the box more than once; then the sum of their volumes is too large. */
 
 /* Cells with more faces are clipped again in each step: they are rare and would delay their work-group. */
 #define CHECKED_FACES 16

@@ -218,7 +218,7 @@ inline REAL rounded_area(int i, int begin, int count, global const int *labels, 
 }
 
 /* Per generator i: kept[k] of each of its faces, and the number kept. Where any cell is doubtful, round-off may let one
-   of two cells have a face of no size that the other does not have. Such a face is dropped, so that the graph is
+   of two cells have a face of zero area that the other does not have. Such a face is dropped, so that the graph is
    symmetric. The cell is flagged as collapsed if the face is wider than round-off explains, or if the areas of its
    faces and those of its neighbors differ by more than a share of the cell. Faces of a neighbor without a row are not
    compared, nor are those of two certain cells. */

@@ -294,7 +294,7 @@ class Loop:
         self.mesh.stages.clear("poisson")
         self.mesh.engine.workspace.clear()
         finer = self.mesh.refine()
-        # One assignment: after an interruption between two, the mesh would be refined once too often.
+        # One assignment, because an interruption between two would leave a mesh that does not belong to its level.
         self.mesh, self.level = finer, self.level - 1
 
     def record(self, progress: float) -> bool:

@@ -134,7 +134,7 @@ class PaperOptions:
 class Checkpoint:
     """A file from which a run continues after the process has ended.
 
-    The file is replaced only when the new one is complete. Only checkpoints are replaced, no other file.
+    The file is replaced only when the new one is complete. A file that is not a checkpoint is never replaced.
 
     Parameters
     ----------

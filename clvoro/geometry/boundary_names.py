@@ -90,7 +90,7 @@ class BoundaryNames:
         if not isinstance(names, Mapping):
             raise InputTypeError(
                 f"{what} is {names!r:.60} of type {type(names).__name__}, expected a mapping from names to numbers or "
-                "names of walls, as {'inlet': [0, 1]}"
+                "names of walls, such as {'inlet': [0, 1]}"
             )
         index = np.full(len(self.index), -1, np.int32)
         for k, (name, walls) in enumerate(names.items()):
@@ -110,7 +110,7 @@ class BoundaryNames:
                 chosen, np.flatnonzero(self.index == self.names.index(name))
             ):
                 raise InputError(
-                    f"{what} has the name {name!r}, which already stands for other {self.kind}s; choose another name"
+                    f"{what} has the name {name!r}, which other {self.kind}s already have; choose another name"
                 )
             index[chosen] = k
         left = np.unique(self.index[(index < 0) & (self.index >= 0)])

@@ -180,7 +180,7 @@ class Box(Domain):
     lower, upper : sequences of 2 or 3 floats
         Opposite corners. Side ``2 a`` is the lower one of axis a, side ``2 a + 1`` the upper one.
     periodic : bool, or a sequence of 2 or 3
-        Directions without walls: what leaves on one side enters on the other. One bool stands for all directions.
+        Directions without walls: opposite sides are joined. One bool applies to all directions.
     names : mapping, optional
         Names of boundaries, each with its sides: numbers, default names, or a sequence of them. The default names are
         ``xMin``, ``xMax``, ``yMin``, ... Sides that are not mentioned keep them.
@@ -268,7 +268,7 @@ class Box(Domain):
         Raises
         ------
         InputError, InputTypeError
-            If a side or name does not exist, or there is none.
+            If a side or name does not exist, or the box has no walls.
         """
         chosen = self.boundaries.select("boundary", walls)
         if not chosen.size:

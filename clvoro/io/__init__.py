@@ -166,7 +166,7 @@ def save(
         unit = "m" if units is None else units
         if not isinstance(unit, str) or not unit.isascii() or not unit.strip():
             raise InputTypeError(
-                f"units is {unit!r:.60}, expected a unit of length, as 'm' or 'km'"
+                f"units is {unit!r:.60}, expected a unit of length, such as 'm' or 'km'"
             )
         _chosen(convention)(contents, path, unit)
     else:

@@ -78,7 +78,7 @@ def _checked(cell_data: object, n: int) -> dict[str, np.ndarray]:
         return {}
     if not isinstance(cell_data, Mapping):
         raise InputTypeError(
-            f"cell_data is a {type(cell_data).__name__}, expected a mapping from names to arrays, as "
+            f"cell_data is a {type(cell_data).__name__}, expected a mapping from names to arrays, such as "
             "{'pressure': values}"
         )
     found = {}

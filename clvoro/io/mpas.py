@@ -175,7 +175,8 @@ def _roundings(diagram: Diagram, distances: np.ndarray) -> np.ndarray:
     # Positions that single precision represents exactly were computed in it.
     eps = np.finfo(np.float32 if np.array_equal(single, double) else np.float64).eps
     places = eps * domain.extent.max() + np.finfo(np.float64).eps * np.abs(diagram.vertices).max()
-    # Round-off of a corner grows as the angle between two bisectors shrinks. Then it is off the third one.
+    # The smaller the angle between two bisectors, the larger the round-off of their corner, and its distance from the
+    # third bisector.
     return np.sqrt(eps) * distances + 64 * places
 
 

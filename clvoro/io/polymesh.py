@@ -127,7 +127,7 @@ def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> lis
     if not isinstance(given, Mapping):
         raise InputTypeError(
             f"types is {types!r:.60} of type {type(types).__name__}, expected a mapping from names of patches to "
-            "types, as {'inlet': 'patch'}"
+            "types, such as {'inlet': 'patch'}"
         )
     for name, kind in given.items():
         if name not in names:

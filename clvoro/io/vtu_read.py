@@ -70,7 +70,7 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
             head = file.read(_LONGEST_HEAD)
             end = head.find(_MARK)
             if end < 0:
-                raise _FileError("it has no appended raw data, as files of clvoro do")
+                raise _FileError("it has no appended raw data, which files of clvoro have")
             start = end + len(_MARK)
             size = os.fstat(file.fileno()).st_size
             file.seek(max(0, size - len(_END)))

@@ -12,7 +12,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     """Return the triples of generators whose cells meet in a vertex (t, 3) int32; see `Diagram.triangles`."""
     if diagram.domain.dim != 2 or any(diagram.domain.periodic):
         raise InputError(
-            f"triangles are for meshes in the plane without seams, not for {diagram.domain}; take "
+            f"triangles are for meshes in the plane without seams, not for {diagram.domain}; use "
             "neighbors and shifts, which every diagram has"
         )
     n, starts = len(diagram), diagram.cell_vertex_starts

@@ -28,7 +28,7 @@ def work(platform: int, device: int) -> None:
         if index not in built:
             text, options = programs[index]
             built[index] = cl.Program(ctx, text).build(options=list(options))
-        with contextlib.suppress(cl.Error):  # the record may be of another version
+        with contextlib.suppress(cl.Error):  # the record may be from another version
             kernel = cl.Kernel(built[index], name)
             kernel.set_args(*(np.zeros(size, np.uint8) if size else zeros for size in sizes))
             cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))

@@ -222,7 +222,9 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
     if any(d.default for d in devices):
         lines.append("* is the default.")
     elif os.environ.get("PYOPENCL_CTX"):
-        lines.append(f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} chooses no working device.")
+        lines.append(
+            f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r} does not select a working device."
+        )
     else:
         lines.append(f"There is no default: {INSTALL_HINT}.")
     return "\n".join(lines)
@@ -318,7 +320,7 @@ def _from_environment() -> _Candidate:
         device = cl.create_some_context(interactive=False).devices[0]
     except Exception as error:
         raise DeviceError(
-            f"PYOPENCL_CTX={value!r} chooses no OpenCL device ({one_line(str(error), 200)}); "
+            f"PYOPENCL_CTX={value!r} does not select an OpenCL device ({one_line(str(error), 200)}); "
             "unset it, or set it to indices that `clvoro devices` shows"
         ) from error
     return _describe(device, f"PYOPENCL_CTX={value!r}")
@@ -404,8 +406,6 @@ def _complaint(
     if left:
         best = min(left, key=lambda c: c.rank)
         how = f"use device={best.index!r}" if chosen else "leave the device out"
-        remedy = (
-            f"{how} to use {best.title}, or install the OpenCL driver of the device that you want"
-        )
+        remedy = f"{how} to use {best.title}, or install the OpenCL driver of the one that you want"
     lines.append(f"  remedy: {remedy}; `clvoro devices` tests each device")
     return "\n".join(lines)

@@ -95,7 +95,7 @@ def probe(device: cl.Device, ctx: cl.Context | None = None) -> str:
 
 
 def failure(error: Exception) -> str:
-    """Return the reason against a device on which `error` was raised."""
+    """Return why a device is unusable on which `error` was raised."""
     return f"it cannot build and run a kernel: {one_line(str(error) or repr(error), 300)}"
 
 

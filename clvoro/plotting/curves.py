@@ -92,9 +92,8 @@ def _drawable(values: np.ndarray, quantity: str) -> np.ndarray:
 def plot_displacements(result: Result, figure: Any = None) -> Any:
     """Draw the Lloyd and the Poisson displacements of the first and of the last step.
 
-    Arrows have the length of the displacement times the factor in the panel's title. Of a mesh
-    with more than 2500 generators only a window around the smallest cells is shown: over all of
-    it no arrow could be seen.
+    Arrows have the length of the displacement times the factor in the panel's title. For a mesh with more than 2500
+    generators only a window around the smallest cells is shown, because arrows over the whole mesh would be too small.
 
     Returns
     -------

@@ -109,8 +109,8 @@ def _cut(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> Section:
     # The cell lies behind the face: counter-clockwise, its polygon runs from the exit to the entry.
     edges = np.stack(
         [
-            _meetings(vertices, height, corners[nexts[downs]], corners[downs]),
-            _meetings(vertices, height, corners[ups], corners[nexts[ups]]),
+            _crossings(vertices, height, corners[nexts[downs]], corners[downs]),
+            _crossings(vertices, height, corners[ups], corners[nexts[ups]]),
         ],
         axis=1,
     )
@@ -133,7 +133,7 @@ def plane_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
 
-def _meetings(
+def _crossings(
     vertices: np.ndarray, height: np.ndarray, below: np.ndarray, above: np.ndarray
 ) -> np.ndarray:
     """Return the intersections of the plane with edges between vertices below and above it."""

@@ -107,7 +107,7 @@ def plot_slice(
     section = cut_cells(diagram, direction, point)
     if not len(section.cells):
         raise InputError(
-            f"the plane through {point.tolist()} does not meet {diagram.domain}; give a point inside"
+            f"the plane through {point.tolist()} does not intersect {diagram.domain}; give a point inside"
         )
     right, up = plane_axes(direction)
     flat = np.stack([section.corners @ right, section.corners @ up], axis=1)

@@ -44,8 +44,8 @@ def balance_components(
 def connected_components(t: Tessellation) -> np.ndarray:
     """Return the number of each cell's connected component in the neighbor graph, (n,) int.
 
-    The positions of the generators do not tell: a generator in a corner that several pieces share lies in all of them,
-    and a piece without a generator consists of parts of cells and connects them.
+    The positions of the generators are not sufficient for that: a generator in a corner that several pieces share lies
+    in all of them, and a piece without a generator consists of parts of cells and connects them.
     """
     # This import takes 0.2 s, and most runs do without it.
     from scipy.sparse import csgraph, csr_array

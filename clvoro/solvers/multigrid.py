@@ -176,7 +176,7 @@ class Multigrid:
         self._cycle.set_levels(self._levels, self._factor)
 
     def save(self) -> dict[str, np.ndarray]:
-        """Return what `update_finest` builds on: pairs, aggregates and coarse graphs, read from the device."""
+        """Return the arrays that `update_finest` needs: pairs, aggregates and coarse graphs, read from the device."""
         arrays = {"exponent": np.array(self._aggregation.exponent)}
         if self._factor is not None:
             arrays["factor"] = self._factor.get()

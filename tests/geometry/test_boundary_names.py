@@ -257,7 +257,7 @@ SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
         ({"a": [-1]}, InputError, "edge -1, expected"),
         ({"a": [0, 1], "b": [1]}, InputError, "edge 1 both in 'a' and in 'b'"),
         ({"a": []}, InputError, "empty"), ({"a": "b"}, InputError, "name of a boundary: outer"),
-        ({"outer": [0]}, InputError, "already stands for other edges"),
+        ({"outer": [0]}, InputError, "which other edges already have"),
         ({"a b": 0}, InputError, "name 'a b'"), ({"": 0}, InputError, "name ''"), ({"ä": 0}, InputError, "name 'ä'"),
         ({1: 0}, InputError, "name 1"), ({"a": 0.5}, InputTypeError, r"names\['a'\] is 0.5"),
         ({"a": [True]}, InputTypeError, "True"), ({"a": {0: 1}}, InputTypeError, "expected a number or name"),

@@ -196,7 +196,7 @@ def test_bad_cuts_are_named(result, cut, message):
 def test_bad_planes_are_named(result):
     with pytest.raises(InputError, match="normal is 'w'"):
         plot_slice(result, normal="w")
-    with pytest.raises(InputError, match="does not meet"):
+    with pytest.raises(InputError, match="does not intersect"):
         plot_slice(result, through=(0, 0, 7))
     with pytest.raises(InputError, match="3 coordinates"):
         plot_slice(result, through=(0, 0))

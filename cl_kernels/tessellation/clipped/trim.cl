@@ -15,7 +15,7 @@
 #define MOST_OUTSIDE (256 * REAL_EPS)
 
 /* Whether a segment on a face, between a corner of the cell and the end of a chord, leaves the domain across the edge
-   of that chord. Edges miss the tips of needles narrower than round-off. */
+   of that chord. Edges miss corners narrower than round-off. */
 inline bool leads_out(const segment_t *s, const chords_t *c)
 {
     if ((s->from < 0) == (s->to < 0))

@@ -41,7 +41,7 @@ def walls(value: object, place: str) -> Any:
 def names(value: object, place: str) -> dict[str, Any]:
     """Check names of boundaries with their edges or sides."""
     if not isinstance(value, Mapping):
-        raise refuse(place, value, "a table of names, as {inlet = 0, island = [4, 5, 6]}")
+        raise refuse(place, value, "a table of names, such as {inlet = 0, island = [4, 5, 6]}")
     return {name: walls(chosen, f"{place}.{name}") for name, chosen in value.items()}
 
 

@@ -72,7 +72,7 @@ def inward_vectors(domain: Polygon, real: np.dtype) -> np.ndarray:
     before = np.empty_like(ahead)
     before[following] = ahead
     across = before + ahead
-    # The mean of the left normals. In the tip of a needle these cancel: then the direction along it.
+    # The mean of the left normals, or, at corners so sharp that these cancel, the direction along the corner.
     along = ahead - before
     turn = before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0]
     sharp = np.hypot(*across.T) < np.hypot(*along.T)
