@@ -54,8 +54,7 @@ inline bool visit(visited_t *seen, int j)
 /* The generator of `graph` nearest to x. Start at a generator in the bin of x, or near it, and move to a nearer
    neighbor until there is none. A point outside a generator's cell is nearer to one of its neighbors, so the walk
    cannot stop early. */
-inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, global const int *items,
-                             global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
+inline int nearest_generator(global const REAL *x, const graph_t *graph, int n, global const int *items, BIN_ARGS)
 {
     int bin = bin_in_grid(x, grid_frames[0], grid_shapes[0]);
     while (bins[bin].s1 != bins[bin + 1].s1) {
@@ -124,8 +123,7 @@ inline int cut_by_cell(piece_t *piece, REAL4 x, REAL reach, int j, const graph_t
    queues, tables                    capacity and 2 * capacity entries for each work-item */
 kernel void transfer_cell_data(const int size, const int first, global const int *todo, const int capacity,
                                global int *queues, global int *tables, GRAPH_ARGS, const int n_old, OLD_GRAPH_ARGS,
-                               global const int *items, global const int2 *bins, global const FRAME *grid_frames,
-                               global const int4 *grid_shapes, const REAL4 box_lower, const REAL4 box_upper,
+                               global const int *items, BIN_ARGS, const REAL4 box_lower, const REAL4 box_upper,
                                CELL_DATA_ARGS, global REAL *means, global REAL *low, global REAL *high,
                                global REAL *volumes, global REAL *covered, global int *status)
 {

@@ -89,8 +89,7 @@ inline void span_rows(int *nexts, int *rights, int *offsets, int pair, int pairs
 
 /* Collect all generators in the balls and in the box [least, most], and some others. False if there are more than
    `limit` generators, or too many ranges. */
-inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, double4 most, int limit,
-                         global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes)
+inline bool collect_runs(runs_t *runs, const balls_t *balls, double4 least, double4 most, int limit, BIN_ARGS)
 {
     double xs[8], ys[8], zs[8], rs[8];
     const double8 r = balls->r;

@@ -111,8 +111,7 @@ inline double first_look(needs_t *needs, double most)
    = 0 for a cell that remains to be clipped. `first_reach` bounds the first search radius, in units of the spacing.
    Only the first `rows_wanted` generators get rows. */
 kernel void wrap_all_hulls(const int size, const int n, const int rows_wanted, global const double *binned,
-                           global const int *items, global const float *spacing, global float *reach,
-                           global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                           global const int *items, global const float *spacing, global float *reach, BIN_ARGS,
                            const double4 box_lower, const double4 box_upper, const double first_reach, global int *rows,
                            global int *row_counts, global int *places)
 {

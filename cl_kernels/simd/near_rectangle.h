@@ -24,8 +24,7 @@ inline bool add_near_run(near_t *near, int first, int end)
 }
 
 /* Collect the generators in a rectangle, and some near it. False if there are too many. */
-inline bool collect_near(near_t *near, double2 lower, double2 upper, global const int2 *bins,
-                         global const FRAME *grid_frames, global const int4 *grid_shapes)
+inline bool collect_near(near_t *near, double2 lower, double2 upper, BIN_ARGS)
 {
     descent_t way; /* position: row and bin */
     near->count = 0;

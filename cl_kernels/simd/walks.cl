@@ -84,12 +84,9 @@ kernel void order_places(const int size, const int rows, global const int *items
    cell that remains to be clipped. `first_reach` is the first search radius, in units of `spacing`. In a periodic box
    the balls around the vertices are tested. */
 kernel void walk_all_cells(const int size, const int rows, global const int *order, global const double *binned,
-                           global const int *items, global const float *spacing, global float *reach,
-                           global const int2 *bins, global const FRAME *grid_frames, global const int4 *grid_shapes,
+                           global const int *items, global const float *spacing, global float *reach, BIN_ARGS,
                            const double4 box_lower, const double4 box_upper, const double first_reach, const int room,
-                           global int *row_places, global int *row_counts, global int *labels, global double *measures,
-                           global double *centroids, global double *volumes, global double *offsets,
-                           global double *covariances, global int *report HALO_ARGS)
+                           CELL_OUTPUT_ARGS HALO_ARGS)
 {
     WORK_ITEM(stretch);
     output_t out = {room,   items,    reach,     row_places, row_counts, labels,

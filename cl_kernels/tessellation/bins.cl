@@ -88,8 +88,7 @@ kernel void make_grids(const int size, global const int2 *bins, global const int
 }
 
 /* Per generator i whose bin was divided: count it into its new bin. */
-kernel void count_in_child_bins(const int size, global const REAL *points, global const int2 *bins,
-                                global const FRAME *grid_frames, global const int4 *grid_shapes, global int *keys,
+kernel void count_in_child_bins(const int size, global const REAL *points, BIN_ARGS, global int *keys,
                                 global int *ranks, global int *counts)
 {
     WORK_ITEM(i);

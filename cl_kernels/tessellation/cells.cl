@@ -19,8 +19,7 @@
 
    If `some`, rows that have faces are there already (`hulls.cl`, or where others had too many). */
 kernel void clip_polygons(const int size, const int rows_wanted, global const REAL *binned, global const int *items,
-                          global float *reach, global const int2 *bins, global const FRAME *grid_frames,
-                          global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                          global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
                           const REAL4 box_upper, const int some, global int *rows, global int *row_counts,
                           global int *places, global int *flags)
 {

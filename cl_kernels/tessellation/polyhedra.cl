@@ -54,20 +54,12 @@ inline void check_cell_balls(const cell_t *cell, int i, REAL4 place, const halo_
    Only the first `rows` generators get cells; in a periodic box the balls around their vertices are tested.
 
    A face is a fan of triangles (A, B, C), and each with x_i a tetrahedron of volume V = A . (B x C) / 6, centroid
-   S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20.
-
-   row_places, row_counts (n,)   first entry of the cell in the arrays of faces, and number of its faces; the cells are
-                                 in any order, later kernels sort them
-   labels, measures, centroids   of the faces
-   volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl */
+   S / 4 with S = A + B + C, second moments V (A A + B B + C C + S S) / 20. */
 kernel void clip_polyhedra(const int size, const int rows, global const REAL *binned, global const int *items,
-                           global float *reach, global const int2 *bins, global const FRAME *grid_frames,
-                           global const int4 *grid_shapes, global const REAL *points, const REAL4 box_lower,
+                           global float *reach, BIN_ARGS, global const REAL *points, const REAL4 box_lower,
                            const REAL4 box_upper, const int warm, global const int *old_starts,
                            global const int *old_neighbors, const int again, const int room, const REAL share,
-                           global int *row_places, global int *row_counts, global int *labels, global REAL *measures,
-                           global REAL *centroids, global REAL *volumes, global REAL *offsets, global REAL *covariances,
-                           global int *report HALO_ARGS)
+                           CELL_OUTPUT_ARGS HALO_ARGS)
 {
     WORK_ITEM(p);
     const int i = items[p];

@@ -3,6 +3,17 @@
 #define CERTAIN (1 << 30)  /* added if no face is near round-off: other certain cells have the same faces */
 #define COUNT_OF(n) ((n) & (CERTAIN - 1))
 
+/* The output of kernels that make cells in 3D.
+
+   row_places, row_counts (n,)   first entry of a cell in the arrays of faces, and number of its faces; the cells are in
+                                 any order, later kernels sort them
+   labels, measures, centroids   of the faces
+   volumes (n,), offsets (n, 3), covariances (n, 6)  see measure_cells of cells.cl
+   report (2,)                   error bits; number of faces */
+#define CELL_OUTPUT_ARGS                                                                                               \
+    global int *row_places, global int *row_counts, global int *labels, global REAL *measures, global REAL *centroids, \
+        global REAL *volumes, global REAL *offsets, global REAL *covariances, global int *report
+
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not.
    report[0]: error bits; report[1]: number of faces. */
 inline int take_places(global int *report, int count)

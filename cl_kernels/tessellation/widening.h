@@ -26,8 +26,7 @@ inline REAL2 row_extent(const cell_t *cell, REAL below, REAL above)
    half-width `inner` (inner < 0: no bin has been searched), except those farther than twice the farthest corner. Rows
    are searched from x outwards, as near generators cut most. Returns FLAG_* or 0. */
 inline int clip_polygon_by_bins(cell_t *cell, const REAL *x, int own, REAL w, REAL inner, global const REAL *points,
-                                global const REAL *binned, global const int *items, global const int2 *bins,
-                                global const FRAME *grid_frames, global const int4 *grid_shapes)
+                                global const REAL *binned, global const int *items, BIN_ARGS)
 {
     /* Through rows in outward order, parts of rows, bins; and whether the grid's own bin was opened for the inner
        square. */
