@@ -1,4 +1,4 @@
-"""The bins as a structure: walked on the host, they hold every generator once, where it belongs."""
+"""The structure of the bins, read on the host: every generator is in one leaf, at its position."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from tests.reference import patch
 
 
 def child_side(count, dim):
-    """Return how many bins each way a bin of `count` generators is divided into, by the counts that bins aim at."""
+    """Return the number of bins per axis into which a bin of `count` generators is divided."""
     if dim == 2:
         sides = [s for s in range(2, MAX_CHILD_SIDE + 1) if count >= OCCUPANCY * s**2]
         return max(sides, default=2)
@@ -46,7 +46,7 @@ def walk(binned, n, dim, eps):
             (start, grid), (end, next_grid) = bins[first + place : first + place + 2]
             count = end - start
             if grid == next_grid:
-                # What lies about an empty leaf nobody asks.
+                # The spacing at an empty leaf is not used.
                 for width in range(1, max(sides) + 1 if count else 2):
                     block = counts[
                         tuple(slice(max(i - width, 0), i + width + 1) for i in index[::-1])
@@ -85,9 +85,9 @@ def check(binned, points, dim, eps):
         assert (np.diff(items[place]) > 0).all(), "a leaf is not sorted"
         assert count <= SPLIT_COUNT[dim] or level == MAX_LEVELS - 1
         assert np.allclose(reach[place], edge, rtol=1e-6)
-        # float32, and the grid's 1 / edge rounds
+        # float32, and 1 / edge of the grid is rounded
         assert np.allclose(spacings[place], spacing, rtol=1e-6)
-        # A generator lies in its bin, but for what the search takes into account: bin_noise of bins.h.
+        # A generator lies in its bin up to bin_noise (bins.h), which the search allows for.
         inside = points[items[place]].astype(float)
         noise = 16 * eps * (np.abs(inside) + np.abs(first))
         below, above = origin - inside, inside - (origin + edge)
@@ -126,7 +126,7 @@ BOXES = {
     "thread": Box((0, 0), (1, 1e-9)),
     "cube": Box((0, 0, 0), (1, 0.5, 0.75)),
     "sheet": Box((0, 0, 0), (1, 1, 1e-9)),
-    # Beyond seams: the grid begins below 0, and positions beyond 1 round twice as much.
+    # The extended box of a periodic box: the grid begins below 0, and positions beyond 1 have twice the round-off.
     "beyond": ExtendedBox(np.array([-0.507, -0.512]), np.array([1.507, 1.512])),
 }
 
@@ -161,7 +161,7 @@ def test_every_generator_in_one_leaf(ctx, real, box):
 
 
 def test_uniform_sets_stay_on_one_level(ctx):
-    """Of a random set hardly a bin holds more than SPLIT_COUNT: Poisson with mean 2 exceeds 10 in one of 1e5 bins."""
+    """In random sets about one of 1e5 bins holds more than SPLIT_COUNT (Poisson, mean 2)."""
     engine = patch.make_engine(ctx)
     points = patch.random_points(20000, 202)
     leaves = walk(Bins(engine).build(patch.BOX, engine.upload(points), 20000), 20000, 2, 2e-16)
@@ -169,8 +169,8 @@ def test_uniform_sets_stay_on_one_level(ctx):
     assert 0.4 * 20000 < len(leaves) < 0.6 * 20000 + 300
 
 
-def test_repeats_bit_by_bit_whatever_came_before(ctx, real):
-    """Atomics may arrive in any order, and buffers hold what an earlier, larger set has left."""
+def test_bits_do_not_depend_on_earlier_sets(ctx, real):
+    """Neither the order of atomics nor old content of the buffers changes the result."""
     engine = patch.make_engine(ctx, real)
     used, points = Bins(engine), sets(2, patch.BOX)
     first = {}
@@ -186,7 +186,7 @@ def test_repeats_bit_by_bit_whatever_came_before(ctx, real):
 
 @pytest.mark.parametrize("box", BOXES)
 def test_renumbered_bins_are_those_of_the_sorted_generators(ctx, real, box):
-    """Bit by bit: a diagram of generators in any order bins them once, to sort them and to search among them."""
+    """Renumbering gives the bits of a second sort, so that generators are binned once."""
     box = BOXES[box]
     dim = len(box.lower)
     engine = patch.make_engine(ctx, real, dim)
@@ -213,7 +213,7 @@ def test_only_the_first_n_are_binned(ctx):
 
 
 def test_capacity_grows(ctx):
-    """A small set, a large one, one whose levels need more bins than any estimate; then small again."""
+    """A small set, a large one, one with more bins than estimated, and a small one again."""
     engine = patch.make_engine(ctx)
     bins = Bins(engine)
     rng = np.random.default_rng(64)
@@ -226,8 +226,8 @@ def test_capacity_grows(ctx):
         check(bins.build(patch.BOX, engine.upload(points), len(points)), points, 2, 2e-16)
 
 
-def test_leaves_are_sorted_whatever_order_atomics_leave(ctx):
-    """On a CPU they mostly arrive in order: mix the leaves up, and sort them again."""
+def test_leaves_are_sorted_for_any_order_of_atomics(ctx):
+    """Atomics on a CPU mostly arrive in order, so the test shuffles the leaves and sorts them again."""
     engine = patch.make_engine(ctx)
     points = sets(2, patch.BOX)["few places"]
     n, bins = len(points), Bins(engine)

@@ -1,4 +1,4 @@
-"""The diagram against references, and its invariants, over point sets x precision."""
+"""The 2D diagram: comparison with references, and invariants, over point sets and precisions."""
 
 import numpy as np
 import pyopencl as cl
@@ -76,10 +76,10 @@ def points(request):
 
 
 def check_invariants(diagram, eps):
-    """Whatever the input: the cells tile the box, the graph is symmetric, cells close, Euler's formula holds."""
+    """Check that cells tile the box and are closed, that the graph is symmetric, and Euler's formula."""
     n = len(diagram.points)
     box, starts = diagram.domain, diagram.neighbor_starts
-    # Each cell rounds by eps of the box at most; they add up like a random walk.
+    # The round-off of each cell is at most eps of the box; the errors add up like a random walk.
     assert diagram.volumes.sum() == pytest.approx(box.measure, rel=8 * eps)
     assert (diagram.volumes > 0).all()
     i = np.repeat(np.arange(n), np.diff(starts))
@@ -88,7 +88,7 @@ def check_invariants(diagram, eps):
     pairs = set(zip(i[inner].tolist(), j[inner].tolist(), strict=True))
     assert len(pairs) == inner.sum(), "a neighbor is listed twice"
     assert all((b, a) in pairs for a, b in pairs), "the graph is not symmetric"
-    # A closed polygon's outward normals, weighted by length, cancel; corners repeat from cell to cell.
+    # The outward normals of a closed polygon, weighted by length, sum to zero.
     corners = diagram.vertices[diagram.cell_vertices]
     scale = box.extent.max()
     assert (diagram.cell_vertex_starts == starts).all()
@@ -108,7 +108,7 @@ def check_invariants(diagram, eps):
     edges = inner.sum() // 2 + (~inner).sum()
     assert len(diagram.vertices) - edges + n == 1
     assert len(np.unique(diagram.cell_vertices)) == len(diagram.vertices)
-    # Wall faces lie on their wall, and make up its length.
+    # Wall faces lie on their wall and fill it.
     for axis in range(2):
         for side, wall in enumerate((box.lower[axis], box.upper[axis])):
             on = j == -1 - (2 * axis + side)
@@ -132,7 +132,7 @@ def test_against_exact_arithmetic(adapter64, points):
         row = slice(*diagram.neighbor_starts[i : i + 2])
         exact = dict(zip(cell.neighbors, face_lengths(cell.polygon), strict=True))
         seen = dict(zip(diagram.neighbors[row].tolist(), diagram.face_measures[row], strict=True))
-        # Faces of no length (cocircular generators) may be listed by either side.
+        # Faces of zero length (cocircular generators) may exist on one side only.
         for j in set(exact) | set(seen):
             assert seen.get(j, 0) == pytest.approx(exact.get(j, 0), rel=1e-9, abs=1e-13)
 
@@ -147,7 +147,7 @@ def test_against_qhull(adapter64):
     diagram = adapter64.diagram(BOX, points)
     cells = reference.box_voronoi(BOX.lower, BOX.upper, points)
     area = np.array([c.area for c in cells])
-    # Qhull's own vertices carry about 1e-13 of the box.
+    # The error of Qhull's vertices is about 1e-13 of the box.
     assert np.abs(diagram.volumes - area).max() < 1e-12 * BOX.measure
     assert np.abs(diagram.volumes / area - 1).max() < 1e-9
     centroids = np.array([c.centroid for c in cells])
@@ -173,13 +173,13 @@ def test_any_scale_and_place(adapter64, scale):
     box = clvoro.Box((-scale, 3 * scale), (1.5 * scale, 4.5 * scale))
     diagram = adapter64.diagram(box, np.clip(unit * scale + box.lower, box.lower, box.upper))
     assert diagram.volumes.sum() == pytest.approx(box.measure, rel=1e-14)
-    # Shifting by the corner rounds positions to eps, and so areas to eps over the cell's size.
+    # A shift rounds positions to eps, and so areas to eps over the size of a cell.
     assert diagram.volumes / scale**2 == pytest.approx(plain.volumes, rel=1e-11)
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 2e-16])
 def test_near_duplicates(adapter64, gap):
-    """Right down to gaps at which the bisectors with generators far away still differ; refused below."""
+    """Gaps are valid as long as bisectors with far generators differ; smaller gaps are rejected."""
     cluster = np.array([0.7, 0.6]) + gap * np.array([[0, 0], [1, 0], [0, 1]])
     points = np.concatenate([cluster, POINTS["random"]])
     refused = None
@@ -235,7 +235,7 @@ def test_same_bits_twice(adapter):
         assert (getattr(a, name) == getattr(b, name)).all(), name
 
 
-def test_order_of_points_does_not_matter(adapter64):
+def test_result_does_not_depend_on_the_order_of_points(adapter64):
     points = POINTS["graded"]
     order = np.random.default_rng(99).permutation(len(points))
     a, b = adapter64.diagram(BOX, points), adapter64.diagram(BOX, points[order])
@@ -252,8 +252,8 @@ def test_many_cocircular_neighbors_enlarge_the_capacity(adapter64):
 
 
 @pytest.mark.parametrize("name", ["random", "graded"])
-def test_faces_at_work_are_those_of_the_result_rounded(adapter64, name):
-    """In full precision they are measured where the corners are: what is rounded of that has the same bits."""
+def test_faces_of_the_loop_are_those_of_the_result_in_single_precision(adapter64, name):
+    """Faces of the final diagram are measured in full precision; rounded, they have the same bits."""
     engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))
     points = engine.upload(POINTS[name] / BOX.frame[1])
     n, cells = len(points), Cells(engine)
@@ -268,8 +268,8 @@ def test_faces_at_work_are_those_of_the_result_rounded(adapter64, name):
     assert np.array_equal(exact.neighbors.get(), t.neighbors.get())
 
 
-def test_enlarged_capacity_is_for_those_that_need_it(adapter64):
-    """A mesh with a cell of very many faces does not make every later, larger one reserve as much."""
+def test_later_meshes_do_not_keep_an_enlarged_capacity(adapter64):
+    """A mesh with a cell of very many faces does not make later, larger meshes reserve as much."""
     engine = Engine(adapter64.ctx, adapter64.queue, 2, np.dtype(float))
     bins, cells = Bins(engine), Cells(engine)
 
@@ -295,7 +295,7 @@ def test_enlarged_capacity_is_for_those_that_need_it(adapter64):
     )
 )  # fmt: skip
 def test_degenerate_sets(adapter64, places):
-    """Subsets of a lattice that fills the box and its walls, each point off by an ulp or not."""
+    """Subsets of a lattice that covers the box and its walls; some points are off by one ulp."""
     a = np.array(places, float)
     points = a[:, :2] / [12, 8] * BOX.extent
     points = np.where(a[:, 2:] == 0, points, np.nextafter(points, points + a[:, 2:]))
@@ -304,8 +304,8 @@ def test_degenerate_sets(adapter64, places):
 
 
 @pytest.mark.parametrize("seed", [1, 4])
-def test_a_search_that_is_repeated_widens(ctx, seed):
-    """Among generators that coincide in single precision cells shrink to a point, while others need more capacity."""
+def test_a_repeated_search_widens(ctx, seed):
+    """Cells of generators that coincide in single precision shrink to a point, while others need more capacity."""
     rng = np.random.default_rng(seed)
     around = rng.uniform(0, 1, (40, 2))
     cluster = 0.3 + rng.normal(size=(300, 2)) * 10.0 ** -rng.uniform(6, 8)
@@ -316,8 +316,8 @@ def test_a_search_that_is_repeated_widens(ctx, seed):
 
 
 @pytest.mark.parametrize("doubtful", [False, True])
-def test_what_has_two_faces_is_no_cell(ctx, doubtful):
-    """Rounding leaves such rows where generators are too close for the precision: they are refused."""
+def test_cells_with_two_faces_are_rejected(ctx, doubtful):
+    """Round-off makes such rows if generators are too close for the precision."""
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype("float64"))
     cells, points = Cells(engine), engine.upload([[0.2, 0.2], [0.5, 0.3], [0.4, 0.6]])
     for two in (True, False):
@@ -328,7 +328,7 @@ def test_what_has_two_faces_is_no_cell(ctx, doubtful):
             slots[i, : len(labels)] = labels
         rows.slots.set(slots.ravel())
         rows.places.set(np.arange(n, dtype=np.int32))
-        # A doubt has all rows compared, and none is found wanting.
+        # A doubtful cell has all rows compared, and all agree.
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
         rows.flags.set(np.array([0, doubtful, 0, n, n, 0], np.int32))

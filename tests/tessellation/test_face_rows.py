@@ -1,4 +1,4 @@
-"""Rows of faces that are longer than a slot: the same diagram whatever room there is, and room for those rows alone."""
+"""Rows longer than a slot: the diagram does not depend on the room, and only these rows take more room."""
 
 import numpy as np
 import pyopencl as cl
@@ -16,11 +16,11 @@ from tests.reference import patch
 
 BOX = clvoro.Box((0, 0), (1, 1))
 SPOKES = 45
-"""Neighbors of each cell in the middle of a ring: three slots of them, and kernels built anew twice."""
+"""Neighbors of the cell in the middle of each ring: three slots, and two enlargements of the capacity."""
 
 
 def wheels(rings=2, others=400):
-    """A point in the middle of each ring, and many others between the rings."""
+    """Return a point in the middle of each ring, and many others between the rings."""
     rng = np.random.default_rng(5)
     middles = (np.stack(np.meshgrid(*[np.arange(rings)] * 2), axis=-1).reshape(-1, 2) + 0.5) / rings
     turn = 2 * np.pi * (np.arange(SPOKES) + 0.1 * rng.random((len(middles), SPOKES))) / SPOKES
@@ -48,7 +48,7 @@ def compare(a, b):
         assert np.array_equal(a[name], b[name]), name
 
 
-def test_wheels_are_right(engine):
+def test_cells_in_rings_are_correct(engine):
     points = wheels().astype(engine.real)
     diagram = clvoro.Adapter(engine.ctx, engine.real).diagram(BOX, points)
     sides = np.diff(diagram.neighbor_starts)
@@ -56,11 +56,11 @@ def test_wheels_are_right(engine):
     assert (sides[4:] <= SLOT).all()
     expected = reference.box_voronoi(BOX.lower, BOX.upper, np.asarray(points, float))
     areas = np.array([cell.area for cell in expected])
-    # A corner is known as well as positions, and there are some ten to a cell; cells are 0.03 wide.
+    # Corners have the round-off of positions; a cell has about ten, and is 0.03 wide.
     assert diagram.volumes == pytest.approx(areas, abs=0.3 * float(np.finfo(engine.real).eps))
 
 
-def test_without_slots_to_spare_all_is_made_again(engine, monkeypatch):
+def test_without_spare_slots_the_diagram_is_made_again(engine, monkeypatch):
     points = wheels()
     _, _, there = make(engine, points)
     monkeypatch.setattr(cells_module, "spare_slots", lambda _: 1)
@@ -68,8 +68,8 @@ def test_without_slots_to_spare_all_is_made_again(engine, monkeypatch):
     compare(there, again)
 
 
-def test_room_is_taken_for_long_rows_alone(engine):
-    """A workspace of what all cells take in a slot each, and of the spare ones."""
+def test_only_long_rows_take_more_room(engine):
+    """Scratch memory holds one slot per cell and the spare slots."""
     points = wheels()
     n = len(points)
     engine.workspace.clear()
@@ -81,8 +81,8 @@ def test_room_is_taken_for_long_rows_alone(engine):
     engine.workspace.clear()
 
 
-def test_repair_has_room_for_long_rows(engine, monkeypatch):
-    """And gives up where it has none, as for whatever else it cannot do."""
+def test_incremental_update_has_room_for_long_rows(engine, monkeypatch):
+    """Without room the update returns None."""
     points = wheels()
     cells, _, t = make(engine, points)
     moved = engine.upload(points + np.random.default_rng(6).uniform(-1, 1, points.shape) * 1e-5)

@@ -1,4 +1,4 @@
-"""Rows by wrapping hulls against rows by clipping, and against SciPy's hulls."""
+"""Rows from convex hulls: comparison with clipping and with SciPy's hulls."""
 
 import numpy as np
 import pytest
@@ -48,14 +48,14 @@ def point_sets():
         "line": np.column_stack([np.linspace(0.01, 0.99, 777), np.full(777, 0.3)]),
         "walls": np.column_stack([rng.random(400), 0.75 * rng.integers(0, 2, 400)]),
         "near walls": np.concatenate([random[:300] * [1, 1e-5], random[300:900]]),
-        # Of a trio two may stand in line with a corner of a hull, to rounding, while the third does not.
+        # Two of three generators may be collinear with a corner of a hull up to round-off, while the third is not.
         **{
             f"trios, {gap}": np.concatenate(
                 [(p + gap * trio) for p in random[:60]] + [random[60:900]]
             )
             for gap in (1e-6, 1e-8, 1e-9, 1e-10)
         },
-        # The nearest of three in a row has a face as short as they are apart.
+        # The nearest of three generators in a row has a face as short as their distance.
         "rows of three": np.concatenate(
             [(p + fan * [1, gap]) for p, gap in zip(random, gaps, strict=False)] + [random[60:900]]
         ),
@@ -73,7 +73,7 @@ POINTS = point_sets()
 
 
 def wrapped_rows(engine, points, first_reach=FIRST_REACH):
-    """Return the counts of faces after wrapping alone, 0 where a cell is left, and the rows."""
+    """Return the numbers of faces after wrapping alone, 0 for cells left to clipping, and the rows."""
     n, x = len(points), engine.upload(points)
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
     rows = cells.take_rows(n)
@@ -105,7 +105,7 @@ def test_rows_are_those_of_clipping(engine, name):
     assert np.array_equal(counts_a, counts_b), "other faces, or other doubts"
     assert np.array_equal(a.neighbors, b.neighbors)
     assert np.array_equal(a.volumes, b.volumes)
-    # The radius is computed from inverted positions, which round by eps of the ratio of distances.
+    # The radius comes from inverted positions, whose round-off is eps times the ratio of distances.
     assert reach_a == pytest.approx(reach_b, rel=1e-6)
 
 
@@ -113,7 +113,7 @@ def test_rows_are_those_of_clipping(engine, name):
     "name",
     ["1 random", "9 random", "random", "clusters", "ring and center", "lattice to the walls"],
 )
-def test_measures_in_lanes_are_those_of_one_cell(engine, name):
+def test_measures_in_lanes_are_those_of_single_cells(engine, name):
     points = np.clip(POINTS[name], 0, [1, 0.75])
     n, x = len(points), engine.upload(points)
     found = []
@@ -146,7 +146,7 @@ def test_measures_in_lanes_are_those_of_one_cell(engine, name):
     ("name", "share"), [("random", 0.99), ("hexagons", 0.99), ("cubed", 0.95), ("radial", 0.9)]
 )
 def test_most_cells_are_wrapped(engine, name, share):
-    """Else the kernel would be right but useless; lattices, where every decision is near to rounding, are left."""
+    """Otherwise the kernel would be useless. Lattices, where every decision is near round-off, are left to clipping."""
     counts, _ = wrapped_rows(engine, np.clip(POINTS[name], 0, [1, 0.75]))
     assert np.count_nonzero(counts) >= share * len(counts)
 
@@ -163,8 +163,8 @@ def test_cells_have_up_to_sixteen_faces(engine, count, is_wrapped):
 
 @pytest.mark.parametrize("first_reach", [0.2, 0.7, 5.0])
 @pytest.mark.parametrize("name", ["random", "radial", "hexagons", "cubed"])
-def test_rows_do_not_depend_on_where_the_search_begins(engine, name, first_reach):
-    """Too near, no hull holds the generator at first, and searches are repeated; too far, lists are cut."""
+def test_rows_do_not_depend_on_the_first_search_radius(engine, name, first_reach):
+    """With a small radius no hull contains the generator and searches repeat; with a large one lists are cut."""
     points = np.clip(POINTS[name], 0, [1, 0.75])
     (counts, rows), (others, other_rows) = (
         wrapped_rows(engine, points, reach) for reach in (FIRST_REACH, first_reach)
@@ -192,8 +192,8 @@ def test_against_scipy(engine):
         assert rows[i, : counts[i]].tolist() == np.roll(hull, -least).tolist()
 
 
-def test_cells_that_reach_over_many_bins(engine):
-    """Those around a hole meet in its middle: others that are as near by far cannot cut them, and are not looked at."""
+def test_cells_that_span_many_bins(engine):
+    """Cells around a hole meet in its middle. The search must skip most generators within their reach."""
     points = np.clip(POINTS["around a hole"], 0, [1, 0.75])
     nearest = np.argsort(np.hypot(*(points - [0.4, 0.3]).T))[:40]
     cells, x = Cells(engine), engine.upload(points)
@@ -206,7 +206,7 @@ def test_cells_that_reach_over_many_bins(engine):
         assert set(row) == set(np.delete(np.arange(len(points)), i)[hull])
 
 
-def test_coinciding_generators_are_left(engine):
+def test_coincident_generators_are_left_to_clipping(engine):
     points = POINTS["random"][:200].copy()
     points[[30, 77]] = points[123]
     counts, _ = wrapped_rows(engine, points)

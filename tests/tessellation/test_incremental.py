@@ -1,4 +1,4 @@
-"""A diagram carried over to moved generators against one made anew, and what must not be carried over."""
+"""The incremental update: comparison with diagrams made anew, and cases in which it must give up."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def point_sets():
         "hexagons": patch.hexagons(0.04),
         "lattice": square(20),
         "cocircular": 0.4 + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)]),
-        # More faces than are checked one by one, or found in lanes.
+        # More faces than the checks and the lanes handle.
         "wheel": np.concatenate([np.zeros((1, 2)), ring]) + np.array([0.5, 0.4]),
         "walls": np.concatenate([corners, walls, random[:200]]),
         "three": random[:3],
@@ -55,7 +55,7 @@ POINTS = point_sets()
 
 
 class Carried:
-    """A diagram that is carried along, and how one of the same generators comes out anew."""
+    """A diagram that is updated, and the diagram of the same generators made anew."""
 
     def __init__(self, engine, points):
         self.engine, self.n = engine, len(points)
@@ -73,7 +73,7 @@ class Carried:
         )
 
     def move(self, points):
-        """Carry the diagram over to `points`; return it as NumPy arrays, and whether it was."""
+        """Update the diagram to `points`; return it as NumPy arrays, and whether the update succeeded."""
         x = self.engine.upload(points)
         t = self.incremental.update(self.cells, patch.BOX, x, self.t)
         self.t = self.anew(self.cells, points) if t is None else t
@@ -84,7 +84,7 @@ class Carried:
 
 
 def spacing(points):
-    """Distance to the nearest other, (n, 1)."""
+    """Return the distance to the nearest neighbor, (n, 1)."""
     if len(points) == 1:
         return np.full((1, 1), 0.3)
     d = np.linalg.norm(points[:, None] - points[None], axis=2)
@@ -93,7 +93,7 @@ def spacing(points):
 
 
 def check(t, eps):
-    """The cells tile the box, and neighbors know each other."""
+    """Check that the cells tile the box and the graph is symmetric."""
     # In single precision the cluster's spacing is some hundred roundings of its position: corners
     # of the cells around it are known that badly.
     rel = 8 * eps if eps < 1e-10 else 1e-5
@@ -111,8 +111,8 @@ def check(t, eps):
 @pytest.mark.sparse
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
-def test_is_the_diagram_itself(engine, name, share, monkeypatch):
-    """Ten small moves; the same bits as a diagram made anew wherever nothing is degenerate."""
+def test_update_gives_the_diagram_made_anew(engine, name, share, monkeypatch):
+    """Ten small motions give the same bits as a diagram made anew, apart from degenerate vertices."""
     monkeypatch.setattr(
         repair, "FEW", 1
     )  # however small the set, cells are found in lanes where there are any
@@ -132,7 +132,7 @@ def test_is_the_diagram_itself(engine, name, share, monkeypatch):
             assert np.array_equal(t.volumes, expected.volumes)
             assert np.array_equal(t.face_measures, expected.face_measures)
         else:
-            # Only faces of no length may be there in one and not in the other.
+            # Only faces of zero length may exist in one diagram alone.
             assert eps > 1e-10 or name in ("lattice", "hexagons", "cocircular")
             noise = 256 * eps
             assert np.allclose(t.volumes, expected.volumes, rtol=1e-3 if share else 0, atol=noise)
@@ -141,7 +141,7 @@ def test_is_the_diagram_itself(engine, name, share, monkeypatch):
                 faces = zip(a.owners.tolist(), a.neighbors.tolist(), a.face_measures, strict=True)
                 assert all(length < noise for i, j, length in faces if (i, j) not in known)
     if share <= 0.02 and name not in ("clusters", "lattice", "cocircular"):
-        # Of few cells a change concerns too many to be worth a repair.
+        # With few cells a change concerns too many of them.
         assert times == 10 if name != "wheel" else times >= 10 - 250 * share
 
 
@@ -162,8 +162,8 @@ def fitting(t):
 @pytest.mark.sparse
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.2])
-def test_rows_that_are_known_to_fit_do(engine, name, share):
-    """What the next repair takes for granted, against the graph; it would not notice a row that does not fit."""
+def test_rows_marked_as_fitting_fit(engine, name, share):
+    """The next update relies on these marks, so the test compares them with the graph."""
     rng = np.random.default_rng(40967)
     points = POINTS[name].astype(engine.real)
     carried, changed = Carried(engine, points), 0
@@ -184,8 +184,8 @@ def test_rows_that_are_known_to_fit_do(engine, name, share):
         assert changed > 3
 
 
-def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
-    """The others, at walls, in doubt or with more than one change, are clipped: rightly, but at ten times the cost."""
+def test_most_cells_are_made_in_lanes(ctx, monkeypatch):
+    """Cells at walls, doubtful cells and those with several changes are clipped, at ten times the cost."""
     engine, rng = patch.make_engine(ctx), np.random.default_rng(40968)
     if engine.group_size > 1:
         pytest.skip("lanes are for CPUs")
@@ -202,7 +202,7 @@ def test_most_cells_are_found_in_lanes(ctx, monkeypatch):
         if name == "wrap_marked":
             count, listed, slots, counts = args[0], args[1].get(), args[3].get(), args[4].get()
             found.append((listed[:count], counts[:count], slots))
-            # Lanes beyond the last cell leave everything alone.
+            # Lanes beyond the last cell change nothing.
             assert count % 8
             assert (counts[count:] == -7).all()
             assert (slots[SLOT * count :] == -7).all()
@@ -256,8 +256,8 @@ def cross(a, b):
 
 
 @pytest.mark.parametrize("group_size", [None, 128])
-def test_who_is_clipped_has_changed(ctx, group_size, monkeypatch):
-    """At first those whose neighbors are others than before, and hardly anybody else; later hardly anybody."""
+def test_mostly_changed_cells_are_clipped(ctx, group_size, monkeypatch):
+    """The first round clips cells with changed neighbors and few others; later rounds clip few."""
     engine, rng = patch.make_engine(ctx, group_size=group_size), np.random.default_rng(40971)
     points = patch.random_points(3000, 40972)
     carried, rounds, run = Carried(engine, points), [], Engine.run_each
@@ -282,7 +282,7 @@ def test_who_is_clipped_has_changed(ctx, group_size, monkeypatch):
         first, *others = [*rounds, np.zeros(0, int)]
         assert first.tolist() == no_longer_convex(before, points)
         assert set(first.tolist()) <= changed
-        # Two changes beside each other are found out one after the other.
+        # Adjacent changes are found one after the other.
         assert len(changed) - len(first) <= 0.02 * len(changed)
         assert sum(map(len, others)) <= 0.05 * len(changed)
         assert (share > 0) == (len(changed) > 20)
@@ -336,7 +336,7 @@ def checked(before, after, listed, fits):
     return marks, fits
 
 
-def test_rounds_of_clipping(ctx, monkeypatch):
+def test_marks_after_each_round_of_clipping(ctx, monkeypatch):
     """Who is marked after each round, and who is known to fit, of many small sets that change much, row by row."""
     engine, rng = patch.make_engine(ctx), np.random.default_rng(40973)
     run, rounds, state = Engine.run_each, [], {}
@@ -374,7 +374,7 @@ def test_rounds_of_clipping(ctx, monkeypatch):
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 2.0])
 def test_sample_first(engine, share, monkeypatch):
-    """Checked in two parts rows lead to the same bits; where the sample is mostly wrong, the rest is not looked at."""
+    """A check in two parts gives the same bits; if most of the sample is wrong, the rest is not checked."""
     points = POINTS["random"].astype(engine.real)
     rng = np.random.default_rng(40970)
     step = share * spacing(points) * (rng.random(points.shape) - 0.5)
@@ -408,7 +408,7 @@ def test_many_changes_are_made_anew(engine):
 
 
 def test_exchanged_generators(engine):
-    """Every cell is as before, but two have each other's generator."""
+    """All cells stay, but two generators exchange theirs."""
     points = patch.relaxed_points(200, 40965).astype(engine.real)
     carried = Carried(engine, points)
     for i, j in [(0, 1), (17, 91)]:
@@ -421,7 +421,7 @@ def test_exchanged_generators(engine):
 
 
 def test_turned_inside_out(engine):
-    """Reflected, all cells stay convex and consistent, but run clockwise."""
+    """After a reflection all cells are convex and consistent, but clockwise."""
     points = POINTS["random"].astype(engine.real)
     carried = Carried(engine, points)
     mirrored = points.copy()
@@ -433,7 +433,7 @@ def test_turned_inside_out(engine):
 
 @pytest.mark.parametrize("name", ["lattice", "hexagons", "cocircular"])
 def test_onto_a_lattice(engine, name, monkeypatch):
-    """Where faces vanish nearly every row is in doubt: a diagram of faces that are longer than rounding, or none."""
+    """As faces vanish nearly every row is doubtful: the result has only faces above round-off, or none exists."""
     monkeypatch.setattr(repair, "FEW", 1)
     monkeypatch.setattr(repair, "MAX_SHARE", 1.0)
     rng = np.random.default_rng(40975)
@@ -467,7 +467,7 @@ def test_onto_a_lattice(engine, name, monkeypatch):
 
 
 def test_far_jump(engine):
-    """One generator goes across the domain: its old and new surroundings change, nothing else."""
+    """One generator crosses the domain; only its old and new surroundings change."""
     points = patch.relaxed_points(300, 40966).astype(engine.real)
     carried = Carried(engine, points)
     points = points.copy()
@@ -476,7 +476,7 @@ def test_far_jump(engine):
     assert np.array_equal(t.neighbors, carried.reference(points).neighbors)
 
 
-def test_coinciding_generators_are_left_to_the_cells(engine):
+def test_update_gives_up_on_coincident_generators(engine):
     points = POINTS["random"].astype(engine.real)
     carried = Carried(engine, points)
     points = points.copy()
@@ -499,5 +499,5 @@ def test_any_motion(ctx, seed, share, n):
         t, _ = carried.move(points)
         check(t, np.finfo(float).eps)
         expected = carried.reference(points)
-        # As above: coordinates rounded to a grid make points cocircular.
+        # Coordinates rounded to a grid make points cocircular.
         assert np.allclose(t.volumes, expected.volumes, rtol=1e-9, atol=1e-15)

@@ -1,4 +1,4 @@
-"""What a repair withdraws of what it knows, on rows that are made up."""
+"""The marks that an incremental update withdraws, on constructed rows."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.reference import patch
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["at first", "again"])
-def test_who_is_left_by_a_cell_that_is_clipped_again_is_doubted(ctx, again):
+def test_a_former_neighbor_of_a_clipped_cell_loses_its_mark(ctx, again):
     """A row that names too many: the one who is no neighbor may have been found to fit, by the row as it was.
 
     When all cells of a round have been clipped, the old row learns which generators leave it elsewhere.

@@ -1,4 +1,4 @@
-"""The diagram in 3D against references, and its invariants, over point sets x precision."""
+"""The 3D diagram: comparison with references, and invariants, over point sets and precisions."""
 
 import itertools
 
@@ -64,7 +64,7 @@ def point_sets():
         "two": few[:2],
         "three": few,
         "random": rng.random((300, 3)) * extent,
-        # Images in the walls, in the reference, must be apart from their points.
+        # The reference needs mirror images that differ from their points.
         "graded": (0.02 + 0.96 * rng.random((400, 3)) ** 3) * extent,
         "cubic": lattice("cubic", 5),
         "bcc": lattice("bcc", 4),
@@ -99,7 +99,7 @@ FINE = [name for name in POINTS if name not in ("walls, edges and corners", "lat
 
 
 def rows(diagram):
-    """Cell i of each face, and a dictionary of faces by (i, neighbor)."""
+    """Return the cell i of each face, and a dictionary of faces by (i, neighbor)."""
     i = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     return i, {
         pair: k for k, pair in enumerate(zip(i.tolist(), diagram.neighbors.tolist(), strict=True))
@@ -107,7 +107,7 @@ def rows(diagram):
 
 
 def normals(diagram, i):
-    """Outward unit normals of the faces (m, 3)."""
+    """Return the outward unit normals of the faces, (m, 3)."""
     j = diagram.neighbors
     inner = j >= 0
     out = np.zeros((len(j), 3))
@@ -140,7 +140,7 @@ def check_invariants(diagram, eps, crowding=1.0):
     closed = np.zeros((len(diagram), 3))
     np.add.at(closed, i, area[:, None] * normals(diagram, i))
     assert np.abs(closed).max() <= tolerance
-    # Wall faces lie on their wall, and make up its area.
+    # Wall faces lie on their wall and fill it.
     for axis in range(3):
         for side, wall in enumerate((box.lower[axis], box.upper[axis])):
             on = diagram.neighbors == -1 - (2 * axis + side)
@@ -154,7 +154,7 @@ def loop_of(diagram, k):
 
 
 def check_loops(diagram, eps, crowding=1.0):
-    """Loops are polygons with the areas of their faces, the same from both cells; they close every cell."""
+    """Check that loops have the areas of their faces, agree between both cells, and close every cell."""
     i, faces = rows(diagram)
     normal, tolerance = normals(diagram, i), 256 * eps * crowding * diagram.domain.extent.max() ** 2
     edges = [dict() for _ in range(len(diagram))]
@@ -195,8 +195,8 @@ def test_invariants(adapter, name):
 @pytest.mark.sparse
 @pytest.mark.parametrize("kind", list(LATTICES))
 @pytest.mark.parametrize("roundings", [1, 50, 500, 5000])
-def test_lattices_off_by_roundings(adapter, kind, roundings):
-    """Up to eight cells nearly meet in a point, four at an edge: from ties to faces hundreds of roundings wide."""
+def test_lattices_off_by_round_off(adapter, kind, roundings):
+    """Up to eight cells nearly meet at a vertex: from ties to faces that are hundreds of eps wide."""
     rng = np.random.default_rng(8231)
     cube, eps = clvoro.Box((0, 0, 0), (1, 1, 1)), float(np.finfo(adapter.dtype).eps)
     straight = lattice(kind, 5 if kind == "cubic" else 3) / BOX.extent
@@ -214,7 +214,7 @@ def test_lattices_off_by_roundings(adapter, kind, roundings):
 def test_against_qhull(adapter64, name):
     points = POINTS[name]
     diagram = adapter64.diagram(BOX, points)
-    # Qhull's own vertices carry about 1e-13 of the box, more where cells are thin.
+    # The error of Qhull's vertices is about 1e-13 of the box, more in thin cells.
     rel = 1e-9 if name == "clusters" else 1e-10
     for i, cell in enumerate(reference3d.box_voronoi(BOX.lower, BOX.upper, points)):
         assert diagram.volumes[i] == pytest.approx(cell.volume, rel=rel)
@@ -222,7 +222,7 @@ def test_against_qhull(adapter64, name):
         assert np.abs(diagram.centroids[i] - cell.centroid).max() < rel * max(size, 0.1)
         row = slice(*diagram.neighbor_starts[i : i + 2])
         seen = dict(zip(diagram.neighbors[row].tolist(), diagram.face_measures[row], strict=True))
-        # Faces of no area (where many cells meet) may be listed by either side.
+        # Faces of zero area (where many cells meet) may exist on one side only.
         for j in set(cell.faces) | set(seen):
             assert seen.get(j, 0) == pytest.approx(cell.faces.get(j, 0), rel=1e-8, abs=1e-11)
 
@@ -245,7 +245,7 @@ def test_faces_and_moments_against_qhull(adapter64):
 
 @pytest.mark.parametrize("name", ["walls, edges and corners", "lattice on walls"])
 def test_volumes_of_points_on_walls(adapter64, name):
-    """Where mirrored points coincide: against an intersection of half-spaces."""
+    """Mirror images coincide with these points, so the reference intersects half-spaces."""
     points = POINTS[name]
     diagram = adapter64.diagram(BOX, points)
     for i in range(0, len(points), 3):
@@ -259,7 +259,7 @@ def test_volumes_of_points_on_walls(adapter64, name):
 def test_cells_of_a_lattice(adapter, kind, count):
     cube = clvoro.Box((0, 0, 0), (1, 1, 1))
     diagram = adapter.diagram(cube, lattice(kind, 5) / BOX.extent)
-    # Cells two layers off the walls know nothing of them.
+    # Cells two layers away from the walls are those of an infinite lattice.
     inner = (np.abs(diagram.points - 0.5) < 0.27).all(axis=1)
     assert inner.sum() >= 8
     assert (np.diff(diagram.neighbor_starts)[inner] == count).all()
@@ -270,7 +270,7 @@ def tessellation(engine, bins, cells, points, previous=None):
     return cells.tessellate(BOX, x, n, bins.build(BOX, x, n), previous)
 
 
-def test_warm_start_sees_the_same_cells(adapter64):
+def test_warm_start_gives_the_same_cells(adapter64):
     engine = Engine(adapter64.ctx, adapter64.queue, 3, np.dtype(float))
     bins, cells = Bins(engine), Polyhedra(engine)
     rng = np.random.default_rng(515)
@@ -292,7 +292,7 @@ def test_warm_start_sees_the_same_cells(adapter64):
 
 @pytest.mark.parametrize("n", [100, 300])
 def test_many_neighbors_enlarge_the_capacity(adapter64, n):
-    """A generator amid a sphere of others has a face with each of them, and only its cell needs the room."""
+    """The cell in the middle of a sphere of generators has a face with each, and is the only one that needs room."""
     center = np.array([1.0, 0.75, 0.5])
     points = np.concatenate([center + 0.4 * directions(n, np.random.default_rng(31)), [center]])
     diagram = adapter64.diagram(BOX, points)
@@ -300,7 +300,7 @@ def test_many_neighbors_enlarge_the_capacity(adapter64, n):
     check_invariants(diagram, np.finfo(float).eps, 64)
 
 
-def test_too_many_neighbors_are_refused(adapter64):
+def test_too_many_neighbors_are_rejected(adapter64):
     center = np.array([1.0, 0.75, 0.5])
     points = np.concatenate([center + 0.4 * directions(900, np.random.default_rng(31)), [center]])
     with pytest.raises(clvoro.ClvoroError, match="more than 512 faces"):
@@ -323,7 +323,7 @@ def test_same_bits_twice(adapter, name):
         assert np.array_equal(getattr(a, array), getattr(b, array)), array
 
 
-def test_arrays_of_the_plane_are_missing(adapter64):
+def test_2d_arrays_are_missing(adapter64):
     diagram = adapter64.diagram(BOX, POINTS["three"])
     assert not hasattr(diagram, "cell_vertices")
     plane = adapter64.diagram(clvoro.Box((0, 0), (1, 1)), POINTS["three"][:, :2] / 2)
@@ -331,7 +331,7 @@ def test_arrays_of_the_plane_are_missing(adapter64):
 
 
 def test_degenerate_sets(adapter64):
-    """Subsets of a lattice that fills the box and its walls, straight or turned, each point off by an ulp or not."""
+    """Subsets of a lattice that covers the box and its walls, rotated or not; some points are off by one ulp."""
     rng = np.random.default_rng(4099)
     for _ in range(25):
         chosen = rng.permutation(7 * 5 * 4)[: rng.integers(1, 50)]

@@ -1,4 +1,4 @@
-"""What each safeguard of a repair is for: diagrams that without it come out wrong, or are not carried over."""
+"""The purpose of each safeguard of the incremental update: without it a diagram is wrong, or made anew."""
 
 import numpy as np
 import pytest
@@ -10,19 +10,19 @@ from tests.tessellation.test_incremental import Carried
 
 @pytest.fixture
 def generous(monkeypatch):
-    """However much has changed in so few cells, it is repaired; also in lanes, where there are any."""
+    """Let the update accept any share of changed cells, in lanes as well."""
     for name, value in (("MAX_SHARE", 1.0), ("AGAIN_SHARE", 3.0), ("FEW", 1)):
         monkeypatch.setattr(repair, name, value)
 
 
 @pytest.fixture(params=["as it is", "one by one"])
 def group_size(request):
-    """Rows are checked in lanes on CPUs; one by one on GPUs."""
+    """CPUs check rows in lanes, GPUs one by one."""
     return None if request.param == "as it is" else 128
 
 
 def carry(ctx, real, group_size, points, moved):
-    """Return the diagram carried from `points` to `moved`, None if it was not, and that made anew."""
+    """Return the diagram updated from `points` to `moved`, None if the update gave up, and that made anew."""
     engine = patch.make_engine(ctx, real, group_size=group_size)
     points, moved = (np.array(x, engine.real) for x in (points, moved))
     carried = Carried(engine, points)
@@ -62,14 +62,14 @@ def wound_twice(of_three, spacing=0.06):
 @pytest.mark.parametrize("of_three", [False, True], ids=["generator", "three"])
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_cells_that_cover_the_box_twice(ctx, real, group_size, generous, of_three):
-    """A cell whose outline goes twice round its generator, or three that are turned over at a corner, tell."""
+    """A cell that winds twice around its generator, or three cells reversed at a corner, reveal it."""
     t, expected = carry(ctx, real, group_size, *wound_twice(of_three))
     assert expected.volumes.sum() == pytest.approx(0.75, rel=1e-6)
     assert t is None or t.volumes.sum() == pytest.approx(0.75, rel=1e-6)
 
 
-def test_whom_a_row_named_before_is_told(ctx, group_size, generous):
-    """One of four leaves, whose old neighbors still name it: it has to be clipped with them again."""
+def test_former_neighbors_are_clipped_again(ctx, group_size, generous):
+    """One of four cells loses neighbors that still list it: all are clipped again."""
     points = np.array([[0.27, 0.01], [0.38, 0.0], [0.57, 0.02], [0.03, 0.03]])
     moved = points.copy()
     moved[2] = 0.26, 0.01
@@ -77,7 +77,7 @@ def test_whom_a_row_named_before_is_told(ctx, group_size, generous):
     assert t is None or np.allclose(t.volumes, expected.volumes, rtol=0, atol=1e-15)
 
 
-def test_both_who_do_not_fit_are_clipped_again(ctx, group_size, generous):
+def test_two_cells_that_do_not_fit_are_clipped_again(ctx, group_size, generous):
     points = np.array(
         [[0.7414, 0.2586], [0.6, 0.6], [0.6, 0.2], [0.7414, 0.5414], [0.4, 0.4], [0.4586, 0.2586], [0.8, 0.4],
          [0.4586, 0.5414]]
@@ -93,8 +93,8 @@ def test_both_who_do_not_fit_are_clipped_again(ctx, group_size, generous):
 CROSS = [[0.22, 0.34], [0.19, 0.34], [0.22, 0.25], [0.25, 0.31]]
 
 
-def test_rows_that_leave_out_other_faces_of_no_length_stay(ctx, group_size):
-    """Four on a circle, as rounding has them: both pairs may take each other for neighbors, or neither."""
+def test_rows_that_drop_different_faces_of_zero_length_stay(ctx, group_size):
+    """Four generators on a circle up to round-off: both pairs may be neighbors, or neither."""
     t, expected = carry(ctx, "float64", group_size, CROSS, CROSS)
     assert_same(t, expected)
 
@@ -102,13 +102,13 @@ def test_rows_that_leave_out_other_faces_of_no_length_stay(ctx, group_size):
 @pytest.mark.parametrize(
     ("real", "points", "moved"),
     [
-        # A cell's face becomes as short as rounding.
+        # A face becomes as short as round-off.
         ("float64", [[0.2811, 0.2812], [0.3126, 0.2812], [0.2813, 0.3438], [0.3126, 0.3438]],
          [[0.28, 0.28], [0.31, 0.28], [0.28, 0.34], [0.31, 0.34]]),
-        # Four on a circle that is far smaller than their cells.
+        # Four generators on a circle that is far smaller than their cells.
         ("float32", [[0.6991, 0.22476], [0.70043, 0.22476], [0.70043, 0.22576], [0.6991, 0.22576]],
          [[0.6991, 0.22476], [0.70043, 0.22476], [0.70043, 0.22576], [0.6991, 0.22575]]),
-        # A cluster, all of whose corners are near each other beside the rounding of positions.
+        # A cluster whose corners differ by little more than the round-off of positions.
         ("float32", [[0.40047, 0.40051], [0.40058, 0.40043], [0.40075, 0.40016], [0.40034, 0.40043], [0.40042, 0.40038],
                      [0.40053, 0.40041], [0.40055, 0.40058]],
          [[0.45948, 0.40124], [0.45953, 0.40117], [0.4596, 0.40089], [0.45943, 0.40116], [0.45947, 0.40111],
@@ -116,16 +116,16 @@ def test_rows_that_leave_out_other_faces_of_no_length_stay(ctx, group_size):
     ],
     ids=["short faces", "near generators", "small distances"],
 )  # fmt: skip
-def test_bits_where_rounding_decides(ctx, real, points, moved, group_size, generous):
-    """What is carried over has the faces that are found anew, those of no length, too."""
+def test_bits_where_round_off_decides(ctx, real, points, moved, group_size, generous):
+    """The updated diagram has the faces of the one made anew, including those of zero length."""
     t, expected = carry(ctx, real, group_size, points, moved)
     if t is not None:
         assert_same(t, expected)
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-5])
-def test_a_square_lattice_is_carried(ctx, noise, generous):
-    """In single precision four cells meet in almost each corner, and each may see faces that another does not see."""
+def test_a_square_lattice_is_updated(ctx, noise, generous):
+    """In single precision four cells meet at almost every vertex, and may have different faces there."""
     rng, k = np.random.default_rng(50301), (np.arange(60) + 0.5) / 60
     points = np.stack(np.meshgrid(k, 0.75 * k), axis=-1).reshape(-1, 2)
     moved = points + noise * rng.standard_normal(points.shape)
@@ -137,7 +137,7 @@ def test_a_square_lattice_is_carried(ctx, noise, generous):
 
 @pytest.mark.parametrize("count", [14, 18])
 def test_cells_of_many_faces(ctx, count, group_size, generous):
-    """Beyond sixteen faces a cell is clipped anew each time."""
+    """A cell with more than sixteen faces is clipped again in every update."""
     rng, turn = np.random.default_rng(50302), 2 * np.pi * np.arange(count) / count
     ring = [0.5, 0.375] + 0.2 * np.column_stack([np.cos(turn), np.sin(turn)])
     points = np.concatenate([[[0.5, 0.375]], ring + 1e-4 * rng.random(ring.shape)])

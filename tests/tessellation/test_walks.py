@@ -1,4 +1,4 @@
-"""Cells in 3D by walking along their edges against cells by clipping, and against Qhull."""
+"""Cells in 3D from walks along their edges: comparison with clipping and with Qhull."""
 
 import numpy as np
 import pytest
@@ -44,13 +44,13 @@ def point_sets():
         **{f"{n} random": random[:n] for n in (1, 2, 3, 7, 8, 9, 100, STRETCH + 1)},
         "random": random,
         "cubed": rng.random((2000, 3)) ** 3,
-        # Those about the empty ball have long cells, down to its center.
+        # Cells around the empty ball reach its center.
         "hollow": np.clip(0.5 + hollow * directions(rng, 3000), 0, 1),
         "radial": np.clip(spot + 0.6 * shell * directions(rng, 2000), 0, 1),
         "clusters": np.concatenate(
             [spot + s * (rng.random((300, 3)) - 0.5) for s in (1e-2, 1e-4, 1e-6)] + [random[:50]]
         ),
-        # Cells as long as the box with neighbors at a thousandth of that: edges lie on bisectors to a few roundings.
+        # Cells as long as the box with neighbors at a thousandth of that: edges lie on bisectors up to a few eps.
         "spots": np.clip(
             random[:150].repeat(20, axis=0) + 1e-3 * rng.standard_normal((3000, 3)), 1e-6, 1
         ),
@@ -84,7 +84,7 @@ POINTS = point_sets()
 
 
 def walked(engine, points, rows=None):
-    """Return the counts of faces after walking alone, `UNFINISHED` where a cell is left."""
+    """Return the numbers of faces after walking alone, `UNFINISHED` for cells left to clipping."""
     n, x = len(points), engine.upload(points)
     rows = n if rows is None else rows
     cells, b = Polyhedra(engine), Bins(engine).build(CUBE, x, n)
@@ -106,7 +106,7 @@ def walked(engine, points, rows=None):
 
 
 class Rows:
-    """A diagram's rows on the host, faces in the order of labels."""
+    """Return the rows of a diagram on the host, with faces in the order of labels."""
 
     def __init__(self, t):
         starts = t.starts.get()
@@ -122,7 +122,7 @@ class Rows:
 
 
 def tessellations(engine, points, rows=None):
-    """Return the diagram with walking and without it, and the radii that both have left."""
+    """Return the diagram with walking and without it, and the radii after both."""
     n, x = len(points), engine.upload(points)
     found = []
     for walk in (True, False):
@@ -154,7 +154,7 @@ def test_cells_are_those_of_clipping(engine, name):
     ratio = reach**3 / b.volumes
     assert (np.abs(a.offsets - b.offsets).max(axis=1) <= eps * reach * ratio).all()
     assert (np.abs(a.covariances - b.covariances).max(axis=1) <= eps * reach**2 * ratio).all()
-    # Kept in single precision.
+    # Stored in single precision.
     assert reach_a == pytest.approx(reach_b, rel=1e-6)
 
 
@@ -162,18 +162,18 @@ def test_cells_are_those_of_clipping(engine, name):
     ("name", "share"),
     [
         ("random", 0.99), ("bcc, jittered", 0.99), ("cubed", 0.9), ("radial", 0.95), ("hollow", 0.98),
-        # Cells that are open among what is near, and such as many may cut off.
+        # Cells that near generators do not close, and cells that many generators may cut.
         ("a dense and an empty half", 0.99), ("few and a cluster", 0.99), ("clusters", 0.8),
     ],
 )  # fmt: skip
 def test_most_cells_are_walked(engine, name, share):
-    """Else the kernel would be right but useless; lattices, where every decision is near to rounding, are left."""
+    """Otherwise the kernel would be useless. Lattices, where every decision is near round-off, are left to clipping."""
     counts = walked(engine, POINTS[name])
     assert np.count_nonzero(counts > 0) >= share * len(counts)
 
 
 def morton(side):
-    """Return the bins (x, y, z) of a cube of `side` bins each way, a power of two, in the order of Morton's curve."""
+    """Return the bins (x, y, z) of a cube of `side` bins per axis, a power of two, in Morton order."""
     if side == 1:
         return np.zeros((1, 3), int)
     half = morton(side // 2)
@@ -184,8 +184,8 @@ def morton(side):
 
 @pytest.mark.parametrize("name", ["1 random", "random", "cubed", "clusters", "to the walls"])
 @pytest.mark.parametrize("extent", [(1, 1, 1), (1, 0.2, 0.05), (1, 0.6, 1)])
-def test_order(engine, name, extent):
-    """Cubes of bins of the first grid, along x first; in them and in divided bins along Morton's curve."""
+def test_cells_are_walked_in_morton_order(engine, name, extent):
+    """Cubes of bins follow each other along x first; inside them and in divided bins the order is Morton's."""
     box = clvoro.Box((0, 0, 0), extent)
     points = POINTS[name] * box.extent
     n = len(points)
@@ -216,7 +216,7 @@ def test_against_qhull(engine):
         if counts[i] < 0:
             continue
         own = slice(*t.starts[i : i + 2])
-        # Qhull lists images of others behind the walls, too, by faces of no area.
+        # Qhull also lists mirror images of other generators, with faces of zero area.
         faces = {label: area for label, area in cell.faces.items() if area > 1e-12}
         assert t.neighbors[own].tolist() == sorted(faces)
         for k in range(own.start, own.stop):
@@ -230,7 +230,7 @@ def test_against_qhull(engine):
         assert t.covariances[i] == pytest.approx(cell.covariance[np.triu_indices(3)], abs=1e-12)
 
 
-def test_coinciding_generators_are_left(engine):
+def test_coincident_generators_are_left_to_clipping(engine):
     points = POINTS["random"][:300].copy()
     points[[30, 77]] = points[123]
     counts = walked(engine, points)
@@ -238,8 +238,8 @@ def test_coinciding_generators_are_left(engine):
     assert np.count_nonzero(counts > 0) > 250
 
 
-def test_only_some_rows(engine):
-    """Cells of the first generators alone, as periodic boxes want them; the others are there for these."""
+def test_cells_of_the_first_generators_only(engine):
+    """As in periodic boxes, where images get no cells."""
     points = POINTS["random"][:900]
     (a, _), (b, _) = tessellations(engine, points, rows=400)
     whole = tessellations(engine, points)[0][0]
@@ -249,8 +249,8 @@ def test_only_some_rows(engine):
     assert a.volumes == pytest.approx(whole.volumes[:400], rel=1e-12)
 
 
-def test_too_little_room(engine, monkeypatch):
-    """What does not fit is counted, and all is made anew with more room: to the same bits."""
+def test_face_arrays_grow(engine, monkeypatch):
+    """Faces beyond the capacity are counted, and all cells are made again, with the same bits."""
     points = POINTS["random"][:500]
     expected = tessellations(engine, points)[0][0]
     monkeypatch.setattr("clvoro.tessellation.polyhedra.FACES_PER_CELL", 0.1)

@@ -1,4 +1,4 @@
-"""Chords of a polygon's boundary against the nearest of all generators along every edge."""
+"""Chords of the boundary: comparison with the nearest generator along every edge."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ N = 90
 
 
 def envelope(a, e, points):
-    """Who is nearest along a + t e, t = 0 to 1, and where he ceases to be: [(cell, t)], by all of them."""
-    # |a + t e - x|^2 less what all have in common is a line in t: its height, its slope.
+    """Return [(nearest generator, t where it ceases to be nearest)] along a + t e, t = 0 to 1, by brute force."""
+    # |a + t e - x|^2 minus the common terms is linear in t: intercept and slope.
     heights, slopes = ((a - points) ** 2).sum(axis=1), -2 * points @ e
     cell, t, found = int(heights.argmin()), 0.0, []
     while True:
@@ -43,7 +43,7 @@ def test_chords(ctx, name, real):
     cells = np.array([cell for edge in expected for cell, _ in edge])
     rng = np.random.default_rng(5702)
     for _ in range(3):
-        # Whoever held the vertices before, the ways lead to those who hold them now.
+        # The result does not depend on the former owners of vertices.
         boundary.owners.set(rng.integers(0, N, len(vertices)).astype(np.int32))
         boundary._known = N
         chords = boundary.cut(t, N)
@@ -72,8 +72,8 @@ def test_chords(ctx, name, real):
             assert np.array_equal(listed[starts[u] : starts[u + 1]], np.flatnonzero(cells == cell))
 
 
-def test_cells_of_generators_outside_are_named(ctx):
-    """Those that the boundary passes through, and no others."""
+def test_cells_of_outside_generators_that_the_boundary_crosses_are_reported(ctx):
+    """Exactly those cells are reported."""
     domain = POLYGONS["star"]()
     engine = patch.make_engine(ctx, box=domain)
     inside = domain.place(scattered(domain, N, 5703), engine.real)
@@ -96,8 +96,8 @@ def test_cells_of_generators_outside_are_named(ctx):
 
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
-def test_vertices_go_to_the_nearer_of_generators_some_roundings_apart(ctx, real):
-    """Whose distances from there are the same number, but whose bisector passes by far away."""
+def test_vertices_belong_to_the_nearer_of_two_close_generators(ctx, real):
+    """The two rounded distances are equal, but the bisector is far from the vertex."""
     domain = clvoro.Polygon(UNIT)
     engine = patch.make_engine(ctx, real, box=domain)
     vertices = domain.place(domain.oriented.vertices, engine.real).astype(float)

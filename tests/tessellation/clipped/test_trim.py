@@ -1,4 +1,4 @@
-"""Diagrams of polygonal domains against half-planes and shapely, and what must hold of every one."""
+"""Diagrams of polygonal domains: comparison with half-planes and Shapely, and invariants."""
 
 import numpy as np
 import pyopencl as cl
@@ -42,7 +42,7 @@ def compare(adapters, domain, points, length=1024, euler=False):
     for real, adapter in adapters.items():
         diagram = adapter.diagram(domain, points)
         assert faults(diagram, real) == []
-        # Coordinates of domains far from the origin round before the device sees them.
+        # Coordinates of domains far from the origin are rounded before they reach the device.
         far = max(map(abs, (*domain.lower, *domain.upper))) / size
         eps = float(np.finfo(real).eps) + far * float(np.finfo(float).eps)
         assert np.abs(diagram.volumes - cells.areas)[sure].max() < 32 * eps * size**2
@@ -97,7 +97,7 @@ def test_pieces_change_cells(adapters):
     cells = compare(adapters, domain, scattered(domain, 150, 4))
     moved = [p for p in cells.pieces if p.root != p.home]
     assert len(moved) > 300
-    # Not only those that touch a piece with a generator.
+    # Also pieces that touch no piece with a generator.
     roots = {p.root for p in cells.pieces}
     assert roots <= set(range(150))
 
@@ -130,7 +130,7 @@ def test_generators_on_the_boundary(adapters, name):
 
 
 def test_generators_mirrored_at_an_edge(adapters):
-    # Two prongs with a gap between them, whose middle line is every face's.
+    # All faces lie on the middle line of the gap between two prongs.
     domain = clvoro.Polygon(comb(2, 0.9, 0.05))
     y = np.linspace(0.15, 0.95, 9)
     left = np.column_stack([0.25 - 0.02 * np.cos(9 * y), y])
@@ -143,7 +143,7 @@ def test_generators_mirrored_at_an_edge(adapters):
 def test_points_on_a_circle_around_a_vertex(adapters):
     angle = np.arange(24) * (np.pi / 12)
     ring = 0.5 + 0.25 * np.column_stack([np.cos(angle), np.sin(angle)])
-    # All faces meet in (.5, .5), the tip of a slit and of a wedge.
+    # All faces meet at (.5, .5), the tip of a slit and of a wedge.
     for polygon in (slit(0.01, 0.5), [(0, 0), (1, 0), (1, 1), (0.5, 0.5), (0, 1)]):
         domain = clvoro.Polygon(polygon)
         compare(adapters, domain, ring[domain.contains(ring)])
@@ -163,8 +163,8 @@ def test_rings_that_touch(adapters, name):
             assert faults(adapter.diagram(domain, inside), real) == []
 
 
-def test_roundings_decide_nothing(adapters):
-    """Vertices on faces and on Voronoi vertices but for some roundings."""
+def test_round_off_decides_nothing(adapters):
+    """Vertices lie on faces and on Voronoi vertices up to some eps."""
     rng = np.random.default_rng(8)
     for k in range(60):
         real = REALS[k % 2]
@@ -184,7 +184,7 @@ def test_roundings_decide_nothing(adapters):
 
 
 def test_islands_in_a_lake_in_a_cell(adapters):
-    # The generator stands on the island, whose lake and shore lie within its region.
+    # The generator is on the island; the lake and its shore lie in the same convex cell.
     domain = POLYGONS["islands"]()
     cells = compare(adapters, domain, lattice(2, "corners"))
     assert cells.areas[4] == pytest.approx(0.13, abs=1e-12)  # island and the ring within the region
@@ -194,8 +194,8 @@ def test_islands_in_a_lake_in_a_cell(adapters):
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_an_island_whose_shore_goes_to_another(adapters, order):
-    """Two pieces wind around the generator: its own is the nearer one, whichever comes first."""
+def test_an_island_whose_shore_belongs_to_another_cell(adapters, order):
+    """Two pieces surround the generator; the nearer one is its own, in any order."""
     pieces = [[UNIT, UNIT * 0.4 + 0.3], [UNIT * 0.2 + 0.4]]
     domain = clvoro.Polygon.from_pieces(pieces[::order])
     cells = compare(adapters, domain, np.array([(0.5, 0.5), (0.95, 0.5)]))
@@ -218,7 +218,7 @@ def test_holes_that_touch_the_boundary_of_their_piece(adapters):
             for real, adapter in adapters.items():
                 diagram = adapter.diagram(domain, points)
                 assert faults(diagram, real) == []
-                # Coordinates up to 4 round.
+                # Coordinates up to 4 are rounded.
                 assert diagram.volumes[0] == pytest.approx(0.16, abs=4 * float(np.finfo(real).eps))
 
 
@@ -238,7 +238,7 @@ def test_corners_of_an_island_level_with_the_generator(adapters, generator, isla
     compare(adapters, domain, np.array(points, float))
 
 
-def test_what_is_thinner_than_rounding_is_refused_or_right(adapters):
+def test_parts_thinner_than_round_off_are_rejected_or_correct(adapters):
     refused = 0
     for seed in range(12):
         for polygon in (slit(1e-9, 0.6), slit(1e-8, 0.8), spit(1e-9)):
@@ -319,7 +319,7 @@ def test_ghost_generators_change_nothing(stages, name):
 
 @pytest.mark.sparse
 @pytest.mark.parametrize("name", ["star", "holes", "islands", "koch", "comb"])
-def test_repaired_diagrams_are_those_made_anew(stages, name):
+def test_updated_diagrams_are_those_made_anew(stages, name):
     domain = POLYGONS[name]()
     n, rng = 300, np.random.default_rng(77)
     warm = Tessellator(stages, domain, lambda x: np.full(len(x), np.sqrt(domain.measure / n)))
@@ -328,7 +328,7 @@ def test_repaired_diagrams_are_those_made_anew(stages, name):
         on_device = stages.engine.upload(domain.place(points, stages.engine.real))
         previous = warm.tessellate(on_device, n, previous)
         mine = read(stages, domain, previous)
-        # Stages of its own, as buffers are reused.
+        # Separate stages, since buffers are reused.
         fresh = Stages(stages.engine)
         anew = read(fresh, domain, Tessellator(fresh, domain).tessellate(on_device, n))
         again = read(fresh, domain, Tessellator(fresh, domain).tessellate(on_device, n))
