@@ -1,4 +1,4 @@
-"""Open files of others: regular files only, which neither block nor are endless."""
+"""Open files that a caller names. Only regular files are opened: pipes may block, and devices may be endless."""
 
 from __future__ import annotations
 

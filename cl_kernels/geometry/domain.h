@@ -57,7 +57,7 @@ inline REAL wrapped(REAL y, REAL period)
 #define DIFFERENCE(a, from, to) nearest_image((to) - (from), PERIOD(a))
 
 #ifndef POLYGON
-/* Moves the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
+/* Move the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
 inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
 {
     BOX_CORNERS(lower, upper);

@@ -1,6 +1,6 @@
 /* Volume projection: the smallest displacement that gives all cells their volumes, to first order.
 
-   The derivative of the volumes by the generators is exact,
+   The derivative of the volumes with respect to the generators is exact,
 
      dV_i/dx_j = w_ij (x_j - m_ij),   dV_i/dx_i = sum_j w_ij (m_ij - x_i),   w_ij = l_ij / d_ij,
 

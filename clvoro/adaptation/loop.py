@@ -305,7 +305,7 @@ class Loop:
         answer = self.callback(self.rows[-1][0].copy())
         try:
             return bool(answer)
-        except ValueError as error:  # NumPy's, of arrays
+        except ValueError as error:  # a NumPy array has no truth value
             raise InputTypeError(
                 f"callback returned {answer!r:.60} of type {type(answer).__name__}, expected True to stop, False or "
                 f"None to go on ({error})"

@@ -23,7 +23,7 @@ EffortName = Literal["fast", "default", "best"]
 Start = Literal["density", "uniform"]
 METHODS, EFFORTS, STARTS = get_args(MethodName), get_args(EffortName), get_args(Start)
 _MULTILEVEL = ("adaptive", "exact")
-_MOST_STEPS = 10**6  # plan and history are lists with one entry per step
+_MOST_STEPS = 10**6  # schedule and history are lists with one entry per step
 
 _USERS = {
     "effort": _MULTILEVEL,

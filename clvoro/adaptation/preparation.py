@@ -130,8 +130,9 @@ class Preparation:
     def _warn_of_coarse_size(self, required: float) -> None:
         domain = self.domain
         message = (
-            f"the size field requires {required:.2g} cells in a domain of {domain.measure:.6g}, so that the mesh has "
-            "one cell, which is too small; do h and the domain have the same unit of length?"
+            f"h is larger than the domain: the size field requires {required:.2g} cells in a domain of "
+            f"{'area' if domain.dim == 2 else 'volume'} {domain.measure:.6g}, and the mesh has a single cell; do h and "
+            "the domain have the same unit of length?"
         )
         if isinstance(domain, Polygon) and may_be_degrees(domain.lower, domain.upper):
             message += " (Coordinates that are longitudes and latitudes must be projected first.)"

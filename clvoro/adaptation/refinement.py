@@ -43,7 +43,7 @@ class Refinement:
             Size on the new level, at the generators of `t`.
         labels : (n,) int32, optional
         fixed : int
-            Generators with labels below `fixed`, and edges that end in them, bring no new ones.
+            Generators with labels below `fixed`, and edges that end in them, get no new generators.
         """
         engine, k, n = self.engine, self._kernels, t.n
         fixed_args = t.starts if labels is None else labels, np.int32(fixed)

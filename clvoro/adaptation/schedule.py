@@ -39,11 +39,11 @@ from .methods import Method, ProjectedMethod, WeightedMethod
 COARSEST = {2: 1400, 3: 1500}
 """Approximate number of cells of the coarsest level by dimension.
 
-A step on fewer cells is hardly cheaper (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) with 23,000 to
+A step on fewer cells is not much cheaper (see `STEP_CELLS`). Measured on F2 (see bench/convergence.py) with 23,000 to
 100,000 cells, half as many cells and one more level give no better mesh.
 """
 STEP_CELLS = 3000
-"""Cells for which a step takes as long as its launches."""
+"""Cost of the launches of a step, as a number of cells."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ def auto_levels(n: float, dim: int) -> int:
 def is_near(
     dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float
 ) -> bool:
-    """Tell whether a given mesh of `n` cells only needs a correction to be as good as `effort` makes it.
+    """Tell whether a given mesh of `n` cells only needs a correction to reach the quality of `effort`.
 
     Parameters
     ----------

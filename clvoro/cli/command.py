@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +223,7 @@ def _carry_out(argv: Sequence[str] | None) -> int:
     try:
         arguments = build_parser().parse_args(argv)
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _warning_printer()
             return arguments.work(arguments)
     except (OutputError, BuildError) as error:
         return _complain(error, FAILED)
@@ -240,9 +240,17 @@ def _carry_out(argv: Sequence[str] | None) -> int:
         return _complain("interrupted, nothing more has been written", INTERRUPTED)
 
 
-def _show_warning(message: Warning | str, *_: object) -> None:
-    """Print a warning without the place in the code."""
-    print(f"clvoro: warning: {message}", file=sys.stderr)
+def _warning_printer() -> Callable[..., None]:
+    """Return a function that prints each warning once, without the place in the code."""
+    printed: set[str] = set()
+
+    def show(message: Warning | str, *_: object) -> None:
+        text = f"clvoro: warning: {message}"
+        if text not in printed:
+            printed.add(text)
+            print(text, file=sys.stderr)
+
+    return show
 
 
 def _complain(message: object, code: int) -> int:

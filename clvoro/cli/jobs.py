@@ -371,7 +371,7 @@ class Job:
             if isinstance(result.diagram.domain, Polygon):
                 print(f"{name}: {boundary_line(result)}")
         first = "report.html" if self.report else "mesh.vtu"
-        print(f"written: {self.out / first} and what lies beside it")
+        print(f"written: {self.out / first} and the files beside it")
         for name, profile in profiles.items():
             print(f"\nwhere the time of {name} went:\n{profile.table()}")
 

@@ -70,7 +70,7 @@ def write_arrays(
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_file(path) as file,
-        # Coordinates hardly compress. Graphs do, at any level.
+        # Coordinates barely compress. Graphs do, at any level.
         zipfile.ZipFile(file, "w", method, compresslevel=1) as archive,
     ):
         for name, array in {"format": kind, "version": version, **arrays}.items():

@@ -1,8 +1,8 @@
 """Write meshes in 2D by the UGRID conventions, for QGIS, ParaView, xarray and similar programs.
 
 See https://ugrid-conventions.github.io/ugrid-conventions. Vertices are nodes and cells are faces. Indices begin with 0;
--1 stands for a missing item. As in VTK files, cells are not cut at seams: each side of a seam has nodes and edges of
-its own. The loops of a cell around an island are joined by bridges, edges that are passed in both directions.
+-1 stands for a missing item. As in VTK files, cells are not cut at seams: each side of a seam has separate nodes
+and edges. The loops of a cell around an island are joined by bridges, edges that are passed in both directions.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def make_faces(diagram: Diagram) -> Faces:
     wall = np.where(inner, 0, -1 - t.neighbor)
     shift = diagram.shifts[t.rows]
     center = diagram.face_centroids[t.rows].astype(float)
-    if t.flipped.any():  # described by the neighbor alone, hence around it
+    if t.flipped.any():  # only the neighbor has the face, so its position is beside the neighbor
         shift = np.where(t.flipped[:, None], -shift, shift)
         center = center + np.where(t.flipped[:, None], shift * domain.extent, 0.0)
     normal, distance = np.empty((len(wall), d)), np.empty(len(wall))

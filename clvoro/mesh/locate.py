@@ -1,4 +1,4 @@
-"""Which cell holds a point."""
+"""Find the cells that contain points."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ class Result(Sealed):
         convention: Literal["ugrid", "mpas"] | None = None,
         units: str | None = None,
     ) -> None:
-        """Write the mesh to `path`; the suffix chooses the format.
+        """Write the mesh to `path`; the suffix selects the format.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ class BuildNotice:
         self._began = time.monotonic()
 
     def show(self, built: int) -> None:
-        """Show that so many kernels are built."""
+        """Show the number of kernels that are `built`."""
         if time.monotonic() - self._began < PATIENCE:
             return
         text = f"clvoro builds kernels, once for this device: {built} of {self._total}"

@@ -22,8 +22,8 @@ _UNTYPED_CALLS = 3
 class KernelPool:
     """Kernel objects that are used again.
 
-    To make one, and to set the types of its arguments, takes as long as a hundred launches. Stages are made for each
-    run, and take their kernels from here. No two stages have the same one, because a kernel holds its arguments.
+    Creating a kernel object and setting the types of its arguments takes as long as a hundred launches. Stages are made
+    for each run, and take their kernels from here. Two stages never share one, because a kernel holds its arguments.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ def _key_of(argument: object) -> object:
 def set_args(kernel: cl.Kernel, given: list[Any]) -> None:
     """Set the arguments of `kernel`: buffers, numbers and vectors.
 
-    PyOpenCL tries one type after the other for each argument. For a number this takes five times as long as the launch.
+    PyOpenCL tries one type after another for each argument. For a number this takes five times as long as the launch.
     `set_arg_types` avoids it, but takes as long as twenty numbers. So it is called for kernels that are launched often.
     An argument must have the same type in every call.
     """

@@ -175,7 +175,7 @@ class NamedArrays:
     def __init__(self, engine: Engine, spare: float = 0.0) -> None:
         self._engine, self._spare = engine, spare
         self._arrays: dict[tuple, cla.Array] = {}
-        # The last view of each: to make one takes as long as a launch.
+        # The last view of each, because creating a view takes as long as a launch.
         self._parts: dict[tuple, cla.Array] = {}
 
     def __call__(self, *name: object, size: int, dtype: DTypeLike | None = None) -> cla.Array:

@@ -105,7 +105,7 @@ class Workspace:
         start = self._taken[number]
         key = number, start, shape, dtype
         if key not in self._views:
-            # The view is kept, because to make one takes as long as a launch.
+            # The view is kept, because creating one takes as long as a launch.
             view = self._pieces[number].get_sub_region(start, size)
             self._views[key] = make_array(self._queue, shape, dtype, view), start + size
         array, self._taken[number] = self._views[key]

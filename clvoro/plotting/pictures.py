@@ -90,7 +90,7 @@ def _solid_pictures(panels: Mapping[str, Result], history: Picture) -> list[Pict
     pictures: list[Picture] = [
         (
             "size",
-            "Target size h at the generators, on planes amid the smallest cells.",
+            "Target size h at the generators, on planes through the smallest cells.",
             slices("size"),
         ),
         ("cells", f"The mesh ({name}), colored by metric error.", slices("error")),

@@ -277,7 +277,7 @@ class ConjugateGradient:
                 "the linear solve got a right side, start or operator that is not finite: |b|^2 = "
                 f"{norm_b} and |b - A x|^2 = {norm_r} after scaling. Check the input"
             )
-        # Of a constant right side only round-off remains.
+        # A constant right side leaves only round-off.
         if norm_b <= (8 * np.finfo(self.engine.real).eps) ** 2 * removed:
             return -1.0
         self._norm_b = float(norm_b)

@@ -137,7 +137,7 @@ class Multigrid:
         starts : (n + 1,) int32
         columns : (m,) int32
         weights : (m,) real
-            Symmetric, >= 0. The arrays must not change as long as the levels are used.
+            Symmetric, >= 0. The arrays must not change while the levels are used.
         """
         graph = self._aggregation.scale(Graph(starts, columns, weights), 0)
         self._levels, self._factor = [], None

@@ -79,8 +79,9 @@ class _Arrays:
 class VolumeProjection:
     """Solve for the correction u' in ``u = Ld + u'``, ``u' = -W J^T y``, ``(J W J^T + eps) y = r + J Ld``.
 
-    J is the derivative of the log ratios r by the generators, W = diag(h^2). With eps = 0 the log ratios vanish to
-    first order. A penalty eps > 0 gives a shorter displacement and damps the modes that hardly change any volume.
+    J is the derivative of the log ratios r with respect to the generators, W = diag(h^2). With eps = 0 the log ratios
+    vanish to first order. A penalty eps > 0 gives a shorter displacement and damps the modes that barely change any
+    volume.
 
     Conjugate gradients with a diagonal preconditioner start from y = 0, or along the last solution. An iteration takes
     two kernels. The host enqueues as many iterations as the last solve took and then reads their record. The iterate is

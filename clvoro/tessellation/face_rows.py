@@ -9,7 +9,7 @@ import pyopencl.array as cla
 SLOT = 20
 """Faces per slot. A longer row takes several slots."""
 SPARE_SHARE, SPARE_LEAST = 32, 64
-"""One spare slot per so many cells, and the least number of spare slots, at first."""
+"""Number of cells per spare slot, and the least number of spare slots, at first."""
 CROWDED = 1 << 16
 """A flag of the host: there were too few spare slots."""
 

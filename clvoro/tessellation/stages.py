@@ -69,7 +69,7 @@ def tessellate_box(
     exact: bool,
     binned: BinnedPoints | None = None,
 ) -> Tessellation:
-    """Tessellate the box that cells of `domain` are clipped by; see `Tessellator.tessellate`."""
+    """Tessellate the clip box of `domain`; see `Tessellator.tessellate`."""
     if isinstance(stages.cells, Polyhedra):
         binned = stages.bins.build(domain, points, n) if binned is None else binned
         return stages.cells.tessellate(domain, points, n, binned, previous, exact)

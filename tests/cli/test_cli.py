@@ -205,7 +205,9 @@ def test_warnings_are_one_line(here, capsys):
     (here / "meters.toml").write_text(text)
     assert call("run", "meters.toml", "--no-report", "--quiet", "--method", "lloyd") == cli.OK
     printed = capsys.readouterr().err
-    assert printed.startswith("clvoro: warning: the size field requires")
+    assert printed.startswith(
+        "clvoro: warning: h is larger than the domain: the size field requires"
+    )
     assert printed.count("\n") == 1
 
 

@@ -51,8 +51,8 @@ kernel void count_corners(const int size, global const REAL *points, const REAL4
     half_face_counts[i] = count;
 }
 
-/* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each,
-   as the bisector of generators d apart rounds by r / d of what they do at the distance r. */
+/* How sharply the faces of vertex v determine it: the volume that their unit normals span, times d / (d + r) for each
+   face, because the round-off of a bisector grows as r / d, with d the distance of its generators and r that of v. */
 inline REAL sharpness_of(const cell_t *cell, int v)
 {
     const INDEX4 f = cell->faces[v];

@@ -192,6 +192,10 @@ def domain(value: object, place: str) -> dict[str, Any]:
             raise InputError(
                 f"{place} has both {corners[0]}, of a box, and {rings[0]}, of a polygon; leave one of them out"
             )
+        if not corners and not rings:
+            raise InputError(
+                f"{place} is neither a box nor a polygon, expected lower and upper, or outer, or polygon = FILE"
+            )
         if "polygon" in value:
             rest = {key: item for key, item in value.items() if key != "polygon"}
             value = {"kind": "polygon", "file": text(value["polygon"], f"{place}.polygon"), **rest}

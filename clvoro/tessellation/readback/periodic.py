@@ -47,7 +47,7 @@ class _PeriodicReader(_DiagramReader):
 
     def polygons(self) -> np.ndarray:
         """Which of the folded faces are polygons, (m,) bool."""
-        # The two half-faces at a periodic boundary have loops of their own.
+        # The two half-faces at a periodic boundary have separate loops.
         seen = np.diff(self.loop_starts)[self.places] > 0
         i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbors.get()
         inner, last = np.flatnonzero(j >= 0), 3**self.engine.dim - 1
