@@ -1,7 +1,7 @@
-"""Generators near each other, seen from far away: products of distances lose the digits in which they differ.
+"""Close generators, far from a cell: products of distances lose the digits in which these generators differ.
 
-A cell at the other end of the domain and those near each other have to see the same faces between them; where they did
-not, such sets were refused, or a corner was wrong.
+A far cell and the close cells must have the same common faces. Otherwise such sets were rejected, or a corner was
+wrong.
 """
 
 from contextlib import suppress
@@ -20,7 +20,7 @@ UNIT = clvoro.Box((0, 0), (1, 1))
 
 
 def pairs(diagram):
-    """What is beside what, by places: the order of generators is the device's."""
+    """Return the pairs of neighbors by position, since generators are in the order of the device."""
     first = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
     places = [tuple(x) for x in diagram.points.tolist()]
     return {
@@ -31,7 +31,7 @@ def pairs(diagram):
 
 @pytest.mark.parametrize("seed", [0, 2, 3, 5, 11, 20])
 def test_a_line_among_others(ctx, seed):
-    """In single precision; all but 5 were refused once. The positions are the same in both, and so is the diagram."""
+    """Positions are exact in single precision, so both precisions have the same graph."""
     rng = np.random.default_rng(seed)
     n, step = int(rng.integers(20, 150)), rng.choice([1e-4, 2.5e-4, 5e-4])
     way = rng.uniform(0, 6.28)
@@ -45,7 +45,7 @@ def test_a_line_among_others(ctx, seed):
 
 
 def cluster(seed, real):
-    """A few generators near each other (at random, on a line, on a circle), and fewer anywhere."""
+    """Return close generators (random, on a line, on a circle), and a few elsewhere."""
     rng = np.random.default_rng(seed)
     k, size = int(rng.integers(3, 40)), 10 ** rng.uniform(-5 if real == "float32" else -13, -3)
     center = rng.random(2)
@@ -70,10 +70,10 @@ def test_clusters_among_few(ctx, real):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True], ids=["walls", "seams"])
-def test_one_rounding_apart(ctx, periodic, real):
-    """As near as two places may be, whatever is around them: few or many, at random in a square of nine by nine."""
+def test_generators_one_ulp_apart(ctx, periodic, real):
+    """Generators at the least distance of two positions, in a square of nine by nine, among few or many others."""
     box, adapter = clvoro.Box((0, 0), (1, 1), periodic=periodic), clvoro.Adapter(ctx, real)
-    # In a periodic box places are whole multiples of the rounding beside 1.
+    # In a periodic box positions are multiples of the ulp at 1.
     step = float(np.spacing(np.asarray(0.6875, real))) * (2 if periodic else 1)
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -88,9 +88,12 @@ def test_one_rounding_apart(ctx, periodic, real):
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("seed", [20, 39, 55, 135])
 def test_a_cluster_alone_in_a_periodic_box(ctx, seed, real):
-    """All were refused once in single precision. Rows of bins about images are as far off as neighbors are away, and
-    some were left out (135); of four cells that meet in a point each pair of sides of a seam may see another two share
-    a face, as long as a corner of cells so long and narrow rounds."""
+    """These sets failed once in single precision.
+
+    The round-off of rows of bins around images is as large as the distance of neighbors, so the search missed some
+    (135). At a vertex of four cells the two sides of a periodic boundary may have different faces, as long as the
+    round-off of a vertex of such narrow cells.
+    """
     rng, step = np.random.default_rng(seed), float(np.finfo(real).eps)
     count, across = int(rng.integers(50, 300)), int(rng.integers(15, 60))
     lattice = np.unique(rng.integers(0, across, (count, 2)), axis=0)
@@ -103,8 +106,8 @@ def test_a_cluster_alone_in_a_periodic_box(ctx, seed, real):
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("size", [1e-44, 1e-60, 1e-160, 1e-300])
-def test_nearer_than_the_domain_rounds(ctx, dim, size, real):
-    """Beside 0 places may be as near as that: a mesh or an error; the search for neighbors went on for ever once."""
+def test_generators_closer_than_the_round_off_of_the_domain(ctx, dim, size, real):
+    """Near 0 positions may be that close. The search ends, with a mesh or an error."""
     rng = np.random.default_rng(dim)
     points = np.vstack([size * rng.random((10, dim)), rng.random((100, dim))])
     points[0] = 0
@@ -114,7 +117,7 @@ def test_nearer_than_the_domain_rounds(ctx, dim, size, real):
 
 
 def arc(seed, n, real):
-    """On an arc of a circle, at random: all cells meet near its middle, at angles as small as one wishes."""
+    """Return random generators on an arc of a circle: all cells meet near its center, at small angles."""
     rng = np.random.default_rng(seed)
     radius, middle = 10 ** rng.uniform(-3, -0.5), 0.5 + 0.3 * rng.uniform(-1, 1, 2)
     t = rng.uniform(0, rng.uniform(0.1, 2 * np.pi), n)
@@ -126,7 +129,7 @@ def arc(seed, n, real):
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("n", [100, 400])
 def test_arcs(ctx, n, real, monkeypatch):
-    """Some need faces to stay that are no longer than rounding: too many are left out together otherwise."""
+    """For some arcs faces below round-off must stay, since too many would be dropped together."""
     adapter, tried = clvoro.Adapter(ctx, real), []
     take = Cells.take_rows
 
@@ -142,14 +145,14 @@ def test_arcs(ctx, n, real, monkeypatch):
     assert any(tried) or real == "float64"
 
 
-def test_cells_around_a_vertex_take_one_place_for_it(ctx):
-    """Faces of no length left out one after the other had moved it by 600 roundings."""
+def test_cells_around_a_vertex_have_the_same_position_of_it(ctx):
+    """Dropping faces of zero length one after the other once moved the vertex by 600 eps."""
     report = clvoro.Adapter(ctx).diagram(UNIT, arc(305, 400, float)).check()
     assert report, report
 
 
 def exactly_beyond(x, a, b, j):
-    """What `beyond_corner` is, and whether the corner is one of a cell, by fractions; a negative number is a wall."""
+    """Return `beyond_corner` in fractions, and whether the corner is one of a cell. Negative labels are walls."""
 
     def line(label):
         if isinstance(label, int):
@@ -170,7 +173,7 @@ def exactly_beyond(x, a, b, j):
 
 
 def pitch_of(kind, real):
-    """Of a lattice whose points no precision rounds; four odd pitches have more than twice the digits."""
+    """Return points of a lattice that is exact in both precisions, with pitches of more than twice the digits."""
     digits = 32 if real == "float64" else 16
     return np.rint(0.1 * 2**digits) / 2**digits if kind == "odd lattice" else 1 / 8
 
@@ -189,7 +192,7 @@ kernel void probe(const int size, global const REAL *points, global const int4 *
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("kind", ["far", "near", "circle", "lattice", "odd lattice"])
 def test_the_side_of_a_corner(ctx, kind, real):
-    """By fractions: the sign is right, and 0 is where all meet in a point."""
+    """The sign equals that in fractions; 0 means that all planes meet in a point."""
     rng, n = np.random.default_rng(5), 500
     if kind == "far":
         x = rng.random((4 * n, 2))
@@ -220,14 +223,14 @@ def test_the_side_of_a_corner(ctx, kind, real):
         )
         zeros += truth == 0
         assert np.sign(side) == np.sign(float(truth)) or (not is_corner and side == 0)
-        # Twice the digits, less those that cancel.
+        # Twice the digits, minus those that cancel.
         assert abs(Fraction(side) - truth) <= Fraction(0.01) * abs(truth)
     assert zeros < n
     assert zeros > 0 or "lattice" not in kind
 
 
 def exactly_later(x, a, b, begin, way):
-    """What `leaves_later` is, by fractions, and the sum of its terms; 0 if the line does not lead out of both."""
+    """Return `leaves_later` in fractions and the sum of its terms; 0 if the line does not leave both."""
     x, begin, way = ([Fraction(float(v)) for v in pair] for pair in (x, begin, way))
     found = []
     for label in (a, b):
@@ -259,7 +262,7 @@ kernel void probe(const int size, global const REAL *points, global REAL *found)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("kind", ["far", "near", "tie", "lattice", "odd lattice"])
 def test_the_face_that_a_line_leaves_by(ctx, kind, real):
-    """By fractions: of places x, a, b, where a line begins and its way, which may be off by half its last digit."""
+    """The comparison uses fractions of x, a, b, and of the start and direction of the line."""
     rng, n = np.random.default_rng(6), 500
     step = float(np.spacing(np.asarray(0.5, real)))
     x = rng.random((n, 5, 2))
@@ -299,7 +302,7 @@ def test_the_face_that_a_line_leaves_by(ctx, kind, real):
 
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_a_cell_of_a_thousand_faces(ctx, real):
-    """The middle of a circle; without it a thousand cells meet there, but for rounding."""
+    """The cell at the center of a circle; without it a thousand cells meet there up to round-off."""
     t = np.arange(1000) * 2 * np.pi / 1000
     circle = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t)])
     adapter = clvoro.Adapter(ctx, real)

@@ -1,4 +1,4 @@
-"""Generators in corners that rings share: most of the domain is hidden from them, and their cell is on one side."""
+"""Generators in corners that rings share: they see a small part of the domain, and their cell lies on one side."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def tessellate(ctx, domain, points):
 @pytest.mark.parametrize("method", ["exact", "adaptive", "coupled", "weighted"])
 @pytest.mark.parametrize("name", TOUCHING)
 def test_runs_from_shared_corners(ctx, name, method):
-    """New generators were put where those in the corners stand, and sources of one piece were taken for another's."""
+    """New generators once coincided with those in the corners, and pieces exchanged their sources."""
     domain = TOUCHING[name]()
     corners = shared_corners(domain)[:3]
     for real, others in (("float64", 0), ("float64", 20), ("float32", 3)):
@@ -49,8 +49,8 @@ def test_runs_from_shared_corners(ctx, name, method):
 
 
 @pytest.mark.parametrize("name", TOUCHING)
-def test_what_is_split_off_is_apart(ctx, name):
-    """Both halves would come to the generator: it stays, and the new one goes to the middle of the farthest face."""
+def test_generators_from_a_split_are_distinct(ctx, name):
+    """Both halves would coincide with the generator: it stays, and the new one moves to the farthest face."""
     domain = TOUCHING[name]()
     corner = shared_corners(domain)[:1]
     engine, t = tessellate(ctx, domain, corner)
@@ -80,7 +80,7 @@ def test_what_is_split_off_is_apart(ctx, name):
 
 
 def reorganized(engine, domain, t, total):
-    """Return the population after the count has changed by `total`, where cells have their target size."""
+    """Return the generators after the count has changed by `total`, where cells have their target size."""
     one = engine.upload(np.ones(t.n))
     rows = Generators(
         t.points, engine.upload(np.arange(t.n), np.int32), engine.zeros((t.n, 2)),
@@ -92,8 +92,8 @@ def reorganized(engine, domain, t, total):
     )
 
 
-def test_parts_of_the_graph_are_not_told_by_places(ctx):
-    """The one in the corner has its cell in one of the two pieces; without others there, it has both."""
+def test_components_follow_from_the_graph_not_from_positions(ctx):
+    """The generator in the corner has its cell in one of two pieces, or in both if there are no others."""
     domain = TOUCHING["pieces"]()
     corner = shared_corners(domain)
     for others, count in (([(0.2, 0.3), (0.7, 0.6)], 2), ([(0.2, 0.3), (0.1, 0.1)], 1)):

@@ -1,4 +1,4 @@
-"""Sides of cells at the boundary: what of it is straightened, on the device and on the host, ring by ring."""
+"""Sides of cells at the boundary: which parts of it count as one side, on the device and on the host."""
 
 import numpy as np
 import pyopencl as cl
@@ -14,11 +14,11 @@ from tests.reference.wall_sides import outlines
 
 REALS = ("float64", "float32")
 BLUNT = np.array([(0.5, 0.5), (0.4, 0.9), (0.1, 0.5), (0.4, 0.1)])
-"""A hole with a corner so blunt that its two sides are one: they turn by 28 degrees."""
+"""A hole with a corner of 28 degrees, so blunt that its two edges are one side."""
 
 
 def blunt_holes() -> clvoro.Polygon:
-    """Two of them, which touch in that corner: above it and below it the domain ends in a tip."""
+    """Return two such holes that touch at that corner: the domain has tips above and below it."""
     return clvoro.Polygon(UNIT, [BLUNT, BLUNT * (-1, 1) + (1, 0)])
 
 
@@ -33,7 +33,7 @@ def adapters(ctx):
 
 
 def compare(adapter, domain, points):
-    """Sides, and qualities of the host and of the device, with the reference's; return the outlines and the result."""
+    """Compare sides and qualities of host, device and reference; return the outlines and the result."""
     result = adapter.run(domain, 1.0, points=points, method="lloyd", max_steps=0)
     diagram, real = result.diagram, adapter.dtype
     found, straight = outlines(diagram), straighten(diagram, real)
@@ -42,7 +42,7 @@ def compare(adapter, domain, points):
     areas, perimeters = np.array([(found[i].area, found[i].perimeter) for i in some]).T
     size = float(domain.extent.max())
     far = max(map(abs, (*domain.lower, *domain.upper)))
-    # Sums over some hundred faces, each rounded to float64 twice.
+    # Sums over some hundred faces, each rounded twice.
     rounding = 1024 * (2.2e-16 * (size + far))
     assert np.abs(straight.areas[some] - areas).max() < rounding * size + 64 * size**2 * (
         np.finfo(real).eps
@@ -57,7 +57,7 @@ def compare(adapter, domain, points):
 
 @pytest.mark.parametrize("real", REALS)
 def test_a_boundary_goes_along_its_rings_where_they_touch(adapters, real):
-    """The tips at the corner that two holes share are of one cell: its sides are those of the holes, bent there."""
+    """One cell has both tips at the corner that two holes share; its sides are those of the holes."""
     for points in (
         [(0.09, 0.35), (0.62, 0.02), (0.87, 0.85)],
         [(0.85, 0.16), (0.74, 0.02), (0.08, 1.0)],
@@ -68,7 +68,7 @@ def test_a_boundary_goes_along_its_rings_where_they_touch(adapters, real):
 
 @pytest.mark.parametrize("real", REALS)
 def test_parts_of_a_cell_on_both_sides_of_a_face_are_one(adapters, real):
-    """A spit cuts off what lies behind the bisector, x = 1/2: the bottom is one side none the less, a hole none."""
+    """A cell with parts on both sides of x = 1/2: the bottom is one side, a hole is none."""
     outer = [(0, 0), (0.62, 0), (0.48, 0.6), (0.66, 0), (1, 0), (1, 1), (0, 1)]
     hole = np.array([(0.47, 0.1), (0.53, 0.1), (0.53, 0.2), (0.47, 0.2)])
     points = np.array([(0.3, 0.3), (0.7, 0.3)])
@@ -87,12 +87,12 @@ def test_parts_of_a_cell_on_both_sides_of_a_face_are_one(adapters, real):
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("k", [12, 24, 36, 48, 60, 90, 360])
 def test_arcs_of_thirty_degrees_are_one_side(adapters, real, k):
-    """However the turns round of which there are k / 12: circles are drawn with such numbers of edges."""
+    """Circles often have such numbers of edges; the round-off of the turns does not matter."""
     for turned in (0.0, 0.3):
         domain = clvoro.Polygon(1.7 * circle(k, turned) + 0.1)
         compare(adapters[real], domain, np.array([(0.13, 0.21), (0.5, 0.5), (0.0, 1.0)]))
         found, _ = compare(adapters[real], domain, np.array([(0.13, 0.21)]))
-        # A side turns by as many of the turns as fit into 30 degrees, and has one edge more.
+        # A side has as many turns as fit into 30 degrees, and one edge more.
         assert found[0].sides == -(-k // (k // 12 + 1))
     assert 30 < np.degrees(SIDE_TURN) < 30.1
 
@@ -110,7 +110,7 @@ def test_sides_of_all_kinds_of_cells(adapters, real, name):
 
 @pytest.mark.parametrize("real", REALS)
 def test_sides_along_edges_without_a_length(adapters, real):
-    """Edges that are shorter than the precision have no faces, and turn the boundary nevertheless."""
+    """Edges below round-off have no faces, but still turn the boundary."""
     tiny = 3e-11
     corner = np.array([(1 - tiny, 0), (1, tiny)])  # by 45 degrees twice
     bend = np.array(
@@ -125,7 +125,7 @@ def test_sides_along_edges_without_a_length(adapters, real):
 
 @pytest.mark.parametrize("real", REALS)
 def test_missing_neighbors(ctx, real):
-    """A cell along a straight wall lacks 2, one in a corner of 90 degrees 3.5, in one of 270 degrees 0.5 of them."""
+    """A cell at a straight wall lacks 2 neighbors, in a corner of 90 degrees 3.5, of 270 degrees 0.5."""
     for domain in (clvoro.Polygon(comb(2, 0.5, 0.3)), blunt_holes(), POLYGONS["islands"]()):
         dtype = np.dtype(real)
         engine = Engine(ctx, cl.CommandQueue(ctx), 2, dtype, domain.kind(dtype))
@@ -137,6 +137,6 @@ def test_missing_neighbors(ctx, real):
         missing = 6 - t.outlines[0].get().reshape(-1, 2)[: len(points), 1]
         diagram = clvoro.Adapter(ctx, real).diagram(domain, points)
         expected = [o.missing for o in outlines(diagram)]
-        # Sums of up to a dozen turns.
+        # Round-off of sums of up to a dozen turns.
         assert missing == pytest.approx(expected, abs=64 * float(np.finfo(dtype).eps))
         assert {0.0, 2.0} <= set(np.round(expected, 6).tolist())

@@ -1,6 +1,6 @@
-"""Corners of polygons on faces and where faces meet, many at a time: ties that any edge and any cell must settle alike.
+"""Corners of polygons on faces and on vertices: ties that all edges and cells must decide in the same way.
 
-Most such polygons do not tell whether they are; of those here some do, for each rule in chords.cl.
+Most such polygons do not reveal a wrong rule. Each rule in boundary_crossings.cl has some here that do.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from tests.reference.polygon_diagrams import faults
 from tests.reference.shores import blocks, slit, spit
 
 RING = [(x, y) for x in range(-25, 26) for y in range(-25, 26) if x * x + y * y == 625]
-"""On a circle exactly, in whole numbers: all faces between neighbors on it meet in its center."""
+"""Integer points exactly on a circle: all faces between neighbors meet at its center."""
 
 
 @pytest.fixture(scope="module")
@@ -28,14 +28,14 @@ def check(adapters, shape, points):
     for adapter in adapters if len(points) else ():
         diagram = adapter.diagram(domain, points)
         assert faults(diagram, adapter.dtype.name) == []
-        # Some hundred corners of the unit square round.
+        # Round-off of some hundred corners in the unit square.
         eps = float(np.finfo(adapter.dtype).eps)
         assert diagram.volumes.sum(dtype=float) == pytest.approx(domain.measure, abs=64 * eps)
 
 
 @pytest.mark.parametrize("seed", [*range(160, 190), 5215])
 def test_blocks_and_lattices(adapters, seed):
-    """Squares of a lattice, some cut in half, by generators of the same lattice or of a finer one, not all of it."""
+    """Squares of a lattice, some cut in half, with some generators of the same lattice or of a finer one."""
     rng = np.random.default_rng(seed)
     side = int(rng.choice([2, 3, 4]))
     shape = blocks(rng, side)
@@ -51,7 +51,7 @@ def test_blocks_and_lattices(adapters, seed):
 
 @pytest.mark.parametrize("seed", [*range(20), 111, 160, 211, 333, 385, 438, 5553])
 def test_corners_where_many_faces_meet(adapters, seed):
-    """A wedge out of the square, a hole, or a polygon, with a corner in the middle of generators on a circle."""
+    """A wedge of the square, a hole, or a polygon, with a corner at the center of generators on a circle."""
     rng = np.random.default_rng(seed)
     center, ends = np.array([0.5, 0.5]), rng.integers(0, 9, (3, 2)) / 8
     square = shapely.box(0, 0, 1, 1)
@@ -72,8 +72,9 @@ def test_corners_where_many_faces_meet(adapters, seed):
 
 @pytest.mark.parametrize("real", [0, 1])
 def test_generators_as_close_as_a_slit_is_wide(adapters, real):
-    """Their faces with a third lie alike but for rounding, and which of them the slit's sides cross first is a matter
-    of the face between the two: on either side of it a cell ends half the slit beyond the domain.
+    """Two close generators have nearly the same face with a third.
+
+    The order in which the sides of the slit cross these faces follows from the face between the two generators.
     """
     adapter = adapters[real]
     for seed in range(40):
@@ -94,7 +95,7 @@ def test_generators_as_close_as_a_slit_is_wide(adapters, real):
 @pytest.mark.parametrize("make", [slit, spit])
 @pytest.mark.parametrize("real", [0, 1])
 def test_faces_across_the_tip_of_a_wedge(adapters, real, make):
-    """Near it the sides cross a face closer to each other than rounding, in an order that they have all the same."""
+    """Near the tip both sides cross a face within round-off, in a definite order."""
     adapter = adapters[real]
     domain = clvoro.Polygon(make(100 * float(np.finfo(adapter.dtype).eps)))
     tip = np.array([(0.5, 0.3), (2, 0.5)])[int(make is spit)]
@@ -106,11 +107,11 @@ def test_faces_across_the_tip_of_a_wedge(adapters, real, make):
 
 
 PAIR = clvoro.Polygon.from_shapely(shapely.union(shapely.box(0, 0, 1, 1), shapely.box(1, 1, 2, 2)))
-"""Two squares that have a corner in common."""
+"""Two squares with a common corner."""
 
 
 def crowd(seed: int, n: int) -> np.ndarray:
-    """Generators on a circle about that corner, on which their faces meet but for rounding."""
+    """Return generators on a circle around that corner, where their faces meet up to round-off."""
     rng = np.random.default_rng(seed)
     angles = rng.uniform(0, 7) + 2 * np.pi * np.arange(n) / n
     points = 1 + rng.uniform(0.05, 0.3) * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -120,7 +121,7 @@ def crowd(seed: int, n: int) -> np.ndarray:
 @pytest.mark.parametrize("real", [0, 1])
 @pytest.mark.parametrize("n", [8, 60, 200])
 def test_crowds_around_a_corner(adapters, real, n):
-    """Edges found no way from the corner through cells that are cut off there as rounding has it."""
+    """Edges once found no path from the corner through cells that round-off cuts off there."""
     for seed in range(10):
         diagram = adapters[real].diagram(PAIR, crowd(seed, n))
         assert faults(diagram, adapters[real].dtype.name) == []
@@ -128,8 +129,8 @@ def test_crowds_around_a_corner(adapters, real, n):
         assert report, report
 
 
-def test_edges_may_find_no_way(adapters, monkeypatch):
-    """The boundary is put aside where it must be, and an error says so where that does not help."""
+def test_edges_without_a_path_shift_the_boundary_or_raise(adapters, monkeypatch):
+    """The boundary is shifted slightly; an error is raised if that does not help."""
     monkeypatch.setattr(polygonal, "BOUNDARY_SHIFTS", ())
     with pytest.raises(BoundaryError, match="cannot be traced"):
         adapters[0].diagram(PAIR, crowd(0, 200))
@@ -139,8 +140,8 @@ def test_edges_may_find_no_way(adapters, monkeypatch):
 
 
 @pytest.mark.parametrize("real", [0, 1])
-def test_a_boundary_that_is_put_aside(adapters, monkeypatch, real):
-    """By as much as a hole is wide, in single precision: generators at its corners stay in the domain."""
+def test_a_shifted_boundary(adapters, monkeypatch, real):
+    """The shift equals the width of a hole in single precision: generators at its corners stay in the domain."""
     cut, shifts = Boundary.cut, []
 
     def cut_aside(boundary, t, generators, shift):
@@ -163,7 +164,7 @@ def test_a_boundary_that_is_put_aside(adapters, monkeypatch, real):
     assert faults(diagram, adapter.dtype.name) == []
     report = diagram.check()
     assert report, report
-    # Measures are those of the boundary where it was, which is off by some roundings.
+    # Measures are those of the shifted boundary, some eps away.
     off = domain.boundary_distance(diagram.vertices[~domain.contains(diagram.vertices)])
     assert 0 < off.max() <= (polygonal.BOUNDARY_SHIFTS[0] + 4) * eps * domain.frame[1]
     assert shifts == [False, True]
