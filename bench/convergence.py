@@ -11,7 +11,7 @@ Quality and the share of six-sided cells are those of cells away from the walls;
 all cells. Work is in steps of the finest level: a step on a quarter of the cells counts a quarter. Errors are
 absolute: no common factor is removed.
 
-The 3D fields S1, S2 and S3 have a table of their own. Quality is the isoperimetric quotient 36 pi V^2 / S^3
+The 3D fields S1, S2 and S3 have a separate table. Quality is the isoperimetric quotient 36 pi V^2 / S^3
 (.753 for the truncated octahedron), and "finest steps" counts the steps of the finest level alone.
 """
 

@@ -1,4 +1,4 @@
-"""How long the first run takes: processes of their own, with empty kernel caches.
+"""How long the first run takes: separate processes with empty kernel caches.
 
     python bench/first_run.py [--repeat N] [--warm] [--json]
     python bench/first_run.py --record
@@ -90,7 +90,7 @@ PLACE = ROOT / "clvoro" / "opencl" / "first_kernels.json"
 
 
 def in_process(code: str, cache: str | None) -> object:
-    """Run `code` in a process of its own, with kernel caches in `cache`; return what it prints."""
+    """Run `code` in a separate process, with kernel caches in `cache`; return what it prints."""
     env = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),

@@ -21,7 +21,7 @@ The best options (k = 60, N = 4000 and 16000, growth 1.1 to 2, p = 1, 2, 4 and i
   20 % in L1;
 - h_max of 0.1 or more. With 0.05, many cells are on the plateaus;
 - h_min = 0, unless the raster has noise;
-- any effort: the error depends on sizes, hardly on shape.
+- any effort: the error depends on sizes, and barely on shape.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The paper's validation case: its claims, one by one, against what is measured.
+"""The paper's validation case: its claims, one by one, against measurements.
 
 Runs Lloyd only, Poisson only and both coupled from the same uniform random start, for several
 starts, and prints for each claim of the paper what was measured and whether it holds:

@@ -9,7 +9,7 @@ processor times over the number of cores, medians of several runs by turns.
 
 The second table runs the fields F2 and F3 of `bench/convergence.py` on such a polygon, against one
 and a half times the error targets of the box, and its mean quality less .01. Quality is that of cells
-without a face on the boundary; the others have columns of their own.
+without a face on the boundary; the others have separate columns.
 """
 
 from __future__ import annotations

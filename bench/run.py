@@ -51,7 +51,7 @@ CELLS_OF_F2 = 22972
 
 
 BEFORE = 40_000
-"""Cells of the run before: enough for levels, multigrid and whatever else larger runs have."""
+"""Cells of the run before: enough for levels, multigrid and all other parts of larger runs."""
 
 
 def run_once(

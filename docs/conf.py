@@ -130,7 +130,7 @@ def _escape_bars(app, what, name, obj, options, lines):
 
 
 def setup(app):
-    """Register the renderer of formulas, and what is done to docstrings."""
+    """Register the renderer of formulas, and the changes of docstrings."""
     app.connect("autodoc-process-docstring", _escape_bars, priority=100)
     app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
 

@@ -3,7 +3,7 @@
 
 /* Incremental update: the diagram of generators that moved a little, from the previous diagram, without a search.
 
-   The intersection C_i of the box and the half-planes of *any* generators holds the cell V_i of them all. If around
+   The intersection C_i of the box and the half-planes of *some* generators contains the Voronoi cell V_i. If around
    every corner of C_i the cells that meet there name each other as neighbors, in the order of that corner, the C_i fit
    together without gap or overlap, hence cover the box once, and C_i = V_i for all i. So: take the neighbors of the
    previous diagram, check that every cell is still convex and consistent with its neighbors (`check_rows`), clip the

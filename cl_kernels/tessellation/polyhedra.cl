@@ -195,8 +195,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
 
 /* The area that a face of cell i may have by round-off alone. The bisector of generators d apart is off by eps R / d at
    the distance R. Two bisectors with generators at the least distance d meet at an angle of about d / R, as in a ring.
-   Their edge is off by eps R^2 / d^2 of R, and the area of a face along it by as much of R^2, for which the area of all
-   faces stands. */
+   Their edge is off by eps R^2 / d^2 of R, and the area of a face along it by as much of R^2. The area of all faces
+   replaces R^2. */
 inline REAL rounded_area(int i, int begin, int count, global const int *labels, global const REAL *measures,
                          global const REAL *points)
 {

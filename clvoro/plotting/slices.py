@@ -26,7 +26,7 @@ def require_space(diagram: Diagram) -> None:
     """Raise InputError unless the diagram is three-dimensional."""
     if diagram.domain.dim != 3:
         raise InputError(
-            "slices and cut-away views are of meshes in 3D, and this one is in 2D; call result.plot()"
+            "slices and cut-away views need a mesh in 3D, and this one is in 2D; call result.plot()"
         )
 
 

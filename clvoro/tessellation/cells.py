@@ -231,7 +231,7 @@ class Cells:
         """Return the diagram of `points` from the rows of `previous`, replaced by `rows` where these have a slot.
 
         None if the rows are not consistent. `fits` (n,) is 1 for a row if every neighbor lists the generator between
-        the right two neighbors; it becomes 0 where a face due to round-off is dropped.
+        the correct two neighbors; it becomes 0 where a face due to round-off is dropped.
         """
         n, old = previous.n, (previous.starts, previous.neighbors)
         flags, m = self._match(rows, box, points, n, *old, exact=False, fits=fits)

@@ -88,7 +88,7 @@ def test_insertions_and_deletions_match_the_labels(adapter):
 # Interruptions, wherever they come.
 
 
-OWN = ("loop.py", "state.py", "torus.py", "methods.py", "tessellator.py")
+OWN = ("loop.py", "state.py", "periodic_tessellator.py", "methods.py", "tessellator.py")
 
 
 class Pressed:

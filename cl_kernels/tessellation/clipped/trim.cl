@@ -238,8 +238,8 @@ kernel void adopt_pieces(const int size, SEGMENT_ARGS, global const int *touched
     }
 }
 
-/* Per crossed cell: a piece without a taker stays. orphans[place] = 1 for pieces that go to another cell; their
-   uncrossed neighbors, which must list that cell, are marked. */
+/* Per crossed cell: a piece that no other cell takes stays. orphans[place] = 1 for pieces that go to another cell;
+   their uncrossed neighbors, which must list that cell, are marked. */
 kernel void settle_pieces(const int size, SEGMENT_ARGS, global const int *touched, global const int *slots,
                           global const int *list_starts, global const int *loop_pieces, global int *roots,
                           global int *orphans, global int *marks)

@@ -13,7 +13,7 @@ typedef struct {
 } outline_t;
 
 /* Slightly more than 30 degrees, so that an arc of 2 x 15 degrees is one side despite round-off. The host adds the same
-   numbers in the same order (outlines.py). */
+   numbers in the same order (straightening.py). */
 #define SIDE_TURN R(0.524110102527594)
 
 /* The boundary of the cells of a clipped diagram.

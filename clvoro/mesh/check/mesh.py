@@ -61,7 +61,7 @@ def _finish(
 
 
 def _check_structure(check: Check) -> None:
-    """Check that the arrays fit each other, and the graph."""
+    """Check that the shapes of the arrays match, and check the graph."""
     d = check.diagram
     dim, n = d.domain.dim, len(d.points)
     m = len(d.neighbors)

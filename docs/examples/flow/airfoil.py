@@ -24,7 +24,7 @@ airfoil = np.concatenate(
 )
 
 # %%
-# The airfoil is a hole in the domain, and gets a name of its own.
+# The airfoil is a hole in the domain, and its boundary gets a name.
 
 tunnel = [(-1.2, -1), (3, -1), (3, 1), (-1.2, 1)]
 domain = clvoro.Polygon(tunnel, [airfoil], names={"airfoil": "hole-1"})

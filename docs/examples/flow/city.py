@@ -2,7 +2,7 @@
 Wind in a city
 ==============
 
-A horizontal section through some blocks of a city. Each street gets at least six cells across, whatever its width.
+A horizontal section through some blocks of a city. Each street gets at least six cells across, wide or narrow.
 """
 
 import numpy as np
