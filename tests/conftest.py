@@ -24,6 +24,16 @@ for number, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signa
         signal.signal(getattr(signal, number), handler)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def hulls_for_small_meshes():
+    """Let the small meshes of tests exercise the hulls, too."""
+    from clvoro.tessellation.cells import Cells
+
+    before, Cells.hulls_from = Cells.hulls_from, 0
+    yield
+    Cells.hulls_from = before
+
+
 @pytest.fixture(scope="session")
 def ctx():
     from clvoro.opencl.devices import create_context

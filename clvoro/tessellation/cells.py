@@ -52,6 +52,8 @@ class Cells:
 
     lanes = 1
     """Cells that one work-item measures or checks."""
+    hulls_from = 4096
+    """Number of generators from which CPUs use `hulls.cl`. For fewer, its build takes longer than it saves."""
     searches = True
     """Whether neighbors are searched in bins."""
 
@@ -70,10 +72,10 @@ class Cells:
         self._kernels = engine.kernels(
             "tessellation/cells", {**defines, "IN_LANES": int(self.lanes > 1)}
         )
-        self._wrap = None
+        self._hulls = None
         if self.lanes > 1 and self.searches:
             hulls = {"SLOT": SLOT, "MAX_DEPTH": MAX_LEVELS, "EIGHTS": EIGHTS}
-            self._wrap = engine.kernels("simd/hulls", hulls).wrap_all_hulls
+            self._hulls = engine.kernels("simd/hulls", hulls)
 
     @property
     def defines(self) -> dict[str, object]:
@@ -198,11 +200,11 @@ class Cells:
         """Build and match the rows of the first `n` of `total` generators; return as `_match` does."""
         engine, corners = self.engine, box.device_corners(self.engine.real)
         search = binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes
-        wrap = self._wrap
-        some = wrap is not None
-        if wrap is not None:
+        hulls = self._hulls if total >= self.hulls_from else None
+        some = hulls is not None
+        if hulls is not None:
             engine.run_each(
-                wrap, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
+                hulls.wrap_all_hulls, -(-total // (LANES * EIGHTS)), np.int32(total), np.int32(n), binned.points,
                 binned.items, binned.spacing, *search, *corners, engine.real.type(FIRST_REACH),
                 rows.slots, rows.counts, rows.places, group=1,
             )  # fmt: skip

@@ -14,7 +14,7 @@ BOX = patch.BOX
 @pytest.fixture(scope="module")
 def engine(ctx):
     made = patch.make_engine(ctx)
-    if Cells(made)._wrap is None:
+    if Cells(made)._hulls is None:
         pytest.skip("hulls are for CPUs")
     return made
 
@@ -78,7 +78,8 @@ def wrapped_rows(engine, points, first_reach=FIRST_REACH):
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
     rows = cells.take_rows(n)
     engine.run_each(
-        cells._wrap, -(-n // (LANES * EIGHTS)), np.int32(n), np.int32(n), binned.points, binned.items, binned.spacing,
+        cells._hulls.wrap_all_hulls, -(-n // (LANES * EIGHTS)), np.int32(n), np.int32(n), binned.points,
+        binned.items, binned.spacing,
         binned.reach, binned.bins, binned.grid_frames, binned.grid_shapes, *BOX.device_corners(engine.real),
         engine.real.type(first_reach), rows.slots, rows.counts, rows.places, group=1,
     )  # fmt: skip
@@ -98,7 +99,7 @@ def test_rows_are_those_of_clipping(engine, name):
             taken.append(take(n, **options)) or taken[-1]
         )
         if not wrap:
-            cells._wrap = None
+            cells._hulls = None
         t = patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False))
         found.append((t, taken[-1].counts.get()[:n], binned.reach.get()[:n]))
     (a, counts_a, reach_a), (b, counts_b, reach_b) = found
@@ -197,7 +198,7 @@ def test_cells_that_span_many_bins(engine):
     points = np.clip(POINTS["around a hole"], 0, [1, 0.75])
     nearest = np.argsort(np.hypot(*(points - [0.4, 0.3]).T))[:40]
     cells, x = Cells(engine), engine.upload(points)
-    cells._wrap = None
+    cells._hulls = None
     t = patch.fetch(cells.tessellate(BOX, x, len(points), Bins(engine).build(BOX, x, len(points))))
     for i in nearest:
         d = np.delete(points, i, axis=0) - points[i]
