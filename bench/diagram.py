@@ -138,7 +138,7 @@ SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, cubed_3d, radial_3d, core_3d
 
 
 KERNELS = {
-    "clip": ("wrap", "clip", "check", "list", "place"),
+    "clip": ("walk", "wrap", "clip", "check", "list", "place"),
     "match": ("match",),
     "measure": ("measure",),
 }
