@@ -124,6 +124,21 @@ class Tessellation:
     round_off: int = 0
 
 
+@dataclass(frozen=True)
+class NeighborRows:
+    """Neighbors that the cells of `n` generators start from, on the device; -1 for none.
+
+    Attributes
+    ----------
+    starts : (n + 1,) int32
+    neighbors : (m,) int32
+    """
+
+    n: int
+    starts: cla.Array
+    neighbors: cla.Array
+
+
 def restored(
     points: cla.Array, arrays: Mapping[str, cla.Array], saved: Mapping[str, np.ndarray]
 ) -> Tessellation:

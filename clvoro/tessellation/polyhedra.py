@@ -26,6 +26,7 @@ from .device_diagram import (
     ROUGH_SHARE,
     UNEVEN,
     CloseError,
+    NeighborRows,
     Tessellation,
     restored,
 )
@@ -158,7 +159,7 @@ class Polyhedra:
         points: cla.Array,
         n: int,
         binned: BinnedPoints,
-        previous: Tessellation | None = None,
+        previous: Tessellation | NeighborRows | None = None,
         exact: bool = True,
         rows: int | None = None,
         halo_args: tuple[object, ...] = (),
@@ -167,7 +168,7 @@ class Polyhedra:
 
         Parameters
         ----------
-        previous : Tessellation, optional
+        previous : Tessellation or NeighborRows, optional
             A diagram of the same generators at earlier positions: clipping starts from its neighbors.
         exact : bool
             Reject generators so close together that two cells differ about their common face by more than `EXACT_SHARE`
@@ -212,7 +213,7 @@ class Polyhedra:
         n: int,
         binned: BinnedPoints,
         first: cla.Array,
-        previous: Tessellation | None,
+        previous: Tessellation | NeighborRows | None,
         rows: int,
         share: np.floating,
         halo_args: tuple[object, ...],

@@ -11,7 +11,7 @@ from ...geometry.box import Box
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..bins import BinnedPoints
-from ..device_diagram import Tessellation
+from ..device_diagram import NeighborRows, Tessellation
 from .halo import Halo, block_count, block_counts, halo_defines
 
 DROPPED, FAR, COLLAPSED = 1, 2, 4
@@ -79,21 +79,6 @@ class ExtendedPoints:
     firsts: cla.Array
     owners: cla.Array
     codes: cla.Array
-
-
-@dataclass(frozen=True)
-class NeighborRows:
-    """Neighbors that the cells of `n` generators start from, on the device; -1 for none.
-
-    Attributes
-    ----------
-    starts : (n + 1,) int32
-    neighbors : (m,) int32
-    """
-
-    n: int
-    starts: cla.Array
-    neighbors: cla.Array
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ class PeriodicTessellator:
                 rows = None if previous is None else ghost_images.unfold(images, previous)
                 t = cells.tessellate(
                     *args, rows, exact, None if keep_extended else n, images.halo_args
-                )  # type: ignore[arg-type]
+                )
             else:
                 t = cells.tessellate(*args, exact, None if keep_extended else n)
             share = EXACT_SHARE if exact else ROUGH_SHARE
