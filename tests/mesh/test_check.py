@@ -249,11 +249,12 @@ COMMON = {
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True])
 def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
-    """Four cells of a lattice meet at each edge but for rounding. Two of them share a face no wider than that, which
-    may be none: the device has measured it, and a cell's quality differs by more roundings than others' may."""
+    """At each edge of a perturbed lattice two of four cells share a face no wider than round-off. The diagram may drop this
+    face although the device has measured it, so the quality of its cells may differ by more than round-off."""
     adapter, eps = clvoro.Adapter(ctx, dtype), float(np.finfo(dtype).eps)
     box = clvoro.Box((0, 0, 0), (1, 1.1, 1), periodic=periodic)
-    for m, spread in ((5, 30), (7, 30), (10, 200)):
+    # Single precision may refuse this lattice when it is perturbed by 100 units of round-off or more.
+    for m, spread in ((5, 30), (7, 30), (10, 200 if dtype == "float64" else 60)):
         middles = np.stack(np.meshgrid(*[np.arange(m)] * 3), -1).reshape(-1, 3) + 0.5
         noise = spread * eps * np.random.default_rng(3).standard_normal(middles.shape)
         result = adapter.run(

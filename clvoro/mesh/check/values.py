@@ -58,6 +58,10 @@ def check_values(check: Check, result: Result, g: Rebuilt) -> None:
             # The device includes faces that the diagram leaves out as narrow as round-off.
             doubtful = np.flatnonzero(off > 0)
             loose[doubtful[borders_on_lost_faces(d, g, doubtful)]] = True
+            slivers = (
+                d.face_measures < ROUNDINGS * g.unit * g.reach[g.owner]
+            )  # lost faces lie among these
+            loose[doubtful] |= np.bincount(g.owner, slivers, minlength=n)[doubtful] > 0
         rounding *= loose
     check.note(
         "quality", np.maximum(off - 3 * rounding, 0),
