@@ -249,8 +249,9 @@ COMMON = {
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("periodic", [False, True])
 def test_faces_that_were_left_out_had_next_to_no_area(ctx, dtype, periodic):
-    """At each edge of a perturbed lattice two of four cells share a face no wider than round-off. The diagram may drop this
-    face although the device has measured it, so the quality of its cells may differ by more than round-off."""
+    """At each edge of a perturbed lattice two of four cells share a face no wider than round-off.
+
+    The diagram may drop it although the device has measured it, and the quality of its cells may then differ."""
     adapter, eps = clvoro.Adapter(ctx, dtype), float(np.finfo(dtype).eps)
     box = clvoro.Box((0, 0, 0), (1, 1.1, 1), periodic=periodic)
     # Single precision may refuse this lattice when it is perturbed by 100 units of round-off or more.
