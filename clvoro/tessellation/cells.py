@@ -52,7 +52,7 @@ class Cells:
 
     lanes = 1
     """Cells that one work-item measures or checks."""
-    hulls_from = 4096
+    hulls_from = 1000
     """Number of generators from which CPUs use `hulls.cl`. For fewer, its build takes longer than it saves."""
     searches = True
     """Whether neighbors are searched in bins."""
