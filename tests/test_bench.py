@@ -63,7 +63,10 @@ def test_clusters():
     rows = records("clusters.py", "--sets", "3")
     rows += records("clusters.py", "--sets", "3", "--dim", "3", "--kinds", "spheres,rings")
     assert len(rows) == 18
-    assert all(r["meshes"] == r["sets"] == 3 for r in rows)
+    assert all(r["wrong"] == 0 for r in rows)
+    # In 3D generators of random rings may be closer than single precision can separate.
+    certain = [r for r in rows if (r["generators"], r["dtype"]) != ("rings", "float32")]
+    assert all(r["meshes"] == r["sets"] == 3 for r in certain)
 
 
 @pytest.mark.slow
