@@ -60,7 +60,7 @@ def main(times: int, seed: int, patience: float) -> int:
         folder = Path(name)
         while kills < times or not finished:
             before, killed = place_of(folder / "state"), False
-            command = [sys.executable, "-m", "tests.killing", "--work", name]
+            command = [sys.executable, "-m", "tests.robustness.killing", "--work", name]
             child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
             # Once all kills are done, the last run is let through.
             given = rng.uniform(0, patience) if kills < times else 600.0

@@ -287,7 +287,7 @@ def comb(adapter: clvoro.Adapter) -> None:
 
 
 def periodic(adapter: clvoro.Adapter) -> None:
-    """BoxTree that close upon themselves in some directions."""
+    """Boxes that are periodic in some directions."""
     near = lattice(4, 3) + 0.05 * (points(64, 3) - 0.5)
     for x, which in (
         (points(60), (True, True)),

@@ -149,7 +149,15 @@ def simulate(name, *options):
     log = ROOT / f".oclgrind-{'-'.join((str(os.getpid()), name, *options))}.log"
     try:
         done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-m", "tests.oclgrind_work", name, *options],
+            [
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                "tests.robustness.oclgrind_work",
+                name,
+                *options,
+            ],
             cwd=ROOT,
             # Writing the same is a race, too, by OpenCL's memory model: flags are raised by atomic_or.
             env={

@@ -261,7 +261,7 @@ kernel void find_targets(const int size, VERTEX_ARGS, global const float *sharpn
 
 /* Per corner u: its vertex is not merged if the target does not lie on the planes of this corner, too. */
 kernel void reject_targets(const int size, VERTEX_ARGS, global const int *targets, const int doublings,
-                           global uchar *rejected)
+                           global int *rejected)
 {
     WORK_ITEM(u);
     const int a = labels[u], target = targets[a];
@@ -271,12 +271,12 @@ kernel void reject_targets(const int size, VERTEX_ARGS, global const int *target
     const REAL4 there = vertex_position(target, &in), here = vertex_position(a, &in);
     const REAL reach = sqrt(fmax(inner_product(there, there), inner_product(here, here)));
     if (!is_on_planes(u, there, tolerance_at(reach, doublings), &in))
-        rejected[a] = 1;
+        atomic_or(rejected + a, 1);
 }
 
 /* Per vertex: join it to its target. */
 kernel void merge_vertices(const int size, global const int *labels, global const int *targets,
-                           global const uchar *rejected, global int *merged, global int *any)
+                           global const int *rejected, global int *merged, global int *any)
 {
     WORK_ITEM(u);
     if (targets[u] < size && !rejected[u]) {

@@ -155,7 +155,7 @@ class FaceSharing:
                 k.find_targets, self.h, *self._vertices, f.sharpness, f.loop_starts, f.loops, self.twins,
                 self.differs, np.int32(doublings), np.int32(second_pass), distances, targets,
             )  # fmt: skip
-        rejected, any_ = engine.zeros(c, np.uint8), engine.zeros(1, np.int32)
+        rejected, any_ = engine.zeros(c, np.int32), engine.zeros(1, np.int32)
         engine.run_each(
             k.reject_targets, c, *self._vertices, targets, np.int32(doublings), rejected
         )
