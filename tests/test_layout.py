@@ -26,10 +26,8 @@ ORDER = (
 )  # fmt: skip
 """Packages and root modules: each imports only from those before it."""
 UPWARD = {
-    ("mesh.results", "io"),
-    ("mesh.results", "plotting"),
-    ("mesh.diagram", "io"),
-    ("mesh.diagram", "plotting"),
+    ("mesh.output", "io"),
+    ("mesh.output", "plotting"),
     ("mesh.diagram", "remapping"),
 }
 """Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, transfer."""

@@ -23,7 +23,7 @@ MEAN_ERROR, LARGEST_ERROR = 0.05, 1.0
 """Limits of |e|. For size fields of moderate growth the mean is at most 0.02 and the largest value at most 0.3; where h
 jumps 1 : 2 between two cells, the largest value is 1."""
 STEEP = 1.25
-"""Ratio of the sizes of adjacent cells above which the growth of h is the reason of an error."""
+"""Ratio of the sizes of adjacent cells above which a size error is attributed to the growth of h."""
 ROUND_OFF_ERROR = 0.1
 """Mean |e| because of round-off, over the ratio of the spacing of positions to h. Random changes of up to half a
 spacing cost 0.095 (0.07 in 3D) times this ratio (`bench/precision.py --noise`)."""

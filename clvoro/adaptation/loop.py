@@ -34,8 +34,8 @@ SAMPLING_GAIN = 0.36
 WINDOW = 10
 """Steps over which error and quality are averaged to detect stagnation."""
 LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
-"""Corrections of the number of cells end at the second change of sign of the missing cells without a reduction to this
-share of the smallest number so far. For smooth fields the sign changes at most once."""
+"""Corrections of the number of cells end if they oscillate: if the number of missing cells changes its sign so often
+without falling to this share of the smallest number so far. For smooth fields the sign changes at most once."""
 INTERRUPTED = "interrupted"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 """Reasons of converged runs."""

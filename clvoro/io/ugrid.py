@@ -30,7 +30,7 @@ _FACE_DATA = {
     "quality": "cell quality",
     "area": "cell area",
 }
-"""Names of cell data, and what programs show for them."""
+"""Names of cell data, and their titles in other programs."""
 _NONE = np.int32(-1)
 
 

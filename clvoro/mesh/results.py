@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .diagram import Diagram
+from .output import MeshOutput
 from .read_only import Sealed
 
 if TYPE_CHECKING:
-    import meshio
-    import pyvista
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
-    from ..geometry.boundary_names import Walls
-    from ..io.polymesh import PatchType
-    from ..plotting.colors import Color
-    from ..plotting.solids import View
     from .check.findings import Report
     from .quality import Measures
 
@@ -68,7 +61,7 @@ class Displacements(Sealed):
 
 
 @dataclass(frozen=True, eq=False)
-class Result(Sealed):
+class Result(Sealed, MeshOutput):
     """The mesh of a run, with its sizes, errors, quality and history.
 
     Arrays are read-only; take a ``copy()`` to change one.
@@ -137,139 +130,6 @@ class Result(Sealed):
     ) -> np.ndarray:
         """Transfer cell data (n,) or (n, k) to another mesh of the same domain; see `Diagram.transfer`."""
         return self.diagram.transfer(values, onto, order, limited=limited, adapter=adapter)
-
-    def save(
-        self,
-        path: str | PathLike[str],
-        *,
-        cell_data: Mapping[str, ArrayLike] | None = None,
-        patches: Mapping[str, Walls] | None = None,
-        types: Mapping[str, PatchType] | None = None,
-        thickness: float | None = None,
-        convention: Literal["ugrid", "mpas"] | None = None,
-        units: str | None = None,
-    ) -> None:
-        """Write the mesh to `path`; the suffix selects the format.
-
-        Parameters
-        ----------
-        path : str or path
-            ``.npz`` (for `clvoro.load`), ``.vtu``, netCDF (``.nc``), OpenFOAM's ``polyMesh``, ...
-        cell_data : mapping, optional
-            Data of your own by name, one number or row of numbers per cell.
-        patches, types, thickness, convention, units : optional
-            Of single formats; see `clvoro.io.save`.
-
-        Raises
-        ------
-        InputError, InputTypeError
-            As `clvoro.io.save`.
-        """
-        from ..io import save
-
-        save(
-            self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness, convention=convention,
-            units=units,
-        )  # fmt: skip
-
-    def plot(
-        self,
-        color: Color | ArrayLike = "error",
-        *,
-        label: str | None = None,
-        view: View | None = None,
-        ax: Any = None,
-        limits: tuple[float, float] | None = None,
-        window: tuple[ArrayLike, ArrayLike] | None = None,
-        normal: str | ArrayLike = "z",
-        through: ArrayLike | None = None,
-        cut: str | ArrayLike | None = "octant",
-        angles: tuple[float, float] | None = None,
-        edges: bool = True,
-        key: bool = True,
-        title: str | None = None,
-    ) -> Any:
-        """Draw the cells with Matplotlib.
-
-        Parameters
-        ----------
-        color : str or (n,) array of real numbers
-            "error", "quality", "size", "sides", "skewness", "volume", or data of your own.
-        label : str, optional
-            Text at the color bar.
-        view : "slices", "slice" or "cutaway", optional
-            For 3D; "slices" by default.
-        ax, limits, window, normal, through, cut, angles, edges, key, title : optional
-            See `clvoro.plotting.plot_mesh`.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        InputError, InputTypeError
-            If a color does not exist, or an option is for other pictures.
-        ClvoroError
-            If Matplotlib is not installed.
-        """
-        from ..plotting import plot_mesh
-
-        return plot_mesh(
-            self, color, label=label, view=view, ax=ax, limits=limits, window=window, normal=normal, through=through,
-            cut=cut, angles=angles, edges=edges, key=key, title=title,
-        )  # fmt: skip
-
-    def to_pyvista(
-        self, cell_data: Mapping[str, ArrayLike] | None = None
-    ) -> pyvista.UnstructuredGrid:
-        """Return the cells as an unstructured grid of PyVista.
-
-        Parameters
-        ----------
-        cell_data : mapping, optional
-            Data of your own by name, one number or row of numbers per cell.
-
-        Returns
-        -------
-        pyvista.UnstructuredGrid
-            Polygons or polyhedra in the order of the generators, with the cell data of a ``.vtu`` file, sizes included.
-
-        Raises
-        ------
-        ClvoroError
-            If PyVista is not installed (``pip install "clvoro[pyvista]"``).
-        InputError, InputTypeError
-            If `cell_data` does not fit the cells.
-        """
-        from ..io import to_pyvista
-
-        return to_pyvista(self, cell_data)
-
-    def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
-        """Return the cells as a mesh of meshio.
-
-        Parameters
-        ----------
-        cell_data : mapping, optional
-            Data of your own by name, one number or row of numbers per cell.
-
-        Returns
-        -------
-        meshio.Mesh
-            One block of cells for each number of corners; the cell data `label` is the row of a cell in this mesh. The
-            other cell data are those of a ``.vtu`` file, sizes included.
-
-        Raises
-        ------
-        ClvoroError
-            If meshio is not installed (``pip install "clvoro[formats]"``).
-        InputError, InputTypeError
-            If `cell_data` does not fit the cells.
-        """
-        from ..io import to_meshio
-
-        return to_meshio(self, cell_data)
 
     def to_shapely(self) -> np.ndarray:
         """Return the cells of a mesh in 2D as polygons of shapely, (n,); see `Diagram.to_shapely`."""

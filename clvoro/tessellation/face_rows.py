@@ -11,7 +11,7 @@ SLOT = 20
 SPARE_SHARE, SPARE_LEAST = 32, 64
 """Number of cells per spare slot, and the least number of spare slots, at first."""
 CROWDED = 1 << 16
-"""A flag of the host: there were too few spare slots."""
+"""A flag that only the host sets: there were too few spare slots."""
 
 
 @dataclass

@@ -22,7 +22,7 @@ MAX_ROUNDS = 6
 MAX_SHARE = 0.4
 """Largest share of cells to clip in the first round. Beyond it a new diagram costs less."""
 AGAIN_SHARE = 0.1
-"""The same for all later rounds together."""
+"""Largest share of cells to clip in all later rounds together."""
 SAMPLE, SAMPLED_FROM = 8, 200_000
 """With at least `SAMPLED_FROM` cells, one work-item in `SAMPLE` runs first, to estimate how many cells changed."""
 WRONG_SHARE = 0.23

@@ -321,7 +321,7 @@ def _check_nearest(check: Check, g: Rebuilt, slack: float) -> None:
     d = check.diagram
     corners = d.vertices[g.corners]
     own = np.linalg.norm(corners - d.points[g.cells], axis=1)
-    # For the tree a period of 0 means none.
+    # The tree takes a period of 0 for an axis that is not periodic.
     lower, periods = np.array(d.domain.lower), np.where(d.domain.periodic, d.domain.extent, 0.0)
     last = np.where(periods > 0, np.nextafter(periods, 0), np.inf)
     tree = KDTree(np.minimum(d.points - lower, last), boxsize=periods)

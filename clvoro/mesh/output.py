@@ -1,0 +1,165 @@
+"""Files, pictures and other libraries: the methods that `Diagram` and `Result` share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+
+if TYPE_CHECKING:
+    import meshio
+    import pyvista
+    from numpy.typing import ArrayLike
+
+    from ..geometry.boundary_names import Walls
+    from ..io.polymesh import PatchType
+    from ..plotting.colors import Color
+    from ..plotting.solids import View
+    from .diagram import Diagram
+    from .results import Result
+
+
+class MeshOutput:
+    """Base of `Diagram` and `Result`: save, plot and convert the cells."""
+
+    default_color: ClassVar[Color] = "error"
+
+    @property
+    def _self(self) -> Result | Diagram:
+        return cast("Result | Diagram", self)
+
+    def save(
+        self,
+        path: str | PathLike[str],
+        *,
+        cell_data: Mapping[str, ArrayLike] | None = None,
+        patches: Mapping[str, Walls] | None = None,
+        types: Mapping[str, PatchType] | None = None,
+        thickness: float | None = None,
+        convention: Literal["ugrid", "mpas"] | None = None,
+        units: str | None = None,
+    ) -> None:
+        """Write the mesh to `path`; the suffix selects the format.
+
+        Parameters
+        ----------
+        path : str or path
+            ``.npz`` (for `clvoro.load`), ``.vtu``, netCDF (``.nc``), OpenFOAM's ``polyMesh``, ...
+        cell_data : mapping, optional
+            Data of your own by name, one number or row of numbers per cell.
+        patches, types, thickness, convention, units : optional
+            Of single formats; see `clvoro.io.save`.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            As `clvoro.io.save`.
+        """
+        from ..io import save
+
+        save(
+            self._self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness,
+            convention=convention, units=units,
+        )  # fmt: skip
+
+    def plot(
+        self,
+        color: Color | ArrayLike | None = None,
+        *,
+        label: str | None = None,
+        view: View | None = None,
+        ax: Any = None,
+        limits: tuple[float, float] | None = None,
+        window: tuple[ArrayLike, ArrayLike] | None = None,
+        normal: str | ArrayLike = "z",
+        through: ArrayLike | None = None,
+        cut: str | ArrayLike | None = "octant",
+        angles: tuple[float, float] | None = None,
+        edges: bool = True,
+        key: bool = True,
+        title: str | None = None,
+    ) -> Any:
+        """Draw the cells with Matplotlib.
+
+        Parameters
+        ----------
+        color : str or (n,) array of real numbers, optional
+            "quality", "sides", "skewness", "volume", for a result also "error" and "size", or data of your own. By
+            default "error" for a result, "quality" for a diagram.
+        label : str, optional
+            Text at the color bar.
+        view : "slices", "slice" or "cutaway", optional
+            For 3D; "slices" by default.
+        ax, limits, window, normal, through, cut, angles, edges, key, title : optional
+            See `clvoro.plotting.plot_mesh`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If a color does not exist, or an option is for other pictures.
+        ClvoroError
+            If Matplotlib is not installed.
+        """
+        from ..plotting import plot_mesh
+
+        return plot_mesh(
+            self._self, self.default_color if color is None else color, label=label, view=view, ax=ax,
+            limits=limits, window=window, normal=normal, through=through, cut=cut, angles=angles, edges=edges, key=key,
+            title=title,
+        )  # fmt: skip
+
+    def to_pyvista(
+        self, cell_data: Mapping[str, ArrayLike] | None = None
+    ) -> pyvista.UnstructuredGrid:
+        """Return the cells as an unstructured grid of PyVista.
+
+        Parameters
+        ----------
+        cell_data : mapping, optional
+            Data of your own by name, one number or row of numbers per cell.
+
+        Returns
+        -------
+        pyvista.UnstructuredGrid
+            Polygons or polyhedra in the order of the generators, with the cell data of a ``.vtu`` file,
+            for a result sizes included.
+
+        Raises
+        ------
+        ClvoroError
+            If PyVista is not installed (``pip install "clvoro[pyvista]"``).
+        InputError, InputTypeError
+            If `cell_data` does not fit the cells.
+        """
+        from ..io import to_pyvista
+
+        return to_pyvista(self._self, cell_data)
+
+    def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
+        """Return the cells as a mesh of meshio.
+
+        Parameters
+        ----------
+        cell_data : mapping, optional
+            Data of your own by name, one number or row of numbers per cell.
+
+        Returns
+        -------
+        meshio.Mesh
+            One block of cells for each number of corners; the cell data `label` is the row of a cell in this mesh. The
+            other cell data are those of a ``.vtu`` file.
+
+        Raises
+        ------
+        ClvoroError
+            If meshio is not installed (``pip install "clvoro[formats]"``).
+        InputError, InputTypeError
+            If `cell_data` does not fit the cells.
+        """
+        from ..io import to_meshio
+
+        return to_meshio(self._self, cell_data)
