@@ -64,7 +64,7 @@ class MeshOutput:
 
     def plot(
         self,
-        color: Color | ArrayLike | None = None,
+        color: Color | Literal["default"] | ArrayLike = "default",
         *,
         label: str | None = None,
         view: View | None = None,
@@ -106,8 +106,9 @@ class MeshOutput:
         """
         from ..plotting import plot_mesh
 
+        chosen = self.default_color if isinstance(color, str) and color == "default" else color
         return plot_mesh(
-            self._self, self.default_color if color is None else color, label=label, view=view, ax=ax,
+            self._self, chosen, label=label, view=view, ax=ax,
             limits=limits, window=window, normal=normal, through=through, cut=cut, angles=angles, edges=edges, key=key,
             title=title,
         )  # fmt: skip
