@@ -21,16 +21,17 @@ HOUSE = PACKAGE.parent
 CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
 ORDER = (
-    "errors", "arguments", "files", "opencl", "geometry", "mesh", "io", "sizing", "tessellation", "solvers",
-    "adaptation", "remapping", "plotting", "adapter", "__init__", "cli", "__main__",
+    "errors", "arguments", "files", "opencl", "geometry", "mesh", "finite_volumes", "io", "sizing", "tessellation",
+    "solvers", "adaptation", "remapping", "plotting", "adapter", "__init__", "cli", "__main__",
 )  # fmt: skip
 """Packages and root modules: each imports only from those before it."""
 UPWARD = {
+    ("mesh.output", "finite_volumes"),
     ("mesh.output", "io"),
     ("mesh.output", "plotting"),
     ("mesh.diagram", "remapping"),
 }
-"""Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, transfer."""
+"""Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, solver_mesh, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")

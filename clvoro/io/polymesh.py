@@ -12,17 +12,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arguments import check_number
 from ..errors import InputError, InputTypeError
+from ..finite_volumes.prisms import polyhedra
+from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import Walls
-from ..mesh.connectivity import (
-    FaceTopology,
-    cell_corners,
-    face_topology,
-    take_rows,
-)
+from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
-from .cyclic import CyclicPair, Patch, add_cyclic_faces
+from .cyclic import Patch, cyclic_patches
 
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
@@ -59,6 +55,7 @@ def poly_mesh(
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
+    walls: WallShape = "straight",
 ) -> PolyMesh:
     """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
 
@@ -74,6 +71,8 @@ def poly_mesh(
         Type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane". By default "wall".
     thickness : float, optional
         In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
+    walls : {"straight", "exact"}, optional
+        See `Diagram.solver_mesh`.
 
     Raises
     ------
@@ -85,39 +84,26 @@ def poly_mesh(
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
     kinds = _kinds(parts.names, types)
-    faces = _by_group(face_topology(diagram), parts.index)
-    walls = -1 - faces.neighbor[faces.inner :]
-    counts = np.bincount(parts.index[walls], minlength=len(parts.names)).tolist()
+    mesh = make_solver_mesh(diagram, walls, collapse=False)
+    cells = polyhedra(mesh, thickness)
+    groups = parts.index[-1 - mesh.neighbor[mesh.inner : mesh.outer]]
+    counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [Patch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
-    pairs: list[CyclicPair] = []
-    if any(domain.periodic):
-        faces, pairs = add_cyclic_faces(diagram, faces)
-    owner, neighbor = faces.owner, faces.neighbor[: faces.inner]
+    made += cyclic_patches(mesh)
     if domain.dim == 2:
-        height = _height(diagram, thickness)
-        points, starts, corners = _extruded(diagram, faces.corners, height)
-    elif thickness is not None:
-        raise InputError(
-            "thickness is for meshes in 2D, and the mesh has 3 dimensions; leave it out"
-        )
-    else:
-        points, starts, corners = diagram.vertices, faces.starts, faces.corners
-    first = len(owner) - 2 * sum(pair.size for pair in pairs)
-    for pair in pairs:
-        corners = pair.align(points, starts, corners, first)
-        made += pair.patches()
-        first += 2 * pair.size
-    if domain.dim == 2:
-        owner = np.concatenate([owner, *2 * [np.arange(len(diagram))]])
-        made += [Patch("back", "empty", len(diagram)), Patch("front", "empty", len(diagram))]
+        made += [Patch("back", "empty", len(mesh)), Patch("front", "empty", len(mesh))]
     own = {patch.name for patch in made[len(parts.names) :]}
     clash = [name for name in parts.names if name in own]
     if clash:
         raise InputError(
             f"the boundary {clash[0]!r} has the name of a patch that OpenFOAM needs here; choose another name"
         )
-    used, corners = np.unique(corners, return_inverse=True)
-    return PolyMesh(points[used], starts, corners.ravel(), owner, neighbor, made)
+    order = np.arange(len(cells.owner))
+    order[mesh.inner : mesh.outer] = mesh.inner + np.argsort(groups, kind="stable")
+    starts, corners = take_rows(cells.starts, cells.corners, order)
+    return PolyMesh(
+        cells.points, starts, corners, cells.owner[order], mesh.neighbor[: mesh.inner], made
+    )
 
 
 def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[str]:
@@ -139,53 +125,3 @@ def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> lis
                 f"types has {kind!r:.60} for {name}, expected one of {', '.join(known)}"
             )
     return [given.get(name, "wall") for name in names]
-
-
-def _height(diagram: Diagram, thickness: float | None) -> float:
-    if thickness is None:
-        return float(np.sqrt(diagram.domain.measure / len(diagram)))
-    return check_number("thickness", thickness, above=0)
-
-
-def _by_group(faces: FaceTopology, groups: np.ndarray) -> FaceTopology:
-    """Return `faces` with the faces on the boundary sorted by the group of their wall."""
-    outer = np.argsort(groups[-1 - faces.neighbor[faces.inner :]], kind="stable") + faces.inner
-    if (np.diff(outer) > 0).all():
-        return faces
-    order = np.concatenate([np.arange(faces.inner), outer])
-    starts, corners = take_rows(faces.starts, faces.corners, order)
-    return FaceTopology(
-        faces.owner[order],
-        faces.neighbor[order],
-        faces.rows[order],
-        starts,
-        corners,
-        faces.flipped[order],
-    )
-
-
-def _extruded(
-    diagram: Diagram, sides: np.ndarray, thickness: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, and starts and corners of the faces of prisms: sides, then bottoms, then tops."""
-    flat, v = diagram.vertices, len(diagram.vertices)
-    points = np.concatenate([np.pad(flat, ((0, 0), (0, 1))), np.pad(flat, ((0, 0), (0, 1)))])
-    points[v:, 2] = thickness
-    a, b = sides.reshape(-1, 2).T
-    walls = np.stack([a, b, b + v, a + v], axis=1)
-    starts, corners = cell_corners(diagram)
-    everyone = np.arange(len(diagram))
-    key = np.sort(np.repeat(everyone, np.diff(starts)) * v + corners)
-    twice = key[1:][np.diff(key) == 0] // max(v, 1)
-    if twice.size:
-        raise InputError(
-            f"cell {twice[0]} ({len(np.unique(twice))} in all) goes around a part of the boundary or touches itself, "
-            "and a face in OpenFOAM has no hole; use smaller cells there, leave out the hole, or save as .vtu"
-        )
-    _, bottoms = take_rows(starts, corners, everyone, np.ones(len(diagram), bool))
-    lengths = np.concatenate([np.full(len(walls), 4), np.diff(starts), np.diff(starts)])
-    return (
-        points,
-        np.concatenate([[0], np.cumsum(lengths)]),
-        np.concatenate([walls.ravel(), bottoms, corners + v]),
-    )

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     import pyvista
     from numpy.typing import ArrayLike
 
+    from ..finite_volumes.solver_mesh import SolverMesh, WallShape
     from ..geometry.boundary_names import Walls
     from ..io.polymesh import PatchType
     from ..plotting.colors import Color
@@ -61,6 +62,25 @@ class MeshOutput:
             self._self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness,
             convention=convention, units=units,
         )  # fmt: skip
+
+    def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> SolverMesh:
+        """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
+
+        Parameters
+        ----------
+        walls : {"straight", "exact"}
+            With "straight" the wall faces of a cell that turn by at most 30 degrees in sum become one straight face.
+        collapse : bool
+            Whether short edges and small faces are collapsed.
+
+        Returns
+        -------
+        SolverMesh
+        """
+        from ..finite_volumes.solver_mesh import make_solver_mesh
+
+        diagram = getattr(self._self, "diagram", self._self)
+        return make_solver_mesh(diagram, walls, collapse)
 
     def plot(
         self,

@@ -12,11 +12,12 @@ ROWS = [
     ],
     [("tessellation", "the diagram on the device"), ("solvers", "Poisson, projection")],
     [("sizing", "size fields"), ("io", "files")],
+    [("finite_volumes", "what solvers read")],
     [("mesh", "Diagram, Result, checks")],
     [("geometry", "domains, shapes, layers")],
     [("opencl", "devices, kernels, arrays")],
 ]  # fmt: skip
-FILLS = ["#e8eef7", "#dbe7f5", "#cfe0f2", "#c3d9ef", "#b7d2ec", "#abcbe9", "#9fc4e6"]
+FILLS = ["#f2f6fb", "#e8eef7", "#dbe7f5", "#cfe0f2", "#c3d9ef", "#b7d2ec", "#abcbe9", "#9fc4e6"]
 
 
 def main() -> None:

@@ -1,0 +1,111 @@
+"""Faces at the seams of a periodic box, once for each of the two cells."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import ClvoroError
+from ..mesh.connectivity import (
+    FaceTopology,
+    face_corners,
+    face_keys,
+    face_owners,
+    face_topology,
+    take_rows,
+)
+from ..mesh.diagram import Diagram
+
+
+def faces_with_seams(diagram: Diagram) -> tuple[FaceTopology, np.ndarray, np.ndarray]:
+    """Return the faces of `diagram`, those at seams twice and at the end; their twins (f,); their shifts (f, d) int8.
+
+    For each periodic direction the faces on the upper side come first. A face that is shifted in several directions
+    belongs to the first of them.
+
+    Raises
+    ------
+    ClvoroError
+        If a face exists on one side of a seam only.
+    """
+    faces = face_topology(diagram)
+    count = len(faces.owner)
+    if not any(diagram.domain.periodic):
+        return faces, np.full(count, -1), np.zeros((count, diagram.domain.dim), np.int8)
+    shifts = diagram.shifts.astype(np.int64)
+    starts, corners = face_corners(diagram)
+    rows = np.flatnonzero(shifts.any(axis=1) & (np.diff(starts) > 0))
+    here, there = face_keys(diagram, rows)
+    axis = np.argmax(shifts[rows] != 0, axis=1)
+    is_upper = shifts[rows, axis] > 0
+    upper = np.flatnonzero(is_upper)[np.lexsort((here[is_upper], axis[is_upper]))]
+    lower = np.flatnonzero(~is_upper)[np.lexsort((there[~is_upper], axis[~is_upper]))]
+    sides = np.diff(starts)[rows]
+    if not (
+        np.array_equal(here[upper], there[lower]) and np.array_equal(sides[upper], sides[lower])
+    ):
+        raise ClvoroError(
+            "the two sides of a seam have different faces, because some are as short as round-off; use dtype='float64'"
+        )
+    kept = np.flatnonzero(~shifts[faces.rows].any(axis=1))
+    first = len(kept)
+    order, twin = [], [np.full(first, -1)]
+    for a in range(diagram.domain.dim):
+        these = axis[upper] == a
+        k = int(np.count_nonzero(these))
+        order += [upper[these], lower[these]]
+        twin += [first + k + np.arange(k), first + np.arange(k)]
+        first += 2 * k
+    rows = rows[np.concatenate(order)]
+    kept_starts, kept_corners = take_rows(faces.starts, faces.corners, kept)
+    seam_starts, seam_corners = take_rows(starts, corners, rows)
+    seams = FaceTopology(
+        np.concatenate([faces.owner[kept], face_owners(diagram)[rows]]),
+        np.concatenate([faces.neighbor[kept], diagram.neighbors[rows]]),
+        np.concatenate([faces.rows[kept], rows]),
+        np.concatenate([kept_starts, kept_starts[-1] + seam_starts[1:]]),
+        np.concatenate([kept_corners, seam_corners]),
+        np.concatenate([faces.flipped[kept], np.zeros(len(rows), bool)]),
+    )
+    twins = np.concatenate(twin)
+    shift = np.concatenate([np.zeros((len(kept), diagram.domain.dim), np.int64), shifts[rows]])
+    if diagram.domain.dim == 3:
+        period = shift * np.array(diagram.domain.extent)
+        aligned = align_seams(diagram.vertices, seams.starts, seams.corners, twins, period)
+        seams = FaceTopology(
+            seams.owner, seams.neighbor, seams.rows, seams.starts, aligned, seams.flipped
+        )
+    return seams, twins, shift.astype(np.int8)
+
+
+def align_seams(
+    points: np.ndarray,
+    starts: np.ndarray,
+    corners: np.ndarray,
+    twin: np.ndarray,
+    period: np.ndarray,
+) -> np.ndarray:
+    """Return the corners of all faces; at seams the first corner of a lower face is the image of that of its twin.
+
+    Parameters
+    ----------
+    points : (v, d) float
+    starts, corners : int
+        Corners of each face as ragged rows.
+    twin : (f,) int
+    period : (f, d) float
+        Shift of each face times the extent of the box.
+    """
+    lower = np.flatnonzero((twin >= 0) & (twin < np.arange(len(twin))))
+    if not len(lower):
+        return corners
+    counts = np.diff(starts)[lower]
+    face, base = np.repeat(np.arange(len(lower)), counts), np.cumsum(counts) - counts
+    within = np.arange(counts.sum()) - base[face]
+    places = starts[lower][face] + within
+    # The twin's period leads from the lower to the upper side.
+    wanted = points[corners[starts[twin[lower]]]] - period[twin[lower]]
+    off = ((points[corners[places]] - wanted[face]) ** 2).sum(axis=1)
+    nearest = np.lexsort((off, face))[base] - base
+    turned = np.array(corners)
+    turned[places] = corners[starts[lower][face] + (within + nearest[face]) % counts[face]]
+    return turned

@@ -1,0 +1,151 @@
+"""The mesh as a solver sees it: points, and faces with corners, owner and neighbor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from ..arguments import check_choice
+from ..geometry.box import Domain
+from ..mesh.connectivity import following, take_rows
+from ..mesh.diagram import Diagram
+from ..mesh.read_only import Sealed
+from .seams import faces_with_seams
+
+WallShape = Literal["straight", "exact"]
+"""What the wall faces of one cell become: one straight face, or as many as the domain has edges there."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SolverMesh(Sealed):
+    """A mesh as a finite-volume solver sees it.
+
+    The faces between two cells come first, in upper-triangular order: by owner, then by neighbor. The faces on walls
+    follow, wall by wall, each in the order of the owners. The last are the faces at the seams of a periodic box, twice
+    each, once for each of the two cells: for each periodic direction those on the upper side, then in the same order
+    those on the lower side.
+
+    Attributes
+    ----------
+    domain : Box or Polygon
+    cells : int
+        Number of cells. Cell i is that of generator i.
+    points : (v, d) float64
+        Corners of faces. At seams each image is a separate point.
+    starts : (f + 1,) int64
+    corners : (k,) int64
+        Corners of face i, ``corners[starts[i]:starts[i + 1]]``. In 2D the owner lies to the left of the way from the
+        first corner to the second. In 3D the order is counter-clockwise as seen from outside of the owner. At a seam
+        the corners of the lower face are the images of those of the upper face, in opposite order; in 3D the
+        first is the image of the first.
+    owner : (f,) int32
+    neighbor : (f,) int32
+        Cell on the other side, owner < neighbor for the first `inner` faces; -1 - k on wall k of the domain.
+    twin : (f,) int64
+        At a seam the image of the face; -1 for other faces.
+    shift : (f, d) int8
+        At a seam the image of the face is at ``shift * domain.extent``, counted from the twin. Else 0.
+    half_face : (f,) int64
+        A half-face of the diagram for each face.
+    """
+
+    domain: Domain
+    cells: int
+    points: np.ndarray
+    starts: np.ndarray
+    corners: np.ndarray
+    owner: np.ndarray
+    neighbor: np.ndarray
+    twin: np.ndarray
+    shift: np.ndarray
+    half_face: np.ndarray
+
+    @property
+    def dim(self) -> int:
+        """Number of dimensions."""
+        return int(self.points.shape[1])
+
+    @cached_property
+    def inner(self) -> int:
+        """Number of faces between two cells, without those at seams: the first ones."""
+        return int(np.count_nonzero((self.neighbor >= 0) & (self.twin < 0)))
+
+    @cached_property
+    def outer(self) -> int:
+        """Number of faces between two cells or on walls: all but the last ones, at seams."""
+        return int(np.count_nonzero(self.twin < 0))
+
+    def __len__(self) -> int:
+        return self.cells
+
+    def __repr__(self) -> str:
+        return f"SolverMesh({self.cells} cells, {len(self.owner)} faces)"
+
+    def changed(self, **arrays: Any) -> SolverMesh:
+        """Return a mesh with some other arrays; points without a face are dropped."""
+        return _compact(replace(self, **arrays))
+
+    def take_faces(self, kept: np.ndarray) -> SolverMesh:
+        """Return the mesh with the faces `kept` (ascending indices or a mask) only."""
+        rows = np.flatnonzero(kept) if kept.dtype == bool else kept
+        place = np.full(len(self.owner) + 1, -1)
+        place[rows] = np.arange(len(rows))
+        starts, corners = take_rows(self.starts, self.corners, rows)
+        return self.changed(
+            starts=starts,
+            corners=corners,
+            owner=self.owner[rows],
+            neighbor=self.neighbor[rows],
+            twin=place[self.twin[rows]],
+            shift=self.shift[rows],
+            half_face=self.half_face[rows],
+        )
+
+    @cached_property
+    def images(self) -> np.ndarray:
+        """Class of each point, (v,) int64: points that are periodic images of one another have the same number."""
+        import scipy.sparse
+
+        upper = np.flatnonzero(self.twin > np.arange(len(self.twin)))
+        v = len(self.points)
+        _, there = take_rows(self.starts, self.corners, upper)
+        counts, back = take_rows(
+            self.starts, self.corners, self.twin[upper], np.ones(len(upper), bool)
+        )
+        if self.dim == 2:
+            back = back[following(counts)]
+        graph = scipy.sparse.coo_array((np.ones(len(there)), (there, back)), (v, v))
+        return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def make_solver_mesh(
+    diagram: Diagram, walls: WallShape = "straight", collapse: bool = True
+) -> SolverMesh:
+    """Return `diagram` as a solver sees it; see `Diagram.solver_mesh`."""
+    check_choice("walls", walls, ("straight", "exact"))
+    faces, twin, shift = faces_with_seams(diagram)
+    return _compact(
+        SolverMesh(
+            domain=diagram.domain,
+            cells=len(diagram),
+            points=diagram.vertices.astype(np.float64),
+            starts=faces.starts.astype(np.int64),
+            corners=faces.corners.astype(np.int64),
+            owner=faces.owner,
+            neighbor=faces.neighbor,
+            twin=twin,
+            shift=shift,
+            half_face=faces.rows,
+        )
+    )
+
+
+def _compact(mesh: SolverMesh) -> SolverMesh:
+    """Return `mesh` without points that no face has."""
+    used, corners = np.unique(mesh.corners, return_inverse=True)
+    if len(used) == len(mesh.points):
+        return mesh
+    return replace(mesh, points=mesh.points[used], corners=corners.ravel())
