@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +11,9 @@ from ..arguments import check_number
 from ..errors import InputError
 from ..mesh.connectivity import take_rows
 from ..mesh.read_only import Sealed
-from .solver_mesh import SolverMesh
+
+if TYPE_CHECKING:
+    from .solver_mesh import SolverMesh
 
 
 @dataclass(frozen=True, eq=False)

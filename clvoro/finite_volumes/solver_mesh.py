@@ -13,6 +13,8 @@ from ..geometry.box import Domain
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import Sealed
+from .geometry import face_geometry
+from .measures import SolverMeasures
 from .seams import faces_with_seams
 
 WallShape = Literal["straight", "exact"]
@@ -82,7 +84,29 @@ class SolverMesh(Sealed):
         return self.cells
 
     def __repr__(self) -> str:
-        return f"SolverMesh({self.cells} cells, {len(self.owner)} faces)"
+        changed = f", {self.area_change:+.2g} of the domain" if self.area_change else ""
+        return f"SolverMesh({self.cells} cells, {len(self.owner)} faces{changed})"
+
+    @cached_property
+    def area_change(self) -> float:
+        """Volume (2D: area) of all cells minus that of the domain, over that of the domain; 0 up to round-off.
+
+        Straight walls cut off parts of the domain, and add others.
+        """
+        d, measure = self.dim, self.domain.measure
+        walls = slice(self.inner, len(self.owner))
+        low = np.array(self.domain.lower)
+        starts = self.starts[walls.start :] - self.starts[walls.start]
+        corners = self.points[self.corners[self.starts[walls.start] :]] - low
+        if d == 2:
+            a, b = corners.reshape(-1, 2, 2).swapaxes(0, 1)
+            total = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2)
+        else:
+            count = np.arange(len(corners))
+            centers, areas = face_geometry(corners, starts, count)
+            total = float((centers * areas).sum() / 3)
+        change = total / measure - 1
+        return change if abs(change) > 1e-12 else 0.0
 
     def changed(self, **arrays: Any) -> SolverMesh:
         """Return a mesh with some other arrays; points without a face are dropped."""
@@ -105,6 +129,17 @@ class SolverMesh(Sealed):
         )
 
     @cached_property
+    def measures(self) -> SolverMeasures:
+        """Non-orthogonality, skewness and more as OpenFOAM computes them; each is computed when first used.
+
+        Raises
+        ------
+        InputError
+            In 2D for a cell around an island or one that touches itself, as a face of OpenFOAM has no hole.
+        """
+        return SolverMeasures(self)
+
+    @cached_property
     def images(self) -> np.ndarray:
         """Class of each point, (v,) int64: points that are periodic images of one another have the same number."""
         import scipy.sparse
@@ -122,25 +157,35 @@ class SolverMesh(Sealed):
 
 
 def make_solver_mesh(
-    diagram: Diagram, walls: WallShape = "straight", collapse: bool = True
+    diagram: Diagram,
+    walls: WallShape = "straight",
+    collapse: bool = True,
+    parts: np.ndarray | None = None,
 ) -> SolverMesh:
-    """Return `diagram` as a solver sees it; see `Diagram.solver_mesh`."""
+    """Return `diagram` as a solver sees it; see `Diagram.solver_mesh`.
+
+    `parts` (k,) int is the index of the named part of the boundary of each wall, if it is not the domain's.
+    """
+    from .straight_walls import straight_walls
+
     check_choice("walls", walls, ("straight", "exact"))
     faces, twin, shift = faces_with_seams(diagram)
-    return _compact(
-        SolverMesh(
-            domain=diagram.domain,
-            cells=len(diagram),
-            points=diagram.vertices.astype(np.float64),
-            starts=faces.starts.astype(np.int64),
-            corners=faces.corners.astype(np.int64),
-            owner=faces.owner,
-            neighbor=faces.neighbor,
-            twin=twin,
-            shift=shift,
-            half_face=faces.rows,
-        )
+    mesh = SolverMesh(
+        domain=diagram.domain,
+        cells=len(diagram),
+        points=diagram.vertices.astype(np.float64),
+        starts=faces.starts.astype(np.int64),
+        corners=faces.corners.astype(np.int64),
+        owner=faces.owner,
+        neighbor=faces.neighbor,
+        twin=twin,
+        shift=shift,
+        half_face=faces.rows,
     )
+    if walls == "straight" and mesh.dim == 2:
+        parts = diagram.domain.boundaries.index if parts is None else parts
+        mesh = straight_walls(mesh, diagram, parts)
+    return _compact(mesh)
 
 
 def _compact(mesh: SolverMesh) -> SolverMesh:

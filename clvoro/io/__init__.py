@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
+from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.boundary_names import Walls
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -86,6 +87,7 @@ def save(
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
+    walls: WallShape | None = None,
     convention: Literal["ugrid", "mpas"] | None = None,
     units: str | None = None,
 ) -> None:
@@ -126,6 +128,11 @@ def save(
         outlets and far fields need "patch": ``types={"inlet": "patch"}``.
     thickness : float, optional
         For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
+    walls : {"straight", "exact"}, optional
+        For OpenFOAM. With "straight", the default, the faces of a cell on the boundary become one straight face where
+        they turn by at most 30 degrees in sum, and face ends near a corner of the domain move into it: solvers reject
+        cells that are not convex. See `Diagram.solver_mesh`, whose `area_change` is what this adds to the domain.
+        With "exact" the faces follow the domain.
     convention : {"ugrid", "mpas"}, optional
         For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each edge
         the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and vertices with
@@ -144,7 +151,7 @@ def save(
     path = Path(check_path("path", path))
     suffix = path.suffix.lower()
     is_foam = path.name == "polyMesh" or suffix == ".foam"
-    for_foam = {"patches": patches, "types": types, "thickness": thickness}
+    for_foam = {"patches": patches, "types": types, "thickness": thickness, "walls": walls}
     for_netcdf = {"convention": convention, "units": units}
     for options, fits, format_, name in (
         (for_foam, is_foam, "OpenFOAM", ".foam"),

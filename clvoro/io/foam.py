@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.boundary_names import Walls
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
@@ -30,6 +31,7 @@ def write_foam(
     patches: Mapping[str, Walls] | None = None,
     types: Mapping[str, PatchType] | None = None,
     thickness: float | None = None,
+    walls: WallShape | None = None,
 ) -> None:
     """Write a polyMesh.
 
@@ -38,10 +40,10 @@ def write_foam(
     path : Path
         The folder ``.../constant/polyMesh``, which is created if it does not exist; its five files are replaced, others
         are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in ``CASE/constant/polyMesh``.
-    patches, types, thickness : optional
+    patches, types, thickness, walls : optional
         See `poly_mesh`.
     """
-    mesh = poly_mesh(contents.diagram, patches, types, thickness)
+    mesh = poly_mesh(contents.diagram, patches, types, thickness, walls or "straight")
     marker = path if path.suffix.lower() == ".foam" else None
     folder = path if marker is None else path.parent / "constant" / "polyMesh"
     if marker is not None:

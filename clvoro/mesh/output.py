@@ -37,6 +37,7 @@ class MeshOutput:
         patches: Mapping[str, Walls] | None = None,
         types: Mapping[str, PatchType] | None = None,
         thickness: float | None = None,
+        walls: WallShape | None = None,
         convention: Literal["ugrid", "mpas"] | None = None,
         units: str | None = None,
     ) -> None:
@@ -48,7 +49,7 @@ class MeshOutput:
             ``.npz`` (for `clvoro.load`), ``.vtu``, netCDF (``.nc``), OpenFOAM's ``polyMesh``, ...
         cell_data : mapping, optional
             Data of your own by name, one number or row of numbers per cell.
-        patches, types, thickness, convention, units : optional
+        patches, types, thickness, walls, convention, units : optional
             Of single formats; see `clvoro.io.save`.
 
         Raises
@@ -59,7 +60,7 @@ class MeshOutput:
         from ..io import save
 
         save(
-            self._self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness,
+            self._self, path, cell_data=cell_data, patches=patches, types=types, thickness=thickness, walls=walls,
             convention=convention, units=units,
         )  # fmt: skip
 

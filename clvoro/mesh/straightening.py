@@ -97,7 +97,7 @@ def _stretches(
     diagram: Diagram, domain: Polygon, owner: np.ndarray, real: np.dtype
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the stretch of each half-face, (m,), or -1; and the first and the last half-face of each stretch, (s,)."""
-    following = _along_rings(diagram, domain)
+    following = along_rings(diagram, domain)
     edges = _places(diagram, domain)
     begins = _beginnings(domain, following, edges, owner)
     onward, of_face, cells = following.tolist(), edges.tolist(), owner.tolist()
@@ -134,7 +134,7 @@ def _places(diagram: Diagram, domain: Polygon) -> np.ndarray:
     return np.where(diagram.neighbors < 0, domain.oriented.places[walls], -1)
 
 
-def _along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
+def along_rings(diagram: Diagram, domain: Polygon) -> np.ndarray:
     """Return for each half-face on the boundary the next one on its ring, (m,); -1 if there is none."""
     rows = np.flatnonzero(diagram.neighbors < 0)
     edge = _places(diagram, domain)[rows]

@@ -190,9 +190,9 @@ def test_as_vtk_reads_it(result, tmp_path):
     np.testing.assert_allclose(np.abs(found), volumes, rtol=0, atol=1e-4 * volumes.mean())
 
 
-def check_mesh(result, folder):
-    """The output of checkMesh for a result saved in `folder`."""
-    io.save(result, folder / "case.foam")
+def check_mesh(result, folder, *options, **settings):
+    """The output of checkMesh for a result saved in `folder` with some settings."""
+    io.save(result, folder / "case.foam", **settings)
     system = folder / "system"
     system.mkdir()
     times = "startTime 0; endTime 1; deltaT 1; writeInterval 1;"
@@ -204,7 +204,11 @@ def check_mesh(result, folder):
     # The settings of Debian's package; other installations set the variable.
     env = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
     done = subprocess.run(
-        ["checkMesh", "-case", str(folder)], env=env, capture_output=True, text=True, check=False
+        ["checkMesh", "-case", str(folder), *options],
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -1,0 +1,93 @@
+"""Centers, areas and volumes of polyhedra by the formulas of OpenFOAM.
+
+A face is divided into triangles about the mean of its corners, a cell into pyramids about the mean of the centers of
+its faces. Flat faces of convex cells get their exact centroids.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..mesh.connectivity import following
+from ..mesh.read_only import Sealed
+
+_TINY = 1e-150
+"""OpenFOAM's ROOTVSMALL, which keeps quotients finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry(Sealed):
+    """What follows from the points of polyhedra.
+
+    Attributes
+    ----------
+    centers : (f, 3) float64
+        Centers of the faces.
+    areas : (f, 3) float64
+        Area vectors: normal to the face, out of its owner, as long as its area.
+    centroids : (n, 3) float64
+    volumes : (n,) float64
+    """
+
+    centers: np.ndarray
+    areas: np.ndarray
+    centroids: np.ndarray
+    volumes: np.ndarray
+
+
+def face_geometry(
+    points: np.ndarray, starts: np.ndarray, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return centers and area vectors of faces, (f, 3) each.
+
+    Parameters
+    ----------
+    points : (v, 3) float
+    starts : (f + 1,) int, corners : int
+        Corners of each face, at least three.
+    """
+    here = points[corners]
+    means = np.add.reduceat(here, starts[:-1]) / np.diff(starts)[:, None]
+    middle = np.repeat(means, np.diff(starts), axis=0)
+    there = points[corners[following(starts)]]
+    normals = np.cross(there - here, middle - here)
+    weights = np.linalg.norm(normals, axis=1)
+    total = np.add.reduceat(weights, starts[:-1])
+    # Relative to the mean, so that little is lost in cancellation.
+    moments = np.add.reduceat(weights[:, None] * (here + there - 2 * middle), starts[:-1])
+    centers = means + moments / np.maximum(3 * total, _TINY)[:, None]
+    return centers, np.add.reduceat(normals, starts[:-1]) / 2
+
+
+def cell_geometry(
+    centers: np.ndarray, areas: np.ndarray, owner: np.ndarray, neighbor: np.ndarray, cells: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return centroids (n, 3) and volumes (n,) of cells.
+
+    Parameters
+    ----------
+    centers, areas : (f, 3) float
+    owner : (f,) int
+    neighbor : (k,) int
+        Cells behind the first k faces; no other face has a cell behind it.
+    cells : int
+    """
+    cell = np.concatenate([owner, neighbor])
+    k = len(neighbor)
+    middles = np.concatenate([centers, centers[:k]])
+    outward = np.concatenate([areas, -areas[:k]])
+    counts = np.maximum(np.bincount(cell, minlength=cells), 1)
+    means = sum_rows(cell, middles, cells) / counts[:, None]
+    arms = middles - means[cell]
+    thrice = np.einsum("ij,ij->i", outward, arms)
+    volumes = np.bincount(cell, thrice, cells)
+    moments = sum_rows(cell, thrice[:, None] * arms, cells)
+    safe = np.where(np.abs(volumes) > _TINY**2, volumes, np.inf)
+    return means + 0.75 * moments / safe[:, None], volumes / 3
+
+
+def sum_rows(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return for each place the sum of its `values` (k, d): (count, d)."""
+    return np.stack([np.bincount(places, column, count) for column in values.T], axis=1)

@@ -1,0 +1,379 @@
+"""Measures of a solver mesh as OpenFOAM's `checkMesh` computes them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..mesh.connectivity import following, take_rows
+from .geometry import Geometry, cell_geometry, face_geometry, sum_rows
+from .prisms import polyhedra
+
+if TYPE_CHECKING:
+    from .solver_mesh import SolverMesh
+
+PLANAR_COSINE = 1e-6
+"""Two faces of a cell are concave if a center is nearer to the other's plane than this, over the distance of both."""
+_TINY = 1e-150
+_PAIRS = 1 << 22
+"""Pairs of faces that are compared at a time."""
+
+
+class SolverMeasures:
+    """Measures of a solver mesh, each computed when first used.
+
+    In 2D they are those of one layer of prisms. Measures of faces have one row per face of the solver mesh, then in 2D
+    one per bottom and one per top of a cell. Source of the formulas: OpenFOAM v1912, `primitiveMeshTools` and
+    `polyMeshTools`. Unknowns are at the centroids.
+    """
+
+    def __init__(self, mesh: SolverMesh, thickness: float | None = None) -> None:
+        self.mesh = mesh
+        self.cells = polyhedra(mesh, thickness)
+
+    @cached_property
+    def geometry(self) -> Geometry:
+        """Centers, areas, centroids and volumes of the polyhedra."""
+        p, k = self.cells, self.mesh.inner
+        centers, areas = face_geometry(p.points, p.starts, p.corners)
+        made = cell_geometry(centers, areas, p.owner, self.mesh.neighbor[:k], len(self.mesh))
+        return Geometry(centers, areas, *made)
+
+    @cached_property
+    def face_cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The cell, the face and the sign of the normal for each side of each face, three arrays (s,)."""
+        f, k = len(self.cells.owner), self.mesh.inner
+        return (
+            np.concatenate([self.cells.owner, self.mesh.neighbor[:k]]).astype(np.int64),
+            np.concatenate([np.arange(f), np.arange(k)]),
+            np.concatenate([np.ones(f), -np.ones(k)]),
+        )
+
+    @cached_property
+    def coupled(self) -> np.ndarray:
+        """Faces with a cell on both sides, those at seams included, (c,) int."""
+        return np.flatnonzero(self.mesh.neighbor >= 0)
+
+    @cached_property
+    def _across(self) -> np.ndarray:
+        """Centroid of the neighbor of each coupled face, beside the owner, (c, 3)."""
+        mesh = self.mesh
+        period = mesh.shift[self.coupled] * np.array(mesh.domain.extent)
+        period = np.pad(period, ((0, 0), (0, 3 - mesh.dim)))
+        return self.geometry.centroids[mesh.neighbor[self.coupled]] + period
+
+    @cached_property
+    def non_orthogonality(self) -> np.ndarray:
+        """Angle in degrees between the normal of each face and the line from centroid to centroid; 0 on walls."""
+        g, c = self.geometry, self.coupled
+        line = self._across - g.centroids[self.cells.owner[c]]
+        angle = np.zeros(len(g.centers))
+        across = np.linalg.norm(np.cross(line, g.areas[c]), axis=1)
+        angle[c] = np.degrees(np.arctan2(across, np.einsum("ij,ij->i", line, g.areas[c])))
+        return angle
+
+    @cached_property
+    def skewness(self) -> np.ndarray:
+        """Offset of each face's center from the line between the centroids, over the extent of the face that way.
+
+        The least extent is a fifth of the distance of the centroids. On a wall the line is normal to the face.
+        """
+        g, p = self.geometry, self.cells
+        arm = g.centers - g.centroids[p.owner]
+        square = np.maximum(np.einsum("ij,ij->i", g.areas, g.areas), _TINY**2)
+        line = g.areas * (np.einsum("ij,ij->i", g.areas, arm) / square)[:, None]
+        least = 0.4 * np.linalg.norm(line, axis=1)
+        line[self.coupled] = self._across - g.centroids[p.owner[self.coupled]]
+        least[self.coupled] = 0.2 * np.linalg.norm(line[self.coupled], axis=1)
+        along = np.einsum("ij,ij->i", g.areas, line) + _TINY
+        offset = arm - (np.einsum("ij,ij->i", g.areas, arm) / along)[:, None] * line
+        size = np.linalg.norm(offset, axis=1)
+        direction = offset / (size + _TINY)[:, None]
+        face = np.repeat(np.arange(len(g.centers)), np.diff(p.starts))
+        reach = np.abs(
+            np.einsum("ij,ij->i", p.points[p.corners] - g.centers[face], direction[face])
+        )
+        extent = np.maximum(np.maximum.reduceat(reach, p.starts[:-1]), least)
+        return size / (extent + _TINY)
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """The smaller of the distances of both centroids from the face over their sum; 1/2 is best, 1 on walls."""
+        g, c = self.geometry, self.coupled
+        here = np.einsum("ij,ij->i", g.areas[c], g.centers[c] - g.centroids[self.cells.owner[c]])
+        there = np.einsum("ij,ij->i", g.areas[c], self._across - g.centers[c])
+        here, there = np.abs(here), np.abs(there)
+        weight = np.ones(len(g.centers))
+        weight[c] = np.minimum(here, there) / (here + there + _TINY**2)
+        return weight
+
+    @cached_property
+    def volume_ratio(self) -> np.ndarray:
+        """Smaller over larger volume of the two cells at each face; 1 on walls."""
+        v, c = self.geometry.volumes, self.coupled
+        here, there = v[self.cells.owner[c]], v[self.mesh.neighbor[c]]
+        ratio = np.ones(len(self.cells.owner))
+        ratio[c] = np.minimum(here, there) / (np.maximum(here, there) + _TINY**2)
+        return ratio
+
+    @cached_property
+    def flatness(self) -> np.ndarray:
+        """Area of each face over the sum of the areas of its triangles about the center; 1 for a flat convex face."""
+        g, p = self.geometry, self.cells
+        counts = np.diff(p.starts)
+        center = np.repeat(g.centers, counts, axis=0)
+        here, there = p.points[p.corners], p.points[p.corners[following(p.starts)]]
+        triangles = np.linalg.norm(np.cross(there - here, center - here), axis=1) / 2
+        sums = np.add.reduceat(triangles, p.starts[:-1])
+        return np.where(counts > 3, np.linalg.norm(g.areas, axis=1) / (sums + _TINY), 1.0)
+
+    @cached_property
+    def pyramids(self) -> np.ndarray:
+        """Smaller volume of the two pyramids of each face, with the centroids of its cells as tips."""
+        g, k = self.geometry, self.mesh.inner
+        arm = g.centers - g.centroids[self.cells.owner]
+        volumes = np.einsum("ij,ij->i", g.areas, arm) / 3
+        beyond = g.centroids[self.mesh.neighbor[:k]] - g.centers[:k]
+        volumes[:k] = np.minimum(volumes[:k], np.einsum("ij,ij->i", g.areas[:k], beyond) / 3)
+        return volumes
+
+    @cached_property
+    def openness(self) -> np.ndarray:
+        """Largest component of the sum of each cell's area vectors over the sum of its absolute values, (n,)."""
+        cell, face, sign = self.face_cells
+        areas = self.geometry.areas[face] * sign[:, None]
+        return (np.abs(sum_rows(cell, areas, len(self.mesh))) / (self._spread + _TINY)).max(axis=1)
+
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        """Sum of the absolute components of each cell's area vectors, (n, 3)."""
+        cell, face, _ = self.face_cells
+        return sum_rows(cell, np.abs(self.geometry.areas[face]), len(self.mesh))
+
+    @cached_property
+    def aspect_ratio(self) -> np.ndarray:
+        """Largest over smallest extent along the axes, and in 3D surface over volume to 2/3 (1 for a cube), (n,)."""
+        spread = self._spread[:, : self.mesh.dim]
+        ratio = spread.max(axis=1) / (spread.min(axis=1) + _TINY)
+        if self.mesh.dim == 2:
+            return ratio
+        volumes = np.maximum(self.geometry.volumes, _TINY)
+        return np.maximum(ratio, spread.sum(axis=1) / (6 * volumes ** (2 / 3)))
+
+    @cached_property
+    def determinant(self) -> np.ndarray:
+        """Determinant of the sum of products of the area vectors between cells, 1 for a cube within others, (n,)."""
+        cell, face, _ = self.face_cells
+        between = np.zeros(len(self.cells.owner), bool)
+        between[self.coupled] = True
+        kept = between[face]
+        cell, areas, n = cell[kept], self.geometry.areas[face[kept]], len(self.mesh)
+        mean = np.bincount(cell, np.linalg.norm(areas, axis=1), n)
+        counts = np.bincount(cell, minlength=n)
+        scaled = areas / (mean / np.maximum(counts, 1))[cell][:, None]
+        products = (scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9)
+        tensors = sum_rows(cell, products, n).reshape(-1, 3, 3)
+        if self.mesh.dim == 2:
+            tensors[:, 2, 2] = 1
+        return np.where(counts > 0, np.abs(np.linalg.det(tensors)) / 8, 0.0)
+
+    @cached_property
+    def concave(self) -> np.ndarray:
+        """Whether OpenFOAM counts the cell as concave: a face's center is beyond the plane of another one, (n,)."""
+        cell, face, sign = self.face_cells
+        order = np.argsort(cell, kind="stable")
+        counts = np.bincount(cell, minlength=len(self.mesh))
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        areas = self.geometry.areas[face[order]] * sign[order][:, None]
+        normals = areas / np.maximum(np.linalg.norm(areas, axis=1), _TINY)[:, None]
+        centers = self.geometry.centers[face[order]]
+        concave = np.zeros(len(self.mesh), bool)
+        ends = np.cumsum(counts.astype(np.int64) ** 2)
+        first = 0
+        while first < len(counts):
+            before = ends[first - 1] if first else 0
+            last = max(int(np.searchsorted(ends, before + _PAIRS)), first + 1)
+            rows = np.arange(first, last)
+            a = np.repeat(
+                np.arange(starts[first], starts[last]), np.repeat(counts[rows], counts[rows])
+            )
+            squares = counts[rows] ** 2
+            base = np.repeat(np.cumsum(squares) - squares, squares)
+            size = np.repeat(counts[rows], squares)
+            b = np.repeat(starts[rows], squares) + (np.arange(len(a)) - base) % size
+            apart = centers[b] - centers[a]
+            apart /= np.maximum(np.linalg.norm(apart, axis=1), _TINY)[:, None]
+            wrong = (np.einsum("ij,ij->i", apart, normals[a]) > -PLANAR_COSINE) & (a != b)
+            concave[np.repeat(rows, squares)[wrong]] = True
+            first = last
+        return concave
+
+    @cached_property
+    def concavity(self) -> np.ndarray:
+        """Largest angle between two faces of each cell beyond 180 degrees, in degrees, (n,)."""
+        g, p, (cell, face, sign) = self.geometry, self.cells, self.face_cells
+        edge, _ = self._edges
+        starts, places = take_rows(p.starts, np.arange(len(p.corners)), face)
+        side = np.repeat(np.arange(len(face)), np.diff(starts))
+        order = np.lexsort((edge[places], cell[side]))
+        places, side = places[order], side[order]
+        pairs = np.flatnonzero((np.diff(edge[places]) == 0) & (np.diff(cell[side]) == 0))
+        a, b, places = side[pairs], side[pairs + 1], places[pairs]
+        one, two = (g.areas[face[x]] * sign[x, None] for x in (a, b))
+        across = np.cross(one, two)
+        # Around the first face, counter-clockwise as seen from outside of the cell.
+        along = p.points[p.corners[following(p.starts)[places]]] - p.points[p.corners[places]]
+        concave = np.einsum("ij,ij->i", across, along) * sign[a] < 0
+        size = np.linalg.norm(across, axis=1)
+        angle = np.degrees(np.arctan2(size, np.einsum("ij,ij->i", one, two)))
+        worst = np.zeros(len(self.mesh))
+        np.maximum.at(worst, cell[a], np.where(concave, angle, 0.0))
+        return worst
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """The edge that follows each corner of a face, (k,), and the two points of each edge, (e, 2)."""
+        p = self.cells
+        ends = np.sort(np.stack([p.corners, p.corners[following(p.starts)]], axis=1), axis=1)
+        key = ends[:, 0].astype(np.int64) * len(p.points) + ends[:, 1]
+        _, first, edge = np.unique(key, return_index=True, return_inverse=True)
+        return edge.ravel(), ends[first]
+
+    @cached_property
+    def bad_tetrahedra(self) -> np.ndarray:
+        """Number of OpenFOAM's complaints about each face's tetrahedra with the centroids, (f,) int.
+
+        One for each cell in which a triangle about the face's center has no positive volume. One more if no corner of
+        the face is the base of a fan of triangles with positive volumes on both sides.
+        """
+        g, p, k = self.geometry, self.cells, self.mesh.inner
+        counts = np.diff(p.starts)
+        face = np.repeat(np.arange(len(counts)), counts)
+        after = p.corners[following(p.starts)]
+        a, b = p.points[p.corners], p.points[after]
+        tips = np.full((2, len(counts), 3), np.nan)
+        tips[0] = g.centroids[p.owner]
+        tips[1, self.coupled] = self._across
+        bad = np.zeros(len(counts), int)
+        for side, last in ((0, len(counts)), (1, k)):
+            rows = face < last
+            fine = _positive(a[rows], b[rows], g.centers[face[rows]], tips[side, face[rows]], side)
+            bad[:last] += np.bincount(face[rows], ~fine, last) > 0
+        # Fans from the first corner; others only where these fail.
+        left, base = np.arange(len(counts)), 0
+        while left.size:
+            starts, items = take_rows(p.starts, np.arange(len(p.corners)), left)
+            row = np.repeat(np.arange(len(left)), np.diff(starts))
+            within = np.arange(len(items)) - starts[row]
+            apart = (within - base) % counts[left][row]
+            used = (apart > 0) & (apart < counts[left][row] - 1)
+            items, row = items[used], row[used]
+            foot = p.points[p.corners[p.starts[left[row]] + base]]
+            fine = _positive(a[items], b[items], foot, tips[0, left[row]], 0)
+            two = np.isfinite(tips[1, left[row], 0])
+            fine[two] &= _positive(
+                a[items[two]], b[items[two]], foot[two], tips[1, left[row[two]]], 1
+            )
+            failed = left[np.bincount(row, ~fine, len(left)) > 0]
+            base += 1
+            ended = counts[failed] <= base
+            bad[failed[ended]] += 1
+            left = failed[~ended]
+        return bad
+
+    # Short edges and small faces, relative to the size of a cell.
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Size of each cell: its volume to the power 1/3, in 2D the root of its area, (n,)."""
+        volumes = np.maximum(self.geometry.volumes, 0)
+        if self.mesh.dim == 3:
+            return np.cbrt(volumes)
+        return np.sqrt(volumes / self.cells.points[:, 2].max())
+
+    @cached_property
+    def edge_lengths(self) -> np.ndarray:
+        """Length of the shortest edge of each face over the smaller size of its cells; in 2D of the face itself."""
+        p, f = self.cells, len(self.mesh.owner)
+        if self.mesh.dim == 2:
+            a, b = self.mesh.points[self.mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
+            lengths = np.linalg.norm(b - a, axis=1)
+        else:
+            steps = p.points[p.corners[following(p.starts)]] - p.points[p.corners]
+            lengths = np.minimum.reduceat(np.linalg.norm(steps, axis=1), p.starts[:-1])
+        return lengths / np.maximum(self._face_sizes[:f], _TINY)
+
+    @cached_property
+    def _face_sizes(self) -> np.ndarray:
+        """Smaller size of the cells at each face, (f,)."""
+        sizes = self.sizes[self.cells.owner].copy()
+        c = self.coupled
+        sizes[c] = np.minimum(sizes[c], self.sizes[self.mesh.neighbor[c]])
+        return sizes
+
+    def _least(self, values: np.ndarray) -> np.ndarray:
+        """Return the least of `values` (f,) among the faces of each cell, (n,)."""
+        cell, face, _ = self.face_cells
+        some = face < len(values)
+        least = np.full(len(self.mesh), np.inf)
+        np.minimum.at(least, cell[some], values[face[some]])
+        return least
+
+    @cached_property
+    def shortest_edge(self) -> np.ndarray:
+        """Length of the shortest edge of each cell over the smaller size of the cells at it, (n,)."""
+        return self._least(self.edge_lengths)
+
+    @cached_property
+    def smallest_face(self) -> np.ndarray:
+        """Area of the smallest face of each cell over the square of the smaller size of its cells; 2D: length, (n,)."""
+        if self.mesh.dim == 2:
+            return self.shortest_edge
+        return self._least(np.linalg.norm(self.geometry.areas, axis=1) / self._face_sizes**2)
+
+    def summary(self) -> dict[str, float]:
+        """Return the extremes, the means and for edges and faces the percentiles, by name."""
+        c = self.coupled
+        angle = self.non_orthogonality[
+            c[self.mesh.twin[c] < c]
+        ]  # one side of each seam: not the upper
+        found = {
+            "max_non_orthogonality": float(angle.max(initial=0)),
+            "mean_non_orthogonality": _mean_angle(angle),
+            "max_skewness": float(self.skewness.max(initial=0)),
+            "max_concavity": float(self.concavity.max(initial=0)),
+            "concave_cells": int(self.concave.sum()),
+        }
+        for name, values in (
+            ("edge", self.shortest_edge),
+            ("face", self.smallest_face),
+        ):
+            found[f"min_{name}"] = float(values.min(initial=np.inf))
+            for share in (0.1, 1, 10):
+                found[f"{name}_percentile_{share:g}"] = float(np.percentile(values, share))
+        return found
+
+
+def _mean_angle(degrees: np.ndarray) -> float:
+    """Return the angle in degrees whose cosine is the mean of the cosines, as OpenFOAM prints it."""
+    if not len(degrees):
+        return 0.0
+    return float(np.degrees(np.arccos(np.clip(np.cos(np.radians(degrees)).mean(), -1, 1))))
+
+
+def _positive(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, tip: np.ndarray, side: int
+) -> np.ndarray:
+    """Return whether tetrahedra have a volume above OpenFOAM's least quality, on the side 0 (owner) or 1, (k,).
+
+    The quality is the volume over that of the regular tetrahedron with the same circumsphere, the limit 1e-30.
+    """
+    u, v, w = b - a, c - a, tip - a
+    six = np.einsum("ij,ij->i", np.cross(u, v), w)
+    signed = six if side else -six
+    lengths = [np.einsum("ij,ij->i", x, x)[:, None] for x in (u, v, w)]
+    top = lengths[0] * np.cross(v, w) + lengths[1] * np.cross(w, u) + lengths[2] * np.cross(u, v)
+    radius = np.linalg.norm(top, axis=1) / np.maximum(2 * np.abs(six), _TINY)
+    return signed / 6 > 1e-30 * (8 / 27 * np.sqrt(3)) * np.minimum(radius, 1e15) ** 3

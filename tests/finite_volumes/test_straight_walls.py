@@ -1,0 +1,147 @@
+"""Straight walls: chords, corners that faces meet, names that faces do not cross."""
+
+import numpy as np
+import pytest
+import shapely
+
+import clvoro
+from clvoro import Polygon
+from clvoro.errors import InputError
+
+SQUARE = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
+ELL = np.array([(0.0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
+
+
+def circle(k: int, r: float, turned: float = 0.1) -> np.ndarray:
+    angle = np.arange(k) * (2 * np.pi / k) + turned
+    return 0.5 + r * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def adapt(ctx, domain, size=0.08, **options) -> clvoro.Result:
+    return clvoro.Adapter(ctx).run(domain, size, effort="fast", **options)
+
+
+def wall_faces(mesh) -> list:
+    """The faces on walls: (owner, edge of the domain, first point, second point)."""
+    walls = range(mesh.inner, mesh.outer)
+    ends = mesh.points[mesh.corners.reshape(-1, 2)]
+    return [(int(mesh.owner[f]), -1 - int(mesh.neighbor[f]), *ends[f]) for f in walls]
+
+
+def polygons(mesh) -> list:
+    """The cells, one after the other, from the points and faces alone."""
+    sides = {i: {} for i in range(len(mesh))}
+    for f, (a, b) in enumerate(mesh.corners.reshape(-1, 2).tolist()):
+        sides[mesh.owner[f]][a] = b
+        if f < mesh.inner:
+            sides[mesh.neighbor[f]][b] = a
+    found = []
+    for cell in sides.values():
+        loop = [next(iter(cell))]
+        while cell[loop[-1]] != loop[0]:
+            loop.append(cell[loop[-1]])
+        assert len(loop) == len(cell)
+        found.append(shapely.Polygon(mesh.points[loop]))
+    return found
+
+
+def concave_by(polygon: shapely.Polygon) -> float:
+    """Largest interior angle minus 180 degrees."""
+    x = np.array(polygon.exterior.coords)[:-1]
+    a, b = x - np.roll(x, 1, axis=0), np.roll(x, -1, axis=0) - x
+    turns = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1))
+    return -np.degrees(turns.min())
+
+
+@pytest.fixture(scope="module")
+def ring(ctx) -> clvoro.Result:
+    """A square with a circle of 90 edges."""
+    return adapt(ctx, Polygon(SQUARE, [circle(90, 0.2)], names={"circle": range(4, 94)}))
+
+
+def test_exact_walls_are_those_of_the_diagram(ring):
+    mesh = ring.solver_mesh("exact", collapse=False)
+    assert [p.area for p in polygons(mesh)] == pytest.approx(ring.diagram.volumes, abs=1e-13)
+    assert mesh.area_change == 0
+    assert len(mesh.owner) == len(ring.diagram.faces)
+    with pytest.raises(InputError, match="walls is 'round', expected"):
+        ring.solver_mesh("round")
+
+
+def test_cells_on_a_circle_have_one_straight_face_there(ring):
+    mesh = ring.solver_mesh()
+    on_circle = [face for face in wall_faces(mesh) if face[1] >= 4]
+    assert len({face[0] for face in on_circle}) == len(on_circle)
+    assert len(ring.solver_mesh("exact").owner) > len(mesh.owner)
+    cells = polygons(mesh)
+    assert max(concave_by(p) for p in cells) < 1e-9
+    # Chords are inside of the circle: the domain grows by the segments between chord and boundary.
+    edges = [shapely.LineString([a, b]) for _, _, a, b in on_circle]
+    loop = shapely.polygonize(edges).geoms[0]
+    grown = shapely.Polygon(circle(90, 0.2)).area - loop.area
+    assert grown > 1e-4
+    assert mesh.area_change == pytest.approx(grown / ring.diagram.domain.measure, rel=1e-9)
+    assert sum(p.area for p in cells) == pytest.approx(1 - loop.area, rel=1e-12)
+    assert "of the domain" in repr(mesh)
+
+
+def test_cells_do_not_overlap(ring):
+    cells = polygons(ring.solver_mesh())
+    tree = shapely.STRtree(cells)
+    for i, j in tree.query(cells, predicate="overlaps").T:
+        assert cells[i].intersection(cells[j]).area < 1e-14
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_face_ends_in_a_corner_that_is_near(ctx, seed):
+    """Two generators, nearly at the same distance from the corner, put the face's end beside it."""
+    rng = np.random.default_rng(seed)
+    corner = np.array([0.5, 0.5])
+    near = corner + 0.1 * np.array([(1, -0.4), (-0.4, 1)]) + rng.uniform(-0.01, 0.01, (2, 2))
+    far = np.array([(x, y) for x in (0.1, 0.3, 0.5, 0.7, 0.9) for y in (0.1, 0.3)])
+    far = np.concatenate([far, far[[0, 1, 2, 3]] + (0, 0.4), far[[0, 2]] + (0, 0.8)])
+    points = np.concatenate([near, far + rng.uniform(-0.02, 0.02, far.shape)])
+    diagram = clvoro.Adapter(ctx).diagram(Polygon(ELL), points)
+    assert max(map(concave_by, polygons(diagram.solver_mesh("exact")))) > 80
+    mesh = diagram.solver_mesh()
+    cells = polygons(mesh)
+    assert max(map(concave_by, cells)) < 1e-9
+    assert sum(p.touches(shapely.Point(corner)) for p in cells) == 2
+    assert mesh.area_change == 0
+
+
+def test_a_corner_without_a_face_end_remains(ctx):
+    points = np.array([(0.4, 0.4), (0.1, 0.9), (0.9, 0.1)])
+    mesh = clvoro.Adapter(ctx).diagram(Polygon(ELL), points).solver_mesh()
+    assert max(map(concave_by, polygons(mesh))) == pytest.approx(90)
+    assert mesh.area_change == 0
+
+
+def test_faces_do_not_cross_from_one_name_to_another(ctx):
+    domain = Polygon(circle(64, 0.4), names={"in": range(20), "out": range(30, 64)})
+    mesh = adapt(ctx, domain).solver_mesh()
+    changes = domain.vertices[[0, 20, 30]]
+    ends = np.array([face[2:] for face in wall_faces(mesh)]).reshape(-1, 2)
+    for place in changes:
+        assert np.linalg.norm(ends - place, axis=1).min() == 0
+    for _, edge, a, b in wall_faces(mesh):
+        middle = (a + b) / 2 - 0.5
+        angle = (np.arctan2(middle[1], middle[0]) - 0.1) % (2 * np.pi) / (2 * np.pi) * 64
+        assert (edge < 20, edge < 30) == (angle < 20, angle < 30)
+    one = adapt(ctx, Polygon(circle(64, 0.4))).solver_mesh()
+    ends = np.array([face[2:] for face in wall_faces(one)]).reshape(-1, 2)
+    assert min(np.linalg.norm(ends - place, axis=1).min() for place in changes) > 0
+
+
+def test_a_rough_coast_becomes_smooth(ctx):
+    """Boundaries with ten edges per cell that turn to and fro."""
+    rng = np.random.default_rng(5)
+    shore = circle(400, 0.4)
+    shore = 0.5 + (shore - 0.5) * (1 + 0.01 * rng.standard_normal(400))[:, None]
+    result = adapt(ctx, Polygon(shore))
+    mesh = result.solver_mesh()
+    cells = polygons(mesh)
+    assert min(p.area for p in cells) > 0
+    assert max(map(concave_by, cells)) < 1e-9
+    assert abs(mesh.area_change) < 0.01
+    assert len(wall_faces(mesh)) < 2 * len({face[0] for face in wall_faces(mesh)})
