@@ -20,7 +20,6 @@ from polygon import lake
 
 import clvoro
 from clvoro import sizing
-from clvoro.cli.cases.naca import naca4
 
 LIMITS = (0.008, 0.12)
 """Ends of the scale of colors; the lower one leaves room under the smallest cells, for faces to show on them."""
@@ -45,10 +44,10 @@ def shore() -> Example:
 
 
 def channel() -> Example:
-    wing = naca4("2412", chord=0.7, leading_edge=(0.4, 0.62), angle=10)
+    wing = clvoro.curves.naca("2412", chord=0.7, leading_edge=(0.4, 0.62), angle_of_attack=10)
     walls = [(0, 0), (2, 0), (2, 1.2), (0, 1.2)]
     domain = clvoro.Polygon(walls, [wing])
-    layers = clvoro.Layers(0.008, count=4, growth=1.3, spacing=0.022, edges=range(4, 4 + len(wing)))
+    layers = clvoro.Layers(0.008, count=4, growth=1.3, spacing=0.022, edges="hole-1")
     return Example(
         "layers=Layers(0.008, count=4, ...)",
         domain,

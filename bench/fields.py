@@ -19,7 +19,6 @@ from _common import FIRST_SEED, PICTURES, Report, figures, heading, make_adapter
 
 import clvoro
 from clvoro import sizing
-from clvoro.cli.cases.naca import naca4
 
 BOX = clvoro.Box((0, 0), (1.5, 1))
 LIMITS = (0.008, 0.12)
@@ -98,13 +97,13 @@ def from_solution(kind: str) -> Example:
 
 def composition() -> Example:
     """Return a wing section and its wake over a background that is coarser to the right."""
-    wing = naca4("4415", chord=0.55, leading_edge=(0.3, 0.58), angle=8)
-    near = sizing.Distance(sizing.ClosedPolyline(wing), h_min=0.012, growth=1.2, h_max=0.1)
-    wake = [tuple(wing[0]), (1.5, 0.42)]
+    wing = clvoro.curves.naca("4415", chord=0.55, leading_edge=(0.3, 0.58), angle_of_attack=8)
+    near = sizing.Distance(wing, h_min=0.012, growth=1.2, h_max=0.1)
+    wake = [tuple(wing.vertices[0]), (1.5, 0.42)]
     behind = sizing.Distance(sizing.Segment(*wake), h_min=0.022, growth=1.15, h_max=0.1)
     size = sizing.minimum(near, behind, sizing.Expression("0.05 + 0.03 * x"))
     return Example(
-        "minimum(wing, wake, background)", size, [np.vstack([wing, wing[:1]])],
+        "minimum(wing, wake, background)", size, [np.vstack([wing.vertices, wing.vertices[:1]])],
         [np.array(wake)],
     )  # fmt: skip
 

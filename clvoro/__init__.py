@@ -11,7 +11,8 @@ diagram are moved, inserted and deleted until its cells have that size and are n
 >>> bool(abs(mesh.diagram.volumes.sum() - domain.measure) < 1e-12)
 True
 
-Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls. Sizes:
+Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shapely), with `Layers` along walls. `curves`
+has circles, ellipses, wing sections and splines for their boundaries. Sizes:
 numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`. `adapt` returns a `Result`, `voronoi` a `Diagram`
 of given generators; both have arrays, `save`, `plot`, `check` and `transfer`, and `load` reads a saved result.
 `Adapter` is the full interface, on a device of your choice, with `MultilevelOptions`, `PaperOptions` and `Checkpoint`;
@@ -19,7 +20,7 @@ Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors and warnings 
 `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is ``clvoro``; begin with ``clvoro --help``.
 """
 
-from . import sizing
+from . import curves, sizing
 from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
 from .adapter import Adapter, adapt, voronoi
 from .errors import ClvoroError, Interrupted
@@ -49,6 +50,7 @@ __all__ = [
     "Result",
     "adapt",
     "create_context",
+    "curves",
     "list_devices",
     "load",
     "profile",

@@ -16,7 +16,7 @@ from ..errors import InputError, InputTypeError
 
 Walls = int | str | Iterable[int | str]
 """A selection of walls: a number, a name, or several of them."""
-_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
+WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
 _LISTED = 12  # names or numbers in an error message
 
 
@@ -94,7 +94,7 @@ class BoundaryNames:
             )
         index = np.full(len(self.index), -1, np.int32)
         for k, (name, walls) in enumerate(names.items()):
-            if not isinstance(name, str) or not _WORD.fullmatch(name):
+            if not isinstance(name, str) or not WORD.fullmatch(name):
                 raise InputError(
                     f"{what} has the name {name!r:.60}, expected a word of ASCII letters, digits, _, . and - that "
                     "begins with a letter or _"

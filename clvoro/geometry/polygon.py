@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -13,9 +14,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
 from ..opencl.engine import DomainKind
 from .boundary_names import BoundaryNames, Walls
+from .curved_edges import CurvedEdges
+from .curves import Curve
 from .edge_grid import bin_edges
 from .geojson import pieces_of_geojson, pieces_of_shape, pieces_of_wkt
 from .region import Region
@@ -42,14 +46,15 @@ class Polygon(Region):
 
     Parameters
     ----------
-    outer : array_like (k, 2)
-        Vertices of the outer ring in either orientation; the first may be repeated at the end.
-    holes : sequence of array_like (k, 2)
-        Rings of holes in either orientation; they may touch each other and the outer ring in single points.
+    outer : array_like (k, 2), curve, or list of points and curves
+        The outer ring in either orientation: its vertices, of which the first may be repeated at the end; a closed
+        curve of `clvoro.curves`; or a list of points and open curves, joined by straight edges.
+    holes : sequence of rings
+        Holes, each like `outer`; they may touch each other and the outer ring in single points.
     names : mapping, optional
         Names of boundaries, each with its edges: numbers, default names, or a sequence of them. By default a boundary
-        is a ring: ``outer``, ``hole-1``, ``hole-2``, ..., or ``outer-1``, ``outer-2``, ... with several pieces. Edges
-        that are not mentioned keep the name of their ring.
+        is a ring: ``outer``, ``hole-1``, ``hole-2``, ..., or ``outer-1``, ``outer-2``, ... with several pieces, or a
+        curve with a name. Edges that are not mentioned keep the name of their curve or ring.
 
     Attributes
     ----------
@@ -61,6 +66,9 @@ class Polygon(Region):
         its holes.
     piece_of_ring : (r,) int32
         Number of the piece that each ring bounds; pieces may touch in single points.
+    curves : tuple of clvoro.curves.Curve
+        The curves of the boundary, in the order of their edges. Their vertices lie on them, and straight edges within
+        the curve's tolerance stand for them; `on_curve` returns points on the curves themselves.
     oriented : OrientedRings
         The same edges with the domain on their left, for algorithms.
     lower, upper : (2,) tuples of float
@@ -72,8 +80,9 @@ class Polygon(Region):
         With the ring and the place: if a vertex is not finite; a ring has fewer than 3 distinct vertices or no area,
         or crosses or touches itself; a hole is outside, overlaps another one or divides the domain; pieces overlap; an
         edge is shorter than 1e-12 of the domain; or the domain is too large, too small or too far from the origin for
-        float64. Also if a name is not a word, clashes with another one, or stands for an edge that does not exist or
-        has a name already.
+        float64. Also if a ring is an open curve, or a curve ends near the next point of its ring, but not in it. Also
+        if a name is not a word, clashes with another one, or stands for an edge that does not exist or has a name
+        already.
 
     Examples
     --------
@@ -82,6 +91,12 @@ class Polygon(Region):
     >>> pond = clvoro.Polygon(square, [island], names={"island": range(4, 7), "inlet": 3})
     >>> round(pond.measure, 12), pond.boundary_names
     (0.98, ('island', 'inlet', 'outer'))
+
+    A step with a rounded edge:
+
+    >>> edge = clvoro.curves.arc((0.9, 0.4), 0.1, 90, 0, name="edge")
+    >>> clvoro.Polygon([(0, 0.5), edge, (1, 0), (3, 0), (3, 1), (0, 1)]).boundary_names
+    ('outer', 'edge')
     """
 
     framed_by: Polygon | None = None
@@ -172,7 +187,12 @@ class Polygon(Region):
                 raise
             raise InputError(f"{source}: {error}") from error
 
-    def _build(self, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None) -> None:
+    def _build(
+        self,
+        pieces: Sequence[Sequence[object]],
+        names: Mapping[str, Walls] | None,
+        curves: object = None,
+    ) -> None:
         made = make_rings(pieces)
         rings = [ring for piece in made for ring in piece]
         self.vertices = np.concatenate([ring.given for ring in rings])
@@ -182,6 +202,10 @@ class Polygon(Region):
         )
         for array in self._arrays():
             array.setflags(write=False)
+        self.curved = CurvedEdges.join([ring.curved for ring in rings])
+        if curves:
+            ends = self.vertices[self._next_given]
+            self.curved = CurvedEdges.described(curves, self.vertices, ends)
         self.oriented = OrientedRings.of(rings)
         self.lower = tuple(self.vertices.min(axis=0).tolist())
         self.upper = tuple(self.vertices.max(axis=0).tolist())
@@ -191,6 +215,58 @@ class Polygon(Region):
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.vertices, self.ring_starts, self.piece_of_ring
+
+    @property
+    def curves(self) -> tuple[Curve, ...]:
+        """The curves of the boundary."""
+        return self.curved.curves
+
+    def on_curve(self, points: np.ndarray, edges: np.ndarray) -> np.ndarray:
+        """Return the nearest points on the boundary's curves, exact to round-off.
+
+        Parameters
+        ----------
+        points : (n, 2) array of float
+            Points on or near the boundary, nearer than the radius of curvature.
+        edges : (n,) array of int
+            The number of the edge that each point belongs to.
+
+        Returns
+        -------
+        (n, 2) float64
+            On the part of a curve that the edge stands for, the nearest point. Corners of curves and vertices of the
+            polygon stay where they are. Points of straight edges are returned as they are.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If an edge does not exist or the shapes differ.
+
+        Examples
+        --------
+        >>> disc = clvoro.Polygon(clvoro.curves.circle((0, 0), 1))
+        >>> middles = (disc.vertices + np.roll(disc.vertices, -1, axis=0)) / 2
+        >>> bool(abs(np.hypot(*disc.on_curve(middles, np.arange(len(middles))).T) - 1).max() < 1e-15)
+        True
+        """
+        points, edges = check_rows("points", points, 2), np.asarray(edges)
+        if edges.shape != points.shape[:1] or edges.dtype.kind not in "iu":
+            raise InputError(
+                f"edges has dtype {edges.dtype} and shape {edges.shape}, expected integers of shape {points.shape[:1]}"
+            )
+        if edges.size and not (edges.min() >= 0 and edges.max() < len(self.vertices)):
+            raise InputError(
+                f"edges has {edges.min()} to {edges.max()}, expected 0 to {len(self.vertices) - 1}"
+            )
+        after = self._next_given[edges]
+        return self.curved.nearest(points, edges, self.vertices[edges], self.vertices[after])
+
+    @cached_property
+    def _next_given(self) -> np.ndarray:
+        """The vertex at the end of each of the caller's edges, (k,)."""
+        after = np.arange(1, len(self.vertices) + 1)
+        after[self.ring_starts[1:] - 1] = self.ring_starts[:-1]
+        return after
 
     # Equal domains have the same rings in the same order, with equal numbers of edges. Names may differ.
 
@@ -204,8 +280,11 @@ class Polygon(Region):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of vertices, rings and pieces: the same for equal domains."""
-        return hashlib.sha256(b"".join(array.tobytes() for array in self._arrays())).hexdigest()
+        """SHA-256 of vertices, rings, pieces and curves: the same for equal domains."""
+        content = b"".join(array.tobytes() for array in self._arrays())
+        if self.curves:
+            content += json.dumps(self.curved.describe(), sort_keys=True).encode()
+        return hashlib.sha256(content).hexdigest()
 
     def __repr__(self) -> str:
         pieces, holes = self.n_pieces, len(self.piece_of_ring) - self.n_pieces
@@ -214,6 +293,8 @@ class Polygon(Region):
             parts.append(f"{pieces} pieces")
         if holes:
             parts.append(f"{holes} hole{'s' if holes > 1 else ''}")
+        if self.curves:
+            parts.append(f"{len(self.curves)} curve{'s' if len(self.curves) > 1 else ''}")
         corners = [", ".join(f"{c:.6g}" for c in corner) for corner in (self.lower, self.upper)]
         return f"Polygon({', '.join(parts)} within ({corners[0]}) and ({corners[1]}))"
 
@@ -226,6 +307,7 @@ class Polygon(Region):
             "vertices": self.vertices.tolist(),
             "ring_starts": self.ring_starts.tolist(),
             "piece_of_ring": self.piece_of_ring.tolist(),
+            **({"curves": self.curved.describe()} if self.curves else {}),
             **({"names": dict(self.names)} if self.names else {}),
         }
 
@@ -262,7 +344,11 @@ class Polygon(Region):
         # Close the rings: a last vertex equal to the first one would be dropped as the closing one.
         rings = [np.concatenate([vertices[a:b], vertices[a : a + 1]]) for a, b in pairwise(starts)]
         firsts = [*np.flatnonzero(steps), len(rings)]
-        return cls.from_pieces([rings[a:b] for a, b in pairwise(firsts)], values.get("names"))
+        made = cls.__new__(cls)
+        made._build(
+            [rings[a:b] for a, b in pairwise(firsts)], values.get("names"), values.get("curves")
+        )
+        return made
 
     @property
     def measure(self) -> float:
@@ -276,7 +362,15 @@ class Polygon(Region):
             for is_outer, o, h in zip(first, np.cumsum(first), np.cumsum(~first), strict=True)
         ]
         index = np.repeat(np.arange(len(names), dtype=np.int32), np.diff(self.ring_starts))
-        return BoundaryNames(tuple(names), index, "edge")
+        for c, curve in enumerate(self.curves):
+            if curve.name is not None:
+                names += [] if curve.name in names else [curve.name]
+                index[self.curved.curve == c] = names.index(curve.name)
+        used, first = np.unique(index, return_index=True)
+        used = used[np.argsort(first)]  # in the order of their first edges
+        place = np.empty(len(names), np.int32)
+        place[used] = np.arange(len(used))
+        return BoundaryNames(tuple(names[k] for k in used), place[index], "edge")
 
     def find_edges(self, what: str, walls: Walls | None) -> np.ndarray:
         """Return the places in `oriented` of the selected edges, (m,) int64, ascending.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from numbers import Real
@@ -19,6 +19,7 @@ import shapely
 from ..arguments import check_rows
 from ..errors import InputError, InputTypeError
 from .box import LARGEST_EDGE
+from .curved_edges import CurvedEdges, has_curves, unroll
 
 SHORTEST_EDGE = 1e-12
 """Shortest edge, as a share of the bounding box's longest edge."""
@@ -43,12 +44,15 @@ class Ring:
         Number of each edge in `given`: edge i goes from vertex i to the next.
     name : str
         Name in errors: "outer ring", "hole 2 of piece 0".
+    curved : CurvedEdges
+        The curves that edges of `given` stand for.
     """
 
     given: np.ndarray
     vertices: np.ndarray
     numbers: np.ndarray
     name: str
+    curved: CurvedEdges
 
 
 @dataclass(frozen=True)
@@ -188,6 +192,9 @@ def _halves(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _cleaned(given: object, name: str) -> Ring:
     """Check one ring, and drop vertices that are equal to the next one."""
+    curved = None
+    if has_curves(given):
+        given, curved = unroll(given, name)
     hint = _other_maker(given)
     if hint:
         raise InputTypeError(
@@ -204,15 +211,17 @@ def _cleaned(given: object, name: str) -> Ring:
         raise InputError(
             f"Polygon's {name} has vertex {bad[0]} at {_at(array[bad[0]])}, expected finite numbers"
         )
-    if len(array) > 1 and (array[0] == array[-1]).all():
-        array = array[:-1]
+    if curved is None:
+        if len(array) > 1 and (array[0] == array[-1]).all():
+            array = array[:-1]
+        curved = CurvedEdges.straight(len(array))
     long = (array != np.roll(array, -1, axis=0)).any(axis=1)
     vertices = array[long]
     if len(vertices) < 3:
         raise InputError(
             f"Polygon's {name} has {len(vertices)} distinct vertices, expected at least 3"
         )
-    return Ring(array, vertices, np.flatnonzero(long), name)
+    return Ring(array, vertices, np.flatnonzero(long), name, curved)
 
 
 def _shape_key(vertices: np.ndarray) -> bytes:
@@ -271,8 +280,9 @@ def _check_lengths(rings: Sequence[Ring]) -> None:
         e = int(np.argmin(length))
         if length[e] < SHORTEST_EDGE * extent.max():
             raise InputError(
-                f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}, "
-                f"{_at(ring.vertices[e])}, expected at least {SHORTEST_EDGE:g} of the domain's size; "
+                f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}"
+                f"{ring.curved.label(ring.numbers[e])}, {_at(ring.vertices[e])}, expected at least "
+                f"{SHORTEST_EDGE:g} of the domain's size; "
                 "merge its ends (shapely.remove_repeated_points(geometry, tolerance) does)"
             )
 
@@ -318,7 +328,7 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
         away.append((float(distance.min()), int(ring.numbers[np.argmin(distance)])))
     close = min(d for d, _ in away) + 1e-9 * float(np.ptp(rings[0].vertices, axis=0).max())
     there = [  # edges are numbered within their rings
-        f"edge {e} of the {ring.name}"
+        f"edge {e} of the {ring.name}{ring.curved.label(e)}"
         for ring, (d, e) in zip(rings, away, strict=True)
         if d <= close
     ]
@@ -351,7 +361,7 @@ def _oriented(ring: Ring, clockwise: bool) -> Ring:
         return ring
     # Edge j of the reversed ring is edge k - 2 - j of the other: it begins where that ends.
     numbers = np.roll(ring.numbers[::-1], -1)
-    return Ring(ring.given, np.ascontiguousarray(ring.vertices[::-1]), numbers, ring.name)
+    return replace(ring, vertices=np.ascontiguousarray(ring.vertices[::-1]), numbers=numbers)
 
 
 def _at(place: np.ndarray) -> str:

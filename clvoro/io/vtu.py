@@ -23,7 +23,7 @@ from ..mesh.straightening import count_sides
 from .atomic import atomic_file
 from .contents import Contents
 
-NAMES = "clvoro names: "
+NAMES, CURVES = "clvoro names: ", "clvoro curves: "
 """Beginning of the comment with names of boundaries."""
 _POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
 _BLOCK = 1 << 20
@@ -57,7 +57,7 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True) -> None:
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
 header_type="UInt64"{compressor}>
 {_comment("clvoro settings: " + json.dumps(contents.settings, default=repr))}
-{_names_comment(diagram.domain)}\
+{_domain_comments(diagram.domain)}\
 <UnstructuredGrid>
 {_field_data(field)}<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
 <Points>
@@ -249,12 +249,15 @@ def _comment(text: str) -> str:
     return f"<!-- {text.replace('--', '- -')} -->"
 
 
-def _names_comment(domain: Domain) -> str:
-    """Return a line with the caller's names of boundaries, which the loader reads."""
-    named = domain.describe().get("names")
-    # A comment has no "--".
-    text = json.dumps(named).replace("--", r"-\u002d")
-    return _comment(NAMES + text) + "\n" if named else ""
+def _domain_comments(domain: Domain) -> str:
+    """Return lines with the caller's names of boundaries and with the curves, which the loader reads."""
+    values = domain.describe()
+    return "".join(
+        # A comment has no "--".
+        _comment(key + json.dumps(values[name]).replace("--", r"-\u002d")) + "\n"
+        for key, name in ((NAMES, "names"), (CURVES, "curves"))
+        if values.get(name)
+    )
 
 
 def _field_data(elements: list[str]) -> str:

@@ -29,10 +29,10 @@ from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
 from .arrays import EXPANSION, LEAST
-from .vtu import NAMES
+from .vtu import CURVES, NAMES
 from .vtu_checks import check_repeated
 
-_LONGEST_HEAD = 1 << 22
+_LONGEST_HEAD = 1 << 24
 _MARK = b'<AppendedData encoding="raw">\n_'
 _END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
@@ -78,7 +78,7 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
                 raise _FileError("it is truncated, or has bytes behind its end")
             reader = _Reader(head[:end], start, size)
             arrays = reader.read_all(file)
-        return _assemble(arrays, reader.names)
+        return _assemble(arrays, reader)
     except _FileError as problem:
         raise InputError(f"cannot read {name}: {problem}") from problem
     except (
@@ -109,6 +109,7 @@ class _Reader:
         self.compressed = False
         self.entries: dict[str, tuple[str, int, int]] = {}
         self.names: dict[str, list[int]] | None = None
+        self.curves: list[object] | None = None
         self._within: list[str] = []
         parser = expat.ParserCreate()
         parser.StartDoctypeDeclHandler = self._refuse
@@ -127,6 +128,8 @@ class _Reader:
         text = text.strip()
         if text.startswith(NAMES):
             self.names = json.loads(text.removeprefix(NAMES))
+        if text.startswith(CURVES):
+            self.curves = json.loads(text.removeprefix(CURVES))
 
     def _element(self, tag: str, given: dict[str, str]) -> None:
         if tag == "VTKFile":
@@ -208,9 +211,7 @@ class _Reader:
             yield data
 
 
-def _assemble(
-    arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None
-) -> Result | Diagram:
+def _assemble(arrays: dict[str, np.ndarray], reader: _Reader) -> Result | Diagram:
     vertices = arrays["Points."].astype(float)
     kinds = arrays["Cells.types"]
     if not len(kinds) or not len(vertices) or not np.isfinite(vertices).all():
@@ -220,7 +221,7 @@ def _assemble(
         raise _FileError("its cells are neither all polygons nor all polyhedra")
     dim = 2 if flat else 3
     x = np.ascontiguousarray(vertices[:, :dim])
-    domain = _domain(arrays, x, names)
+    domain = _domain(arrays, x, reader)
     faces = _cell_polygons(arrays, len(x), domain) if flat else _cell_polyhedra(arrays, len(x))
     owner = np.repeat(np.arange(len(kinds)), np.diff(faces["neighbor_starts"]))
     neighbors = _neighbors(owner, faces.pop("starts"), faces.pop("corners"), x, domain)
@@ -244,17 +245,15 @@ def _assemble(
     )  # fmt: skip
 
 
-def _domain(
-    arrays: dict[str, np.ndarray], x: np.ndarray, names: dict[str, list[int]] | None
-) -> Domain:
+def _domain(arrays: dict[str, np.ndarray], x: np.ndarray, reader: _Reader) -> Domain:
     """Return the domain in the file, or else the bounding box of the vertices."""
     lower, upper, dim = x.min(axis=0), x.max(axis=0), x.shape[1]
     if not (lower < upper).all():
         raise _FileError("its vertices lie on a line")
     if "FieldData.box_periodic" in arrays:
-        return _periodic_box(arrays, dim, names)
-    polygon = _polygon(arrays, names) if dim == 2 else None
-    return polygon or Box(tuple(lower), tuple(upper), names=names)
+        return _periodic_box(arrays, dim, reader.names)
+    polygon = _polygon(arrays, reader) if dim == 2 else None
+    return polygon or Box(tuple(lower), tuple(upper), names=reader.names)
 
 
 def _cell_polygons(arrays: dict[str, np.ndarray], v: int, domain: Domain) -> dict[str, np.ndarray]:
@@ -311,7 +310,7 @@ def _seam(
     return {"shifts": shifts}
 
 
-def _polygon(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) -> Polygon | None:
+def _polygon(arrays: dict[str, np.ndarray], reader: _Reader) -> Polygon | None:
     """Return the polygonal domain in the file; None without one."""
     prefix = "FieldData.domain_"
     values = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
@@ -319,7 +318,7 @@ def _polygon(arrays: dict[str, np.ndarray], names: dict[str, list[int]] | None) 
         return None
     if "vertices" in values:
         values["vertices"] = values["vertices"].reshape(-1, 3)[:, :2]
-    return Polygon.described(**values, names=names)
+    return Polygon.described(**values, names=reader.names, curves=reader.curves)
 
 
 def _set_walls(arrays: dict[str, np.ndarray], neighbors: np.ndarray, domain: Domain) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError, InputTypeError
+from ..geometry import curves
 from ..geometry.box import Box, Domain
 from ..geometry.bvh import Tree
 from ..geometry.polygon import Polygon
@@ -28,7 +29,7 @@ _FAR = 100  # diagonals of the domain beyond which a shape is probably in anothe
 # Kinds of items on the device: see size_item_distance2.
 _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
-Curve = Circle | Segment | Polyline | Edges
+Curve = Circle | Segment | Polyline | Edges | curves.Curve
 Shape = Curve | Surface | Box | Polygon
 
 
@@ -40,8 +41,8 @@ class Distance(Field):
     shapes : shape or iterable of shapes
         `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Sphere`, `Segment`, `Polyline`, `ClosedPolyline`,
         `Surface`; in both a `clvoro.Box`, which stands for its sides, and a `clvoro.Polygon`, which stands for its
-        edges (``domain.boundary("island")`` for some of them). The distance is to the curve or surface, from both
-        sides.
+        edges (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`. The distance is to
+        the curve or surface, from both sides.
     h_min : float
         Size on the shapes.
     growth : float, optional
@@ -85,7 +86,8 @@ class Distance(Field):
             if not isinstance(shape, Shape):
                 raise InputTypeError(
                     f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
-                    "Sphere, Segment, Polyline, ClosedPolyline, Edges, Surface, Box or clvoro.Polygon"
+                    "Sphere, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon or a curve of "
+                    "clvoro.curves"
                 )
         if not self.shapes:
             raise InputError("Distance got no shapes, expected at least one")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import clvoro
 from clvoro import Box, sizing
-from clvoro.cli.cases import Case, builtin_cases, load_case, naca4, toml
+from clvoro.cli.cases import Case, builtin_cases, load_case, toml
 from clvoro.errors import InputError
 
 HEAD = "[domain]\nlower = [0, 0]\nupper = [2, 1]\n"
@@ -27,61 +27,6 @@ def points(n=200):
     return np.random.default_rng(71).random((n, 2)) * (2, 1)
 
 
-# --- NACA sections -------------------------------------------------------------------------------
-
-
-def thickness_at(outline, x):
-    """Vertical thickness of an outline at chord positions x."""
-    nose = outline[:, 0].argmin()
-    upper, lower = outline[: nose + 1][::-1], np.vstack([outline[nose:], outline[:1]])
-    return np.interp(x, *upper.T) - np.interp(x, *lower.T)
-
-
-def test_thickest_place_of_a_symmetric_section():
-    outline = naca4("0012", n_points=400)
-    x = np.linspace(0.05, 0.95, 901)
-    thickness = thickness_at(outline, x)
-    # The published section: 12 % of the chord, at 30 %.
-    assert thickness.max() == pytest.approx(0.12, abs=1e-4)
-    assert x[thickness.argmax()] == pytest.approx(0.30, abs=0.005)
-
-
-def test_section_is_closed_and_counter_clockwise():
-    outline = naca4("2412", n_points=50)
-    assert outline.shape == (100, 2)
-    assert outline[0] == pytest.approx([1, 0], abs=1e-15)
-    assert len(np.unique(outline, axis=0)) == len(outline)
-    x, y = outline.T
-    area = 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    # Integral of the thickness law, 2 * 5 t * (.2969 / 1.5 - .126 / 2 - .3516 / 3 + ...), t = .12.
-    law = 0.2969 / 1.5 - 0.1260 / 2 - 0.3516 / 3 + 0.2843 / 4 - 0.1036 / 5
-    assert area == pytest.approx(10 * 0.12 * law, rel=2e-3)
-
-
-def test_camber_is_two_percent_at_forty():
-    outline = naca4("2412", n_points=2000)
-    nose = len(outline) // 2
-    upper, lower = outline[: nose + 1][::-1], outline[nose:]
-    x = np.linspace(0.2, 0.6, 401)
-    middle = 0.5 * (np.interp(x, *upper.T) + np.interp(x, *lower.T))
-    # The thickness stands on the camber line's normal: the mean height differs from it by less.
-    assert middle.max() == pytest.approx(0.02, abs=2e-4)
-    assert x[middle.argmax()] == pytest.approx(0.4, abs=0.03)
-
-
-def test_section_is_scaled_turned_and_moved():
-    plain, moved = naca4("4415"), naca4("4415", chord=2.0, leading_edge=(1.0, -3.0), angle=30.0)
-    # Nose up about the leading edge: the trailing edge goes down.
-    assert moved[0] == pytest.approx([1 + 2 * math.cos(math.pi / 6), -3 - 1.0])
-    assert np.hypot(*(moved - (1, -3)).T) == pytest.approx(2 * np.hypot(*plain.T))
-
-
-@pytest.mark.parametrize("digits", ["241", "24120", "24a2", "2400", "", "²412"])
-def test_not_a_section(digits):
-    with pytest.raises(InputError, match="four digits"):
-        naca4(digits)
-
-
 # --- reading -------------------------------------------------------------------------------------
 
 
@@ -96,7 +41,7 @@ def test_paper_case_is_the_documented_field():
 
 def test_airfoil_case_leaves_the_section_out_and_resolves_its_wake():
     airfoil = load_case("airfoil")
-    section = clvoro.Polygon(naca4("2412", angle=4.0, n_points=100))
+    section = clvoro.Polygon(clvoro.curves.naca("2412", angle_of_attack=4.0))
     assert airfoil.domain.measure == pytest.approx(6 * 3 - section.measure, rel=1e-12)
     size = airfoil.size_field()
     assert size(np.array([(2.0, -0.085), (-2.0, 1.5)])) == pytest.approx([0.02, 0.12], rel=0.1)

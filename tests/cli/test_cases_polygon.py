@@ -9,7 +9,7 @@ import shapely
 
 import clvoro
 from clvoro import sizing
-from clvoro.cli.cases import Case, builtin_cases, load_case, naca4
+from clvoro.cli.cases import Case, builtin_cases, load_case
 from clvoro.cli.cases.coast import fractal_ring, lake
 from clvoro.cli.cases.files import FOLDER
 from clvoro.errors import InputError
@@ -42,20 +42,36 @@ def test_domains_from_files_and_from_rings(tmp_path) -> None:
         assert again.table() == case.table()
 
 
-def test_shapes_as_rings() -> None:
+def test_curves_as_rings() -> None:
     text = (
-        "[domain]\nouter = { kind = 'circle', center = [1, 2], radius = 3, n_points = 12 }\n"
-        "holes = [{ kind = 'naca4', digits = '2412', leading_edge = [0.5, 2], n_points = 9 },\n"
-        "  [[1, 0], [2, 0], [2, 1]]]\n"
+        "[domain]\nouter = { kind = 'circle', center = [1, 2], radius = 3, name = 'far' }\n"
+        "holes = [{ kind = 'naca', code = '2412', leading_edge = [0.5, 2], trailing_edge = 'blunt' },\n"
+        "  [[1, 0], [2, 0], { kind = 'arc', center = [1, 0], radius = 1, start = 0, end = 90 }],\n"
+        "  { kind = 'spline', points = [[0, 0], [0.5, 0.5], [0, 1]], closed = true, corners = [1] }]\n"
     )
     case = Case.from_toml(text + SIZE, "my.toml")
-    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    circle = np.column_stack([1 + 3 * np.cos(turn), 2 + 3 * np.sin(turn)])
-    section = naca4("2412", leading_edge=(0.5, 2), n_points=9)
-    wanted = clvoro.Polygon(circle, [section, [(1, 0), (2, 0), (2, 1)]])
+    c = clvoro.curves
+    holes = [
+        c.naca("2412", leading_edge=(0.5, 2), trailing_edge="blunt"),
+        [(1, 0), (2, 0), c.arc((1, 0), 1, 0, 90)],
+        c.spline([(0, 0), (0.5, 0.5), (0, 1)], True, [1]),
+    ]
+    wanted = clvoro.Polygon(c.circle((1, 2), 3, name="far"), holes)
     assert case.domain == wanted
+    assert case.domain.boundary_names == ("far", "hole-1", "hole-2", "hole-3")
     again = Case.from_toml(clvoro.cli.cases.toml.write(case.table()), "case.toml")
     assert again.domain == wanted
+
+
+def test_curves_as_shapes() -> None:
+    text = (
+        "[domain]\nlower = [0, 0]\nupper = [1, 1]\n[size]\nkind = 'distance'\nh_min = 0.1\nslope = 1\n"
+        "shapes = [{ kind = 'arc', center = [0, 0], radius = 1, start = 0, end = 45 }]\n"
+    )
+    size = Case.from_toml(text, "my.toml").size_field()
+    assert size(np.array([(0.5, 0.2), (0.0, 1.0)])) == pytest.approx(
+        [0.1 + 1 - np.hypot(0.5, 0.2), 0.1 + 2 * np.sin(np.pi / 8)], abs=1e-6
+    )
 
 
 def test_sizes_from_the_boundary() -> None:
@@ -146,8 +162,8 @@ def test_the_lake_has_cells_across_its_straits() -> None:
 
 def test_the_channel_is_that_of_the_benchmark() -> None:
     case = load_case("channel")
-    circle = 180 / 2 * math.sin(2 * math.pi / 180) * 0.05**2  # a regular polygon of 180 edges
-    assert case.domain.measure == pytest.approx(2.2 * 0.41 - circle, rel=1e-12)
+    assert case.domain.measure == pytest.approx(2.2 * 0.41 - math.pi * 0.05**2, rel=1e-7)
+    assert set(case.domain.boundary_names) == {"walls", "inlet", "outlet", "cylinder"}
     size = case.size_field()
     assert size(np.array([(0.5, 0.2), (2.2, 0.41)])) == pytest.approx([0.005, 0.025])
     (layer,) = case.run_arguments()["layers"]
@@ -165,7 +181,7 @@ def test_cases_run(ctx) -> None:
 LAYERED = """
 [domain]
 outer = [[0, 0], [2, 0], [2, 1], [0, 1]]
-holes = [{ kind = "circle", center = [1, 0.5], radius = 0.2, n_points = 16 }]
+holes = [{ kind = "circle", center = [1, 0.5], radius = 0.2 }]
 
 [size]
 kind = "constant"

@@ -17,7 +17,7 @@ DOMAINS: list[dict[str, Any]] = [
     {"lower": [0, 0], "upper": [2, 2], "periodic": True},
     {"lower": [0, 0], "upper": [2, 2], "periodic": [True, False]},
     {"outer": [[0, 0], [2, 0], [2, 1], [0, 1.5]], "holes": [{"kind": "circle", "center": [1, 0.6], "radius": 0.2}]},
-    {"outer": [[-1, -1], [2, -1], [2, 1], [-1, 1]], "holes": [{"kind": "naca4", "digits": "2412", "n_points": 40}]},
+    {"outer": [[-1, -1], [2, -1], [2, 1], [-1, 1]], "holes": [{"kind": "naca", "code": "2412", "tolerance": 1e-4}]},
     {"polygon": "g.geojson"},
     {"polygon": "w.wkt"},
     {"lower": [0, 0, 0], "upper": [1, 1, 0.7]},
@@ -34,7 +34,7 @@ def some_shape(rng: np.random.Generator, d: int) -> dict[str, Any]:
         {"kind": "polyline", "points": at},
         {"kind": "closed_polyline", "points": at},
         {"kind": "box"},
-        {"kind": "naca4", "digits": "0012", "angle": -5, "n_points": 30},
+        {"kind": "naca", "code": "0012", "angle_of_attack": -5},
         {"kind": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.2},
         {"kind": "surface", "file": "s.stl", "closed": bool(rng.integers(2))},
     ]

@@ -21,9 +21,8 @@ from .checks import file_name
 from .domains import build_domain
 from .fields import build_size, load_array, named_files
 from .files import FOLDER, WRITTEN, locate
-from .naca import naca4
 
-__all__ = ["WRITTEN", "Case", "builtin_cases", "load_case", "naca4"]
+__all__ = ["WRITTEN", "Case", "builtin_cases", "load_case"]
 
 _RUN_ORDER = (
     "method", "methods", "effort", "levels", "error_target", "start", "points", "n_cells",

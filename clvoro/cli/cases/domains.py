@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...errors import InputError
 from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box, Domain
+from ...geometry.curves import Curve
 from ...geometry.polygon import Polygon
 from .files import locate
-from .naca import naca4
 
 
 def build_domain(node: Mapping[str, Any], folder: Path) -> Domain:
@@ -42,12 +40,8 @@ def build_domain(node: Mapping[str, Any], folder: Path) -> Domain:
     return Polygon.from_wkt(text, names)
 
 
-def _ring(node: Any) -> np.ndarray:
-    """Return the vertices of a ring: its own, or those of a shape."""
-    if not isinstance(node, Mapping):
-        return np.array(node, float)
-    rest = {key: value for key, value in node.items() if key != "kind"}
-    if node["kind"] == "naca4":
-        return naca4(**rest)
-    turn = np.linspace(0, 2 * np.pi, rest.get("n_points", 64), endpoint=False)
-    return np.array(rest["center"]) + rest["radius"] * np.column_stack([np.cos(turn), np.sin(turn)])
+def _ring(node: Any) -> Any:
+    """Return a ring: a curve, or points and curves."""
+    if isinstance(node, Mapping):
+        return Curve.described(node)
+    return [Curve.described(item) if isinstance(item, Mapping) else item for item in node]

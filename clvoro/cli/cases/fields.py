@@ -12,10 +12,10 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.box import Box, Domain
+from ...geometry.curves import Curve
 from ...geometry.polygon import Polygon
 from ...io.arrays import read_array
 from .files import locate
-from .naca import naca4
 
 
 def build_size(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
@@ -106,9 +106,7 @@ def _shape(node: Mapping[str, Any], folder: Path, domain: Domain) -> Any:
         return sizing.Polyline(node["points"])
     if kind == "closed_polyline":
         return sizing.ClosedPolyline(node["points"])
-    return sizing.ClosedPolyline(
-        naca4(**{key: value for key, value in node.items() if key != "kind"})
-    )
+    return Curve.described(node)
 
 
 def load_array(path: Path, place: str) -> np.ndarray:

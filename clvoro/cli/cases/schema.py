@@ -45,6 +45,32 @@ def names(value: object, place: str) -> dict[str, Any]:
     return {name: walls(chosen, f"{place}.{name}") for name, chosen in value.items()}
 
 
+_OF_CURVE: dict[str, Check] = {"name": text, "tolerance": positive}
+_CURVES = {
+    "arc": Table(
+        {"center": vector(2), "radius": positive, "start": number, "end": number}, {**_OF_CURVE}
+    ),
+    "ellipse": Table(
+        {"center": vector(2), "semi_axes": vector(2)},
+        {"angle": number, "start": number, "end": number, **_OF_CURVE},
+    ),
+    "naca": Table(
+        {"code": text},
+        {
+            "chord": positive,
+            "leading_edge": vector(2),
+            "angle_of_attack": number,
+            "trailing_edge": one_of("closed", "blunt"),
+            **_OF_CURVE,
+        },
+    ),
+    "spline": Table(
+        {"points": list_of(vector(2), 2)},
+        {"closed": true_or_false, "corners": list_of(whole(0), 0), **_OF_CURVE},
+    ),
+}
+"""The curves of `clvoro.curves`, except circles."""
+
 SHAPE = Kinds(
     {
         "circle": Table({"center": vector(2, 3), "radius": not_negative}, {}),
@@ -55,10 +81,7 @@ SHAPE = Kinds(
         "segment": Table({"a": vector(2, 3), "b": vector(2, 3)}, {}),
         "polyline": Table({"points": vectors(2)}, {}),
         "closed_polyline": Table({"points": vectors(3)}, {}),
-        "naca4": Table(
-            {"digits": text},
-            {"chord": positive, "leading_edge": vector(2), "angle": number, "n_points": whole(3)},
-        ),
+        **_CURVES,
     }
 )
 """A shape that sizes are measured from."""
@@ -139,24 +162,22 @@ _SIZE = Kinds(
     }
 )
 
-_RING = Kinds(
-    {
-        "circle": Table({"center": vector(2), "radius": positive}, {"n_points": whole(3)}),
-        "naca4": Table(
-            {"digits": text},
-            {"chord": positive, "leading_edge": vector(2), "angle": number, "n_points": whole(3)},
-        ),
-    }
+_CURVE = Kinds(
+    {"circle": Table({"center": vector(2), "radius": positive}, {**_OF_CURVE}), **_CURVES}
 )
 
 
 def ring(value: object, place: str) -> Any:
-    """Check for the vertices of a ring, or a shape that has some."""
+    """Check for a closed curve, or a list of points and curves."""
     if isinstance(value, Mapping):
-        return _RING(value, place)
-    if not isinstance(value, (list, tuple)) or len(value) < 3:
-        raise refuse(place, value, "a list of 3 or more points, [x, y] each, or a shape")
-    return [vector(2)(v, f"{place}[{i}]") for i, v in enumerate(value)]
+        return _CURVE(value, place)
+    items = value if isinstance(value, (list, tuple)) else []
+    if len(items) < 3 and not any(isinstance(item, Mapping) for item in items):
+        raise refuse(place, value, "a list of 3 or more points, [x, y] each, or a curve")
+    return [
+        (_CURVE if isinstance(item, Mapping) else vector(2))(item, f"{place}[{i}]")
+        for i, item in enumerate(items)
+    ]
 
 
 def directions(value: object, place: str) -> bool | list[bool]:

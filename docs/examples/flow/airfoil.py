@@ -6,28 +6,14 @@ A NACA 2412 airfoil in a wind tunnel. Four rows of flat cells lie along the airf
 rest.
 """
 
-import numpy as np
-
 import clvoro
 from clvoro import sizing
 
 # %%
-# The outline is that of the NACA formula: thickness around a camber line. Points are dense at both ends.
+# The airfoil is a hole in the domain: a curve, which the mesh resolves as finely as it needs.
 
-s = 0.5 * (1 - np.cos(np.linspace(0, np.pi, 81)))
-camber = np.where(s < 0.4, 0.125 * (0.8 * s - s**2), 0.02 / 0.36 * (0.2 + 0.8 * s - s**2))
-powers = np.stack([np.sqrt(s), s, s**2, s**3, s**4])
-half = 0.6 * np.array([0.2969, -0.1260, -0.3516, 0.2843, -0.1036]) @ powers
-half[-1] = 0
-airfoil = np.concatenate(
-    [np.stack([s, camber + half], 1)[::-1], np.stack([s, camber - half], 1)[1:-1]]
-)
-
-# %%
-# The airfoil is a hole in the domain, and its boundary gets a name.
-
-tunnel = [(-1.2, -1), (3, -1), (3, 1), (-1.2, 1)]
-domain = clvoro.Polygon(tunnel, [airfoil], names={"airfoil": "hole-1"})
+airfoil = clvoro.curves.naca("2412", name="airfoil")
+domain = clvoro.Polygon([(-1.2, -1), (3, -1), (3, 1), (-1.2, 1)], [airfoil])
 
 # %%
 # Sizes grow from the airfoil and, more slowly, from a line behind it.

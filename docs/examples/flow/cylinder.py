@@ -6,20 +6,17 @@ The benchmark of Schäfer and Turek (1996): flow around a cylinder that stands o
 mesh has boundary layers at the cylinder and names for all parts of the boundary.
 """
 
-import numpy as np
-
 import clvoro
 from clvoro import sizing
 
 # %%
-# The edges of the channel have the numbers 0 to 3, counted along the ring. The cylinder is the first hole.
+# The edges of the channel have the numbers 0 to 3, counted along the ring. The cylinder is a curve with a name.
 
-turn = np.linspace(0, 2 * np.pi, 120, endpoint=False)
-cylinder = np.column_stack([0.2 + 0.05 * np.cos(turn), 0.2 + 0.05 * np.sin(turn)])
+cylinder = clvoro.curves.circle((0.2, 0.2), 0.05, name="cylinder")
 domain = clvoro.Polygon(
     [(0, 0), (2.2, 0), (2.2, 0.41), (0, 0.41)],
     [cylinder],
-    names={"walls": [0, 2], "outlet": 1, "inlet": 3, "cylinder": "hole-1"},
+    names={"walls": [0, 2], "outlet": 1, "inlet": 3},
 )
 
 # %%
