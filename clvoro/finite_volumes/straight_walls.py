@@ -4,6 +4,8 @@ A run is what a cell has of a ring of the domain, from one face end to the next.
 Before that, a face end may move along the wall into a vertex of the domain: into a re-entrant corner, so that both
 cells are convex, or into another kink that a chord would cut off. Each move must lower a cost: the area between the
 boundary and the chords, and a price for kinks into the cell, for slivers and for the way of the face end.
+
+Where the boundary is a curve, all points on walls lie on the curve itself.
 """
 
 from __future__ import annotations
@@ -60,6 +62,7 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
     """
     if not isinstance(diagram.domain, Polygon):
         return mesh
+    mesh = _on_curves(mesh, diagram.domain)
     work = _Work(mesh, diagram, parts)
     spared: set[int] = set()
     for _ in range(_ROUNDS):
@@ -69,6 +72,19 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
             return made
         spared |= broken
     return mesh
+
+
+def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
+    """Return `mesh` with the points on walls moved from the domain's edges to its curves."""
+    if not domain.curves:
+        return mesh
+    walls = slice(mesh.inner, mesh.outer)
+    ends, edges = mesh.corners.reshape(-1, 2)[walls], -1 - mesh.neighbor[walls]
+    rows, first = np.unique(ends, return_index=True)
+    points = mesh.points.copy()
+    # A point between two edges is a vertex of the domain, which is on the curves of both.
+    points[rows] = domain.on_curve(points[rows], np.repeat(edges, 2)[first])
+    return replace(mesh, points=points)
 
 
 class _Work:

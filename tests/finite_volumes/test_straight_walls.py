@@ -145,3 +145,43 @@ def test_a_rough_coast_becomes_smooth(ctx):
     assert max(map(concave_by, cells)) < 1e-9
     assert abs(mesh.area_change) < 0.01
     assert len(wall_faces(mesh)) < 2 * len({face[0] for face in wall_faces(mesh)})
+
+
+def test_points_on_curved_walls_lie_on_the_curves(ctx):
+    """A wing section with a sharp trailing edge, an ellipse, and a rounded corner."""
+    wing = clvoro.curves.naca("0012", 1.0, (0, 0), 5)
+    oval = clvoro.curves.ellipse((0.5, 0.7), (0.4, 0.1))
+    outer = [(-1, -1), (2, -1), clvoro.curves.arc((1.5, 1), 0.5, 0, 90), (-1, 1.5)]
+    domain = Polygon(outer, [wing, oval])
+    size = clvoro.sizing.Distance([wing, oval], 0.04, slope=0.2, h_max=0.2)
+    result = adapt(ctx, domain, size)
+    found = {0: [], 1: [], 2: [], -1: []}
+    for _, edge, a, b in wall_faces(result.solver_mesh()):
+        found[int(domain.curved.curve[edge])] += [a, b]
+    x, y = np.array(found[0]).T
+    assert np.abs(np.hypot(x - 1.5, y - 1) - 0.5).max() < 1e-12
+    x, y = np.array(found[2]).T
+    assert np.abs(((x - 0.5) / 0.4) ** 2 + ((y - 0.7) / 0.1) ** 2 - 1).max() < 1e-12
+    x, y = np.array(found[1]).T
+    c, s = np.cos(np.radians(5)), np.sin(np.radians(5))
+    x, y = c * x - s * y, s * x + c * y
+    t = np.sqrt(np.maximum(x, 0))
+    half = 0.6 * np.polyval([-0.1036, 0, 0.2843, 0, -0.3516, 0, -0.1260, 0.2969, 0], t)
+    # Beside the nose the distance is less than the difference in height.
+    assert np.abs((np.abs(y) - half) * np.minimum(1, t)).max() < 1e-12
+    tip = domain.vertices[domain.ring_starts[1]]
+    assert sum((corner == tip).all() for corner in found[1]) == 2
+    assert result.solver_mesh("exact").area_change == 0
+
+
+def test_the_change_of_area_is_of_second_order(ctx):
+    """Cells beside a circle: chords between points on the circle."""
+    disc = clvoro.curves.circle((0.5, 0.5), 0.4)
+    changes = []
+    for h in (0.1, 0.05, 0.025):
+        mesh = adapt(ctx, Polygon(disc), h).solver_mesh()
+        assert max(map(concave_by, polygons(mesh))) < 1e-9
+        area = sum(p.area for p in polygons(mesh))
+        changes.append(1 - area / (np.pi * 0.4**2))
+    order = np.log2(np.array(changes[:-1]) / changes[1:])
+    assert order == pytest.approx(2, abs=0.25)
