@@ -88,6 +88,17 @@ def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
     InputError
         For a cell around an island, or one that touches itself.
     """
+    starts, loop, broken = simple_loops(mesh)
+    if broken.size:
+        raise InputError(
+            f"cell {broken[0]} ({len(broken)} in all) goes around a part of the boundary or touches itself, "
+            "and a face in OpenFOAM has no hole; use smaller cells there, leave out the hole, or save as .vtu"
+        )
+    return starts, loop
+
+
+def simple_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return starts and points as `cell_loops`, and the cells that are no simple polygons, whose rows mean nothing."""
     a, b = mesh.corners.reshape(-1, 2).T
     k, v = mesh.inner, len(mesh.points)
     cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
@@ -98,7 +109,7 @@ def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
     counts = np.bincount(cell, minlength=len(mesh))
     starts = np.concatenate([[0], np.cumsum(counts)])
     after = np.minimum(np.searchsorted(key, cell * v + end), len(key) - 1)
-    loop = np.full(len(key), -1)
+    loop = begin.copy()
     seen = np.zeros(len(key), bool)
     cells, place = np.flatnonzero(counts), starts[:-1][counts > 0]
     for step in range(int(counts.max(initial=0))):
@@ -107,10 +118,4 @@ def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
         loop[starts[cells] + step] = begin[place]
         seen[place] = True
         place = after[place]
-    broken = np.unique(cell[~seen | np.concatenate([[False], np.diff(key) == 0])])
-    if broken.size:
-        raise InputError(
-            f"cell {broken[0]} ({len(broken)} in all) goes around a part of the boundary or touches itself, "
-            "and a face in OpenFOAM has no hole; use smaller cells there, leave out the hole, or save as .vtu"
-        )
-    return starts, loop
+    return starts, loop, np.unique(cell[~seen | np.concatenate([[False], np.diff(key) == 0])])

@@ -110,7 +110,7 @@ class SolverMesh(Sealed):
 
     def changed(self, **arrays: Any) -> SolverMesh:
         """Return a mesh with some other arrays; points without a face are dropped."""
-        return _compact(replace(self, **arrays))
+        return compact(replace(self, **arrays))
 
     def take_faces(self, kept: np.ndarray) -> SolverMesh:
         """Return the mesh with the faces `kept` (ascending indices or a mask) only."""
@@ -166,6 +166,7 @@ def make_solver_mesh(
 
     `parts` (k,) int is the index of the named part of the boundary of each wall, if it is not the domain's.
     """
+    from .short_edges import collapse_short_edges
     from .straight_walls import straight_walls
 
     check_choice("walls", walls, ("straight", "exact"))
@@ -182,13 +183,15 @@ def make_solver_mesh(
         shift=shift,
         half_face=faces.rows,
     )
+    parts = diagram.domain.boundaries.index if parts is None else parts
     if walls == "straight" and mesh.dim == 2:
-        parts = diagram.domain.boundaries.index if parts is None else parts
         mesh = straight_walls(mesh, diagram, parts)
-    return _compact(mesh)
+    if collapse and mesh.dim == 2:
+        mesh = collapse_short_edges(mesh, parts)
+    return compact(mesh)
 
 
-def _compact(mesh: SolverMesh) -> SolverMesh:
+def compact(mesh: SolverMesh) -> SolverMesh:
     """Return `mesh` without points that no face has."""
     used, corners = np.unique(mesh.corners, return_inverse=True)
     if len(used) == len(mesh.points):

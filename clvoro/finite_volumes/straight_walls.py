@@ -30,7 +30,6 @@ _CUT = 0.03
 """The same for a kink out of the cell."""
 _SLIVER = 0.1
 _KINK_PRICE, _SLIVER_PRICE, _WAY_PRICE = 0.5, 0.02, 0.02
-_ROUNDS = 4
 
 Point = tuple[float, float]
 
@@ -64,14 +63,10 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
         return mesh
     mesh = _on_curves(mesh, diagram.domain)
     work = _Work(mesh, diagram, parts)
-    spared: set[int] = set()
-    for _ in range(_ROUNDS):
-        made = work.straightened(spared)
-        broken = work.broken(made) - spared
-        if not broken:
+    while True:
+        made = work.straightened()
+        if not work.spare(np.flatnonzero(~_starlike(made)).tolist()):
             return made
-        spared |= broken
-    return mesh
 
 
 def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
@@ -96,7 +91,9 @@ class _Work:
         self.ends = mesh.corners.reshape(-1, 2)
         self.sizes = np.sqrt(np.maximum(cell_areas(mesh), 0)).tolist()
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
-        self.first_exact = {c for c in np.flatnonzero(~_starlike(mesh)).tolist()}
+        self.spared = np.zeros(
+            len(mesh), int
+        )  # 1: the ends do not move; 2: the walls remain as they are
         self.next = self._following(diagram)
         self.at = self._single_faces()
 
@@ -127,8 +124,14 @@ class _Work:
         places = np.flatnonzero(single[inner])
         return {int(inner[p]): (int(p) // 2, int(p) % 2) for p in places}
 
-    def runs(self, spared: set[int]) -> list[_Run]:
-        """Return the runs of all cells; those of `spared` cells have no movable ends."""
+    def spare(self, cells: list[int]) -> bool:
+        """Do less in these cells, which straight walls turned inside out; return whether that is possible."""
+        left = [c for c in cells if self.spared[c] < 2]
+        self.spared[left] += 1
+        return bool(left)
+
+    def runs(self) -> list[_Run]:
+        """Return the runs of all cells."""
         owner = self.mesh.owner[self.walls].tolist()
         begin = self.ends[self.walls, 0].tolist()
         previous = [-1] * len(owner)
@@ -147,7 +150,7 @@ class _Work:
         for run in found.values():
             j = self.next[run.faces[-1]]
             other = found.get(j)
-            if other is None or other is run or {run.cell, other.cell} & spared:
+            if other is None or other is run or self.spared[[run.cell, other.cell]].any():
                 continue
             at = self.at.get(begin[j])
             sides = {run.cell, other.cell}
@@ -232,9 +235,9 @@ class _Work:
         (x, y), (u, v) = self.points[a], self.points[b]
         return hypot(u - x, v - y)
 
-    def straightened(self, spared: set[int]) -> SolverMesh:
-        """Return the mesh with straight walls, but for the cells `spared`."""
-        mesh, runs = self.mesh, self.runs(spared)
+    def straightened(self) -> SolverMesh:
+        """Return the mesh with straight walls."""
+        mesh, runs = self.mesh, self.runs()
         moved = self.move_ends(runs)
         corners = self.ends.copy()
         for (face, side), point in moved.items():
@@ -247,7 +250,7 @@ class _Work:
         for run in runs:
             done[run.faces] = True
             count = len(run.faces)
-            if run.cell in spared:
+            if self.spared[run.cell] == 2:
                 kept = list(range(count + 1))
             else:
                 kept = _kept(self.line(run.faces), self.fixed(run.faces), self.sizes[run.cell])
@@ -279,19 +282,6 @@ class _Work:
             shift=mesh.shift[rows],
             half_face=mesh.half_face[rows],
         )
-
-    def broken(self, made: SolverMesh) -> set[int]:
-        """Return the cells that straight walls turned inside out, with those beside them."""
-        bad = ~_starlike(made)
-        bad[list(self.first_exact)] = False
-        if not bad.any():
-            return set()
-        k = made.inner
-        i, j = made.owner[:k], made.neighbor[:k]
-        near = bad.copy()
-        near[i[bad[j]]] = True
-        near[j[bad[i]]] = True
-        return set(np.flatnonzero(near).tolist())
 
 
 def cell_areas(mesh: SolverMesh) -> np.ndarray:

@@ -132,7 +132,7 @@ def save(
         For OpenFOAM. With "straight", the default, the faces of a cell on the boundary become one straight face where
         they turn by at most 30 degrees in sum, and face ends near a corner of the domain move into it: solvers reject
         cells that are not convex. See `Diagram.solver_mesh`, whose `area_change` is what this adds to the domain.
-        With "exact" the faces follow the domain.
+        Short edges are collapsed. With "exact" all faces are those of the diagram.
     convention : {"ugrid", "mpas"}, optional
         For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each edge
         the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and vertices with

@@ -84,7 +84,7 @@ def poly_mesh(
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
     kinds = _kinds(parts.names, types)
-    mesh = make_solver_mesh(diagram, walls, parts=parts.index)
+    mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
     groups = parts.index[-1 - mesh.neighbor[mesh.inner : mesh.outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()

@@ -67,16 +67,36 @@ class MeshOutput:
     def solver_mesh(self, walls: WallShape = "straight", collapse: bool = True) -> SolverMesh:
         """Return the mesh as a finite-volume solver sees it: points, and each face with corners, owner and neighbor.
 
+        Solvers reject or mistrust cells that are not convex, and faces that are much smaller than their cells. The
+        diagram itself has such cells where the boundary has corners or is finer than the mesh.
+
         Parameters
         ----------
         walls : {"straight", "exact"}
-            With "straight" the wall faces of a cell that turn by at most 30 degrees in sum become one straight face.
+            With "straight", in 2D: the wall faces of a cell that turn by at most 30 degrees in sum become one straight
+            face, and so do farther turns that are smaller than a quarter of the cell. A face end that is nearer to a
+            corner of the domain than a quarter of the smaller cell moves into it. Faces of different names remain
+            apart. The change of area is the mesh's `area_change`.
         collapse : bool
-            Whether short edges and small faces are collapsed.
+            Whether the ends of short faces become one point: in 2D of faces shorter than 0.02 (on walls 0.05) times
+            the width of the thinner cell, while cells remain convex. Corners and ends of names stay in place.
 
         Returns
         -------
         SolverMesh
+            See `clvoro.finite_volumes.solver_mesh.SolverMesh`. Its `measures` are those of OpenFOAM's `checkMesh`.
+
+        Raises
+        ------
+        InputError
+            If `walls` is something else.
+
+        Examples
+        --------
+        >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]
+        >>> mesh = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).solver_mesh()
+        >>> mesh, mesh.measures.non_orthogonality.max().round(1)
+        (SolverMesh(4 cells, 13 faces), np.float64(9.6))
         """
         from ..finite_volumes.solver_mesh import make_solver_mesh
 
