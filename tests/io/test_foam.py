@@ -73,7 +73,7 @@ def read(folder):
 @pytest.fixture
 def mesh(result, tmp_path):
     folder = tmp_path / "constant" / "polyMesh"
-    io.save(result, folder)
+    io.save(result, folder, walls="exact")
     assert {p.name for p in folder.iterdir()} == {
         "points", "faces", "owner", "neighbour", "boundary",
     }  # fmt: skip
@@ -173,7 +173,7 @@ def test_as_vtk_reads_it(result, tmp_path):
     vtk = pytest.importorskip("vtk")
     from vtk.util.numpy_support import vtk_to_numpy
 
-    io.save(result, tmp_path / "case.foam")
+    io.save(result, tmp_path / "case.foam", walls="exact")
     (tmp_path / "system").mkdir()
     (tmp_path / "system" / "controlDict").write_text(
         "FoamFile { version 2.0; format ascii; class dictionary; object controlDict; }\n"

@@ -31,7 +31,7 @@ def result(request, ctx):
 
 @pytest.fixture
 def mesh(result, tmp_path):
-    io.save(result, tmp_path / "polyMesh")
+    io.save(result, tmp_path / "polyMesh", walls="exact")
     return read(tmp_path / "polyMesh")
 
 
@@ -147,7 +147,7 @@ def test_one_cell_is_its_own_neighbor(ctx, tmp_path):
 @pytest.mark.skipif(shutil.which("laplacianFoam") is None, reason="laplacianFoam is not installed")
 def test_openfoam_conducts_heat_across_the_seams(result, tmp_path):
     """One implicit step of diffusion agrees with one computed from the diagram."""
-    check_mesh(result, tmp_path)
+    check_mesh(result, tmp_path, walls="exact")
     d, box = result.diagram, result.diagram.domain
     n, conductivity = len(d), 0.01
     before = np.random.default_rng(7).random(n)
