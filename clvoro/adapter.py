@@ -320,7 +320,8 @@ class Adapter:
             If a checkpoint cannot be written, for example on a full disk. The run continues, and the previous
             checkpoint is kept.
         MismatchWarning, CoarseSizeWarning
-            If a part of the input barely overlaps the domain, for example because it has another unit of length.
+            If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
+            domain is narrower than half a cell somewhere; says where.
         PrecisionWarning
             If `dtype` is too coarse for the sizes.
         SizeErrorWarning

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from ..arguments import warn
 from ..errors import InputError, MismatchWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.boundary_layers import Layers, columns_of
 from ..geometry.box import Domain
+from ..geometry.polygon import Polygon
 from ..mesh.results import Result
 from ..sizing import Sizing
 from ..sizing.field import Field
+from ..sizing.gaps import NARROW, find_narrowest
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
@@ -50,6 +52,38 @@ def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -
         found += layer_mismatches(f"layers[{k}]", layer, field, domain)
     for text in found:
         warn(text, MismatchWarning)
+
+
+def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Warn if cells of the target size do not fit between the walls of `domain` somewhere.
+
+    Parameters
+    ----------
+    domain : Domain
+    size : callable
+        Takes points (n, d) and returns target sizes (n,).
+
+    Warns
+    -----
+    MismatchWarning
+    """
+    if isinstance(domain, Polygon):
+        found = find_narrowest(domain, size)
+    else:
+        center = (np.array(domain.lower) + domain.upper) / 2
+        widths = np.where(domain.periodic, np.inf, domain.extent)
+        found = center, float(widths.min()), float(size(center[None])[0])
+    if found is None or found[1] >= NARROW * found[2]:
+        return
+    place, width, wanted = found
+    where = ", ".join(f"{x:.6g}" for x in place)
+    warn(
+        f"the domain is narrower than half a cell: {width:.3g} wide at ({where}), where the size field is "
+        f"{wanted:.3g}; "
+        "cells there are long and reach from wall to wall. Use smaller sizes there, as sizing.FeatureSize does"
+        f"{', or close the gap' if isinstance(domain, Polygon) else ''}",
+        MismatchWarning,
+    )
 
 
 def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:

@@ -15,7 +15,7 @@ from ..geometry.polygon import Polygon
 from ..sizing import Sizing, as_field
 from ..sizing.field import Field
 from ..sizing.layers import limit_beside_layers
-from .diagnostics import check_precision, warn_of_mismatches
+from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import Extras, check_memory, estimate_memory
 from .forecast import expected_boundary_cells, expected_images, expected_surplus
 from .methods import Relaxation, make_method
@@ -100,6 +100,8 @@ class Preparation:
         self.target = n_cells if n_cells is not None else max(1, round(required))
         if n_cells is None and required < 0.5:
             self._warn_of_coarse_size(required)
+        elif self._tree is not None:
+            warn_of_narrow_parts(domain, self.sizing)
         scaled = options.multilevel and n_cells is not None
         self.factor = (required / self.target) ** (1 / domain.dim) if scaled else 1.0
         self.levels = 0

@@ -32,7 +32,7 @@ from .arrays import EXPANSION, LEAST
 from .vtu import CURVES, NAMES
 from .vtu_checks import check_repeated
 
-_LONGEST_HEAD = 1 << 24
+_LONGEST_HEAD = 1 << 22
 _MARK = b'<AppendedData encoding="raw">\n_'
 _END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,12 +12,18 @@ from ..geometry.polygon import Polygon
 FACING = math.radians(135)
 """Least angle between the directions from the center of a gap to its walls: the walls of a corner of more than 45
 degrees do not face each other."""
+NARROW = 0.5
+"""A gap is too narrow if its width is less than this times the target size. A cell from wall to wall is then more than
+four times as long as wide."""
 CORNER = math.radians(30)
 """Turns of more than this are corners, not curves."""
 _FAN = math.radians(7.5)  # between the directions from a corner
 _PER_RADIUS = 4  # samples of an edge per radius of the balls at it
 _MAX_SAMPLES = 2048  # of one edge
 _ROUNDS = 40
+_TIP = 6.0  # sizes of boundary between the walls of a tip or a bay, at most
+_PARTS = 256  # of the domain, in which the size hardly changes
+_MOST_WALL_SAMPLES = 20_000
 _CLOSE = 1e-9
 
 
@@ -67,6 +74,79 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
 
 
+def find_narrowest(
+    domain: Polygon, size: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, float, float] | None:
+    """Return where the domain is narrower than half a cell of the target size: the place, the width and the size there.
+
+    The narrowest place in units of the size is returned, or None. The tips of corners and short bays do not count:
+    places whose walls are connected by less than `_TIP` sizes of boundary.
+
+    Parameters
+    ----------
+    domain : Polygon
+    size : callable
+        Takes points (n, 2) and returns target sizes (n,).
+    """
+    points, normals, along, h = _wall_samples(domain, size)
+    begin, end, radius = _balls(domain, points, normals, 2 * h)
+    rows = np.flatnonzero(np.isfinite(radius))
+    if not rows.size:
+        return None
+    middle = 0.5 * (begin[rows] + end[rows])
+    width, wanted = np.hypot(*(end[rows] - begin[rows]).T), size(middle)
+    thin = width < NARROW * wanted
+    rows, middle, width, wanted = rows[thin], middle[thin], width[thin], wanted[thin]
+    if not rows.size:
+        return None
+    starts = domain.oriented.ring_starts
+    lengths, reached = _ring_lengths(domain)
+    edge, _ = domain.nearest_edge(end[rows])
+    place = domain.oriented.places[edge]
+    there = reached[place] + np.hypot(*(end[rows] - domain.oriented.vertices[place]).T)
+    ring = np.searchsorted(starts, place, side="right") - 1
+    own = np.searchsorted(reached[starts[:-1]], along[rows], side="right") - 1
+    way = np.abs(there - along[rows])
+    way = np.where(ring == own, np.minimum(way, lengths[ring] - way), math.inf)
+    apart = np.flatnonzero(way > _TIP * wanted)
+    if not apart.size:
+        return None
+    k = apart[np.argmin((width / wanted)[apart])]
+    return middle[k], float(width[k]), float(wanted[k])
+
+
+def _ring_lengths(domain: Polygon) -> tuple[np.ndarray, np.ndarray]:
+    """Return the length of each ring, (r,), and of the boundary before each oriented edge, all rings in turn, (k,)."""
+    oriented = domain.oriented
+    edge = oriented.vertices[oriented.next_vertex] - oriented.vertices
+    total = np.concatenate([[0.0], np.cumsum(np.hypot(*edge.T))])
+    return np.diff(total[oriented.ring_starts]), total[:-1]
+
+
+def _wall_samples(
+    domain: Polygon, size: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return points on the boundary (n, 2), about half a size apart, their normals, places along it, and sizes (n,)."""
+    start = domain.oriented.vertices
+    edge = start[domain.oriented.next_vertex] - start
+    length = np.hypot(*edge.T)
+    # Long edges in parts, along which the size changes.
+    parts = np.ceil(length / (domain.extent.max() / _PARTS)).astype(np.int64)
+    row = np.repeat(np.arange(len(edge)), parts)
+    first = (np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[row]
+    share = first + 0.5 / parts[row]
+    counts = 2 * length[row] / parts[row] / size(start[row] + share[:, None] * edge[row])
+    reached = np.concatenate([[0.0], np.cumsum(counts)])
+    n = int(np.clip(np.ceil(reached[-1]), 1, _MOST_WALL_SAMPLES))
+    at = (np.arange(n) + 0.5) / n * reached[-1]
+    part = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(row) - 1)
+    t = first[part] + (at - reached[part]) / np.maximum(counts[part], 1e-300) / parts[row[part]]
+    row = row[part]
+    points = start[row] + t[:, None] * edge[row]
+    normals = np.column_stack([-edge[row, 1], edge[row, 0]]) / length[row, None]
+    return points, normals, _ring_lengths(domain)[1][row] + t * length[row], size(points)
+
+
 def _from_corners(
     domain: Polygon, normal: np.ndarray, most: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -90,11 +170,11 @@ def _from_corners(
 
 
 def _balls(
-    domain: Polygon, points: np.ndarray, normal: np.ndarray, most: float
+    domain: Polygon, points: np.ndarray, normal: np.ndarray, most: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the two points where balls touch the boundary, `points` and another one, and their radii.
 
-    The radius is infinite where the walls do not face each other, or are farther apart than `most`.
+    The radius is infinite where the walls do not face each other, or are farther apart than `most`, one number or (n,).
     """
     n = len(points)
     # The width of a gap is at least the radius of its ball times 2 sin(FACING / 2).

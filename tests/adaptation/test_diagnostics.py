@@ -1,6 +1,7 @@
 """Warnings for mismatched units and positions, and none for correct input."""
 
 import json
+import math
 import re
 import warnings
 
@@ -9,7 +10,7 @@ import pytest
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.diagnostics import layer_mismatches
+from clvoro.adaptation.diagnostics import layer_mismatches, warn_of_narrow_parts
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, InputError, MismatchWarning, SizeErrorWarning
 
@@ -259,3 +260,72 @@ def test_warning_of_size_errors(ctx, method, effort):
             callback=lambda row: row["step"] == 9,
         )
         adapter.run(square, JUMP, method="lloyd", max_steps=2, seed=1)
+
+
+# --- domains that are narrower than cells
+
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+STRAIT = [
+    (0, 0),
+    (1, 0),
+    (1, 0.49),
+    (2, 0.48),
+    (2, 0),
+    (3, 0),
+    (3, 1),
+    (2, 1),
+    (2, 0.5),
+    (1, 0.5),
+    (1, 1),
+    (0, 1),
+]
+ISLAND = [(0.01, 0.3), (0.3, 0.3), (0.3, 0.7), (0.02, 0.7)]
+NARROW = {
+    # name: (domain, h, width, a place on the line from - to); no place where nothing is narrow
+    "strait": (clvoro.Polygon(STRAIT), 0.04, 0.01, ((1, 0.495), (1.05, 0.495))),
+    "strait of wide cells": (clvoro.Polygon(STRAIT), 0.019, None, None),
+    "island": (clvoro.Polygon(SQUARE, [ISLAND]), 0.05, 0.01, ((0.005, 0.3), (0.006, 0.35))),
+    "islands": (
+        clvoro.Polygon(SQUARE, [clvoro.curves.circle((0.3, 0.5), 0.1), clvoro.curves.circle((0.51, 0.5), 0.1)]),
+        0.05, 0.01, ((0.405, 0.49), (0.405, 0.51))),
+    "needle": (clvoro.Polygon([(0, 0), (1, 0), (1, 0.01)]), 0.05, None, ((0.15, 0), (0.2, 0.002))),
+    "corner of 30 degrees": (clvoro.Polygon([(0, 0), (1, 0), (1, math.tan(math.pi / 6))]), 0.02, None, None),
+    "short bay": (
+        clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.52, 1), (0.52, 1.1), (0.5, 1.1), (0.5, 1), (0, 1)]),
+        0.1, None, None),
+    "thin hole": (clvoro.Polygon(SQUARE, [[(0.3, 0.5), (0.7, 0.499), (0.7, 0.501)]]), 0.1, None, None),
+    "square": (clvoro.Polygon(SQUARE), 0.1, None, None),
+    "box": (clvoro.Box((0, 0), (8, 0.1)), 0.4, 0.1, ((4, 0.05), (4, 0.05))),
+    "periodic box": (clvoro.Box((0, 0), (8, 0.1), periodic=(False, True)), 0.4, None, None),
+    "box in 3D": (clvoro.Box((0, 0, 0), (2, 2, 0.1)), 0.3, 0.1, ((1, 1, 0.05), (1, 1, 0.05))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("domain", "h", "width", "line"), NARROW.values(), ids=NARROW)
+def test_narrow_parts(domain, h, width, line):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_of_narrow_parts(domain, lambda x: np.full(len(x), h))
+    if line is None:
+        assert not caught
+        return
+    (message,) = [str(w.message) for w in caught]
+    found, place = re.search(
+        r"half a cell: (\S+) wide at \((.*)\), where the size field is ", message
+    ).groups()
+    assert width is None or float(found) == pytest.approx(width, rel=0.06)
+    place = np.array(place.split(", "), float)
+    low, high = np.array(line)
+    slack = 0.01 if isinstance(domain, clvoro.Polygon) else 1e-9
+    assert (place >= low - slack).all()
+    assert (place <= high + slack).all()
+
+
+def test_narrow_parts_are_those_of_the_size_field():
+    domain = clvoro.Polygon(STRAIT)
+    size = near(sizing.Segment((1, 0.5), (2, 0.5)), h_min=0.005, growth=1.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_narrow_parts(domain, size)
+    with pytest.warns(MismatchWarning, match=r"0.01\d* wide at \(1.0"):
+        clvoro.adapt(domain, 0.1, "fast")
