@@ -24,8 +24,8 @@ _FREE, _WALL, _CORNER = range(3)
 def collapse_short_edges(mesh: SolverMesh, parts: np.ndarray) -> SolverMesh:
     """Return a mesh in 2D without short faces, as far as its cells remain convex.
 
-    A corner of the domain and a point where the name of the boundary changes stay where they are, and a point on a wall
-    stays on it; among others the middle of the face is tried first, then its ends. The images of a point at the seams
+    A corner of the domain and a point where the name of the boundary changes stay where they are. Of two points on a
+    wall one takes the place of both. Inside, the middle of the face is tried first, then its ends. The images of a point at the seams
     of a periodic box move together.
 
     Parameters
@@ -96,8 +96,11 @@ def _collapse_some(
     target = p.copy()
     choices = [(p + q) / 2, p, q]
     equal = kind[a[faces]] == kind[b[faces]]
+    free = equal & (
+        kind[a[faces]] == _FREE
+    )  # the middle of two points on a wall may be off a curve
     allowed = [
-        equal,
+        free,
         equal | (kind[a[faces]] > kind[b[faces]]),
         equal | (kind[a[faces]] < kind[b[faces]]),
     ]
