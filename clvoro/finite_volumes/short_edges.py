@@ -25,8 +25,8 @@ def collapse_short_edges(mesh: SolverMesh, parts: np.ndarray) -> SolverMesh:
     """Return a mesh in 2D without short faces, as far as its cells remain convex.
 
     A corner of the domain and a point where the name of the boundary changes stay where they are. Of two points on a
-    wall one takes the place of both. Inside, the middle of the face is tried first, then its ends. The images of a point at the seams
-    of a periodic box move together.
+    wall one takes the place of both. Inside, the middle of the face is tried first, then its ends. The images of a
+    point at the seams of a periodic box move together.
 
     Parameters
     ----------

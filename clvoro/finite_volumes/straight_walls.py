@@ -3,7 +3,8 @@
 A run is what a cell has of a ring of the domain, from one face end to the next. Its faces become chords (`_kept`).
 Before that, a face end may move along the wall into a vertex of the domain: into a re-entrant corner, so that both
 cells are convex, or into another kink that a chord would cut off. Each move must lower a cost: the area between the
-boundary and the chords, and a price for kinks into the cell, for slivers and for the way of the face end.
+boundary and the chords, and prices for their distance, for kinks into the cell, for slivers and for the way of the
+face end.
 
 Where the boundary is a curve, all points on walls lie on the curve itself.
 """
@@ -28,8 +29,8 @@ _FILLED = 0.25
 """A kink into the cell is cut off if it is nearer than this to the chord, over the size of the cell."""
 _CUT = 0.03
 """The same for a kink out of the cell."""
-_SLIVER = 0.1
-_KINK_PRICE, _SLIVER_PRICE, _WAY_PRICE = 0.5, 0.02, 0.02
+_SLIVER, _SHORT, _SHARP = 0.1, 0.03, np.pi / 3
+_KINK_PRICE, _SHARP_PRICE, _SLIVER_PRICE, _OFF_PRICE, _WAY_PRICE = 0.5, 0.1, 0.02, 0.2, 0.02
 
 Point = tuple[float, float]
 
@@ -42,10 +43,8 @@ class _Run:
     faces: list[int]
     before: _Run | None = None  # across the face end at the beginning; None if that end is fixed
     after: _Run | None = None
-    end: tuple[int, int] = (
-        -1,
-        -1,
-    )  # the face between two cells at the end, and which of its corners
+    end: tuple[int, int] = (-1, -1)
+    """The face between two cells at the end, and which of its corners."""
 
 
 def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> SolverMesh:
@@ -91,9 +90,8 @@ class _Work:
         self.ends = mesh.corners.reshape(-1, 2)
         self.sizes = np.sqrt(np.maximum(cell_areas(mesh), 0)).tolist()
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
-        self.spared = np.zeros(
-            len(mesh), int
-        )  # 1: the ends do not move; 2: the walls remain as they are
+        # 1: the ends of the cell do not move; 2: its walls remain as they are.
+        self.spared, self.most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
         self.next = self._following(diagram)
         self.at = self._single_faces()
 
@@ -126,7 +124,7 @@ class _Work:
 
     def spare(self, cells: list[int]) -> bool:
         """Do less in these cells, which straight walls turned inside out; return whether that is possible."""
-        left = [c for c in cells if self.spared[c] < 2]
+        left = [c for c in cells if self.spared[c] < self.most[c]]
         self.spared[left] += 1
         return bool(left)
 
@@ -304,7 +302,7 @@ def _fans(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _starlike(mesh: SolverMesh) -> np.ndarray:
-    """Return whether each cell's centroid sees all of its faces from inside, (n,)."""
+    """Return whether each cell's centroid sees all of its faces from inside, (n,); short faces do not count."""
     k, n = mesh.inner, len(mesh)
     a, b = mesh.corners.reshape(-1, 2).T
     cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
@@ -320,6 +318,7 @@ def _starlike(mesh: SolverMesh) -> np.ndarray:
     )
     p, q = p - middle[cell], q - middle[cell]
     seen = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] > 0
+    seen |= ((q - p) ** 2).sum(axis=1) < _SHORT**2 * area[cell]
     return (area > 0) & (np.bincount(cell, ~seen, n) == 0)
 
 
@@ -330,10 +329,11 @@ def _turn(a: Point, b: Point, c: Point) -> float:
 
 
 def _offset(a: Point, b: Point, c: Point) -> float:
-    """Return the distance of b from the line through a and c."""
+    """Return the distance of b from the straight line between a and c."""
     x, y, u, v = c[0] - a[0], c[1] - a[1], b[0] - a[0], b[1] - a[1]
-    length = hypot(x, y)
-    return abs(x * v - y * u) / length if length > 0 else hypot(u, v)
+    square = x * x + y * y
+    t = min(max((x * u + y * v) / square, 0.0), 1.0) if square > 0 else 0.0
+    return hypot(u - t * x, v - t * y)
 
 
 def _kept(line: list[Point], fixed: list[bool], size: float) -> list[int]:
@@ -362,20 +362,23 @@ def _kept(line: list[Point], fixed: list[bool], size: float) -> list[int]:
         if where < 0:
             break
         del kept[where]
-    _drop_for_area(line, fixed, kept)
+    _drop_for_area(line, fixed, kept, _FILLED * size)
     return kept
 
 
-def _drop_for_area(line: list[Point], fixed: list[bool], kept: list[int]) -> None:
-    """Drop kinks without which the area of the cell is nearer to the exact one: rough walls have such."""
+def _drop_for_area(line: list[Point], fixed: list[bool], kept: list[int], limit: float) -> None:
+    """Drop kinks nearer than `limit` without which the area is nearer to the exact one: rough walls have such."""
     if len(kept) == 2:
         return
     lost = _area(line) - _area([line[i] for i in kept])
     while True:
         best, where, saved = abs(lost), -1, 0.0
         for k in range(1, len(kept) - 1):
-            area = _area([line[i] for i in kept[k - 1 : k + 2]])
-            if not fixed[kept[k] - 1] and abs(lost + area) < best:
+            three = [line[i] for i in kept[k - 1 : k + 2]]
+            area = _area(three)
+            if fixed[kept[k] - 1] or _offset(*three) > limit:
+                continue
+            if abs(lost + area) < best:
                 best, where, saved = abs(lost + area), k, area
         if where < 0:
             return
@@ -396,6 +399,14 @@ def _cost(line: list[Point], fixed: list[bool], kept: list[int], size: float) ->
     total = 0.0
     for first, last in pairwise(kept):
         total += abs(_area(line[first : last + 1]))
+        off, farthest = 0.0, first
+        for i in range(first + 1, last):
+            here = _offset(line[first], line[i], line[last])
+            if here > off:
+                off, farthest = here, i
+        total += _OFF_PRICE * off * size
+        if farthest > first and _turn(line[first], line[farthest], line[last]) < -_SHARP:
+            total += _SHARP_PRICE * size * size
         (x, y), (u, v) = line[first], line[last]
         if hypot(u - x, v - y) < _SLIVER * size:
             total += _SLIVER_PRICE * size * size
