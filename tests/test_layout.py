@@ -26,12 +26,13 @@ ORDER = (
 )  # fmt: skip
 """Packages and root modules: each imports only from those before it."""
 UPWARD = {
+    ("mesh.diagram", "finite_volumes"),
     ("mesh.output", "finite_volumes"),
     ("mesh.output", "io"),
     ("mesh.output", "plotting"),
     ("mesh.diagram", "remapping"),
 }
-"""Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, solver_mesh, transfer."""
+"""Imports against the order, all inside methods of `Result` and `Diagram`: save, plot, check, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
 OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[.*\])?$")

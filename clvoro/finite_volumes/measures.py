@@ -214,7 +214,7 @@ class SolverMeasures:
     def concavity(self) -> np.ndarray:
         """Largest angle between two faces of each cell beyond 180 degrees, in degrees, (n,)."""
         g, p, (cell, face, sign) = self.geometry, self.cells, self.face_cells
-        edge, _ = self._edges
+        edge = self.edge_of_corner
         starts, places = take_rows(p.starts, np.arange(len(p.corners)), face)
         side = np.repeat(np.arange(len(face)), np.diff(starts))
         order = np.lexsort((edge[places], cell[side]))
@@ -240,6 +240,22 @@ class SolverMeasures:
         key = ends[:, 0].astype(np.int64) * len(p.points) + ends[:, 1]
         _, first, edge = np.unique(key, return_index=True, return_inverse=True)
         return edge.ravel(), ends[first]
+
+    @property
+    def edge_of_corner(self) -> np.ndarray:
+        """The edge that follows each corner of a face, (k,)."""
+        return self._edges[0]
+
+    @property
+    def edges(self) -> np.ndarray:
+        """The two points of each edge of the polyhedra, (e, 2)."""
+        return self._edges[1]
+
+    @cached_property
+    def edge_spans(self) -> np.ndarray:
+        """Length of each edge of the polyhedra, (e,)."""
+        a, b = self.cells.points[self.edges].swapaxes(0, 1)
+        return np.linalg.norm(b - a, axis=1)
 
     @cached_property
     def bad_tetrahedra(self) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
+    from ..finite_volumes.gate import Solver, SolverReport
+    from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.box import Domain
     from .cell import Cell
     from .check.findings import Report
@@ -291,17 +293,55 @@ class Diagram(MeshOutput):
 
         return measure_mesh(self)
 
-    def check(self) -> Report:
+    @overload
+    def check(self, solver: None = None, *, walls: WallShape | None = None) -> Report: ...
+
+    @overload
+    def check(self, solver: Solver, *, walls: WallShape | None = None) -> SolverReport: ...
+
+    def check(
+        self, solver: Solver | None = None, *, walls: WallShape | None = None
+    ) -> Report | SolverReport:
         """Verify the diagram on the host: graph, faces, volumes, and the Voronoi property.
+
+        Parameters
+        ----------
+        solver : {"openfoam"}, optional
+            Check the mesh that a solver gets instead, by that solver's criteria. "openfoam": those of `checkMesh
+            -allGeometry -allTopology` of OpenFOAM v1912, by its formulas, for the mesh that `save` writes. OpenFOAM
+            need not be installed.
+        walls : {"straight", "exact"}, optional
+            With `solver`: as for `save`.
 
         Returns
         -------
-        Report
-            True if every property holds. ``print`` it, or call its ``demand()``, which raises an error otherwise.
-        """
-        from .check import check_diagram
+        Report or SolverReport
+            True if every property holds, or if the solver accepts the mesh. ``print`` it, or call its ``demand()``,
+            which raises an error otherwise. A `SolverReport` lists each criterion with value, limit and worst place.
 
-        return check_diagram(self)
+        Raises
+        ------
+        InputError
+            If the solver or `walls` is something else, or `walls` is given without a solver.
+
+        Examples
+        --------
+        >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8), (0.3, 0.7)]
+        >>> report = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).check(solver="openfoam")
+        >>> report.ok, round(report["non-orthogonality"].value, 1), report["skewness"].limit
+        (True, 9.6, 4)
+        """
+        if solver is None:
+            if walls is not None:
+                raise InputError(
+                    f"walls is {walls!r:.60}, and no solver; say which one: solver='openfoam'"
+                )
+            from .check import check_diagram
+
+            return check_diagram(self)
+        from ..finite_volumes.gate import check_for_solver
+
+        return check_for_solver(self, solver, "straight" if walls is None else walls)
 
     def transfer(
         self,

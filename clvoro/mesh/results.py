@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from ..adapter import Adapter
+    from ..finite_volumes.gate import Solver, SolverReport
+    from ..finite_volumes.solver_mesh import WallShape
     from .check.findings import Report
     from .quality import Measures
 
@@ -113,8 +115,21 @@ class Result(Sealed, MeshOutput):
     settings: dict[str, Any] = field(default_factory=dict)
     origin: np.ndarray | None = None
 
-    def check(self) -> Report:
-        """Verify diagram, sizes, error, quality and history on the host (see `Diagram.check`)."""
+    @overload
+    def check(self, solver: None = None, *, walls: WallShape | None = None) -> Report: ...
+
+    @overload
+    def check(self, solver: Solver, *, walls: WallShape | None = None) -> SolverReport: ...
+
+    def check(
+        self, solver: Solver | None = None, *, walls: WallShape | None = None
+    ) -> Report | SolverReport:
+        """Verify diagram, sizes, error, quality and history on the host, or the mesh of a solver.
+
+        See `Diagram.check`.
+        """
+        if solver is not None or walls is not None:
+            return self.diagram.check(solver, walls=walls)
         from .check import check_result
 
         return check_result(self)

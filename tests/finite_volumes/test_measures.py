@@ -13,6 +13,8 @@ from tests.io.test_foam import check_mesh, needs_openfoam
 from tests.reference import solids
 
 NUMBER = r"([-+.\deE]*\d)"
+COUNTED = {"concavity": "concave", "face pyramids": "pyramids"}
+"""Criteria whose faces or cells checkMesh counts."""
 
 
 def random_points(n: int, d: int, seed: int) -> np.ndarray:
@@ -93,7 +95,8 @@ def measured(m: SolverMeasures) -> dict[str, float]:
 )
 def test_figures_are_those_of_openfoam(ctx, tmp_path, name, walls):
     diagram = diagram_of(name, ctx)
-    expected = printed(check_mesh(diagram, tmp_path, "-allGeometry", walls=walls))
+    text = check_mesh(diagram, tmp_path, "-allGeometry", "-allTopology", walls=walls)
+    expected = printed(text)
     found = measured(diagram.solver_mesh(walls, walls == "straight").measures)
     assert expected.keys() >= {"non_orthogonality", "skewness", "determinant", "area", "volume"}
     for key, value in found.items():
@@ -101,6 +104,13 @@ def test_figures_are_those_of_openfoam(ctx, tmp_path, name, walls):
         assert value == pytest.approx(expected.get(key, value), rel=2e-5), key
         if key in ("concave", "pyramids", "tetrahedra"):
             assert value == expected.get(key, 0), key
+    report = diagram.check(solver="openfoam", walls=walls)
+    assert report.ok == ("Mesh OK." in text), f"{text}\n{report}"
+    assert report["regions"].value == float(re.search(r"Number of regions: (\d+)", text)[1])
+    for name, key in COUNTED.items():
+        assert report[name].count == expected.get(key, 0), name
+    shown = re.search(r"Max skewness = .*?, (\d+) highly skew", text)
+    assert report["skewness"].count == (int(shown[1]) if shown else 0)
 
 
 def test_cubes_by_hand():

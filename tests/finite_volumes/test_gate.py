@@ -1,0 +1,95 @@
+"""Criteria of solvers: values, limits, places; the report as text."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import InputError
+from clvoro.mesh.check.findings import CheckError
+from tests.finite_volumes.test_straight_walls import ELL, SQUARE, circle
+
+
+@pytest.fixture(scope="module")
+def good(ctx) -> clvoro.Result:
+    domain = clvoro.Polygon(SQUARE, [circle(60, 0.2)])
+    return clvoro.Adapter(ctx).run(domain, 0.06, effort="fast")
+
+
+@pytest.fixture(scope="module")
+def bad(ctx) -> clvoro.Diagram:
+    """Cell 0 surrounds the corner at (0.5, 0.5)."""
+    points = np.array([(0.4, 0.4), (0.1, 0.9), (0.9, 0.1)])
+    return clvoro.Adapter(ctx).diagram(clvoro.Polygon(ELL), points)
+
+
+def test_a_good_mesh_is_accepted(good):
+    report = good.check(solver="openfoam")
+    assert report
+    assert good.diagram.check("openfoam") == report
+    report.demand()
+    mesh = good.solver_mesh()
+    assert (report.cells, report.faces) == (len(mesh), len(mesh.owner))
+    assert report.area_change == mesh.area_change
+    text = str(report)
+    assert "for openfoam: accepted" in text.splitlines()[0]
+    assert "of the domain by straight walls" in text.splitlines()[0]
+    assert len(text.splitlines()) == 2 + len(report.criteria)
+    assert report.as_dict()["criteria"][0]["name"] == "boundary openness"
+
+
+def test_exact_walls_of_a_circle_are_rejected(good):
+    report = good.check(solver="openfoam", walls="exact")
+    assert not report
+    concave = report["concavity"]
+    assert concave.value == pytest.approx(6)
+    assert concave.count > 10
+    assert not concave.ok
+    assert report.area_change == 0
+    distance = np.linalg.norm(np.array(concave.place) - 0.5)
+    assert 0.2 < distance < 0.3
+    assert np.allclose(good.diagram.centroids[concave.cell], concave.place, atol=0.01)
+
+
+def test_a_corner_is_named_with_its_place(bad):
+    report = bad.check(solver="openfoam")
+    assert not report.ok
+    concave = report["concavity"]
+    assert (concave.value, concave.cell, concave.count) == (pytest.approx(90), 0, 1)
+    assert len(concave.place) == 2
+    assert "rejected" in str(report)
+    assert "1 fail" in str(concave)
+    assert "cell 0 at (" in str(concave)
+    with pytest.raises(CheckError, match="concavity"):
+        report.demand()
+
+
+def test_a_cell_around_an_island_is_the_only_finding(ctx):
+    domain = clvoro.Polygon(SQUARE, [circle(5, 0.05)])
+    points = np.array([(0.6, 0.5), (0.05, 0.5), (0.95, 0.5)])
+    diagram = clvoro.Adapter(ctx).diagram(domain, points)
+    report = diagram.check(solver="openfoam")
+    assert [c.name for c in report.criteria] == ["cells around islands"]
+    assert (report.ok, report.criteria[0].cell) == (False, 0)
+
+
+def test_two_regions_are_reported_but_accepted(ctx):
+    domain = clvoro.Polygon.from_shapely(two_squares())
+    report = clvoro.Adapter(ctx).run(domain, 0.2, effort="fast").check(solver="openfoam")
+    assert report.ok
+    assert (report["regions"].value, report["regions"].count) == (2, 1)
+
+
+def two_squares():
+    import shapely
+
+    return shapely.MultiPolygon([shapely.box(0, 0, 1, 1), shapely.box(1.5, 0, 2.5, 1)])
+
+
+def test_wrong_arguments_are_refused(good, bad):
+    with pytest.raises(InputError, match="solver is 'fluent', expected one of openfoam"):
+        good.check(solver="fluent")
+    for mesh in (good, bad):
+        with pytest.raises(InputError, match="walls is 'exact', and no solver"):
+            mesh.check(walls="exact")
+    with pytest.raises(InputError, match="walls is 'round'"):
+        good.check(solver="openfoam", walls="round")
