@@ -1,0 +1,233 @@
+"""Collapse short edges and small faces of 3D meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from ..mesh.connectivity import following, take_rows
+from .merging import Cells, Limits, Merges, face_shapes, pack, ranges
+from .solver_mesh import SolverMesh
+
+SHORT_EDGE = 0.02
+"""Edges shorter than this share of h, the cube root of a cell's volume, are collapsed."""
+SMALL_FACE = 1e-3
+"""Faces smaller than this share of h^2 are collapsed."""
+_WIDEST = 0.15
+"""Most extent of vertices that become one, as a share of h."""
+_SWEEPS = 8
+
+
+@dataclass(frozen=True)
+class Shortness:
+    """Short edges and small faces of a mesh: pairs of points (e, 2), and indices of faces (f,)."""
+
+    edges: np.ndarray
+    faces: np.ndarray
+
+
+def find_short(mesh: SolverMesh, sizes: np.ndarray) -> Shortness:
+    """Return the edges shorter than 0.02 h and the faces smaller than 0.001 h^2 of one of their cells.
+
+    At seams the images of an edge or face count once each.
+
+    Parameters
+    ----------
+    mesh : SolverMesh
+        In 3D.
+    sizes : (n,) float
+        h of each cell, in the domain's unit of length.
+    """
+    face = np.repeat(np.arange(len(mesh.owner)), np.diff(mesh.starts))
+    h = _face_sizes(mesh.owner, mesh.neighbor, sizes)
+    x = mesh.points[mesh.corners]
+    after = following(mesh.starts)
+    short = np.linalg.norm(x[after] - x, axis=1) < SHORT_EDGE * h[face]
+    ends = np.sort(np.stack([mesh.corners, mesh.corners[after]], axis=1)[short], axis=1)
+    areas = np.linalg.norm(face_shapes(x, mesh.starts, face).areas, axis=1)
+    return Shortness(np.unique(ends, axis=0), np.flatnonzero(areas < SMALL_FACE * h**2))
+
+
+def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = None) -> SolverMesh:
+    """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
+
+    The ends of an edge, or the corners of a face, become one point: their mean, or one of them. Points on walls, edges
+    and corners of the box stay on them, and images of a point move together. The cells therefore still fill the domain.
+    Faces that lose their area vanish, and their cells are no longer neighbors. An edge or face is left as it is if
+    otherwise a face would be warped or a cell concave; see `Limits`.
+
+    Parameters
+    ----------
+    mesh : SolverMesh
+        In 3D.
+    sizes : (n,) float
+        h of each cell, in the domain's unit of length.
+    limits : Limits, optional
+    """
+    cells, faces = _fold(mesh, limits)
+    active = _Scan(cells, sizes, np.arange(len(cells.owner))).around()
+    for _ in range(_SWEEPS):
+        done = 0
+        for kind in (_Scan.clusters, _Scan.small_faces, _Scan.edges):
+            done += cells.merge(kind(_Scan(cells, sizes, active)))
+        if not done:
+            break
+        active = np.union1d(active, cells.faces_of(np.flatnonzero(cells.touched)))
+    return _unfold(mesh, cells, faces) if cells.touched.any() else mesh
+
+
+def _face_sizes(owner: np.ndarray, neighbor: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the larger h of both cells of each face."""
+    return np.maximum(sizes[owner], sizes[np.where(neighbor >= 0, neighbor, owner)])
+
+
+def _fold(mesh: SolverMesh, limits: Limits | None) -> tuple[Cells, np.ndarray]:
+    """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
+    upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
+    starts, corners = take_rows(mesh.starts, mesh.corners, upper)
+    points, codes = mesh.points, np.zeros(len(mesh.points), np.int64)
+    extent = np.asarray(mesh.domain.extent, float)
+    classes = np.arange(len(points))
+    if len(upper) < len(mesh.owner):
+        _, first, classes = np.unique(mesh.images, return_index=True, return_inverse=True)
+        away = np.where(mesh.domain.periodic, (points - points[first[classes]]) / extent, 0)
+        codes = pack(np.rint(away))
+        points = points[first]
+    cells = Cells(
+        points, starts, classes[corners], codes[corners], mesh.owner[upper], mesh.neighbor[upper],
+        pack(mesh.shift[upper]), len(mesh), extent, limits,
+    )  # fmt: skip
+    return cells, upper
+
+
+def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
+    """Return `mesh` as `cells` have become."""
+    alive = cells.count > 0
+    kept = np.zeros(len(mesh.owner), bool)
+    kept[upper] = alive
+    seam = upper[mesh.twin[upper] >= 0]
+    kept[mesh.twin[seam]] = kept[seam]
+    left = np.flatnonzero(kept)
+    # The lower face at a seam has the corners of the upper one in opposite order.
+    place = np.full(len(mesh.owner), -1)
+    place[upper] = np.arange(len(upper))
+    lower = place[left] < 0
+    source = place[np.where(lower, mesh.twin[left], left)]
+    counts = cells.count[source]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    where = ranges(cells.begin[source], counts)
+    _, where = take_rows(starts, where, np.arange(len(left)), lower)
+    shift = np.repeat(np.where(lower, cells.face_codes[source], 0), counts)
+    vertices, codes = cells.corners[where], cells.codes[where] - shift
+    order = np.lexsort((codes, vertices))
+    new = np.ones(len(order), bool)
+    new[1:] = (np.diff(vertices[order]) != 0) | (np.diff(codes[order]) != 0)
+    corners = np.empty(len(order), np.int64)
+    corners[order] = np.cumsum(new) - 1
+    points = cells.positions(vertices[order][new], codes[order][new])
+    faces = np.full(len(mesh.owner) + 1, -1)
+    faces[left] = np.arange(len(left))
+    return mesh.changed(
+        points=points,
+        starts=starts,
+        corners=corners,
+        owner=mesh.owner[left],
+        neighbor=mesh.neighbor[left],
+        twin=faces[mesh.twin[left]],
+        shift=mesh.shift[left],
+        half_face=mesh.half_face[left],
+    )
+
+
+class _Scan:
+    """The sides of some faces, from one corner to the next, and which are short; which of the faces are small.
+
+    Attributes
+    ----------
+    faces : (f,) int
+    starts : (f + 1,) int
+        Rows of the sides of each face.
+    begin, end : (k,) int
+        Vertices.
+    code : (k,) int
+        Packed offset of the end from the beginning.
+    length, h : (k,) float
+    small : (f,) bool
+    """
+
+    def __init__(self, cells: Cells, sizes: np.ndarray, faces: np.ndarray) -> None:
+        self.cells, self.faces = cells, faces[cells.count[faces] > 0]
+        self.starts, places = cells.face_corners(self.faces)
+        face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
+        x = cells.positions(cells.corners[places], cells.codes[places])
+        after = following(self.starts)
+        h = _face_sizes(cells.owner[self.faces], cells.neighbor[self.faces], sizes)
+        self.begin = cells.corners[places]
+        self.end = self.begin[after]
+        self.code = cells.codes[places][after] - cells.codes[places]
+        self.length, self.h = np.linalg.norm(x[after] - x, axis=1), h[face]
+        self.short = self.length < SHORT_EDGE * self.h
+        areas = face_shapes(x, self.starts, face).areas
+        self.small = np.linalg.norm(areas, axis=1) < SMALL_FACE * h**2
+
+    def around(self) -> np.ndarray:
+        """Return the faces of all cells at short sides and small faces."""
+        c = self.cells
+        marked = np.zeros(len(c.points), bool)
+        marked[self.begin[self.short]] = marked[self.end[self.short]] = True
+        marked[self.begin[np.repeat(self.small, np.diff(self.starts))]] = True
+        near = self.faces[np.bitwise_or.reduceat(marked[self.begin], self.starts[:-1])]
+        cell = np.zeros(c.n, bool)
+        cell[c.owner[near]] = True
+        cell[c.neighbor[near][c.neighbor[near] >= 0]] = True
+        return np.flatnonzero(cell[c.owner] | (cell[c.neighbor] & (c.neighbor >= 0)))
+
+    def clusters(self) -> Merges:
+        """Return the vertices that short sides connect."""
+        i, j = self.begin[self.short], self.end[self.short]
+        vertices, local = np.unique(np.concatenate([i, j]), return_inverse=True)
+        i, j = local.reshape(2, -1)
+        graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), 2 * (len(vertices),))
+        k, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        h = np.full(k, np.inf)
+        np.minimum.at(h, label[i], self.h[self.short])
+        order = np.argsort(label, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=k))])
+        return self._sets(starts, vertices[order], h)
+
+    def small_faces(self) -> Merges:
+        """Return the corners of small faces."""
+        rows = np.flatnonzero(self.small)
+        starts, places = take_rows(self.starts, np.arange(len(self.begin)), rows)
+        return self._sets(starts, self.begin[places], self.h[self.starts[rows]])
+
+    def edges(self) -> Merges:
+        """Return the ends of short sides, and of the shortest side of each small face."""
+        wanted = self.short & (self.begin != self.end)
+        rows = np.flatnonzero(self.small)
+        if len(rows):
+            face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
+            order = np.lexsort((self.length, face))
+            wanted[order[self.starts[rows]]] = True
+        i, j = self.begin[wanted], self.end[wanted]
+        i, j = np.minimum(i, j), np.maximum(i, j)
+        _, first = np.unique(i * len(self.cells.points) + j, return_index=True)
+        pairs = np.stack([i[first], j[first]], axis=1)
+        return self._sets(2 * np.arange(len(pairs) + 1), pairs.ravel(), self.h[wanted][first])
+
+    def _sets(self, starts: np.ndarray, vertices: np.ndarray, h: np.ndarray) -> Merges:
+        """Return those sets of vertices that are close together."""
+        k = len(starts) - 1
+        sets = np.repeat(np.arange(k), np.diff(starts))
+        x = self.cells.points[vertices]
+        away = x - x[starts[:-1]][sets]
+        steps = np.rint(away / self.cells.extent)
+        away -= steps * self.cells.extent
+        extent = np.zeros(k)
+        np.maximum.at(extent, sets, np.linalg.norm(away, axis=1))
+        priority = extent / h
+        merges = Merges(starts, vertices, -pack(steps), priority)
+        return merges.take(np.flatnonzero(priority <= _WIDEST))
