@@ -9,7 +9,8 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..mesh.connectivity import following, take_rows
-from .merging import Cells, Limits, Merges, face_shapes, pack, ranges
+from .geometry import face_geometry
+from .merging import Cells, Limits, Merges, pack, ranges
 from .solver_mesh import SolverMesh
 
 SHORT_EDGE = 0.02
@@ -18,6 +19,8 @@ SMALL_FACE = 1e-3
 """Faces smaller than this share of h^2 are collapsed."""
 _WIDEST = 0.15
 """Most extent of vertices that become one, as a share of h."""
+LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
+"""Tried in turn, the later ones where short edges or small faces are left."""
 _SWEEPS = 8
 
 
@@ -47,7 +50,7 @@ def find_short(mesh: SolverMesh, sizes: np.ndarray) -> Shortness:
     after = following(mesh.starts)
     short = np.linalg.norm(x[after] - x, axis=1) < SHORT_EDGE * h[face]
     ends = np.sort(np.stack([mesh.corners, mesh.corners[after]], axis=1)[short], axis=1)
-    areas = np.linalg.norm(face_shapes(x, mesh.starts, face).areas, axis=1)
+    areas = np.linalg.norm(face_geometry(mesh.points, mesh.starts, mesh.corners)[1], axis=1)
     return Shortness(np.unique(ends, axis=0), np.flatnonzero(areas < SMALL_FACE * h**2))
 
 
@@ -66,16 +69,19 @@ def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = 
     sizes : (n,) float
         h of each cell, in the domain's unit of length.
     limits : Limits, optional
+        By default those of `LIMITS` in turn.
     """
-    cells, faces = _fold(mesh, limits)
-    active = _Scan(cells, sizes, np.arange(len(cells.owner))).around()
-    for _ in range(_SWEEPS):
-        done = 0
-        for kind in (_Scan.clusters, _Scan.small_faces, _Scan.edges):
-            done += cells.merge(kind(_Scan(cells, sizes, active)))
-        if not done:
-            break
-        active = np.union1d(active, cells.faces_of(np.flatnonzero(cells.touched)))
+    cells, faces = _fold(mesh, sizes)
+    active = _Scan(cells, np.arange(len(cells.owner))).around()
+    for cells.limits in LIMITS if limits is None else (limits,):
+        for _ in range(_SWEEPS):
+            done = sum(
+                cells.merge(kind(_Scan(cells, active)))
+                for kind in (_Scan.clusters, _Scan.small_faces, _Scan.edges)
+            )
+            active = np.union1d(active, cells.faces_of(np.flatnonzero(cells.touched)))
+            if not done:
+                break
     return _unfold(mesh, cells, faces) if cells.touched.any() else mesh
 
 
@@ -84,7 +90,7 @@ def _face_sizes(owner: np.ndarray, neighbor: np.ndarray, sizes: np.ndarray) -> n
     return np.maximum(sizes[owner], sizes[np.where(neighbor >= 0, neighbor, owner)])
 
 
-def _fold(mesh: SolverMesh, limits: Limits | None) -> tuple[Cells, np.ndarray]:
+def _fold(mesh: SolverMesh, sizes: np.ndarray) -> tuple[Cells, np.ndarray]:
     """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
     upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
     starts, corners = take_rows(mesh.starts, mesh.corners, upper)
@@ -98,7 +104,7 @@ def _fold(mesh: SolverMesh, limits: Limits | None) -> tuple[Cells, np.ndarray]:
         points = points[first]
     cells = Cells(
         points, starts, classes[corners], codes[corners], mesh.owner[upper], mesh.neighbor[upper],
-        pack(mesh.shift[upper]), len(mesh), extent, limits,
+        pack(mesh.shift[upper]), extent, sizes, SMALL_FACE,
     )  # fmt: skip
     return cells, upper
 
@@ -158,19 +164,19 @@ class _Scan:
     small : (f,) bool
     """
 
-    def __init__(self, cells: Cells, sizes: np.ndarray, faces: np.ndarray) -> None:
+    def __init__(self, cells: Cells, faces: np.ndarray) -> None:
         self.cells, self.faces = cells, faces[cells.count[faces] > 0]
         self.starts, places = cells.face_corners(self.faces)
         face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
         x = cells.positions(cells.corners[places], cells.codes[places])
         after = following(self.starts)
-        h = _face_sizes(cells.owner[self.faces], cells.neighbor[self.faces], sizes)
+        h = _face_sizes(cells.owner[self.faces], cells.neighbor[self.faces], cells.sizes)
         self.begin = cells.corners[places]
         self.end = self.begin[after]
         self.code = cells.codes[places][after] - cells.codes[places]
         self.length, self.h = np.linalg.norm(x[after] - x, axis=1), h[face]
         self.short = self.length < SHORT_EDGE * self.h
-        areas = face_shapes(x, self.starts, face).areas
+        areas = face_geometry(x, self.starts, np.arange(len(x)))[1]
         self.small = np.linalg.norm(areas, axis=1) < SMALL_FACE * h**2
 
     def around(self) -> np.ndarray:
@@ -183,7 +189,7 @@ class _Scan:
         cell = np.zeros(c.n, bool)
         cell[c.owner[near]] = True
         cell[c.neighbor[near][c.neighbor[near] >= 0]] = True
-        return np.flatnonzero(cell[c.owner] | (cell[c.neighbor] & (c.neighbor >= 0)))
+        return np.flatnonzero(cell[c.owner] | cell[np.where(c.neighbor < 0, c.owner, c.neighbor)])
 
     def clusters(self) -> Merges:
         """Return the vertices that short sides connect."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
 
 from ..mesh.connectivity import following, take_rows
+from .geometry import cell_geometry, face_geometry
 
 _BASE = 64
 """Offsets of images, three numbers between -32 and 31, are digits of one integer: offsets add as integers."""
@@ -119,16 +119,17 @@ class Cells:
         owner: np.ndarray,
         neighbor: np.ndarray,
         face_codes: np.ndarray,
-        cells: int,
         extent: np.ndarray,
-        limits: Limits | None = None,
+        sizes: np.ndarray,
+        small: float,
     ) -> None:
         self.points, self.extent = np.array(points, float), np.asarray(extent, float)
         self.begin, self.count = starts[:-1].copy(), np.diff(starts)
         self.corners, self.codes = corners.astype(np.int64), codes.astype(np.int64)
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
-        self.face_codes, self.n = face_codes, cells
-        self.limits = Limits() if limits is None else limits
+        self.face_codes, self.n = face_codes, len(sizes)
+        self.sizes, self.small = sizes, small
+        self.limits = Limits()
         v, f = len(points), len(owner)
         rows = np.repeat(np.arange(f), self.count)
         self.walls = np.zeros(v, np.int64)
@@ -139,13 +140,13 @@ class Cells:
         self.at_cell = _inverse(
             np.concatenate([self.owner, self.neighbor[inner]]),
             np.concatenate([np.arange(f), inner]),
-            cells,
+            self.n,
         )
         self.next = np.full(v, -1)  # vertices that have been merged, as linked lists
         self.last = np.arange(v)
         self.now = np.arange(v)  # the vertex that each vertex has become, and where its image is
         self.now_code = np.zeros(v, np.int64)
-        self.touched = np.zeros(cells, bool)
+        self.touched = np.zeros(self.n, bool)
 
     # Positions.
 
@@ -231,17 +232,18 @@ class Cells:
         good = region.is_manifold()
         targets = self._targets(merges)
         chosen = np.zeros((k, 3))
-        before = _Region(self, merges, cells, sets[first], merged=False).quality()
-        most = (
-            np.maximum(before[0], self.limits.non_orthogonality),
-            np.maximum(before[1], self.limits.skewness),
+        before = _Region(self, merges, cells, sets[first], merged=False).assess()
+        at_most = replace(
+            before,
+            angle=np.maximum(before.angle, self.limits.non_orthogonality),
+            skewness=np.maximum(before.skewness, self.limits.skewness),
         )
         left = good.copy()
         for attempt in range(targets.shape[1]):
             here = np.isfinite(targets[:, attempt, 0]) & left
             if not here.any():
                 continue
-            fits = region.is_valid(targets[:, attempt], here, most)
+            fits = here & (region.assess(targets[:, attempt]) <= at_most)
             chosen[fits] = targets[fits, attempt]
             left &= ~fits
         done = good & ~left
@@ -316,6 +318,45 @@ class Cells:
         self.corners[there] = region.corners[places]
         self.codes[there] = region.codes[places]
         self.touched[region.cells[done[region.set_of_cell]]] = True
+
+
+@dataclass(frozen=True)
+class _Defects:
+    """What is wrong with the cells at each set of vertices, (k,) each.
+
+    Attributes
+    ----------
+    count, serious : int
+        Warped faces, inverted tetrahedra, concave pairs of faces: all, and those without small faces.
+    angle, skewness : float
+        Largest non-orthogonality in degrees, and skewness of the faces.
+    """
+
+    count: np.ndarray
+    serious: np.ndarray
+    angle: np.ndarray
+    skewness: np.ndarray
+
+    def __le__(self, other: _Defects) -> np.ndarray:
+        return (
+            (self.count <= other.count)
+            & (self.serious <= other.serious)
+            & (self.angle <= other.angle)
+            & (self.skewness <= other.skewness)
+        )
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """Faces and cells of a region: `seen` and `outward` are centers and areas of faces as each cell sees them."""
+
+    centers: np.ndarray
+    areas: np.ndarray
+    flatness: np.ndarray
+    seen: np.ndarray
+    outward: np.ndarray
+    middles: np.ndarray
+    volumes: np.ndarray
 
 
 class _Lookup:
@@ -521,63 +562,63 @@ class _Region:
         wrong.append(np.flatnonzero(euler != 2))
         return np.concatenate(wrong)
 
-    def is_valid(
-        self, targets: np.ndarray, wanted: np.ndarray, most: tuple[np.ndarray, np.ndarray]
-    ) -> np.ndarray:
-        """Return which merges leave faces flat and cells convex if their vertices meet in `targets`, (k,) bool.
-
-        Parameters
-        ----------
-        targets : (k, 3) float
-        wanted : (k,) bool
-            The merges to check.
-        most : two (k,) float
-            Largest non-orthogonality, in degrees, and skewness of the faces at the vertex.
-        """
+    def assess(self, targets: np.ndarray | None = None) -> _Defects:
+        """Return what is wrong with the cells if the vertices of each set meet in `targets` (k, 3)."""
         limits, w = self.whole.limits, self.whole
         x = w.positions(self.corners, self.codes)
-        moved = np.flatnonzero(self.new >= 0)
-        x[moved] = targets[self.new[moved]] + unpack(self.codes[moved]) * w.extent
+        if targets is not None:
+            moved = np.flatnonzero(self.new >= 0)
+            x[moved] = targets[self.new[moved]] + unpack(self.codes[moved]) * w.extent
         with np.errstate(invalid="ignore", divide="ignore"):
-            shapes = face_shapes(x, self.starts, self.face)
-            flat = (shapes.flatness >= limits.flatness) & shapes.is_star
-            good = wanted & ~self._bad(self.set_of_face[self.alive & ~flat])
-            centers, areas, volumes, middles = self._cells(shapes)
-            height = np.einsum("ij,ij->i", areas, centers - middles[self.side_cell])
-            wrong = ~(volumes > 0)
-            wrong[self.side_cell[~(height > 0)]] = True
-            good &= ~self._bad(self.set_of_cell[wrong])
-            good &= ~self._bad(self._bad_tetrahedra(x, shapes, middles))
-            angle, skewness = self._quality(x, shapes, middles)
-            good &= (angle <= most[0]) & (skewness <= most[1])
-            wrong = is_concave(
-                centers, areas, self.side_cell, len(self.cells),
-                limits.concavity, good[self.set_of_cell],
-            )  # fmt: skip
-        return good & ~self._bad(self.set_of_cell[wrong])
+            shapes = self._shapes(x)
+            own, other = w.owner[self.faces], w.neighbor[self.faces]
+            h = np.maximum(w.sizes[own], w.sizes[np.where(other < 0, own, other)])
+            large = np.linalg.norm(shapes.areas, axis=1) >= w.small * h**2
+            changed = self.alive & (self.set_of_face >= 0)
+            wrong = changed & ~(shapes.flatness >= limits.flatness)
+            wrong |= changed & self._bad_tetrahedra(x, shapes)
+            arms = shapes.seen - shapes.middles[self.side_cell]
+            low = ~(np.einsum("ij,ij->i", shapes.outward, arms) > 0)
+            wrong[self.side_face[low]] |= changed[self.side_face[low]]
+            sets = self.set_of_face
+            count = np.bincount(sets[wrong], minlength=self.k)
+            serious = np.bincount(sets[wrong & large], minlength=self.k)
+            part = self.set_of_cell
+            count += np.bincount(part[~(shapes.volumes > 0)], minlength=self.k)
+            for kind, total in ((np.ones_like(large), count), (large, serious)):
+                pairs = concave_pairs(
+                    shapes.seen, shapes.outward, self.side_cell, len(self.cells), limits.concavity,
+                    kind[self.side_face], changed[self.side_face],
+                )  # fmt: skip
+                total += np.bincount(part, pairs, self.k).astype(np.int64)
+            angle, skewness = self._quality(x, shapes)
+        return _Defects(count, serious, angle, skewness)
 
-    def quality(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the largest non-orthogonality, in degrees, and skewness of the faces of each set, (k,) float each."""
-        x = self.whole.positions(self.corners, self.codes)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            shapes = face_shapes(x, self.starts, self.face)
-            return self._quality(x, shapes, self._cells(shapes)[3])
-
-    def _cells(self, shapes: FaceShapes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return centers and outward areas of the faces as each cell sees them; volumes and centroids of the cells."""
+    def _shapes(self, x: np.ndarray) -> _Shapes:
+        """Return centers and areas of the faces with corners at `x` (k, 3), and of the cells."""
+        f, rows = len(self.faces), np.flatnonzero(self.alive)
+        starts = np.append(self.starts[rows], len(x))
+        centers, areas = np.full((f, 3), np.nan), np.full((f, 3), np.nan)
+        centers[rows], areas[rows] = face_geometry(x, starts, np.arange(len(x)))
+        about = np.cross(x[self.after] - x, centers[self.face] - x)
+        spread = 0.5 * np.bincount(self.face, np.linalg.norm(about, axis=1), f)
         side = self.side_face
-        centers = shapes.centers[side] - unpack(self.side_code) * self.whole.extent
-        areas = shapes.areas[side] * self.side_sign[:, None]
-        return centers, areas, *cell_shapes(centers, areas, self.side_cell, len(self.cells))
+        seen = centers[side] - unpack(self.side_code) * self.whole.extent
+        outward = areas[side] * self.side_sign[:, None]
+        none = np.zeros(0, np.int64)
+        middles, volumes = cell_geometry(seen, outward, self.side_cell, none, len(self.cells))
+        flatness = np.linalg.norm(areas, axis=1) / spread
+        return _Shapes(centers, areas, flatness, seen, outward, middles, volumes)
 
-    def _bad_tetrahedra(self, x: np.ndarray, shapes: FaceShapes, middles: np.ndarray) -> np.ndarray:
-        """Return the sets with a face whose tetrahedra with the centers of its cells are not all positive.
+    def _bad_tetrahedra(self, x: np.ndarray, shapes: _Shapes) -> np.ndarray:
+        """Return whether the tetrahedra of a face with the centers of its cells are not all positive, (f,) bool.
 
         Its triangles are those about its center, and the fan about one of its corners, whichever will do.
         """
         rows = np.flatnonzero(self.set_of_face[self.side_face] >= 0)
         face = self.side_face[rows]
-        origins = middles[self.side_cell[rows]] + unpack(self.side_code[rows]) * self.whole.extent
+        origins = shapes.middles[self.side_cell[rows]]
+        origins = origins + unpack(self.side_code[rows]) * self.whole.extent
         counts = np.diff(self.starts)
         fans = np.zeros(len(self.corners))
         bad = np.zeros(len(self.faces), bool)
@@ -595,12 +636,11 @@ class _Region:
             least = volume.min(axis=2) > _THIN * about.sum(axis=1)[:, None]
             np.add.at(fans, places[~least], 1)
         some = np.bincount(self.face[fans == 0], minlength=len(self.faces)) > 0
-        return self.set_of_face[bad | ~(some | ~self.alive)]
+        return bad | ~(some | ~self.alive)
 
-    def _quality(
-        self, x: np.ndarray, shapes: FaceShapes, middles: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        w = self.whole
+    def _quality(self, x: np.ndarray, shapes: _Shapes) -> tuple[np.ndarray, np.ndarray]:
+        """Return the largest non-orthogonality, in degrees, and skewness of the faces of each set, (k,) float each."""
+        w, middles = self.whole, shapes.middles
         rows = np.flatnonzero(self.alive & (self.set_of_face >= 0))
         faces = self.faces[rows]
         center, area = shapes.centers[rows], shapes.areas[rows]
@@ -629,93 +669,44 @@ class _Region:
         return worst[0], worst[1]
 
 
-@dataclass(frozen=True)
-class FaceShapes:
-    """Faces by OpenFOAM's formulas: centers (f, 3), area vectors (f, 3), flatness (f,), and whether the triangles about
-    the center all turn the same way, (f,) bool."""
+def concave_pairs(
+    centers: np.ndarray,
+    areas: np.ndarray,
+    cell: np.ndarray,
+    cells: int,
+    limit: float,
+    counted: np.ndarray,
+    changed: np.ndarray,
+) -> np.ndarray:
+    """Return for each cell the number of pairs of faces that checkMesh takes for concave, (n,) int.
 
-    centers: np.ndarray
-    areas: np.ndarray
-    flatness: np.ndarray
-    is_star: np.ndarray
-
-
-def face_shapes(x: np.ndarray, starts: np.ndarray, face: np.ndarray) -> FaceShapes:
-    """Return the shapes of polygons with the corners `x` (k, 3) of the faces `face` (k,), as ragged rows."""
-    f = len(starts) - 1
-    counts = np.maximum(np.diff(starts), 1)
-    after = following(starts)
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(face, values[:, a], f) for a in range(3)], axis=1)
-
-    middle = total(x) / counts[:, None]
-    y = x[after]
-    normal = np.cross(y - x, middle[face] - x)
-    size = np.linalg.norm(normal, axis=1)
-    sums = np.bincount(face, size, f)
-    areas = 0.5 * total(normal)
-    centers = total(size[:, None] * (x + y + middle[face])) / (3 * sums[:, None])
-    centers = np.where((counts == 3)[:, None], middle, centers)
-    around = np.cross(y - x, centers[face] - x)
-    spread = 0.5 * np.bincount(face, np.linalg.norm(around, axis=1), f)
-    turn = np.einsum("ij,ij->i", around, areas[face]) > 0
-    return FaceShapes(
-        centers,
-        areas,
-        np.linalg.norm(areas, axis=1) / spread,
-        np.bincount(face[~turn], minlength=f) == 0,
-    )
-
-
-def cell_shapes(
-    centers: np.ndarray, areas: np.ndarray, cell: np.ndarray, cells: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return volumes (n,) and centroids (n, 3) of cells from their faces, by OpenFOAM's pyramids.
+    Checked is the cosine of the outward normal of a face and the direction from its center to that of another face.
 
     Parameters
     ----------
     centers, areas : (k, 3) float
         Of each face as seen from a cell; areas point outward.
     cell : (k,) int
+    limit : float
+        The largest cosine.
+    counted, changed : (k,) bool
+        Both faces of a pair are counted, one of them is changed.
     """
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.bincount(cell, values[:, a], cells) for a in range(3)], axis=1)
-
-    middle = total(centers) / np.bincount(cell, minlength=cells)[:, None]
-    pyramid = np.einsum("ij,ij->i", areas, centers - middle[cell])
-    volumes = np.bincount(cell, pyramid, cells)
-    moment = total(pyramid[:, None] * (0.75 * centers + 0.25 * middle[cell]))
-    return volumes / 3, moment / volumes[:, None]
-
-
-def is_concave(
-    centers: np.ndarray,
-    areas: np.ndarray,
-    cell: np.ndarray,
-    cells: int,
-    limit: float,
-    wanted: np.ndarray,
-) -> np.ndarray:
-    """Return which of the cells `wanted` (n,) bool are concave as checkMesh sees it, (n,) bool.
-
-    Checked is the cosine of the outward normal of a face and the direction from its center to that of another face.
-    """
-    concave = np.zeros(cells, bool)
+    pairs = np.zeros(cells, np.int64)
     order = np.argsort(cell, kind="stable")
     counts = np.bincount(cell, minlength=cells)
     starts = np.concatenate([[0], np.cumsum(counts)])
-    for k in np.unique(counts[wanted]).tolist():
-        rows = np.flatnonzero(wanted & (counts == k))
+    for k in np.unique(counts).tolist():
+        rows = np.flatnonzero(counts == k)
         places = order[starts[rows][:, None] + np.arange(k)]
-        c, s = centers[places], areas[places]
+        c, s, own, new = centers[places], areas[places], counted[places], changed[places]
         c = c - c.mean(axis=1, keepdims=True)
         s = s / np.linalg.norm(s, axis=2, keepdims=True)
         height = s @ c.transpose(0, 2, 1) - np.einsum("mij,mij->mi", s, c)[:, :, None]
         squares = np.einsum("mij,mij->mi", c, c)
         far = squares[:, :, None] + squares[:, None, :] - 2 * c @ c.transpose(0, 2, 1)
         steep = height > limit * np.sqrt(np.maximum(far, 0))
+        steep &= own[:, :, None] & own[:, None, :] & (new[:, :, None] | new[:, None, :])
         steep[:, np.arange(k), np.arange(k)] = False
-        concave[rows] = steep.any(axis=(1, 2))
-    return concave
+        pairs[rows] = np.count_nonzero(steep, axis=(1, 2))
+    return pairs

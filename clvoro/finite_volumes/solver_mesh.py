@@ -166,6 +166,7 @@ def make_solver_mesh(
 
     `parts` (k,) int is the index of the named part of the boundary of each wall, if it is not the domain's.
     """
+    from .collapse import collapse_short
     from .short_edges import collapse_short_edges
     from .straight_walls import straight_walls
 
@@ -188,6 +189,8 @@ def make_solver_mesh(
         mesh = straight_walls(mesh, diagram, parts)
     if collapse and mesh.dim == 2:
         mesh = collapse_short_edges(mesh, parts)
+    if collapse and mesh.dim == 3:
+        mesh = collapse_short(mesh, np.cbrt(diagram.volumes))
     return compact(mesh)
 
 
