@@ -9,8 +9,8 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from ..mesh.connectivity import following, take_rows
-from .geometry import face_geometry
-from .merging import Cells, Limits, Merges, pack, ranges
+from .geometry import face_geometry, sum_rows
+from .merging import Cells, Limits, Merges, pack, ranges, smaller_size
 from .solver_mesh import SolverMesh
 
 SHORT_EDGE = 0.02
@@ -22,6 +22,8 @@ _WIDEST = 0.15
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
 _SWEEPS = 8
+_CHUNK = 1 << 16
+"""Faces that are scanned at a time."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,10 @@ class Shortness:
 
 
 def find_short(mesh: SolverMesh, sizes: np.ndarray) -> Shortness:
-    """Return the edges shorter than 0.02 h and the faces smaller than 0.001 h^2 of one of their cells.
+    """Return the edges shorter than 0.02 h and the faces smaller than 0.001 h^2.
 
-    At seams the images of an edge or face count once each.
+    h is that of the smaller cell of a face; for an edge any face with that edge counts. At seams the images of an edge
+    or face count once each.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ def find_short(mesh: SolverMesh, sizes: np.ndarray) -> Shortness:
         h of each cell, in the domain's unit of length.
     """
     face = np.repeat(np.arange(len(mesh.owner)), np.diff(mesh.starts))
-    h = _face_sizes(mesh.owner, mesh.neighbor, sizes)
+    h = smaller_size(mesh.owner, mesh.neighbor, sizes)
     x = mesh.points[mesh.corners]
     after = following(mesh.starts)
     short = np.linalg.norm(x[after] - x, axis=1) < SHORT_EDGE * h[face]
@@ -72,22 +75,19 @@ def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = 
         By default those of `LIMITS` in turn.
     """
     cells, faces = _fold(mesh, sizes)
-    active = _Scan(cells, np.arange(len(cells.owner))).around()
+    active = _flagged(cells, np.arange(len(cells.owner)))
     for cells.limits in LIMITS if limits is None else (limits,):
         for _ in range(_SWEEPS):
+            cells.touched[:] = False
             done = sum(
                 cells.merge(kind(_Scan(cells, active)))
                 for kind in (_Scan.clusters, _Scan.small_faces, _Scan.edges)
             )
-            active = np.union1d(active, cells.faces_of(np.flatnonzero(cells.touched)))
+            near = cells.faces_of(np.flatnonzero(cells.touched))
+            active = _flagged(cells, np.union1d(active, near))
             if not done:
                 break
-    return _unfold(mesh, cells, faces) if cells.touched.any() else mesh
-
-
-def _face_sizes(owner: np.ndarray, neighbor: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the larger h of both cells of each face."""
-    return np.maximum(sizes[owner], sizes[np.where(neighbor >= 0, neighbor, owner)])
+    return mesh if (cells.now == np.arange(len(cells.now))).all() else _unfold(mesh, cells, faces)
 
 
 def _fold(mesh: SolverMesh, sizes: np.ndarray) -> tuple[Cells, np.ndarray]:
@@ -148,6 +148,17 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     )
 
 
+def _flagged(cells: Cells, faces: np.ndarray) -> np.ndarray:
+    """Return those of `faces` that are small or have a short side."""
+    parts = [np.zeros(0, np.int64)]
+    for first in range(0, len(faces), _CHUNK):
+        scan = _Scan(cells, faces[first : first + _CHUNK])
+        flagged = scan.small.copy()
+        flagged[np.searchsorted(scan.starts, np.flatnonzero(scan.short), "right") - 1] = True
+        parts.append(scan.faces[flagged])
+    return np.concatenate(parts)
+
+
 class _Scan:
     """The sides of some faces, from one corner to the next, and which are short; which of the faces are small.
 
@@ -170,26 +181,15 @@ class _Scan:
         face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
         x = cells.positions(cells.corners[places], cells.codes[places])
         after = following(self.starts)
-        h = _face_sizes(cells.owner[self.faces], cells.neighbor[self.faces], cells.sizes)
+        h = smaller_size(cells.owner[self.faces], cells.neighbor[self.faces], cells.sizes)
         self.begin = cells.corners[places]
         self.end = self.begin[after]
         self.code = cells.codes[places][after] - cells.codes[places]
         self.length, self.h = np.linalg.norm(x[after] - x, axis=1), h[face]
         self.short = self.length < SHORT_EDGE * self.h
-        areas = face_geometry(x, self.starts, np.arange(len(x)))[1]
-        self.small = np.linalg.norm(areas, axis=1) < SMALL_FACE * h**2
-
-    def around(self) -> np.ndarray:
-        """Return the faces of all cells at short sides and small faces."""
-        c = self.cells
-        marked = np.zeros(len(c.points), bool)
-        marked[self.begin[self.short]] = marked[self.end[self.short]] = True
-        marked[self.begin[np.repeat(self.small, np.diff(self.starts))]] = True
-        near = self.faces[np.bitwise_or.reduceat(marked[self.begin], self.starts[:-1])]
-        cell = np.zeros(c.n, bool)
-        cell[c.owner[near]] = True
-        cell[c.neighbor[near][c.neighbor[near] >= 0]] = True
-        return np.flatnonzero(cell[c.owner] | cell[np.where(c.neighbor < 0, c.owner, c.neighbor)])
+        away = x - x[self.starts[face]]
+        twice = sum_rows(face, np.cross(away, away[after]), len(self.faces))
+        self.small = np.linalg.norm(twice, axis=1) < 2 * SMALL_FACE * h**2
 
     def clusters(self) -> Merges:
         """Return the vertices that short sides connect."""
@@ -234,6 +234,6 @@ class _Scan:
         away -= steps * self.cells.extent
         extent = np.zeros(k)
         np.maximum.at(extent, sets, np.linalg.norm(away, axis=1))
-        priority = extent / h
-        merges = Merges(starts, vertices, -pack(steps), priority)
-        return merges.take(np.flatnonzero(priority <= _WIDEST))
+        reach = 1.2 * np.maximum(extent, SHORT_EDGE * h)
+        merges = Merges(starts, vertices, -pack(steps), extent / h, reach)
+        return merges.take(np.flatnonzero(extent <= _WIDEST * h))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
@@ -13,6 +13,8 @@ from .geometry import cell_geometry, face_geometry
 _BASE = 64
 """Offsets of images, three numbers between -32 and 31, are digits of one integer: offsets add as integers."""
 _TRIES = 4
+_CHUNK = 2048
+"""Sets of vertices that are tried at a time."""
 _THIN = 1e-6
 """Least volume of a tetrahedron over that of the pyramid of its face."""
 
@@ -33,6 +35,11 @@ def ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return ``starts[0], starts[0] + 1, ...``, `counts[0]` numbers, then those of the next row."""
     ends = np.cumsum(counts)
     return np.arange(ends[-1] if len(ends) else 0) + np.repeat(starts - (ends - counts), counts)
+
+
+def smaller_size(owner: np.ndarray, neighbor: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the smaller of the `sizes` (n,) of both cells of each face, (f,)."""
+    return np.minimum(sizes[owner], sizes[np.where(neighbor >= 0, neighbor, owner)])
 
 
 @dataclass(frozen=True)
@@ -69,12 +76,15 @@ class Merges:
         Packed offsets of the images that coincide with the first vertex of the set.
     priority : (k,) float
         The least is tried first.
+    reach : (k,) float
+        Most distance of the vertices from the first; sets that are wider are left out.
     """
 
     starts: np.ndarray
     vertices: np.ndarray
     codes: np.ndarray
     priority: np.ndarray
+    reach: np.ndarray
 
     @property
     def sets(self) -> np.ndarray:
@@ -84,7 +94,13 @@ class Merges:
     def take(self, rows: np.ndarray) -> Merges:
         """Return some of the sets."""
         starts, places = take_rows(self.starts, np.arange(len(self.vertices)), rows)
-        return Merges(starts, self.vertices[places], self.codes[places], self.priority[rows])
+        return Merges(
+            starts,
+            self.vertices[places],
+            self.codes[places],
+            self.priority[rows],
+            self.reach[rows],
+        )
 
 
 class Cells:
@@ -173,8 +189,7 @@ class Cells:
     def merge(self, merges: Merges) -> int:
         """Merge each set that leaves all cells valid; return how many do."""
         done = 0
-        while len(merges.starts) > 1:
-            merges = self._current(merges)
+        while len((merges := self._current(merges)).starts) > 1:
             sets, faces = self._star(merges)
             cells = np.concatenate([self.owner[faces], self.neighbor[faces]])
             sets = np.concatenate([sets, sets])[cells >= 0]
@@ -204,7 +219,14 @@ class Cells:
         starts = np.concatenate([[0], np.cumsum(counts[kept])])
         codes = codes[first]
         codes = codes - np.repeat(codes[starts[:-1]], np.diff(starts))
-        return Merges(starts, vertices[first], codes, merges.priority[kept])
+        made = Merges(starts, vertices[first], codes, merges.priority[kept], merges.reach[kept])
+        x = self.positions(made.vertices, made.codes)
+        away = np.linalg.norm(x - x[starts[:-1]][made.sets], axis=1)
+        return made.take(
+            np.flatnonzero(
+                np.bincount(made.sets, away > made.reach[made.sets], len(starts) - 1) == 0
+            )
+        )
 
     def _star(self, merges: Merges) -> tuple[np.ndarray, np.ndarray]:
         """Return pairs (set, face with one of its vertices); pairs may repeat."""
@@ -224,31 +246,45 @@ class Cells:
 
     def _try(self, merges: Merges, sets: np.ndarray, cells: np.ndarray) -> int:
         """Merge those of the sets that leave their cells valid; no two sets have a cell in common."""
+        pairs = np.unique(sets * self.n + cells)
+        sets, cells = np.divmod(pairs, self.n)
         k = len(merges.starts) - 1
-        if k == 0:
-            return 0
-        cells, first = np.unique(cells, return_index=True)
-        region = _Region(self, merges, cells, sets[first])
-        good = region.is_manifold()
+        done = 0
+        for first in range(0, k, _CHUNK):
+            begin, end = np.searchsorted(sets, [first, first + _CHUNK])
+            part = merges.take(np.arange(first, min(first + _CHUNK, k)))
+            done += self._try_some(part, sets[begin:end] - first, cells[begin:end])
+        return done
+
+    def _try_some(self, merges: Merges, sets: np.ndarray, cells: np.ndarray) -> int:
         targets = self._targets(merges)
-        chosen = np.zeros((k, 3))
-        before = _Region(self, merges, cells, sets[first], merged=False).assess()
-        at_most = replace(
-            before,
-            angle=np.maximum(before.angle, self.limits.non_orthogonality),
-            skewness=np.maximum(before.skewness, self.limits.skewness),
-        )
-        left = good.copy()
+        region = Region(self, merges, cells, sets)
+        left = region.is_manifold() & np.isfinite(targets[:, 0, 0])
+        most = Region(self, merges, cells, sets, merged=False).assess()
+        most.angle[:] = np.maximum(most.angle, self.limits.non_orthogonality)
+        most.skewness[:] = np.maximum(most.skewness, self.limits.skewness)
+        done = 0
         for attempt in range(targets.shape[1]):
-            here = np.isfinite(targets[:, attempt, 0]) & left
-            if not here.any():
+            rows = np.flatnonzero(left & np.isfinite(targets[:, attempt, 0]))
+            if not len(rows):
                 continue
-            fits = here & (region.assess(targets[:, attempt]) <= at_most)
-            chosen[fits] = targets[fits, attempt]
+            if 2 * len(rows) < region.k or attempt == 0:
+                # The sets that are left become those of the region.
+                merges, targets, most = merges.take(rows), targets[rows], most.take(rows)
+                rank = np.full(region.k, -1)
+                rank[rows] = np.arange(len(rows))
+                cells, sets = cells[rank[sets] >= 0], rank[sets]
+                sets = sets[sets >= 0]
+                if len(rows) < region.k:
+                    region = Region(self, merges, cells, sets)
+                left = np.ones(len(rows), bool)
+                rows = np.arange(len(rows))
+            fits = left & (region.assess(targets[:, attempt]) <= most)
+            fits &= np.isfinite(targets[:, attempt, 0])
+            self._commit(merges, region, fits, targets[:, attempt])
             left &= ~fits
-        done = good & ~left
-        self._commit(merges, region, done, chosen)
-        return int(np.count_nonzero(done))
+            done += int(np.count_nonzero(fits))
+        return done
 
     def _targets(self, merges: Merges) -> np.ndarray:
         """Return where the vertices of each set may meet, (k, tries, 3): their mean, or one of them; or nan.
@@ -280,9 +316,7 @@ class Cells:
         targets[anchor < 0] = np.nan
         return targets
 
-    def _commit(
-        self, merges: Merges, region: _Region, done: np.ndarray, chosen: np.ndarray
-    ) -> None:
+    def _commit(self, merges: Merges, region: Region, done: np.ndarray, chosen: np.ndarray) -> None:
         sets = merges.sets
         head = merges.vertices[merges.starts[:-1]]
         self.points[head[done]] = chosen[done]
@@ -336,6 +370,10 @@ class _Defects:
     serious: np.ndarray
     angle: np.ndarray
     skewness: np.ndarray
+
+    def take(self, rows: np.ndarray) -> _Defects:
+        """Return those of some of the sets."""
+        return _Defects(self.count[rows], self.serious[rows], self.angle[rows], self.skewness[rows])
 
     def __le__(self, other: _Defects) -> np.ndarray:
         return (
@@ -420,7 +458,7 @@ def _independent(sets: np.ndarray, cells: np.ndarray, priority: np.ndarray, n: i
     return chosen
 
 
-class _Region:
+class Region:
     """The cells around some sets of vertices, with their faces as they are after the merge."""
 
     def __init__(
@@ -571,8 +609,7 @@ class _Region:
             x[moved] = targets[self.new[moved]] + unpack(self.codes[moved]) * w.extent
         with np.errstate(invalid="ignore", divide="ignore"):
             shapes = self._shapes(x)
-            own, other = w.owner[self.faces], w.neighbor[self.faces]
-            h = np.maximum(w.sizes[own], w.sizes[np.where(other < 0, own, other)])
+            h = smaller_size(w.owner[self.faces], w.neighbor[self.faces], w.sizes)
             large = np.linalg.norm(shapes.areas, axis=1) >= w.small * h**2
             changed = self.alive & (self.set_of_face >= 0)
             wrong = changed & ~(shapes.flatness >= limits.flatness)
@@ -585,12 +622,12 @@ class _Region:
             serious = np.bincount(sets[wrong & large], minlength=self.k)
             part = self.set_of_cell
             count += np.bincount(part[~(shapes.volumes > 0)], minlength=self.k)
-            for kind, total in ((np.ones_like(large), count), (large, serious)):
-                pairs = concave_pairs(
-                    shapes.seen, shapes.outward, self.side_cell, len(self.cells), limits.concavity,
-                    kind[self.side_face], changed[self.side_face],
-                )  # fmt: skip
-                total += np.bincount(part, pairs, self.k).astype(np.int64)
+            pairs = concave_pairs(
+                shapes.seen, shapes.outward, self.side_cell, len(self.cells), limits.concavity,
+                changed[self.side_face], large[self.side_face],
+            )  # fmt: skip
+            count += np.bincount(part, pairs[0], self.k).astype(np.int64)
+            serious += np.bincount(part, pairs[1], self.k).astype(np.int64)
             angle, skewness = self._quality(x, shapes)
         return _Defects(count, serious, angle, skewness)
 
@@ -675,10 +712,10 @@ def concave_pairs(
     cell: np.ndarray,
     cells: int,
     limit: float,
-    counted: np.ndarray,
     changed: np.ndarray,
-) -> np.ndarray:
-    """Return for each cell the number of pairs of faces that checkMesh takes for concave, (n,) int.
+    large: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each cell the number of pairs of faces that checkMesh takes for concave, and of large ones, (n,) int.
 
     Checked is the cosine of the outward normal of a face and the direction from its center to that of another face.
 
@@ -689,24 +726,27 @@ def concave_pairs(
     cell : (k,) int
     limit : float
         The largest cosine.
-    counted, changed : (k,) bool
-        Both faces of a pair are counted, one of them is changed.
+    changed, large : (k,) bool
+        One face of a pair is changed; both are large.
     """
-    pairs = np.zeros(cells, np.int64)
+    pairs, large_pairs = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
     order = np.argsort(cell, kind="stable")
     counts = np.bincount(cell, minlength=cells)
     starts = np.concatenate([[0], np.cumsum(counts)])
     for k in np.unique(counts).tolist():
         rows = np.flatnonzero(counts == k)
         places = order[starts[rows][:, None] + np.arange(k)]
-        c, s, own, new = centers[places], areas[places], counted[places], changed[places]
+        c, s, new = centers[places], areas[places], changed[places]
         c = c - c.mean(axis=1, keepdims=True)
         s = s / np.linalg.norm(s, axis=2, keepdims=True)
         height = s @ c.transpose(0, 2, 1) - np.einsum("mij,mij->mi", s, c)[:, :, None]
         squares = np.einsum("mij,mij->mi", c, c)
         far = squares[:, :, None] + squares[:, None, :] - 2 * c @ c.transpose(0, 2, 1)
         steep = height > limit * np.sqrt(np.maximum(far, 0))
-        steep &= own[:, :, None] & own[:, None, :] & (new[:, :, None] | new[:, None, :])
+        steep &= new[:, :, None] | new[:, None, :]
         steep[:, np.arange(k), np.arange(k)] = False
-        pairs[rows] = np.count_nonzero(steep, axis=(1, 2))
-    return pairs
+        m, i, j = np.nonzero(steep)
+        pairs += np.bincount(rows[m], minlength=cells)
+        both = large[places[m, i]] & large[places[m, j]]
+        large_pairs += np.bincount(rows[m[both]], minlength=cells)
+    return pairs, large_pairs
