@@ -1,7 +1,7 @@
 """A polyhedral mesh as lists, to merge two of its vertices and check all of it, in plain Python.
 
-Formulas: OpenFOAM v1912, `primitiveMeshFaceCentresAndAreas.C`, `primitiveMeshCellCentresAndVols.C`,
-`primitiveMeshTools.C`, `primitiveMeshCheck.C`.
+Formulas: OpenFOAM v1912, the methods of `primitiveMesh` for faces and cells, `primitiveMeshTools.C`,
+`primitiveMeshCheck.C`.
 """
 
 from __future__ import annotations
