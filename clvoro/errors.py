@@ -94,5 +94,9 @@ class SizeErrorWarning(UserWarning):
     """The cells of a finished mesh are far from their target sizes; the message says where and why."""
 
 
+class SolverWarning(UserWarning):
+    """A solver's own check of a mesh was requested, and the solver is not installed."""
+
+
 class UnusedOptionWarning(UserWarning):
     """An option was given that the method of a run does not use; the message names the methods that do."""

@@ -29,7 +29,8 @@ OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 _EPILOG = """\
 exit codes:
   0    done
-  1    the run failed, or a file could not be written; check: a mesh is wrong
+  1    the run failed, or a file could not be written; check: a mesh is wrong;
+       run --check-solver: the solver rejects the mesh
   2    bad usage or input, or the output folder cannot be made;
        check: a file cannot be read
   3    no usable device
@@ -45,6 +46,7 @@ examples:
   clvoro run my.toml --checkpoint my.state --resume my.state
   clvoro convert result/mesh.npz mesh.nc
   clvoro check result/mesh.vtu          verify the mesh
+  clvoro check --for openfoam result/mesh.vtu
 """
 
 
@@ -147,6 +149,12 @@ def _add_output(run: Any) -> None:
         default=(),
         help=f"further mesh files, such as foam,nc: {', '.join(MESH_FILES)}",
     )
+    _add_walls(run)
+    run.add_argument(
+        "--check-solver",
+        choices=("openfoam",),
+        help="check the mesh by the criteria of a solver, with its own program if that is installed",
+    )
     run.add_argument("--no-report", action="store_true", help="no pictures and no page")
     run.add_argument(
         "--picture-format",
@@ -162,6 +170,14 @@ def _add_output(run: Any) -> None:
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
 
 
+def _add_walls(command: Any) -> None:
+    command.add_argument(
+        "--walls",
+        choices=("straight", "exact"),
+        help="boundary of a mesh for OpenFOAM: straight faces (the default), or as in the domain",
+    )
+
+
 def _add_convert(commands: Any) -> None:
     convert = commands.add_parser(
         "convert",
@@ -175,6 +191,7 @@ def _add_convert(commands: Any) -> None:
     convert.add_argument(
         "--convention", choices=("ugrid", "mpas"), help="content of a .nc file (default: ugrid)"
     )
+    _add_walls(convert)
 
 
 def _add_check(commands: Any) -> None:
@@ -182,10 +199,18 @@ def _add_check(commands: Any) -> None:
         "check",
         help="verify meshes: volumes, graph, faces, the Voronoi property, error and quality",
         description="Verify meshes that clvoro wrote, on the host alone, and print each violation with its place. "
+        "With --for openfoam: print each criterion of its checkMesh, with value, limit and worst place. "
         "Exit code 0: all is right; 1: something is wrong; 2: a file cannot be read.",
     )
     check.set_defaults(work=_check)
     check.add_argument("files", metavar="FILE", nargs="+", help="mesh.npz or mesh.vtu")
+    check.add_argument(
+        "--for",
+        dest="solver",
+        choices=("openfoam",),
+        help="check by the criteria of this solver, which need not be installed, instead",
+    )
+    _add_walls(check)
     check.add_argument("--json", action="store_true", help="print one JSON object per file")
 
 
@@ -296,8 +321,12 @@ def _run(arguments: argparse.Namespace) -> int:
         checkpoint=arguments.checkpoint,
         checkpoint_every=arguments.checkpoint_every,
         resume=arguments.resume,
+        walls=arguments.walls,
+        solver=arguments.check_solver,
     )
-    return INTERRUPTED if job.run() else OK
+    if job.run():
+        return INTERRUPTED
+    return FAILED if job.rejected else OK
 
 
 def _level_count(text: str | None) -> str | int | None:
@@ -315,7 +344,12 @@ def _readable(name: str) -> str:
 def _convert(arguments: argparse.Namespace) -> int:
     from ..io import load, save
 
-    save(load(_readable(arguments.mesh)), arguments.out, convention=arguments.convention)
+    save(
+        load(_readable(arguments.mesh)),
+        arguments.out,
+        convention=arguments.convention,
+        walls=arguments.walls,
+    )
     print(f"written: {arguments.out}")
     return OK
 
@@ -328,7 +362,7 @@ def _check(arguments: argparse.Namespace) -> int:
     code = OK
     for name in arguments.files:
         try:
-            report = load(_readable(name)).check()
+            report = load(_readable(name)).check(arguments.solver, walls=arguments.walls)
         except InputError as error:  # the other files are checked all the same
             code = _complain(error, BAD_INPUT)
             continue

@@ -6,6 +6,7 @@ import json
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
@@ -18,9 +19,12 @@ import numpy as np
 from ..adaptation.estimates import available_memory, in_bytes
 from ..adaptation.loop import INTERRUPTED
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
-from ..errors import Aborted, ClvoroError, InputError
+from ..errors import Aborted, ClvoroError, InputError, SolverWarning
+from ..finite_volumes.gate import Solver
+from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.polygon import Polygon
 from ..io import save, write_history
+from ..io.check_mesh import run_check_mesh
 from ..mesh.results import Result
 from ..mesh.summary import boundary_line, summary
 from ..opencl.profile import Profile
@@ -67,6 +71,10 @@ class Job:
     checkpoint, resume : Path or None
     checkpoint_every : float or None
         As `Adapter.run` takes them; for one method only.
+    walls : "straight", "exact" or None
+        As `save` takes it, for the mesh file of OpenFOAM and the check.
+    solver : "openfoam" or None
+        Check the mesh by the criteria of this solver, and with its own program if that is installed.
     """
 
     case: Case
@@ -81,7 +89,10 @@ class Job:
     checkpoint: Path | None = None
     checkpoint_every: float | None = None
     resume: Path | None = None
+    walls: WallShape | None = None
+    solver: Solver | None = None
     interrupted: bool = field(default=False, init=False)
+    rejected: bool = field(default=False, init=False)
 
     def run(self) -> bool:
         """Run all methods, write the files, print the summary; return whether it was interrupted.
@@ -138,6 +149,8 @@ class Job:
                     self._now_and_then(),
                 )  # fmt: skip
         self._summarize(results, where, profiles)
+        if self.solver is not None:
+            self._check_for_solver(results)
         if frames and not self.quiet and not self.as_json:
             print(frames_line(frames))
         return self.interrupted
@@ -211,7 +224,11 @@ class Job:
                 )
 
     def _refuse_formats(self) -> None:
-        """Raise an error before the run if a format cannot hold its mesh."""
+        """Raise an error before the run if a format cannot hold its mesh, or an option is for another format."""
+        if self.walls is not None and self.solver is None and "foam" not in self.mesh_formats:
+            raise InputError(
+                f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format foam, or leave it out"
+            )
         for kind in self.mesh_formats:
             if kind in PLANE and self.case.domain.dim != 2:
                 raise InputError(
@@ -279,7 +296,8 @@ class Job:
         ]
         for kind in self.mesh_formats:
             name, convention = MESH_FILES[kind]
-            tasks.append(partial(save, main, self.out / name, convention=convention))
+            walls = self.walls if kind == "foam" else None
+            tasks.append(partial(save, main, self.out / name, convention=convention, walls=walls))
         for other, result in others:
             tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
             tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
@@ -331,6 +349,32 @@ class Job:
             return None  # no step, or a first one on a coarser level
         points = np.clip(main.initial.points, self.case.domain.lower, self.case.domain.upper)
         return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
+
+    def _check_for_solver(self, results: dict[str, Result]) -> None:
+        """Check the main mesh by the criteria of the solver; its own program has the last word."""
+        *_, main = results.values()
+        walls = self.walls or "straight"
+        report = main.check(self.solver, walls=walls)
+        simple = (
+            report.criteria[0].name != "cells around islands"
+        )  # else OpenFOAM cannot hold the mesh
+        verdict = run_check_mesh(main, walls) if simple else None
+        self.rejected = not (report.ok if verdict is None else verdict.ok)
+        if simple and verdict is None:
+            warnings.warn(
+                "OpenFOAM's checkMesh is not installed: the mesh is checked by the same criteria as clvoro computes "
+                "them; install OpenFOAM (Debian: apt-get install openfoam), or put checkMesh on the PATH",
+                SolverWarning,
+                stacklevel=2,
+            )
+        if self.as_json:
+            said = None if verdict is None else verdict.complaints
+            checked = {"case": self.case.name, **report.as_dict(), "checkMesh": said}
+            print(json.dumps({**checked, "ok": not self.rejected}), flush=True)
+        elif not self.quiet or self.rejected:
+            print(report)
+            if verdict is not None:
+                print("checkMesh: " + ("Mesh OK" if verdict.ok else "; ".join(verdict.complaints)))
 
     def _announce(self, name: str, result: Result, where: str, profile: Profile | None) -> None:
         """Print the run as JSON, if requested."""

@@ -98,6 +98,52 @@ def test_convert(here, capsys):
     assert not (here / "again.xyz").exists()
 
 
+CIRCLE = [[0.5 + 0.2 * np.cos(t), 0.5 + 0.2 * np.sin(t)] for t in np.arange(60) * np.pi / 30]
+ROUND = f"""
+size = 0.08
+[domain]
+outer = [[0, 0], [1, 0], [1, 1], [0, 1]]
+holes = [{np.array(CIRCLE).tolist()}]
+[run]
+effort = "fast"
+"""
+
+
+def test_meshes_are_checked_for_a_solver(here, capsys, monkeypatch):
+    (here / "round.toml").write_text(ROUND)
+    quick = ["run", "round.toml", "--no-report", "--quiet", "--out", "a"]
+    monkeypatch.setenv("PATH", str(here))  # without OpenFOAM
+    assert call(*quick, "--check-solver", "openfoam") == cli.OK
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "warning: OpenFOAM's checkMesh is not installed" in printed.err
+    exact = ["--walls", "exact"]
+    assert call(*quick, "--check-solver", "openfoam", *exact, "--json") == cli.FAILED
+    *_, last = capsys.readouterr().out.splitlines()
+    said = json.loads(last)
+    assert (said["ok"], said["solver"], said["checkMesh"]) == (False, "openfoam", None)
+    assert call("check", "--for", "openfoam", "a/mesh.vtu") == cli.OK
+    assert "for openfoam: accepted" in capsys.readouterr().out
+    assert call("check", "--for", "openfoam", *exact, "a/mesh.npz") == cli.FAILED
+    assert "rejected: skewness, concavity" in capsys.readouterr().out
+    assert call("check", *exact, "a/mesh.npz") == cli.BAD_INPUT
+    assert call(*quick, *exact) == cli.BAD_INPUT
+    assert "no mesh is written for OpenFOAM" in capsys.readouterr().err
+
+
+def test_a_solver_checks_the_mesh_itself(here, capsys, monkeypatch):
+    """With a stand-in for checkMesh, which has the last word."""
+    (here / "round.toml").write_text(ROUND)
+    program = here / "checkMesh"
+    monkeypatch.setenv("PATH", str(here), prepend=os.pathsep)
+    quick = ["run", "round.toml", "--no-report", "--out", "a", "--check-solver", "openfoam"]
+    for says, code in (("Mesh OK.", cli.OK), (" ***Bad cells", cli.FAILED)):
+        program.write_text(f"#!/bin/sh\ntest -f $4/constant/polyMesh/faces && echo '{says}'\n")
+        program.chmod(0o755)
+        assert call(*quick) == code
+        assert f"checkMesh: {says.strip(' *.')}" in capsys.readouterr().out
+
+
 def test_written_case_repeats_the_mesh(here):
     assert call("run", "small.toml", "--no-report", "--quiet", "--k", "0.7", "--out", "a") == 0
     assert call("run", "a/case.toml", "--no-report", "--quiet", "--out", "b") == 0

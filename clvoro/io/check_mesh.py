@@ -1,0 +1,75 @@
+"""OpenFOAM's own verdict: run its `checkMesh` on a mesh."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..finite_volumes.solver_mesh import WallShape
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
+from .contents import Contents
+from .foam import write_foam
+
+_DEBIAN = Path("/usr/share/openfoam")
+"""Where Debian's package has its settings; other installations set WM_PROJECT_DIR."""
+_SCHEMES = ("ddt", "grad", "div", "laplacian", "interpolation", "snGrad")
+_SYSTEM = {
+    "controlDict": "startTime 0; endTime 1; deltaT 1; writeInterval 1;",
+    "fvSchemes": " ".join(f"{scheme}Schemes {{ default none; }}" for scheme in _SCHEMES),
+    "fvSolution": "",
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What `checkMesh -allGeometry -allTopology` says.
+
+    Attributes
+    ----------
+    ok : bool
+        Whether it prints "Mesh OK".
+    complaints : tuple of str
+        Its lines with three stars.
+    text : str
+        All that it prints.
+    """
+
+    ok: bool
+    complaints: tuple[str, ...]
+    text: str
+
+
+def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Verdict | None:
+    """Return the verdict of OpenFOAM's `checkMesh` on a mesh, or None if it is not installed.
+
+    The mesh is written into a temporary case.
+
+    Raises
+    ------
+    InputError
+        If OpenFOAM cannot hold the mesh.
+    """
+    program = shutil.which("checkMesh")
+    if program is None:
+        return None
+    with tempfile.TemporaryDirectory(prefix="clvoro-") as name:
+        case = Path(name)
+        write_foam(Contents.of(mesh), case / "constant" / "polyMesh", walls=walls)
+        (case / "system").mkdir()
+        for file, text in _SYSTEM.items():
+            head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {file}; }}\n"
+            (case / "system" / file).write_text(head + text + "\n", encoding="ascii")
+        settings = {"WM_PROJECT_DIR": str(_DEBIAN)} if _DEBIAN.is_dir() else {}
+        command = [program, "-allGeometry", "-allTopology", "-case", str(case)]
+        done = subprocess.run(
+            command, env={**settings, **os.environ}, capture_output=True, text=True, check=False
+        )
+    text = done.stdout + done.stderr
+    stars = re.findall(r"^ *\*\*\*(.*)$", text, re.MULTILINE)
+    return Verdict("Mesh OK." in text, tuple(line.strip() for line in stars), text)
