@@ -7,11 +7,15 @@ its faces. Flat faces of convex cells get their exact centroids.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..mesh.connectivity import following
 from ..mesh.read_only import Sealed
+
+if TYPE_CHECKING:
+    from .solver_mesh import SolverMesh
 
 _TINY = 1e-150
 """OpenFOAM's ROOTVSMALL, which keeps quotients finite."""
@@ -86,6 +90,28 @@ def cell_geometry(
     moments = sum_rows(cell, thrice[:, None] * arms, cells)
     safe = np.where(np.abs(volumes) > _TINY**2, volumes, np.inf)
     return means + 0.75 * moments / safe[:, None], volumes / 3
+
+
+def polygon_sides(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sides of all cells in 2D: their cells (s,), two ends relative to a corner of the cell, (s, 2) each.
+
+    The last array is that corner for each cell, (n, 2). A cell lies on the left of the way from the first end to the
+    second.
+    """
+    k = mesh.inner
+    a, b = mesh.corners.reshape(-1, 2).T
+    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
+    begin, end = np.concatenate([a, b[:k]]), np.concatenate([b, a[:k]])
+    base = np.zeros(len(mesh), np.int64)
+    base[cell] = begin
+    origins = mesh.points[base]
+    return cell, mesh.points[begin] - origins[cell], mesh.points[end] - origins[cell], origins
+
+
+def polygon_areas(mesh: SolverMesh) -> np.ndarray:
+    """Return the area of each cell in 2D, (n,)."""
+    cell, p, q, _ = polygon_sides(mesh)
+    return np.bincount(cell, p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0], len(mesh)) / 2
 
 
 def sum_rows(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
-from .geometry import Geometry, cell_geometry, face_geometry, sum_rows
-from .prisms import polyhedra
+from .geometry import Geometry, cell_geometry, face_geometry, polygon_areas, sum_rows
+from .prisms import Polyhedra, polyhedra
 
 if TYPE_CHECKING:
     from .solver_mesh import SolverMesh
@@ -30,8 +30,18 @@ class SolverMeasures:
     """
 
     def __init__(self, mesh: SolverMesh, thickness: float | None = None) -> None:
-        self.mesh = mesh
-        self.cells = polyhedra(mesh, thickness)
+        self.mesh, self.thickness = mesh, thickness
+
+    @cached_property
+    def cells(self) -> Polyhedra:
+        """The cells as polyhedra: in 2D prisms.
+
+        Raises
+        ------
+        InputError
+            In 2D for a cell around an island or one that touches itself, as a face of OpenFOAM has no hole.
+        """
+        return polyhedra(self.mesh, self.thickness)
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -304,43 +314,32 @@ class SolverMeasures:
     @cached_property
     def sizes(self) -> np.ndarray:
         """Size of each cell: its volume to the power 1/3, in 2D the root of its area, (n,)."""
-        volumes = np.maximum(self.geometry.volumes, 0)
         if self.mesh.dim == 3:
-            return np.cbrt(volumes)
-        return np.sqrt(volumes / self.cells.points[:, 2].max())
-
-    @cached_property
-    def edge_lengths(self) -> np.ndarray:
-        """Length of the shortest edge of each face over the smaller size of its cells; in 2D of the face itself."""
-        p, f = self.cells, len(self.mesh.owner)
-        if self.mesh.dim == 2:
-            a, b = self.mesh.points[self.mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
-            lengths = np.linalg.norm(b - a, axis=1)
-        else:
-            steps = p.points[p.corners[following(p.starts)]] - p.points[p.corners]
-            lengths = np.minimum.reduceat(np.linalg.norm(steps, axis=1), p.starts[:-1])
-        return lengths / np.maximum(self._face_sizes[:f], _TINY)
+            return np.cbrt(np.maximum(self.geometry.volumes, 0))
+        return np.sqrt(np.maximum(polygon_areas(self.mesh), 0))
 
     @cached_property
     def _face_sizes(self) -> np.ndarray:
-        """Smaller size of the cells at each face, (f,)."""
-        sizes = self.sizes[self.cells.owner].copy()
-        c = self.coupled
-        sizes[c] = np.minimum(sizes[c], self.sizes[self.mesh.neighbor[c]])
-        return sizes
+        """Smaller size of the cells at each face of the solver mesh, (f,)."""
+        owner, neighbor = self.mesh.owner, self.mesh.neighbor
+        here = self.sizes[owner]
+        there = np.where(neighbor >= 0, self.sizes[np.maximum(neighbor, 0)], here)
+        return np.maximum(np.minimum(here, there), _TINY)
 
     def _least(self, values: np.ndarray) -> np.ndarray:
         """Return the least of `values` (f,) among the faces of each cell, (n,)."""
-        cell, face, _ = self.face_cells
-        some = face < len(values)
+        k = self.mesh.inner
         least = np.full(len(self.mesh), np.inf)
-        np.minimum.at(least, cell[some], values[face[some]])
+        np.minimum.at(least, self.mesh.owner, values)
+        np.minimum.at(least, self.mesh.neighbor[:k], values[:k])
         return least
 
     @cached_property
     def shortest_edge(self) -> np.ndarray:
-        """Length of the shortest edge of each cell over the smaller size of the cells at it, (n,)."""
-        return self._least(self.edge_lengths)
+        """Length of the shortest edge of each cell over the smaller size of the cells at its face, (n,)."""
+        points, starts, corners = self.mesh.points, self.mesh.starts, self.mesh.corners
+        lengths = np.linalg.norm(points[corners[following(starts)]] - points[corners], axis=1)
+        return self._least(np.minimum.reduceat(lengths, starts[:-1]) / self._face_sizes)
 
     @cached_property
     def smallest_face(self) -> np.ndarray:
@@ -348,6 +347,18 @@ class SolverMeasures:
         if self.mesh.dim == 2:
             return self.shortest_edge
         return self._least(np.linalg.norm(self.geometry.areas, axis=1) / self._face_sizes**2)
+
+    def line(self) -> str:
+        """Return the worst of the measures as one line of text."""
+        s = self.summary()
+        return (
+            f"non-orthogonality mean {s['mean_non_orthogonality']:.2f}°, max {s['max_non_orthogonality']:.1f}°; "
+            f"skewness max {s['max_skewness']:.2f}; concave cells {s['concave_cells']}; shortest edge "
+            f"{s['min_edge']:.2g} of a cell, 1 % below {s['edge_percentile_1']:.2g}"
+        )
+
+    def __repr__(self) -> str:
+        return f"SolverMeasures({self.line()})"
 
     def summary(self) -> dict[str, float]:
         """Return the extremes, the means and for edges and faces the percentiles, by name."""

@@ -130,13 +130,7 @@ class SolverMesh(Sealed):
 
     @cached_property
     def measures(self) -> SolverMeasures:
-        """Non-orthogonality, skewness and more as OpenFOAM computes them; each is computed when first used.
-
-        Raises
-        ------
-        InputError
-            In 2D for a cell around an island or one that touches itself, as a face of OpenFOAM has no hole.
-        """
+        """Non-orthogonality, skewness and more as OpenFOAM computes them; each is computed when first used."""
         return SolverMeasures(self)
 
     @cached_property

@@ -21,6 +21,7 @@ import numpy as np
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import SIDE_TURN, along_rings
+from .geometry import polygon_areas, polygon_sides, sum_rows
 from .solver_mesh import SolverMesh
 
 REACH = 0.25
@@ -88,7 +89,7 @@ class _Work:
         self.mesh, self.walls = mesh, np.arange(mesh.inner, mesh.outer)
         self.points: list[Point] = list(map(tuple, mesh.points.tolist()))
         self.ends = mesh.corners.reshape(-1, 2)
-        self.sizes = np.sqrt(np.maximum(cell_areas(mesh), 0)).tolist()
+        self.sizes = np.sqrt(np.maximum(polygon_areas(mesh), 0)).tolist()
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
         # 1: the ends of the cell do not move; 2: its walls remain as they are.
         self.spared, self.most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
@@ -282,44 +283,20 @@ class _Work:
         )
 
 
-def cell_areas(mesh: SolverMesh) -> np.ndarray:
-    """Return the area of each cell in 2D, (n,)."""
-    cell, cross, _ = _fans(mesh)
-    return np.bincount(cell, cross, len(mesh)) / 2
-
-
-def _fans(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return cell, twice the area of the triangle with the cell's first corner, and face for each side of a face."""
-    k = mesh.inner
-    a, b = mesh.corners.reshape(-1, 2).T
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
-    begin, end = np.concatenate([a, b[:k]]), np.concatenate([b, a[:k]])
-    base = np.zeros(len(mesh), np.int64)
-    base[cell] = begin
-    p, q = mesh.points[begin] - mesh.points[base[cell]], mesh.points[end] - mesh.points[base[cell]]
-    face = np.concatenate([np.arange(len(a)), np.arange(k)])
-    return cell, p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0], face
-
-
 def _starlike(mesh: SolverMesh) -> np.ndarray:
     """Return whether each cell's centroid sees all of its faces from inside, (n,); short faces do not count."""
-    k, n = mesh.inner, len(mesh)
-    a, b = mesh.corners.reshape(-1, 2).T
-    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]]).astype(np.int64)
-    begin, end = np.concatenate([a, b[:k]]), np.concatenate([b, a[:k]])
-    base = np.zeros(n, np.int64)
-    base[cell] = begin
-    p, q = mesh.points[begin] - mesh.points[base[cell]], mesh.points[end] - mesh.points[base[cell]]
-    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+    cell, p, q, _ = polygon_sides(mesh)
+    n, cross = len(mesh), _cross(p, q)
     area = np.bincount(cell, cross, n)
     safe = np.where(area > 0, area, np.inf)
-    middle = np.stack(
-        [np.bincount(cell, cross * (p[:, c] + q[:, c]), n) / (3 * safe) for c in range(2)], axis=1
-    )
-    p, q = p - middle[cell], q - middle[cell]
-    seen = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] > 0
+    middle = sum_rows(cell, cross[:, None] * (p + q), n) / (3 * safe)[:, None]
+    seen = _cross(p - middle[cell], q - middle[cell]) > 0
     seen |= ((q - p) ** 2).sum(axis=1) < _SHORT**2 * area[cell]
     return (area > 0) & (np.bincount(cell, ~seen, n) == 0)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _turn(a: Point, b: Point, c: Point) -> float:

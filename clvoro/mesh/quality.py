@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +13,9 @@ from ..geometry.polygon import Polygon
 from .connectivity import face_owners
 from .diagram import Diagram
 from .straightening import straighten
+
+if TYPE_CHECKING:
+    from ..finite_volumes.measures import SolverMeasures
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,6 +50,7 @@ class Measures:
         Whether the face is between two cells.
     polygonal : bool
         Whether the domain is a polygon.
+    diagram : Diagram or None
     """
 
     quality: np.ndarray
@@ -55,6 +61,22 @@ class Measures:
     faces: np.ndarray
     inner: np.ndarray
     polygonal: bool = False
+    diagram: Diagram | None = field(default=None, compare=False)
+
+    @cached_property
+    def exact(self) -> SolverMeasures:
+        """Measures of the diagram as OpenFOAM defines them, with unknowns at the centroids.
+
+        Among them `shortest_edge` and `smallest_face` relative to the size of the cell; `summary()` has percentiles.
+        """
+        assert self.diagram is not None
+        return self.diagram.solver_mesh("exact", collapse=False).measures
+
+    @cached_property
+    def solver(self) -> SolverMeasures:
+        """The same of the mesh that a solver gets: with straight walls, without short edges; see `solver_mesh`."""
+        assert self.diagram is not None
+        return self.diagram.solver_mesh().measures
 
     def __repr__(self) -> str:
         return f"Measures({self.line()})"
@@ -142,7 +164,9 @@ def measure_mesh(diagram: Diagram) -> Measures:
     here, there = volumes[owner], np.where(inner, volumes[other], volumes[owner])
     ratio = np.maximum(here, there) / np.minimum(here, there)
     polygonal = isinstance(diagram.domain, Polygon)
-    return Measures(quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal)
+    return Measures(
+        quality, skewness, angle, smallest / largest, ratio, counts, inner, polygonal, diagram
+    )
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

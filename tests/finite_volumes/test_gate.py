@@ -74,7 +74,7 @@ def test_a_cell_around_an_island_is_the_only_finding(ctx):
 
 def test_two_regions_are_reported_but_accepted(ctx):
     domain = clvoro.Polygon.from_shapely(two_squares())
-    report = clvoro.Adapter(ctx).run(domain, 0.2, effort="fast").check(solver="openfoam")
+    report = clvoro.Adapter(ctx).run(domain, 0.1, effort="fast").check(solver="openfoam")
     assert report.ok
     assert (report["regions"].value, report["regions"].count) == (2, 1)
 

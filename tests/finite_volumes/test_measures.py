@@ -147,8 +147,19 @@ def test_centroids_and_concavity_in_2d_are_those_of_polygons(ctx):
     assert m.concavity.max() == pytest.approx(9)
 
 
+def test_measures_of_a_diagram_lead_to_those_of_solvers(ctx):
+    diagram = diagram_of("hole", ctx)
+    m = diagram.measures
+    lengths = np.minimum.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1])
+    assert (m.exact.shortest_edge >= lengths / np.sqrt(diagram.volumes) * (1 - 1e-9)).all()
+    assert (m.exact.shortest_edge < 30 * lengths / np.sqrt(diagram.volumes)).all()
+    assert m.solver.shortest_edge.min() > m.exact.shortest_edge.min()
+    assert m.solver.concave.sum() < m.exact.concave.sum()
+    assert "concave cells" in repr(m.solver)
+
+
 def test_edges_and_faces_have_percentiles(ctx):
-    s = diagram_of("solid", ctx).solver_mesh().measures.summary()
+    s = diagram_of("solid", ctx).measures.exact.summary()
     for kind in ("edge", "face"):
         least = s[f"min_{kind}"]
         assert 0 < least <= s[f"{kind}_percentile_0.1"] <= s[f"{kind}_percentile_1"]
