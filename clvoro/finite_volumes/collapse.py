@@ -81,7 +81,7 @@ def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = 
             cells.touched[:] = False
             done = sum(
                 cells.merge(kind(_Scan(cells, active)))
-                for kind in (_Scan.clusters, _Scan.small_faces, _Scan.edges)
+                for kind in (_Scan.clusters, _Scan.small_faces, _Scan.slivers, _Scan.edges)
             )
             near = cells.faces_of(np.flatnonzero(cells.touched))
             active = _flagged(cells, np.union1d(active, near))
@@ -106,6 +106,10 @@ def _fold(mesh: SolverMesh, sizes: np.ndarray) -> tuple[Cells, np.ndarray]:
         points, starts, classes[corners], codes[corners], mesh.owner[upper], mesh.neighbor[upper],
         pack(mesh.shift[upper]), extent, sizes, SMALL_FACE,
     )  # fmt: skip
+    for wall in np.unique(-1 - mesh.neighbor[mesh.neighbor < 0]).tolist():
+        axis, upper_side = divmod(wall, 2)
+        plane = (mesh.domain.upper if upper_side else mesh.domain.lower)[axis]
+        cells.points[cells.walls & (1 << wall) > 0, axis] = plane
     return cells, upper
 
 
@@ -224,16 +228,43 @@ class _Scan:
         pairs = np.stack([i[first], j[first]], axis=1)
         return self._sets(2 * np.arange(len(pairs) + 1), pairs.ravel(), self.h[wanted][first])
 
-    def _sets(self, starts: np.ndarray, vertices: np.ndarray, h: np.ndarray) -> Merges:
-        """Return those sets of vertices that are close together."""
-        k = len(starts) - 1
-        sets = np.repeat(np.arange(k), np.diff(starts))
+    def slivers(self) -> Merges:
+        """Return the ends of the short sides of faces that vanish if all of them become points."""
+        face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
+        left = np.diff(self.starts) - np.bincount(face[self.short], minlength=len(self.faces))
+        several = np.diff(self.starts) - left > 1
+        rows = np.flatnonzero(self.short & ((left < 3) & several)[face])
+        i, j, set_of = self.begin[rows], self.end[rows], face[rows]
+        apart = np.ones(len(rows), bool)  # sides that begin where another one ends are clusters
+        apart[np.isin(set_of * len(self.cells.points) + i, set_of * len(self.cells.points) + j)] = (
+            False
+        )
+        good = np.bincount(set_of[~apart], minlength=len(self.faces)) == 0
+        rows, pairs = rows[good[set_of]], np.stack([i, j], axis=1)[good[set_of]]
+        sets = np.unique(face[rows], return_inverse=True)[1]
+        return self._sets(2 * np.arange(len(rows) + 1), pairs.ravel(), self.h[rows], sets)
+
+    def _sets(
+        self,
+        starts: np.ndarray,
+        vertices: np.ndarray,
+        h: np.ndarray,
+        sets: np.ndarray | None = None,
+    ) -> Merges:
+        """Return those groups of vertices that are close together; each is a set, or has its place in `sets`."""
+        g = len(starts) - 1
+        sets = np.arange(g) if sets is None else sets
+        group = np.repeat(np.arange(g), np.diff(starts))
         x = self.cells.points[vertices]
-        away = x - x[starts[:-1]][sets]
+        away = x - x[starts[:-1]][group]
         steps = np.rint(away / self.cells.extent)
         away -= steps * self.cells.extent
-        extent = np.zeros(k)
-        np.maximum.at(extent, sets, np.linalg.norm(away, axis=1))
-        reach = 1.2 * np.maximum(extent, SHORT_EDGE * h)
-        merges = Merges(starts, vertices, -pack(steps), extent / h, reach)
-        return merges.take(np.flatnonzero(extent <= _WIDEST * h))
+        width = np.zeros(g)
+        np.maximum.at(width, group, np.linalg.norm(away, axis=1))
+        k = int(sets.max(initial=-1)) + 1
+        extent, size = np.zeros(k), np.full(k, np.inf)
+        np.maximum.at(extent, sets, width)
+        np.minimum.at(size, sets, h)
+        reach = 1.2 * np.maximum(extent, SHORT_EDGE * size)
+        merges = Merges(starts, vertices, -pack(steps), sets, extent / size, reach)
+        return merges.take(np.flatnonzero(extent <= _WIDEST * size))

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 
 from ..mesh.connectivity import following, take_rows
-from .geometry import cell_geometry, face_geometry
+from .geometry import cell_geometry, face_geometry, sum_rows
 
 _BASE = 64
 """Offsets of images, three numbers between -32 and 31, are digits of one integer: offsets add as integers."""
 _TRIES = 4
+_WORSE = 0.02
+"""Change of non-orthogonality, in degrees, and relative change of skewness that is accepted anywhere."""
 _CHUNK = 2048
 """Sets of vertices that are tried at a time."""
 _THIN = 1e-6
@@ -65,42 +68,50 @@ class Limits:
 
 @dataclass(frozen=True)
 class Merges:
-    """Sets of vertices, each to become one vertex.
+    """Groups of vertices, each to become one vertex, in sets that are merged together or not at all.
 
     Attributes
     ----------
-    starts : (k + 1,) int
+    starts : (g + 1,) int
     vertices : int
-        Vertices of set i, ``vertices[starts[i]:starts[i + 1]]``.
+        Vertices of group i, ``vertices[starts[i]:starts[i + 1]]``.
     codes : int
-        Packed offsets of the images that coincide with the first vertex of the set.
+        Packed offsets of the images that coincide with the first vertex of the group.
+    sets : (g,) int
+        Set of each group, ascending from 0.
     priority : (k,) float
         The least is tried first.
     reach : (k,) float
-        Most distance of the vertices from the first; sets that are wider are left out.
+        Most distance of vertices from the first of their group; groups that are wider are left out.
     """
 
     starts: np.ndarray
     vertices: np.ndarray
     codes: np.ndarray
+    sets: np.ndarray
     priority: np.ndarray
     reach: np.ndarray
 
+    @cached_property
+    def group(self) -> np.ndarray:
+        """Group of each vertex."""
+        return np.repeat(np.arange(len(self.sets)), np.diff(self.starts))
+
     @property
-    def sets(self) -> np.ndarray:
-        """Set of each vertex."""
-        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+    def heads(self) -> np.ndarray:
+        """The first vertex of each group."""
+        return self.vertices[self.starts[:-1]]
 
     def take(self, rows: np.ndarray) -> Merges:
-        """Return some of the sets."""
-        starts, places = take_rows(self.starts, np.arange(len(self.vertices)), rows)
+        """Return some of the sets, in the same order."""
+        rank = np.full(len(self.priority), -1)
+        rank[rows] = np.arange(len(rows))
+        groups = np.flatnonzero(rank[self.sets] >= 0)
+        starts, places = take_rows(self.starts, np.arange(len(self.vertices)), groups)
         return Merges(
-            starts,
-            self.vertices[places],
-            self.codes[places],
-            self.priority[rows],
-            self.reach[rows],
-        )
+            starts, self.vertices[places], self.codes[places], rank[self.sets[groups]],
+            self.priority[rows], self.reach[rows],
+        )  # fmt: skip
 
 
 class Cells:
@@ -189,7 +200,7 @@ class Cells:
     def merge(self, merges: Merges) -> int:
         """Merge each set that leaves all cells valid; return how many do."""
         done = 0
-        while len((merges := self._current(merges)).starts) > 1:
+        while len((merges := self._current(merges)).sets):
             sets, faces = self._star(merges)
             cells = np.concatenate([self.owner[faces], self.neighbor[faces]])
             sets = np.concatenate([sets, sets])[cells >= 0]
@@ -202,35 +213,37 @@ class Cells:
         return done
 
     def _current(self, merges: Merges) -> Merges:
-        """Return `merges` of what their vertices have become, without sets of one vertex."""
-        sets, vertices = merges.sets, merges.vertices
+        """Return `merges` of what their vertices have become, without groups of one vertex."""
+        group, vertices = merges.group, merges.vertices
         codes = merges.codes + self.now_code[vertices]
         while True:
             vertices = self.now[vertices]
             if (self.now[vertices] == vertices).all():
                 break
             codes = codes + self.now_code[vertices]
+        v = len(self.points)
         first = np.zeros(len(vertices), bool)
-        first[np.unique(sets * len(self.points) + vertices, return_index=True)[1]] = True
-        counts = np.bincount(sets[first], minlength=len(merges.starts) - 1)
-        first &= counts[sets] > 1
-        counts[counts < 2] = 0
-        kept = counts > 0
+        first[np.unique(group * v + vertices, return_index=True)[1]] = True
+        counts = np.bincount(group[first], minlength=len(merges.sets))
+        first &= counts[group] > 1
+        group, vertices, codes = group[first], vertices[first], codes[first]
+        kept = counts > 1
         starts = np.concatenate([[0], np.cumsum(counts[kept])])
-        codes = codes[first]
         codes = codes - np.repeat(codes[starts[:-1]], np.diff(starts))
-        made = Merges(starts, vertices[first], codes, merges.priority[kept], merges.reach[kept])
-        x = self.positions(made.vertices, made.codes)
-        away = np.linalg.norm(x - x[starts[:-1]][made.sets], axis=1)
-        return made.take(
-            np.flatnonzero(
-                np.bincount(made.sets, away > made.reach[made.sets], len(starts) - 1) == 0
-            )
-        )
+        sets = merges.sets[kept]
+        made = Merges(starts, vertices, codes, sets, merges.priority, merges.reach)
+        x = self.positions(vertices, codes)
+        away = np.linalg.norm(x - x[starts[:-1]][made.group], axis=1)
+        of = sets[made.group]
+        key = np.sort(of * v + vertices)  # a vertex in two groups of a set
+        wrong = np.concatenate([of[away > merges.reach[of]], key[1:][np.diff(key) == 0] // v])
+        good = np.bincount(sets, minlength=len(merges.priority)) > 0
+        good[wrong] = False
+        return made.take(np.flatnonzero(good))
 
     def _star(self, merges: Merges) -> tuple[np.ndarray, np.ndarray]:
         """Return pairs (set, face with one of its vertices); pairs may repeat."""
-        sets, vertices = merges.sets, merges.vertices
+        sets, vertices = merges.sets[merges.group], merges.vertices
         starts, faces = self.at_vertex
         found: list[tuple[np.ndarray, np.ndarray]] = []
         while len(vertices):
@@ -248,7 +261,7 @@ class Cells:
         """Merge those of the sets that leave their cells valid; no two sets have a cell in common."""
         pairs = np.unique(sets * self.n + cells)
         sets, cells = np.divmod(pairs, self.n)
-        k = len(merges.starts) - 1
+        k = len(merges.priority)
         done = 0
         for first in range(0, k, _CHUNK):
             begin, end = np.searchsorted(sets, [first, first + _CHUNK])
@@ -257,57 +270,58 @@ class Cells:
         return done
 
     def _try_some(self, merges: Merges, sets: np.ndarray, cells: np.ndarray) -> int:
+        """Merge those of the sets that leave their cells valid, given pairs of set and cell."""
         targets = self._targets(merges)
         region = Region(self, merges, cells, sets)
-        left = region.is_manifold() & np.isfinite(targets[:, 0, 0])
+        left = region.is_manifold()
         most = Region(self, merges, cells, sets, merged=False).assess()
-        most.angle[:] = np.maximum(most.angle, self.limits.non_orthogonality)
-        most.skewness[:] = np.maximum(most.skewness, self.limits.skewness)
+        most.angle[:] = np.maximum(most.angle + _WORSE, self.limits.non_orthogonality)
+        most.skewness[:] = np.maximum(most.skewness * (1 + _WORSE), self.limits.skewness)
         done = 0
         for attempt in range(targets.shape[1]):
-            rows = np.flatnonzero(left & np.isfinite(targets[:, attempt, 0]))
+            tried = left.copy()
+            tried[merges.sets[~np.isfinite(targets[:, attempt, 0])]] = False
+            rows = np.flatnonzero(tried)
             if not len(rows):
                 continue
-            if 2 * len(rows) < region.k or attempt == 0:
+            if 2 * len(rows) < region.k:
                 # The sets that are left become those of the region.
-                merges, targets, most = merges.take(rows), targets[rows], most.take(rows)
+                kept = np.isin(merges.sets, rows)
+                merges, targets, most = merges.take(rows), targets[kept], most.take(rows)
                 rank = np.full(region.k, -1)
                 rank[rows] = np.arange(len(rows))
                 cells, sets = cells[rank[sets] >= 0], rank[sets]
                 sets = sets[sets >= 0]
-                if len(rows) < region.k:
-                    region = Region(self, merges, cells, sets)
-                left = np.ones(len(rows), bool)
-                rows = np.arange(len(rows))
-            fits = left & (region.assess(targets[:, attempt]) <= most)
-            fits &= np.isfinite(targets[:, attempt, 0])
+                region = Region(self, merges, cells, sets)
+                left = tried = np.ones(len(rows), bool)
+            fits = tried & (region.assess(targets[:, attempt]) <= most)
             self._commit(merges, region, fits, targets[:, attempt])
-            left &= ~fits
+            left = left & ~fits
             done += int(np.count_nonzero(fits))
         return done
 
     def _targets(self, merges: Merges) -> np.ndarray:
-        """Return where the vertices of each set may meet, (k, tries, 3): their mean, or one of them; or nan.
+        """Return where the vertices of each group may meet, (g, tries, 3): their mean, or one of them; or nan.
 
-        On walls vertices stay on the walls. A set is left out if no vertex of it is on all of its walls.
+        On walls vertices stay on the walls. A group is left out if no vertex of it is on all of its walls.
         """
-        sets, k = merges.sets, len(merges.starts) - 1
+        group, g = merges.group, len(merges.sets)
         x = self.positions(merges.vertices, merges.codes)
         size = np.diff(merges.starts)
-        mean = np.stack([np.bincount(sets, x[:, a], k) for a in range(3)], axis=1) / size[:, None]
+        mean = sum_rows(group, x, g) / size[:, None]
         walls = np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1])
-        complete = self.walls[merges.vertices] == walls[sets]
-        targets = np.full((k, 1 + _TRIES, 3), np.nan)
-        far = ((x - mean[sets]) ** 2).sum(axis=1)
-        order = np.lexsort((far, sets))
-        rank = np.arange(len(sets)) - np.repeat(merges.starts[:-1], size)
+        complete = self.walls[merges.vertices] == walls[group]
+        targets = np.full((g, 1 + _TRIES, 3), np.nan)
+        far = ((x - mean[group]) ** 2).sum(axis=1)
+        order = np.lexsort((far, group))
+        rank = np.arange(len(group)) - np.repeat(merges.starts[:-1], size)
         early = rank < _TRIES
-        targets[sets[order][early], 1 + rank[early]] = x[order][early]
+        targets[group[order][early], 1 + rank[early]] = x[order][early]
         targets[:, 0] = mean
         # The coordinates of walls are those of a vertex on all of them.
         rows = np.flatnonzero(complete)
-        anchor = np.full(k, -1)
-        anchor[sets[rows[::-1]]] = rows[::-1]
+        anchor = np.full(g, -1)
+        anchor[group[rows[::-1]]] = rows[::-1]
         for axis in range(3):
             fixed = walls & (3 << (2 * axis)) > 0
             targets[fixed, :, axis] = np.where(
@@ -316,29 +330,21 @@ class Cells:
         targets[anchor < 0] = np.nan
         return targets
 
-    def _commit(self, merges: Merges, region: Region, done: np.ndarray, chosen: np.ndarray) -> None:
-        sets = merges.sets
-        head = merges.vertices[merges.starts[:-1]]
-        self.points[head[done]] = chosen[done]
-        self.walls[head] = np.where(
-            done,
-            np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1]),
-            self.walls[head],
-        )
-        rows = np.flatnonzero(done[sets])
-        rows = rows[merges.vertices[rows] != head[sets[rows]]]
-        gone, into = merges.vertices[rows], head[sets[rows]]
+    def _commit(
+        self, merges: Merges, region: Region, done: np.ndarray, targets: np.ndarray
+    ) -> None:
+        """Merge the sets `done` (k,) bool, whose vertices meet in `targets` (g, 3)."""
+        yes, heads = done[merges.sets], merges.heads
+        walls = np.bitwise_or.reduceat(self.walls[merges.vertices], merges.starts[:-1])
+        self.points[heads[yes]], self.walls[heads[yes]] = targets[yes], walls[yes]
+        rank = np.arange(len(merges.vertices)) - merges.starts[merges.group]
+        rows = np.flatnonzero(yes[merges.group] & (rank > 0))
+        gone, into = merges.vertices[rows], heads[merges.group[rows]]
         self.now[gone] = into
         # The image of the old vertex at offset t is the image of the new one at t - code.
         self.now_code[gone] = -merges.codes[rows]
-        rank = (
-            np.arange(len(rows))
-            - np.concatenate([[0], np.cumsum(np.bincount(sets[rows], minlength=len(done)))])[
-                sets[rows]
-            ]
-        )
-        for step in range(int(rank.max(initial=-1)) + 1):  # append one list to another
-            one = rank == step
+        for step in range(1, int(rank[rows].max(initial=0)) + 1):  # append one list to another
+            one = rank[rows] == step
             self.next[self.last[into[one]]] = gone[one]
             self.last[into[one]] = self.last[gone[one]]
         mine = done[region.set_of_face] & (region.set_of_face >= 0)
@@ -470,7 +476,7 @@ class Region:
         merged: bool = True,
     ) -> None:
         self.whole, self.cells, self.set_of_cell = whole, cells, set_of_cell
-        self.k = len(merges.starts) - 1
+        self.k, self.set_of_group = len(merges.priority), merges.sets
         self.faces = whole.faces_of(cells)
         old_starts, places = whole.face_corners(self.faces)
         corners, codes = whole.corners[places], whole.codes[places]
@@ -478,14 +484,13 @@ class Region:
         member = _Lookup(merges.vertices)
         at = member(corners)
         moved = at >= 0
-        sets = merges.sets
+        group = merges.group[at]
         self.set_of_face = np.full(len(self.faces), -1)
-        self.set_of_face[face[moved]] = sets[at[moved]]
-        self.head = merges.vertices[merges.starts[:-1]]
+        self.set_of_face[face[moved]] = merges.sets[group[moved]]
         if merged:
-            corners[moved] = self.head[sets[at[moved]]]
+            corners[moved] = merges.heads[group[moved]]
             codes[moved] -= merges.codes[at[moved]]
-        new = np.where(moved, sets[at], -1)
+        new = np.where(moved, group, -1)
         # A repeated corner is given once. Faces with fewer than three corners vanish.
         follow = following(old_starts)
         kept = (corners != corners[follow]) | (codes != codes[follow])
@@ -495,7 +500,7 @@ class Region:
         self.starts = np.concatenate([[0], np.cumsum(np.where(self.alive, counts, 0))])
         self.corners, self.codes, self.face = corners[kept], codes[kept], face[kept]
         self.new = new[kept]
-        """Set of each corner that is a merged vertex; -1 for others."""
+        """Group of each corner that is a merged vertex; -1 for others."""
         self.after = following(self.starts)
         self.before = np.empty_like(self.after)
         self.before[self.after] = np.arange(len(self.after))
@@ -518,7 +523,7 @@ class Region:
 
     def is_manifold(self) -> np.ndarray:
         """Return which merges leave the cells topological balls that meet in faces, edges and vertices, (k,) bool."""
-        bad = self._bad(self._repeated())
+        bad = self._bad(self.set_of_group[self._repeated()])
         # Euler's formula for each cell, and two faces at each edge of it.
         counts = np.diff(self.starts)[self.side_face]
         side = np.repeat(np.arange(len(counts)), counts)
@@ -543,7 +548,7 @@ class Region:
         wrong = (euler != 2) | (faces < 4)
         wrong[cell_of_edge[times != 2]] = True
         bad |= self._bad(self.set_of_cell[wrong])
-        return ~(bad | self._bad(self._pinched()))
+        return ~(bad | self._bad(self.set_of_group[self._pinched()]))
 
     def _numbers(self, *keys: np.ndarray) -> np.ndarray:
         """Return equal numbers for equal keys, ascending."""
@@ -557,51 +562,51 @@ class Region:
         return numbers
 
     def _repeated(self) -> np.ndarray:
-        """Return the sets whose vertex occurs twice in a face."""
+        """Return the groups whose vertex occurs twice in a face."""
         rows = np.flatnonzero(self.new >= 0)
-        number = self._numbers(self.face[rows], self.codes[rows])
+        number = self._numbers(self.face[rows], self.new[rows], self.codes[rows])
         twice = np.bincount(number)[number] > 1
         return self.new[rows[twice]]
 
     def _pinched(self) -> np.ndarray:
-        """Return the sets about whose vertex faces meet elsewhere than on one path, or do not surround it once."""
+        """Return the groups about whose vertex faces meet elsewhere than on one path, or do not surround it once."""
         rows = np.flatnonzero(self.new >= 0)
-        sets, faces = self.new[rows], self.face[rows]
+        groups, faces = self.new[rows], self.face[rows]
         # Corners of these faces, relative to the vertex, and the sides that begin there.
         counts = np.diff(self.starts)[faces]
         row = np.repeat(np.arange(len(rows)), counts)
         place = ranges(self.starts[faces], counts)
         number = self._numbers(
-            sets[row], self.corners[place], self.codes[place] - self.codes[rows[row]]
+            groups[row], self.corners[place], self.codes[place] - self.codes[rows[row]]
         )
         ends = np.cumsum(counts)
         after = np.arange(len(place)) + 1
         after[ends - 1] = ends - counts
         side = np.sort(np.stack([number, number[after]]), axis=0)
-        f = len(rows)
+        f, g = len(rows), len(self.set_of_group)
         pairs = _pairs(number, row)
         key, points = np.unique(pairs[0] * f + pairs[1], return_counts=True)
         pairs = _pairs(self._numbers(*side), row)
         sides = np.bincount(np.searchsorted(key, pairs[0] * f + pairs[1]), minlength=len(key))
         one, other = key // max(f, 1), key % max(f, 1)
         split = (points - sides != 1) | (points >= np.minimum(counts[one], counts[other]))
-        wrong = [sets[one[split]]]
+        wrong = [groups[one[split]]]
         beside = (place == self.after[rows[row]]) | (place == self.before[rows[row]])
         # Around the vertex: edges - faces + cells = 2, the outside of the domain included.
-        edges = _count_unique(sets[row[beside]], number[beside], self.k)
+        edges = _count_unique(groups[row[beside]], number[beside], g)
         w, f = self.whole, self.faces[faces]
         inner = w.neighbor[f] >= 0
-        cell_sets = np.concatenate([sets, sets[inner]])
+        cell_groups = np.concatenate([groups, groups[inner]])
         cells = np.concatenate([w.owner[f], w.neighbor[f][inner]])
         frames = np.concatenate([-self.codes[rows], (w.face_codes[f] - self.codes[rows])[inner]])
-        around = _count_unique(cell_sets, self._numbers(cells, frames), self.k)
-        outside = np.bincount(sets[~inner], minlength=self.k) > 0
-        euler = edges - np.bincount(sets, minlength=self.k) + around + outside
+        around = _count_unique(cell_groups, self._numbers(cells, frames), g)
+        outside = np.bincount(groups[~inner], minlength=g) > 0
+        euler = edges - np.bincount(groups, minlength=g) + around + outside
         wrong.append(np.flatnonzero(euler != 2))
         return np.concatenate(wrong)
 
     def assess(self, targets: np.ndarray | None = None) -> _Defects:
-        """Return what is wrong with the cells if the vertices of each set meet in `targets` (k, 3)."""
+        """Return what is wrong with the cells if the vertices of each group meet in `targets` (g, 3)."""
         limits, w = self.whole.limits, self.whole
         x = w.positions(self.corners, self.codes)
         if targets is not None:

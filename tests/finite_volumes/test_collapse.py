@@ -141,7 +141,12 @@ def test_faces_are_in_order_and_seams_are_images(meshes):
 def one_edge(cells, a, b):
     """The ends of an edge as the only set to merge."""
     return Merges(
-        np.array([0, 2]), np.array([a, b]), np.zeros(2, np.int64), np.zeros(1), np.full(1, np.inf)
+        np.array([0, 2]),
+        np.array([a, b]),
+        np.zeros(2, np.int64),
+        np.zeros(1, np.int64),
+        np.zeros(1),
+        np.full(1, np.inf),
     )
 
 
@@ -183,8 +188,8 @@ def test_merges_are_those_of_a_slow_reference():
                     q.positive
                     and q.flatness >= limits.flatness
                     and q.cosine <= limits.concavity
-                    and q.angle <= max(was.angle, limits.non_orthogonality)
-                    and q.skewness <= max(was.skewness, limits.skewness)
+                    and q.angle <= max(was.angle + 0.02, limits.non_orthogonality)
+                    and q.skewness <= max(was.skewness * 1.02, limits.skewness)
                 ):
                     fits = target
                     break
