@@ -11,9 +11,9 @@ Where the boundary is a curve, all points on walls lie on the curve itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from math import atan2, hypot, inf
 
 import numpy as np
@@ -22,30 +22,54 @@ from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import SIDE_TURN, along_rings
 from .geometry import polygon_areas, polygon_sides, sum_rows
+from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
-REACH = 0.25
+REACH = 0.35
 """Farthest way of a face end into a vertex of the domain, over the smaller size of its two cells."""
 _FILLED = 0.25
 """A kink into the cell is cut off if it is nearer than this to the chord, over the size of the cell."""
 _CUT = 0.03
 """The same for a kink out of the cell."""
-_SLIVER, _SHORT, _SHARP = 0.1, 0.03, np.pi / 3
-_KINK_PRICE, _SHARP_PRICE, _SLIVER_PRICE, _OFF_PRICE, _WAY_PRICE = 0.5, 0.1, 0.02, 0.2, 0.02
+_SLIVER, _SHORT, _SHARP, _CONVEX = 0.1, 0.03, np.pi / 3, 1e-4
+_CONCAVE_PRICE, _SHARP_PRICE, _SLIVER_PRICE, _OFF_PRICE, _WAY_PRICE, _TILT_PRICE = (
+    0.5,
+    0.1,
+    0.02,
+    0.2,
+    0.02,
+    0.1,
+)
 
 Point = tuple[float, float]
 
 
-@dataclass
+@dataclass(eq=False)
 class _Run:
     """A cell's part of a ring: wall faces, one after the other."""
 
     cell: int
     faces: list[int]
-    before: _Run | None = None  # across the face end at the beginning; None if that end is fixed
+    behind: list[Point]
+    """The two points before the run in the loop around the cell, if it is known."""
+    ahead: list[Point]
+    """The two points after it."""
+    before: _Run | None = None
+    """The run across the face end at the beginning; None if that end does not move."""
     after: _Run | None = None
     end: tuple[int, int] = (-1, -1)
     """The face between two cells at the end, and which of its corners."""
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Move:
+    """New faces of some runs; those of a run that leaves the wall are empty."""
+
+    faces: list[tuple[_Run, list[int]]]
+    point: int
+    ends: list[tuple[int, int]]
+    price: float
 
 
 def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> SolverMesh:
@@ -89,12 +113,15 @@ class _Work:
         self.mesh, self.walls = mesh, np.arange(mesh.inner, mesh.outer)
         self.points: list[Point] = list(map(tuple, mesh.points.tolist()))
         self.ends = mesh.corners.reshape(-1, 2)
+        self.begin, self.final = (c.tolist() for c in self.ends[self.walls].T)
         self.sizes = np.sqrt(np.maximum(polygon_areas(mesh), 0)).tolist()
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
         # 1: the ends of the cell do not move; 2: its walls remain as they are.
         self.spared, self.most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
         self.next = self._following(diagram)
         self.at = self._single_faces()
+        self.starts, self.loops, broken = simple_loops(mesh)
+        self.broken = set(broken.tolist())
 
     def _following(self, diagram: Diagram) -> list[int]:
         """Return the next wall face on the ring for each one, counted from the first; -1 at an end."""
@@ -129,109 +156,156 @@ class _Work:
         self.spared[left] += 1
         return bool(left)
 
+    # Runs.
+
     def runs(self) -> list[_Run]:
         """Return the runs of all cells."""
         owner = self.mesh.owner[self.walls].tolist()
-        begin = self.ends[self.walls, 0].tolist()
         previous = [-1] * len(owner)
         for i, j in enumerate(self.next):
             if j >= 0:
                 previous[j] = i
-        firsts = [i for i, p in enumerate(previous) if p < 0 or owner[p] != owner[i]]
         found: dict[int, _Run] = {}
-        for i in firsts:
-            run = _Run(owner[i], [i])
-            found[i] = run
-            j = self.next[i]
-            while j >= 0 and owner[j] == run.cell and j != i:
-                run.faces.append(j)
+        for i, p in enumerate(previous):
+            if p >= 0 and owner[p] == owner[i]:
+                continue
+            faces, j = [i], self.next[i]
+            while j >= 0 and owner[j] == owner[i] and j != i:
+                faces.append(j)
                 j = self.next[j]
+            found[i] = _Run(owner[i], faces, *self._beside(owner[i], faces))
         for run in found.values():
             j = self.next[run.faces[-1]]
             other = found.get(j)
             if other is None or other is run or self.spared[[run.cell, other.cell]].any():
                 continue
-            at = self.at.get(begin[j])
+            at = self.at.get(self.begin[j])
             sides = {run.cell, other.cell}
             if at is None or {int(self.mesh.owner[at[0]]), int(self.mesh.neighbor[at[0]])} != sides:
                 continue
-            run.after, other.before, run.end = other, run, at
+            if run.ahead and other.behind:
+                run.after, other.before, run.end = other, run, at
         return list(found.values())
+
+    def _beside(self, cell: int, faces: list[int]) -> tuple[list[Point], list[Point]]:
+        """Return the two points before and the two after some wall faces in the loop around their cell."""
+        loop = self.loops[self.starts[cell] : self.starts[cell + 1]].tolist()
+        if cell in self.broken or len(loop) < len(faces) + 3:
+            return [], []
+        first, last = loop.index(self.begin[faces[0]]), loop.index(self.final[faces[-1]])
+        behind = [loop[first - 2], loop[first - 1]]
+        ahead = [loop[(last + k) % len(loop)] for k in (1, 2)]
+        return [self.points[p] for p in behind], [self.points[p] for p in ahead]
 
     def line(self, faces: Sequence[int]) -> list[Point]:
         """Return the points along wall faces."""
-        ends = self.ends[self.walls[list(faces)]].tolist()
-        return [self.points[a] for a, _ in ends] + [self.points[ends[-1][1]]]
+        return [self.points[self.begin[f]] for f in faces] + [self.points[self.final[faces[-1]]]]
 
     def fixed(self, faces: Sequence[int]) -> list[bool]:
         """Return whether the name of the boundary changes in each inner point of a run."""
         return [self.part[a] != self.part[b] for a, b in pairwise(faces)]
 
-    def cost(self, run: _Run, faces: Sequence[int]) -> float:
-        """Return the cost of a run if it had these faces."""
-        line, fixed = self.line(faces), self.fixed(faces)
+    def kept(self, run: _Run) -> list[int]:
+        """Return which points of a run remain."""
+        if self.spared[run.cell] == 2:
+            return list(range(len(run.faces) + 1))
+        return _kept(self.line(run.faces), self.fixed(run.faces), self.sizes[run.cell])
+
+    def cost(self, run: _Run, faces: Sequence[int], point: int) -> float:
+        """Return the cost of a run if it had these faces, or only this point if there are none."""
         size = self.sizes[run.cell]
-        kept = _kept(line, fixed, size)
-        return _cost(line, fixed, kept, size)
+        if faces:
+            line, fixed = self.line(faces), self.fixed(faces)
+            kept = _kept(line, fixed, size)
+            total, left = _cost(line, kept, size), [line[i] for i in kept]
+        else:
+            total, left = 0.0, [self.points[point]]
+        return total + _concave_price([*run.behind, *left, *run.ahead]) * size * size
+
+    # Face ends that move.
 
     def move_ends(self, runs: list[_Run]) -> dict[tuple[int, int], int]:
         """Move the ends of runs where that lowers the cost; return the new point of the faces' ends that moved."""
-        costs = {id(run): self.cost(run, run.faces) for run in runs}
+        for run in runs:
+            run.cost = self.cost(run, run.faces, -1)
         moved: dict[tuple[int, int], int] = {}
         for _ in range(2):
-            order = sorted(
-                (run for run in runs if run.after is not None),
-                key=lambda r: -costs[id(r)] - costs[id(r.after)],
-            )
             changed = False
-            for run in order:
-                other = run.after
-                assert other is not None
-                if run.end in moved:
+            for run in sorted(runs, key=lambda r: -r.cost):
+                if run.cost <= 1e-4 * self.sizes[run.cell] ** 2 or not run.faces:
                     continue
-                size = min(self.sizes[run.cell], self.sizes[other.cell])
-                now = costs[id(run)] + costs[id(other)]
-                if now <= 1e-4 * size * size:
+                best, gain = None, 0.0
+                for move in self._moves(run, moved):
+                    before = sum(r.cost for r, _ in move.faces)
+                    after = sum(self.cost(r, faces, move.point) for r, faces in move.faces)
+                    if before - after - move.price > gain:
+                        best, gain = move, before - after - move.price
+                if best is None:
                     continue
-                best = (now, run.faces, other.faces, 0.0, 0.0)
-                for here, there in self._moves(run, other, size):
-                    place = self.points[self.ends[self.walls[there[0]], 0]]
-                    old = self.points[self.ends[self.walls[other.faces[0]], 0]]
-                    way = hypot(place[0] - old[0], place[1] - old[1])
-                    one, two = self.cost(run, here), self.cost(other, there)
-                    total = one + two + _WAY_PRICE * way * size
-                    if total < best[0]:
-                        best = (total, here, there, one, two)
-                if best[1] is not run.faces:
-                    run.faces, other.faces = list(best[1]), list(best[2])
-                    costs[id(run)], costs[id(other)] = best[3], best[4]
-                    moved[run.end] = int(self.ends[self.walls[other.faces[0]], 0])
-                    changed = True
+                for r, faces in best.faces:
+                    r.faces, r.cost = faces, self.cost(r, faces, best.point)
+                    if not faces:  # two faces end in the point now
+                        r.before.after = r.after.before = None  # type: ignore[union-attr]
+                        r.before = r.after = None
+                moved |= dict.fromkeys(best.ends, best.point)
+                changed = True
             if not changed:
                 break
         return moved
 
-    def _moves(self, run: _Run, other: _Run, size: float) -> list[tuple[list[int], list[int]]]:
-        """Return the faces of both runs for each vertex that their common end can move into."""
-        found = []
-        reach = REACH * size
+    def _moves(self, run: _Run, moved: dict[tuple[int, int], int]) -> Iterator[_Move]:
+        """Return how the ends of a run can move into vertices of the domain, or the run can leave the wall."""
+        for one, two in ((run.before, run), (run, run.after)):
+            if one is not None and two is not None and one.end not in moved:
+                yield from self._shifts(one, two)
+        one, two = run.before, run.after
+        if one is None or two is None or one is two or one.end in moved or run.end in moved:
+            return
+        reach = REACH * min(self.sizes[r.cell] for r in (one, run, two))
+        ways = [0.0, *accumulate(map(self._length, run.faces))]
+        if ways[-1] > 2 * reach:
+            return
+        points = [self.begin[f] for f in run.faces] + [self.final[run.faces[-1]]]
+        fixed = [k + 1 for k, here in enumerate(self.fixed(run.faces)) if here]
+        for k, point in enumerate(points):
+            if fixed and fixed != [k]:
+                continue
+            price = self._price(one, points[0], point) + self._price(run, points[-1], point)
+            faces = [(one, one.faces + run.faces[:k]), (run, []), (two, run.faces[k:] + two.faces)]
+            if max(ways[k], ways[-1] - ways[k]) <= reach:
+                yield _Move(faces, point, [one.end, run.end], price)
+
+    def _shifts(self, one: _Run, two: _Run) -> Iterator[_Move]:
+        """Return how the common end of two runs can move."""
+        reach = REACH * min(self.sizes[one.cell], self.sizes[two.cell])
+        old = self.begin[two.faces[0]]
         way = 0.0
-        for k in range(1, len(other.faces)):
-            way += self._length(other.faces[k - 1])
+        for k in range(1, len(two.faces)):
+            way += self._length(two.faces[k - 1])
             if way > reach:
                 break
-            found.append((run.faces + other.faces[:k], other.faces[k:]))
+            point = self.begin[two.faces[k]]
+            faces = [(one, one.faces + two.faces[:k]), (two, two.faces[k:])]
+            yield _Move(faces, point, [one.end], self._price(one, old, point))
         way = 0.0
-        for k in range(1, len(run.faces)):
-            way += self._length(run.faces[-k])
+        for k in range(1, len(one.faces)):
+            way += self._length(one.faces[-k])
             if way > reach:
                 break
-            found.append((run.faces[:-k], run.faces[-k:] + other.faces))
-        return found
+            point = self.begin[one.faces[-k]]
+            faces = [(one, one.faces[:-k]), (two, one.faces[-k:] + two.faces)]
+            yield _Move(faces, point, [one.end], self._price(one, old, point))
+
+    def _price(self, run: _Run, old: int, new: int) -> float:
+        """Return the price for moving the end of a run: for its way, and for the angle by which the face turns."""
+        (x, y), (u, v), (s, t) = self.points[old], self.points[new], run.ahead[0]
+        size = self.sizes[run.cell]
+        x, y, u, v = x - s, y - t, u - s, v - t
+        tilt = atan2(x * v - y * u, x * u + y * v)
+        return _WAY_PRICE * hypot(u - x, v - y) * size + _TILT_PRICE * (tilt * size) ** 2
 
     def _length(self, face: int) -> float:
-        a, b = self.ends[self.walls[face]]
-        (x, y), (u, v) = self.points[a], self.points[b]
+        (x, y), (u, v) = self.points[self.begin[face]], self.points[self.final[face]]
         return hypot(u - x, v - y)
 
     def straightened(self) -> SolverMesh:
@@ -241,45 +315,32 @@ class _Work:
         corners = self.ends.copy()
         for (face, side), point in moved.items():
             corners[face, side] = point
-        a: list[int] = []
-        b: list[int] = []
-        cell: list[int] = []
-        source: list[int] = []
+        rows: list[tuple[int, int, int, int]] = []  # two points, cell, wall face
         done = np.zeros(len(self.walls), bool)
         for run in runs:
             done[run.faces] = True
-            count = len(run.faces)
-            if self.spared[run.cell] == 2:
-                kept = list(range(count + 1))
-            else:
-                kept = _kept(self.line(run.faces), self.fixed(run.faces), self.sizes[run.cell])
-            for first, last in pairwise(kept):
+            for first, last in pairwise(self.kept(run) if run.faces else []):
                 part = run.faces[first:last]
                 longest = max(part, key=self._length)
-                a.append(int(self.ends[self.walls[part[0]], 0]))
-                b.append(int(self.ends[self.walls[part[-1]], 1]))
-                cell.append(run.cell)
-                source.append(int(self.walls[longest]))
-        left = self.walls[~done]  # whole rings within one cell
-        a += self.ends[left, 0].tolist()
-        b += self.ends[left, 1].tolist()
-        cell += mesh.owner[left].tolist()
-        source += left.tolist()
-        owner, rows = np.array(cell, mesh.owner.dtype), np.array(source, np.int64)
-        order = np.lexsort((owner, -mesh.neighbor[rows]))
+                rows.append((self.begin[part[0]], self.final[part[-1]], run.cell, longest))
+        for face in np.flatnonzero(~done).tolist():  # whole rings within one cell
+            cell = int(mesh.owner[self.walls[face]])
+            rows.append((self.begin[face], self.final[face], cell, face))
+        a, b, owner, source = np.array(rows, np.int64).reshape(-1, 4).T
+        source = self.walls[source]
+        order = np.lexsort((owner, -mesh.neighbor[source]))
         k = mesh.inner
-        rows = np.concatenate([np.arange(k), rows[order]])
-        outer = np.stack([np.array(a, np.int64), np.array(b, np.int64)], axis=1)[order]
-        ends = np.concatenate([corners[:k], outer])
+        taken = np.concatenate([np.arange(k), source[order]])
+        ends = np.concatenate([corners[:k], np.stack([a, b], axis=1)[order]])
         return replace(
             mesh,
             starts=2 * np.arange(len(ends) + 1),
             corners=ends.ravel(),
-            owner=np.concatenate([mesh.owner[:k], owner[order]]),
-            neighbor=mesh.neighbor[rows],
-            twin=mesh.twin[rows],
-            shift=mesh.shift[rows],
-            half_face=mesh.half_face[rows],
+            owner=np.concatenate([mesh.owner[:k], owner[order].astype(mesh.owner.dtype)]),
+            neighbor=mesh.neighbor[taken],
+            twin=mesh.twin[taken],
+            shift=mesh.shift[taken],
+            half_face=mesh.half_face[taken],
         )
 
 
@@ -326,19 +387,23 @@ def _kept(line: list[Point], fixed: list[bool], size: float) -> list[int]:
             kept.append(i)
             turned = 0.0
     kept.append(last)
-    while len(kept) > 2:
-        best, where = inf, -1
-        for k in range(1, len(kept) - 1):
-            if fixed[kept[k] - 1]:
-                continue
-            a, b, c = (line[i] for i in kept[k - 1 : k + 2])
-            offset = _offset(a, b, c)
-            limit = _FILLED if _turn(a, b, c) < 0 else _CUT
-            if offset < limit * size and offset < best:
-                best, where = offset, k
-        if where < 0:
-            break
-        del kept[where]
+    if len(kept) == 2:
+        return kept
+
+    def offset(k: int) -> float:
+        """Return the distance of a kink from the chord, or infinity if it stays."""
+        a, b, c = line[kept[k - 1]], line[kept[k]], line[kept[k + 1]]
+        far = _offset(a, b, c)
+        limit = _FILLED if _turn(a, b, c) < 0 else _CUT
+        return inf if fixed[kept[k] - 1] or far >= limit * size else far
+
+    offsets = [inf, *map(offset, range(1, len(kept) - 1)), inf]
+    while (least := min(offsets)) < inf:
+        k = offsets.index(least)
+        del kept[k], offsets[k]
+        for j in (k - 1, k):
+            if 0 < j < len(kept) - 1:
+                offsets[j] = offset(j)
     _drop_for_area(line, fixed, kept, _FILLED * size)
     return kept
 
@@ -371,8 +436,8 @@ def _area(line: list[Point]) -> float:
     return area / 2
 
 
-def _cost(line: list[Point], fixed: list[bool], kept: list[int], size: float) -> float:
-    """Return the cost of a run with the points `kept`."""
+def _cost(line: list[Point], kept: list[int], size: float) -> float:
+    """Return the cost of a run with the points `kept`, apart from corners that are not convex."""
     total = 0.0
     for first, last in pairwise(kept):
         total += abs(_area(line[first : last + 1]))
@@ -387,8 +452,14 @@ def _cost(line: list[Point], fixed: list[bool], kept: list[int], size: float) ->
         (x, y), (u, v) = line[first], line[last]
         if hypot(u - x, v - y) < _SLIVER * size:
             total += _SLIVER_PRICE * size * size
-    for k in range(1, len(kept) - 1):
-        a, b, c = (line[i] for i in kept[k - 1 : k + 2])
-        if _turn(a, b, c) < 1e-6:
-            total += _KINK_PRICE * size * size
     return total
+
+
+def _concave_price(line: list[Point]) -> float:
+    """Return the price for corners on a line, without its ends, that are not convex."""
+    price = 0.0
+    for k in range(1, len(line) - 1):
+        turn = _turn(*line[k - 1 : k + 2])
+        if turn < _CONVEX:
+            price += _CONCAVE_PRICE * (0.1 + min(-turn, 1.0))
+    return price

@@ -170,7 +170,8 @@ def test_points_on_curved_walls_lie_on_the_curves(ctx):
     # Beside the nose the distance is less than the difference in height.
     assert np.abs((np.abs(y) - half) * np.minimum(1, t)).max() < 1e-12
     tip = domain.vertices[domain.ring_starts[1]]
-    assert sum((corner == tip).all() for corner in found[1]) == 2
+    # Beside the tip no generators are at equal distances, and it may be cut off.
+    assert min(np.hypot(*(corner - tip)) for corner in found[1]) < 0.05 * 0.04
     assert result.solver_mesh("exact", collapse=False).area_change == 0
 
 
