@@ -163,9 +163,15 @@ def _independent(
     rank = np.tile(np.arange(len(faces)), 2)
     starts, touched = take_rows(first, cells, ends)
     ranks = np.repeat(rank, np.diff(starts))
-    best = np.full(n, len(faces))
-    np.minimum.at(best, touched, ranks)
-    return faces[np.bincount(ranks, best[touched] != ranks, len(faces)) == 0]
+    left, chosen, taken = np.ones(len(faces), bool), np.zeros(len(faces), bool), np.zeros(n, bool)
+    while left.any():
+        best = np.full(n, len(faces))
+        np.minimum.at(best, touched[left[ranks]], ranks[left[ranks]])
+        first = left & (np.bincount(ranks, best[touched] != ranks, len(faces)) == 0)
+        chosen |= first
+        taken[touched[first[ranks]]] = True
+        left &= np.bincount(ranks, taken[touched], len(faces)) == 0
+    return faces[chosen]
 
 
 def _shifts(mesh: SolverMesh, points: np.ndarray, origins: np.ndarray) -> np.ndarray:
