@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ..arguments import check_path
+from ..arguments import check_choice, check_path
 from ..errors import InputError, InputTypeError
 from ..finite_volumes.solver_mesh import WallShape
 from ..geometry.boundary_names import Walls
@@ -44,7 +44,7 @@ __all__ = [
     "write_history",
 ]
 
-_WRITERS = {".npz": write_npz, ".vtu": write_vtu}
+_WRITERS = {".npz": write_npz}
 _CONVENTIONS = {"ugrid": write_ugrid, "mpas": write_mpas}
 
 
@@ -129,10 +129,11 @@ def save(
     thickness : float, optional
         For OpenFOAM and a mesh in 2D: height of the layer of prisms. By default the mean width of a cell.
     walls : {"straight", "exact"}, optional
-        For OpenFOAM. With "straight", the default, the faces of a cell on the boundary become one straight face where
-        they turn by at most 30 degrees in sum, and face ends near a corner of the domain move into it: solvers reject
-        cells that are not convex. See `Diagram.solver_mesh`, whose `area_change` is what this adds to the domain.
-        Short edges are collapsed. With "exact" all faces are those of the diagram.
+        For OpenFOAM and ``.vtu``. With "straight", the default for OpenFOAM, the file has the cells of
+        `Diagram.solver_mesh`: the faces of a cell on the boundary become one straight face where they turn by at most
+        30 degrees in sum, face ends near a corner of the domain move into it, and short edges are collapsed. Solvers
+        reject cells that are not convex. `load` does not read such a ``.vtu`` file. With "exact", the default for
+        ``.vtu``, all faces are those of the diagram, as in all other formats.
     convention : {"ugrid", "mpas"}, optional
         For netCDF. With "ugrid", the default: cells as polygons with size, error, quality and area, and for each edge
         the number of its wall and its boundary; at seams as in ``.vtu``. With "mpas": cells, edges and vertices with
@@ -151,7 +152,7 @@ def save(
     path = Path(check_path("path", path))
     suffix = path.suffix.lower()
     is_foam = path.name == "polyMesh" or suffix == ".foam"
-    for_foam = {"patches": patches, "types": types, "thickness": thickness, "walls": walls}
+    for_foam = {"patches": patches, "types": types, "thickness": thickness}
     for_netcdf = {"convention": convention, "units": units}
     for options, fits, format_, name in (
         (for_foam, is_foam, "OpenFOAM", ".foam"),
@@ -162,12 +163,18 @@ def save(
             raise InputError(
                 f"cannot write {path} with {given[0]}, which is for {format_}; save as {name} or leave it out"
             )
+    if walls is not None:
+        check_choice("walls", walls, ("straight", "exact"))
+        if not is_foam and suffix != ".vtu":
+            raise InputError(
+                f"cannot write {path} with walls, which is for OpenFOAM and .vtu; save as .foam or leave it out"
+            )
     if is_foam:
         if contents.extra:
             raise InputError(
                 f"cannot write cell_data to {path}: OpenFOAM's polyMesh holds none; save as .vtu or leave it out"
             )
-        write_foam(contents, path, **for_foam)
+        write_foam(contents, path, **for_foam, walls=walls)
     elif suffix == ".nc":
         check_plane(contents, path)
         unit = "m" if units is None else units
@@ -176,6 +183,8 @@ def save(
                 f"units is {unit!r:.60}, expected a unit of length, such as 'm' or 'km'"
             )
         _chosen(convention)(contents, path, unit)
+    elif suffix == ".vtu":
+        write_vtu(contents, path, walls=walls)
     else:
         _WRITERS.get(suffix, write_foreign)(contents, path)
 

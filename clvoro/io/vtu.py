@@ -15,9 +15,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from ..finite_volumes.geometry import polygon_areas
+from ..finite_volumes.prisms import cell_loops
+from ..finite_volumes.solver_mesh import SolverMesh, WallShape, make_solver_mesh
 from ..geometry.box import Domain
 from ..geometry.polygon import Polygon
-from ..mesh.connectivity import face_corners, face_owners, next_faces
+from ..mesh.connectivity import face_corners, face_owners, next_faces, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
@@ -25,41 +28,52 @@ from .contents import Contents
 
 NAMES, CURVES = "clvoro names: ", "clvoro curves: "
 """Beginning of the comment with names of boundaries."""
+SOLVER_MESH = "clvoro solver mesh: the cells are not those of a diagram"
 _POLYGON, _POLYHEDRON = 7, 42  # VTK_POLYGON, VTK_POLYHEDRON
 _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
 
-def write_vtu(contents: Contents, path: Path, compress: bool = True) -> None:
+def write_vtu(
+    contents: Contents, path: Path, compress: bool = True, walls: WallShape | None = None
+) -> None:
     """Write the cells as polygons or polyhedra with cell data.
 
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
     `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); the vector `generator`, from the
     origin to the cell's generator; and data of the caller. Comments hold the settings and the caller's names of
     boundaries, field data a polygonal or periodic domain. In a periodic box cells are not cut at the seams.
+
+    With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
+    file is no diagram to `load`.
     """
     diagram = contents.diagram
     n = len(diagram)
     appended = _Appended(compress)
-    points = appended.add(None, in_space(diagram.vertices))
+    mesh = make_solver_mesh(diagram) if walls == "straight" else None
+    vertices = diagram.vertices if mesh is None else mesh.points
+    points = appended.add(None, in_space(vertices))
     if diagram.domain.dim == 2:
-        kind, topology = _POLYGON, _polygons(diagram)
+        kind, topology = _POLYGON, _polygons(diagram if mesh is None else mesh)
     else:
-        kind, topology = _POLYHEDRON, polyhedra(diagram)
+        kind, topology = _POLYHEDRON, polyhedra(diagram if mesh is None else mesh)
     topology["types"] = np.full(n, kind, np.uint8)
+    values = cell_data(contents)
+    if mesh is not None:
+        values |= _solver_data(mesh)
     cells = [appended.add(name, array) for name, array in topology.items()]
-    data = [appended.add(name, values) for name, values in cell_data(contents).items()]
-    field = [
-        appended.add(name, array, tuples=True) for name, array in _domain_data(diagram).items()
-    ]
+    data = [appended.add(name, array) for name, array in values.items()]
+    about = _domain_data(diagram) if mesh is None else {}
+    field = [appended.add(name, array, tuples=True) for name, array in about.items()]
+    note = "" if mesh is None else _comment(SOLVER_MESH) + "\n"
     compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
     head = f"""<?xml version="1.0"?>
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
 header_type="UInt64"{compressor}>
 {_comment("clvoro settings: " + json.dumps(contents.settings, default=repr))}
-{_domain_comments(diagram.domain)}\
+{note}{_domain_comments(diagram.domain)}\
 <UnstructuredGrid>
-{_field_data(field)}<Piece NumberOfPoints="{len(diagram.vertices)}" NumberOfCells="{n}">
+{_field_data(field)}<Piece NumberOfPoints="{len(vertices)}" NumberOfCells="{n}">
 <Points>
 {points}
 </Points>
@@ -128,24 +142,45 @@ def _polygon_graph(diagram: Diagram) -> dict[str, np.ndarray]:
     }
 
 
-def _polygons(diagram: Diagram) -> dict[str, np.ndarray]:
+def _polygons(mesh: Diagram | SolverMesh) -> dict[str, np.ndarray]:
     """Return the corners of cells, counter-clockwise, and the end of each cell's part."""
-    return {
-        "connectivity": diagram.cell_vertices,
-        "offsets": diagram.cell_vertex_starts[1:],
-    }
+    if isinstance(mesh, SolverMesh):
+        starts, corners = cell_loops(mesh)
+        return {"connectivity": corners.astype(np.int32), "offsets": starts[1:].astype(np.int32)}
+    return {"connectivity": mesh.cell_vertices, "offsets": mesh.cell_vertex_starts[1:]}
 
 
-def polyhedra(diagram: Diagram) -> dict[str, np.ndarray]:
+def _half_faces(mesh: Diagram | SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return cell, starts and corners of each half-face in 3D, cell by cell."""
+    if not isinstance(mesh, SolverMesh):
+        return face_owners(mesh), *face_corners(mesh)
+    k = mesh.inner
+    cell = np.concatenate([mesh.owner, mesh.neighbor[:k]])
+    order = np.argsort(cell, kind="stable")
+    face = np.concatenate([np.arange(len(mesh.owner)), np.arange(k)])[order]
+    turned = order >= len(mesh.owner)
+    return cell[order], *take_rows(mesh.starts, mesh.corners, face, turned)
+
+
+def _solver_data(mesh: SolverMesh) -> dict[str, np.ndarray]:
+    """Return the cell data that differ from those of the diagram."""
+    counts = np.bincount(mesh.owner, minlength=len(mesh))
+    counts += np.bincount(mesh.neighbor[: mesh.inner], minlength=len(mesh))
+    if mesh.dim == 2:
+        return {"volume": polygon_areas(mesh), "sides": counts.astype(np.int32)}
+    return {"volume": mesh.measures.geometry.volumes, "faces_of_cell": counts.astype(np.int32)}
+
+
+def polyhedra(mesh: Diagram | SolverMesh) -> dict[str, np.ndarray]:
     """Return the corners and faces of cells in VTK's arrays.
 
     `faces` has for each cell the number of its faces, and then for each face the number of its corners and the corners,
     counter-clockwise as seen from outside. `faceoffsets` has the end of each cell's part.
     """
-    n, v = len(diagram), len(diagram.vertices)
-    starts, corners = face_corners(diagram)
+    n, v = len(mesh), len(mesh.points if isinstance(mesh, SolverMesh) else mesh.vertices)
+    owner, starts, corners = _half_faces(mesh)
     sides = np.diff(starts)
-    owner, sides = face_owners(diagram)[sides > 0], sides[sides > 0]
+    owner, sides = owner[sides > 0], sides[sides > 0]
     faces = np.bincount(owner, minlength=n)
     ends = np.cumsum(1 + faces + np.bincount(owner, sides, minlength=n).astype(np.int64))
     index = np.int32 if len(ends) == 0 or ends[-1] < 2**31 else np.int64

@@ -29,7 +29,7 @@ from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Result
 from .arrays import EXPANSION, LEAST
-from .vtu import CURVES, NAMES
+from .vtu import CURVES, NAMES, SOLVER_MESH
 from .vtu_checks import check_repeated
 
 _LONGEST_HEAD = 1 << 22
@@ -126,6 +126,10 @@ class _Reader:
 
     def _comment(self, text: str) -> None:
         text = text.strip()
+        if text == SOLVER_MESH:
+            raise _FileError(
+                "it holds the mesh for solvers, which is no diagram; load a .npz file, or a .vtu file with exact walls"
+            )
         if text.startswith(NAMES):
             self.names = json.loads(text.removeprefix(NAMES))
         if text.startswith(CURVES):

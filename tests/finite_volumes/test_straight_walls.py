@@ -186,3 +186,48 @@ def test_the_change_of_area_is_of_second_order(ctx):
         changes.append(1 - area / (np.pi * 0.4**2))
     order = np.log2(np.array(changes[:-1]) / changes[1:])
     assert order == pytest.approx(2, abs=0.25)
+
+
+@pytest.mark.parametrize("name", ["plane", "solid"])
+def test_vtu_files_hold_solver_meshes(ring, ctx, tmp_path, name):
+    vtk = pytest.importorskip("vtk")
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    result = ring
+    if name == "solid":
+        result = clvoro.Adapter(ctx).run(clvoro.Box((0, 0, 0), (1, 1, 1)), 0.2, effort="fast")
+    result.save(tmp_path / "exact.vtu", walls="exact")
+    result.save(tmp_path / "mesh.vtu")
+    assert (tmp_path / "mesh.vtu").read_bytes() == (tmp_path / "exact.vtu").read_bytes()
+    result.save(tmp_path / "mesh.vtu", walls="straight", cell_data={"mine": result.quality})
+    reader = vtk.vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(tmp_path / "mesh.vtu"))
+    sizes = vtk.vtkCellSizeFilter()
+    sizes.SetInputConnection(reader.GetOutputPort())
+    sizes.Update()
+    grid = sizes.GetOutput()
+    data = {
+        key: vtk_to_numpy(grid.GetCellData().GetArray(key))
+        for key in ("volume", "error", "mine", "Area", "Volume")
+    }
+    mesh = result.solver_mesh()
+    measured = data["Area" if name == "plane" else "Volume"]
+    # In 3D faces are slightly warped, and VTK divides them into other triangles than OpenFOAM.
+    assert measured == pytest.approx(data["volume"], rel=1e-6 if name == "plane" else 5e-3)
+    assert data["volume"].sum() == pytest.approx(
+        result.diagram.domain.measure * (1 + mesh.area_change)
+    )
+    assert (data["error"] == result.size_error).all()
+    assert (data["mine"] == result.quality).all()
+    assert grid.GetNumberOfPoints() == len(mesh.points)
+    with pytest.raises(InputError, match="holds the mesh for solvers, which is no diagram"):
+        clvoro.load(tmp_path / "mesh.vtu")
+
+
+def test_other_formats_have_exact_walls(ring, tmp_path):
+    for name, walls in (("mesh.npz", "exact"), ("mesh.nc", "straight"), ("mesh.vtk", "exact")):
+        with pytest.raises(InputError, match="with walls, which is for OpenFOAM and"):
+            ring.save(tmp_path / name, walls=walls)
+    with pytest.raises(InputError, match="walls is 'round', expected one of straight, exact"):
+        ring.save(tmp_path / "mesh.vtu", walls="round")
+    assert not list(tmp_path.iterdir())
