@@ -13,7 +13,7 @@ from ..arguments import check_integer, check_number
 from ..errors import InputError, InputTypeError
 from .boundary_names import Walls
 from .box import Box, Domain
-from .layer_columns import count_columns, find_chains, place_columns
+from .layer_columns import count_columns, count_fan, find_chains, place_columns, place_fan
 from .polygon import Polygon
 
 _NEAR = 0.6  # of a cell: of two generators that are nearer to each other than this, one is dropped
@@ -132,11 +132,17 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
     for layer in layers:
         for chain in find_chains(polygon, _chosen(domain, layer)):
-            feet, normals = place_columns(chain, layer.width, layer.thickness)
+            feet, normals = place_columns(chain, layer.width)
+            near = min(layer.width, layer.heights.min())
             for y in layer.rows:
-                found.append(feet + y * normals)
-                limits.append(np.full(len(feet), _NEAR * min(layer.width, layer.heights.min())))
-                walls.append(np.full(len(feet), y))
+                fan = place_fan(chain, layer.width, y)
+                apart = chain.fan * y / max(len(fan), 1)
+                found += [feet + y * normals, fan]
+                limits += [
+                    np.full(len(feet), _NEAR * near),
+                    np.full(len(fan), _NEAR * min(near, apart)),
+                ]
+                walls.append(np.full(len(feet) + len(fan), y))
     points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
     kept = polygon.contains(points)
     walls_of_all = np.concatenate([chosen_segments(domain, layer) for layer in layers])
@@ -183,8 +189,9 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
         chains = find_chains(polygon, _chosen(domain, layer))
         if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
             raise InputError(_NO_ROOM)
-        columns = sum(sum(count_columns(chain, layer.width, layer.thickness)) for chain in chains)
+        columns = sum(count_columns(chain, layer.width) for chain in chains)
         total += columns * (layer.count + 1)
+        total += sum(count_fan(chain, layer.width, y) for chain in chains for y in layer.rows)
     return total
 
 
@@ -224,7 +231,7 @@ def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
     polygon, _ = as_polygon(domain)
     chains = find_chains(polygon, _chosen(domain, layer))
-    made = [place_columns(chain, layer.width, layer.thickness) for chain in chains]
+    made = [place_columns(chain, layer.width) for chain in chains]
     feet, normals = zip(*made, strict=True)
     return np.concatenate(feet), np.concatenate(normals)
 

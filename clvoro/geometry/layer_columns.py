@@ -68,12 +68,28 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
     return chains
 
 
-def count_columns(chain: Chain, width: float, thickness: float) -> tuple[int, int]:
-    """Return the number of columns along the chain, and the number of those that fan out from its end."""
+def count_columns(chain: Chain, width: float) -> int:
+    """Return the number of columns along the chain."""
     corners, _ = _begun(chain, width)
     _, counts = _runs(np.hypot(*np.diff(corners, axis=0).T), width)
-    fan = chain.fan * (thickness + width) / 2 / width
-    return sum(map(int, counts.tolist())), round(min(fan, _MOST))
+    return sum(map(int, counts.tolist()))
+
+
+def count_fan(chain: Chain, width: float, height: float) -> int:
+    """Return the number of generators at the distance `height` around the corner at the end of the chain.
+
+    There are at least two. Faces between them end in the corner; the cell of a single one would go around it.
+    """
+    return max(2, round(min(chain.fan * height / width, _MOST))) if chain.fan else 0
+
+
+def place_fan(chain: Chain, width: float, height: float) -> np.ndarray:
+    """Return generators (m, 2) at the distance `height` around the corner at the end of the chain."""
+    count = count_fan(chain, width, height)
+    along = chain.corners[-1] - chain.corners[-2]
+    normal = math.atan2(along[0], -along[1])
+    angles = normal - chain.fan * (np.arange(count) + 0.5) / max(count, 1)
+    return chain.corners[-1] + height * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
@@ -131,13 +147,12 @@ def _places(lengths: np.ndarray, width: float, joined: bool) -> np.ndarray:
     return starts[run] + before[run] + number * steps[run]
 
 
-def place_columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+def place_columns(chain: Chain, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the wall, about `width` apart, and unit normals (c, 2) into the domain of the columns."""
     corners, joined = _begun(chain, width)
     along = np.diff(corners, axis=0)
     lengths = np.hypot(*along.T)
     reached = np.concatenate([[0], np.cumsum(lengths)])
-    _, fan = count_columns(chain, width, thickness)
     at = _places(lengths, width, joined)
     edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
     share = ((at - reached[edge]) / lengths[edge])[:, None]
@@ -154,8 +169,4 @@ def place_columns(chain: Chain, width: float, thickness: float) -> tuple[np.ndar
         + to_first * (at_corners[edge] - normal[edge])
         + to_last * (at_corners[edge + 1] - normal[edge])
     )
-    feet, normals = corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]
-    angles = -chain.fan * (np.arange(fan) + 0.5) / max(fan, 1)
-    end = math.atan2(normal[-1, 1], normal[-1, 0])
-    fanned = np.column_stack([np.cos(end + angles), np.sin(end + angles)])
-    return np.vstack([feet, np.tile(corners[-1], (fan, 1))]), np.vstack([normals, fanned])
+    return corners[edge] + share * along[edge], mixed / np.hypot(*mixed.T)[:, None]

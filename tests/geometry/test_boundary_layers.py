@@ -1,11 +1,14 @@
 """Boundary layers: layers of cells along walls, whose generators do not move."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import shapely
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError
+from clvoro.finite_volumes.prisms import cell_loops
 from clvoro.geometry.boundary_layers import (
     Layers,
     chosen_segments,
@@ -161,7 +164,34 @@ def test_layers_in_corners_and_gaps_belong_to_the_nearest_wall():
     off = np.abs(near[:, None] - layers.rows).min(axis=1)
     assert off.max() < 0.1 * layers.rows[-1] + 1e-12
     gaps = np.hypot(*(rows[:, None] - rows).T) + np.eye(len(rows))
-    assert gaps.min() >= 0.6 * 0.02 - 1e-12
+    corner = np.min([np.hypot(*(rows - c).T) for c in ((1, 0.15), (2, 0.15))], axis=0)
+    away = corner > layers.rows[1] * 1.01
+    assert gaps[away].min() >= 0.6 * 0.02 - 1e-12
+    # Two generators of each row around re-entrant corners, at the distance of the row.
+    for row in layers.rows[:2]:
+        assert np.count_nonzero(np.abs(corner - row) < 1e-12) == 4
+    assert gaps.min() == pytest.approx(2 * layers.rows[0] * np.sin(np.pi / 8))
+
+
+@pytest.mark.parametrize("spacing", [0.01, 0.04])
+@pytest.mark.parametrize("angle", [50.5, 60, 90, 120, 150, 170])
+def test_faces_end_in_the_corners_of_bodies_with_layers(adapter, angle, spacing):
+    """A triangle with a corner that turns by `angle`: cells around it are convex."""
+    slope = np.tan(np.radians(180 - angle) / 2)
+    body = [(0, 0), (-0.3, -0.3 * slope), (-0.3, 0.3 * slope)]
+    shift = body[1][1] - 0.2
+    domain = clvoro.Polygon([(-0.5, shift), (0.2, shift), (0.2, -shift), (-0.5, -shift)], [body])
+    layers = Layers(0.004, count=3, spacing=spacing, edges="hole-1")
+    mesh = adapter.run(domain, 0.08, layers=layers, effort="fast").solver_mesh()
+    faces = mesh.points[mesh.corners.reshape(-1, 2)]
+    for corner in body:
+        assert (faces[: mesh.inner] == corner).all(axis=-1).any()
+    starts, loops = cell_loops(mesh)
+    for first, last in pairwise(starts.tolist()):
+        x = mesh.points[loops[first:last]]
+        a, b = x - np.roll(x, 1, axis=0), np.roll(x, -1, axis=0) - x
+        turns = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1))
+        assert turns.min() > -1e-9
 
 
 def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
