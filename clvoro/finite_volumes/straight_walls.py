@@ -3,8 +3,8 @@
 A run is what a cell has of a ring of the domain, from one face end to the next. Its faces become chords (`_kept`).
 Before that, a face end may move along the wall into a vertex of the domain: into a re-entrant corner, so that both
 cells are convex, or into another kink that a chord would cut off. Each move must lower a cost: the area between the
-boundary and the chords, and prices for their distance, for kinks into the cell, for slivers and for the way of the
-face end.
+boundary and the chords, and prices for their distance, for corners that are not convex, for slivers and skew faces, and
+for the way of the face end. A cell with little of the wall may leave it: both ends of its run move into one point.
 
 Where the boundary is a curve, all points on walls lie on the curve itself.
 """
@@ -21,25 +21,19 @@ import numpy as np
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..mesh.straightening import SIDE_TURN, along_rings
-from .geometry import polygon_areas, polygon_sides, sum_rows
+from .geometry import polygon_sides, sum_rows
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
-REACH = 0.35
+REACH = 0.4
 """Farthest way of a face end into a vertex of the domain, over the smaller size of its two cells."""
 _FILLED = 0.25
 """A kink into the cell is cut off if it is nearer than this to the chord, over the size of the cell."""
 _CUT = 0.03
 """The same for a kink out of the cell."""
 _SLIVER, _SHORT, _SHARP, _CONVEX = 0.1, 0.03, np.pi / 3, 1e-4
-_CONCAVE_PRICE, _SHARP_PRICE, _SLIVER_PRICE, _OFF_PRICE, _WAY_PRICE, _TILT_PRICE = (
-    0.5,
-    0.1,
-    0.02,
-    0.2,
-    0.02,
-    0.1,
-)
+_CONCAVE_PRICE, _SHARP_PRICE, _OFF_PRICE, _SKEW_PRICE = 0.5, 0.1, 0.2, 0.03
+_SLIVER_PRICE, _WAY_PRICE, _TILT_PRICE = 0.02, 0.02, 0.1
 
 Point = tuple[float, float]
 
@@ -114,7 +108,9 @@ class _Work:
         self.points: list[Point] = list(map(tuple, mesh.points.tolist()))
         self.ends = mesh.corners.reshape(-1, 2)
         self.begin, self.final = (c.tolist() for c in self.ends[self.walls].T)
-        self.sizes = np.sqrt(np.maximum(polygon_areas(mesh), 0)).tolist()
+        areas, centroids = _centroids(mesh)
+        self.sizes = np.sqrt(np.maximum(areas, 0)).tolist()
+        self.centroids: list[Point] = list(map(tuple, centroids.tolist()))
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
         # 1: the ends of the cell do not move; 2: its walls remain as they are.
         self.spared, self.most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
@@ -218,6 +214,9 @@ class _Work:
             line, fixed = self.line(faces), self.fixed(faces)
             kept = _kept(line, fixed, size)
             total, left = _cost(line, kept, size), [line[i] for i in kept]
+            for a, b in pairwise(left):
+                skewness = _skewness(a, b, self.centroids[run.cell])
+                total += _SKEW_PRICE * (max(skewness - 1, 0) * size) ** 2
         else:
             total, left = 0.0, [self.points[point]]
         return total + _concave_price([*run.behind, *left, *run.ahead]) * size * size
@@ -344,16 +343,24 @@ class _Work:
         )
 
 
-def _starlike(mesh: SolverMesh) -> np.ndarray:
-    """Return whether each cell's centroid sees all of its faces from inside, (n,); short faces do not count."""
-    cell, p, q, _ = polygon_sides(mesh)
+def _centroids(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return area and centroid of each cell, (n,) and (n, 2)."""
+    cell, p, q, origins = polygon_sides(mesh)
     n, cross = len(mesh), _cross(p, q)
     area = np.bincount(cell, cross, n)
     safe = np.where(area > 0, area, np.inf)
     middle = sum_rows(cell, cross[:, None] * (p + q), n) / (3 * safe)[:, None]
-    seen = _cross(p - middle[cell], q - middle[cell]) > 0
-    seen |= ((q - p) ** 2).sum(axis=1) < _SHORT**2 * area[cell]
-    return (area > 0) & (np.bincount(cell, ~seen, n) == 0)
+    return area / 2, origins + middle
+
+
+def _starlike(mesh: SolverMesh) -> np.ndarray:
+    """Return whether each cell's centroid sees all of its faces from inside, (n,); short faces do not count."""
+    cell, p, q, origins = polygon_sides(mesh)
+    areas, centroids = _centroids(mesh)
+    middle = (centroids - origins)[cell]
+    seen = _cross(p - middle, q - middle) > 0
+    seen |= ((q - p) ** 2).sum(axis=1) < 2 * _SHORT**2 * areas[cell]
+    return (areas > 0) & (np.bincount(cell, ~seen, len(mesh)) == 0)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -453,6 +460,17 @@ def _cost(line: list[Point], kept: list[int], size: float) -> float:
         if hypot(u - x, v - y) < _SLIVER * size:
             total += _SLIVER_PRICE * size * size
     return total
+
+
+def _skewness(a: Point, b: Point, centroid: Point) -> float:
+    """Return OpenFOAM's skewness of a wall face from a to b."""
+    x, y = b[0] - a[0], b[1] - a[1]
+    length = hypot(x, y)
+    u, v = (a[0] + b[0]) / 2 - centroid[0], (a[1] + b[1]) / 2 - centroid[1]
+    if length == 0:
+        return 0.0
+    off, height = abs(x * u + y * v) / length, abs(x * v - y * u) / length
+    return off / max(length / 2, 0.4 * height)
 
 
 def _concave_price(line: list[Point]) -> float:

@@ -75,7 +75,7 @@ class MeshOutput:
         walls : {"straight", "exact"}
             With "straight", in 2D: the wall faces of a cell that turn by at most 30 degrees in sum become one straight
             face, and so do farther turns that are smaller than a quarter of the cell. A face end that is nearer to a
-            corner of the domain than about a third of the smaller cell moves into it. Faces of different names remain
+            corner of the domain than 0.4 of the smaller cell moves into it. Faces of different names remain
             apart. The change of area is the mesh's `area_change`.
         collapse : bool
             Whether the ends of short faces become one point: in 2D of faces shorter than 0.02 (on walls 0.05) times
