@@ -92,7 +92,7 @@ def cell_loops(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
     if broken.size:
         raise InputError(
             f"cell {broken[0]} ({len(broken)} in all) goes around a part of the boundary or touches itself, "
-            "and a face in OpenFOAM has no hole; use smaller cells there, leave out the hole, or save as .vtu"
+            "and the cells of solvers have no holes; use smaller cells there, leave out the hole, or save as .vtu"
         )
     return starts, loop
 

@@ -18,6 +18,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .contents import Contents
+from .disv import Disv, DisvBoundary, make_disv
 from .foam import write_foam
 from .formats import check_plane, write_foreign
 from .history import write_history
@@ -34,11 +35,18 @@ if TYPE_CHECKING:
     import pyvista
     from numpy.typing import ArrayLike
 
+    from ..finite_volumes.solver_mesh import WallShape
+    from .fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
+
 __all__ = [
+    "Disv",
+    "DisvBoundary",
     "check_writable",
     "load",
     "make_folder",
     "save",
+    "to_disv",
+    "to_fipy",
     "to_meshio",
     "to_pyvista",
     "write_history",
@@ -187,6 +195,25 @@ def save(
         write_vtu(contents, path, walls=walls)
     else:
         _WRITERS.get(suffix, write_foreign)(contents, path)
+
+
+def to_disv(mesh: Result | Diagram, walls: WallShape = "straight") -> Disv:
+    """Return the grid of MODFLOW 6's DISV package; see `Diagram.to_disv`."""
+    return make_disv(Contents.of(mesh).diagram, walls)
+
+
+def to_fipy(mesh: Result | Diagram, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
+    """Return a mesh of FiPy; see `Diagram.to_fipy`."""
+    diagram = Contents.of(mesh).diagram
+    try:
+        from .fipy_mesh import make_fipy_mesh
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] != "fipy":
+            raise
+        from .convert import missing
+
+        raise missing("FiPy", "solvers", "to_fipy()") from error
+    return make_fipy_mesh(diagram, walls)
 
 
 def to_meshio(

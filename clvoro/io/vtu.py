@@ -40,7 +40,8 @@ def write_vtu(
     """Write the cells as polygons or polyhedra with cell data.
 
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
-    `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); the vector `generator`, from the
+    `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); for each name that the caller
+    gave to a boundary `boundary:NAME` (1 where the cell has a face on it, else 0); the vector `generator`, from the
     origin to the cell's generator; and data of the caller. Comments hold the settings and the caller's names of
     boundaries, field data a polygonal or periodic domain. In a periodic box cells are not cut at the seams.
 
@@ -218,6 +219,7 @@ def cell_data(contents: Contents) -> dict[str, np.ndarray]:
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),
         "label": np.arange(n, dtype=np.int32),
         "boundary": largest_boundary(diagram),
+        **_on_boundaries(diagram),
         "generator": in_space(diagram.points),
         **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.extra.items()},
     }
@@ -234,6 +236,20 @@ def largest_boundary(diagram: Diagram) -> np.ndarray:
         -1 - diagram.neighbors[walls]
     ]
     return found
+
+
+def _on_boundaries(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Return for each boundary that the caller has named which cells have a face on it, (n,) uint8."""
+    domain = diagram.domain
+    walls = np.flatnonzero(diagram.neighbors < 0)
+    part = domain.boundary_index[-1 - diagram.neighbors[walls]]
+    cell, n = face_owners(diagram)[walls], len(diagram)
+    return {
+        f"boundary:{name}": (
+            np.bincount(cell[part == domain.boundary_names.index(name)], minlength=n) > 0
+        ).astype(np.uint8)
+        for name in domain.describe().get("names") or ()
+    }
 
 
 def in_space(points: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from ..finite_volumes.solver_mesh import SolverMesh, WallShape
     from ..geometry.boundary_names import Walls
+    from ..io.disv import Disv
+    from ..io.fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
     from ..io.polymesh import PatchType
     from ..plotting.colors import Color
     from ..plotting.solids import View
@@ -208,3 +210,67 @@ class MeshOutput:
         from ..io import to_meshio
 
         return to_meshio(self._self, cell_data)
+
+    def to_disv(self, walls: WallShape = "straight") -> Disv:
+        """Return the cells as a grid for MODFLOW 6's DISV package, as FloPy takes it.
+
+        The cell centers are the generators: control-volume finite differences need the line between two centers
+        perpendicular to the face, and that is the Voronoi property. FloPy is not needed here.
+
+        Parameters
+        ----------
+        walls : {"straight", "exact"}
+            See `solver_mesh`.
+
+        Returns
+        -------
+        Disv
+            ``ModflowGwfdisv(model, nlay=1, top=top, botm=bottom, **disv.gridprops)`` makes the package.
+            ``disv.boundaries["river"]`` has the cells at that boundary, and lengths and distances of their faces.
+
+        Raises
+        ------
+        InputError
+            In 3D, in a periodic box, and for a cell around an island.
+
+        Examples
+        --------
+        >>> basin = clvoro.Box((0, 0), (2, 1), names={"river": "xMax"})
+        >>> disv = clvoro.voronoi(basin, [(0.5, 0.5), (1.5, 0.5)]).to_disv()
+        >>> disv.gridprops["cell2d"]
+        [(0, 0.5, 0.5, 4, 0, 3, 2, 1), (1, 1.5, 0.5, 4, 0, 4, 5, 3)]
+        >>> river = disv.boundaries["river"]
+        >>> river.cells.tolist(), river.conductance(0.01).tolist()
+        ([1], [0.02])
+        """
+        from ..io import to_disv
+
+        return to_disv(self._self, walls)
+
+    def to_fipy(self, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
+        """Return the cells as a mesh of FiPy.
+
+        The cell centers are the generators. The center of a face is where the line between two generators crosses it,
+        on walls the foot of the generator's perpendicular. There FiPy's two-point flux has no error of first order.
+
+        Parameters
+        ----------
+        walls : {"straight", "exact"}
+            See `solver_mesh`.
+
+        Returns
+        -------
+        fipy.meshes.mesh2D.Mesh2D or fipy.meshes.mesh.Mesh
+            In the order of the generators. ``mesh.physicalFaces["inlet"]`` marks the faces of a boundary, for
+            ``variable.constrain(value, mesh.physicalFaces["inlet"])``.
+
+        Raises
+        ------
+        ClvoroError
+            If FiPy is not installed (``pip install "clvoro[solvers]"``).
+        InputError
+            In a periodic box, and in 2D for a cell around an island.
+        """
+        from ..io import to_fipy
+
+        return to_fipy(self._self, walls)

@@ -1,0 +1,119 @@
+"""Diagrams in 2D as the grid of MODFLOW 6's DISV package, with boundaries by name; FloPy writes the files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..finite_volumes.prisms import cell_loops
+from ..finite_volumes.two_point import two_point_faces
+from ..mesh.connectivity import take_rows
+from ..mesh.read_only import Sealed
+
+if TYPE_CHECKING:
+    from ..finite_volumes.solver_mesh import WallShape
+    from ..mesh.diagram import Diagram
+
+
+@dataclass(frozen=True, eq=False)
+class DisvBoundary(Sealed):
+    """The faces of a DISV grid on one boundary of the domain.
+
+    Attributes
+    ----------
+    cells : (k,) int32
+        Cell of each face, from 0 as in FloPy; ascending. A cell with several faces is listed several times.
+    lengths : (k,) float64
+        Lengths of the faces.
+    distances : (k,) float64
+        Distances of the faces from the centers of their cells.
+    feet : (k, 2) float64
+        Points of the faces that are nearest to the centers of their cells, where the boundary's head belongs.
+    """
+
+    cells: np.ndarray
+    lengths: np.ndarray
+    distances: np.ndarray
+    feet: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def conductance(self, transmissivity: float | np.ndarray) -> np.ndarray:
+        """Return the conductance between boundary and cell center, (k,), as the packages GHB, RIV and DRN take it.
+
+        Parameters
+        ----------
+        transmissivity : float or (k,) array
+            Hydraulic conductivity times thickness of the layer, of all faces or of each.
+        """
+        return transmissivity * self.lengths / self.distances
+
+
+@dataclass(frozen=True, eq=False)
+class Disv(Sealed):
+    """A grid for MODFLOW 6's DISV package; see `Diagram.to_disv`.
+
+    Attributes
+    ----------
+    vertices : (v, 2) float64
+    cell_vertex_starts : (n + 1,) int64
+    cell_vertices : (k,) int64
+        Vertices of cell i, ``cell_vertices[cell_vertex_starts[i]:cell_vertex_starts[i + 1]]``, clockwise.
+    centers : (n, 2) float64
+        Centers of the cells: the generators.
+    boundaries : dict of DisvBoundary
+        Faces on each boundary of the domain, by its name.
+    """
+
+    vertices: np.ndarray
+    cell_vertex_starts: np.ndarray
+    cell_vertices: np.ndarray
+    centers: np.ndarray
+    boundaries: dict[str, DisvBoundary]
+
+    @property
+    def gridprops(self) -> dict[str, Any]:
+        """Arguments of FloPy's ``ModflowGwfdisv``: ``nvert``, ``ncpl``, ``vertices`` and ``cell2d``, from 0."""
+        corners = np.split(self.cell_vertices, self.cell_vertex_starts[1:-1])
+        return {
+            "nvert": len(self.vertices),
+            "ncpl": len(self.centers),
+            "vertices": [(k, *x) for k, x in enumerate(self.vertices.tolist())],
+            "cell2d": [
+                (i, *x, len(c), *c.tolist())
+                for i, (x, c) in enumerate(zip(self.centers.tolist(), corners, strict=True))
+            ],
+        }
+
+    def __repr__(self) -> str:
+        return f"Disv({len(self.centers)} cells, {len(self.vertices)} vertices; {', '.join(self.boundaries)})"
+
+
+def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
+    """Return the DISV grid of `diagram`; see `Diagram.to_disv`."""
+    domain = diagram.domain
+    if domain.dim != 2:
+        raise InputError(
+            "DISV grids are layers of 2D cells, and this diagram is in 3D; mesh the plane and give MODFLOW the layers"
+        )
+    if any(domain.periodic):
+        raise InputError(
+            "DISV grids have no periodic sides, and this box has; use a box without periodic directions"
+        )
+    mesh = diagram.solver_mesh(walls, collapse=False)
+    starts, loops = cell_loops(mesh)
+    cells = np.arange(len(mesh))
+    faces = two_point_faces(mesh, diagram.points)
+    found = {}
+    for k, name in enumerate(domain.boundary_names):
+        rows = np.flatnonzero(faces.boundary == k)
+        rows = rows[np.argsort(faces.owner[rows], kind="stable")]
+        found[name] = DisvBoundary(
+            faces.owner[rows], faces.area[rows], faces.near[rows], faces.foot[rows]
+        )
+    starts, corners = take_rows(starts, loops, cells, np.ones(len(cells), bool))
+    return Disv(mesh.points, starts, corners, diagram.points.astype(float), found)
