@@ -167,9 +167,12 @@ def _solver_data(mesh: SolverMesh) -> dict[str, np.ndarray]:
     """Return the cell data that differ from those of the diagram."""
     counts = np.bincount(mesh.owner, minlength=len(mesh))
     counts += np.bincount(mesh.neighbor[: mesh.inner], minlength=len(mesh))
-    if mesh.dim == 2:
-        return {"volume": polygon_areas(mesh), "sides": counts.astype(np.int32)}
-    return {"volume": mesh.measures.geometry.volumes, "faces_of_cell": counts.astype(np.int32)}
+    flat = mesh.dim == 2
+    return {
+        "volume": polygon_areas(mesh) if flat else mesh.measures.geometry.volumes,
+        "sides" if flat else "faces_of_cell": counts.astype(np.int32),
+        **_on_boundaries(mesh.domain, mesh.owner, mesh.neighbor, len(mesh)),
+    }
 
 
 def polyhedra(mesh: Diagram | SolverMesh) -> dict[str, np.ndarray]:
@@ -219,7 +222,7 @@ def cell_data(contents: Contents) -> dict[str, np.ndarray]:
         "sides" if flat else "faces_of_cell": counts.astype(np.int32),
         "label": np.arange(n, dtype=np.int32),
         "boundary": largest_boundary(diagram),
-        **_on_boundaries(diagram),
+        **_on_boundaries(diagram.domain, face_owners(diagram), diagram.neighbors, n),
         "generator": in_space(diagram.points),
         **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.extra.items()},
     }
@@ -238,18 +241,17 @@ def largest_boundary(diagram: Diagram) -> np.ndarray:
     return found
 
 
-def _on_boundaries(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return for each boundary that the caller has named which cells have a face on it, (n,) uint8."""
-    domain = diagram.domain
-    walls = np.flatnonzero(diagram.neighbors < 0)
-    part = domain.boundary_index[-1 - diagram.neighbors[walls]]
-    cell, n = face_owners(diagram)[walls], len(diagram)
-    return {
-        f"boundary:{name}": (
-            np.bincount(cell[part == domain.boundary_names.index(name)], minlength=n) > 0
-        ).astype(np.uint8)
-        for name in domain.describe().get("names") or ()
-    }
+def _on_boundaries(
+    domain: Domain, owner: np.ndarray, neighbor: np.ndarray, n: int
+) -> dict[str, np.ndarray]:
+    """Return for each boundary that the caller has named which of `n` cells have a face on it, (n,) uint8."""
+    on_wall = neighbor < 0
+    part, cell = domain.boundary_index[-1 - neighbor[on_wall]], owner[on_wall]
+    found = {}
+    for name in domain.describe().get("names") or ():
+        found[f"boundary:{name}"] = mask = np.zeros(n, np.uint8)
+        mask[cell[part == domain.boundary_names.index(name)]] = 1
+    return found
 
 
 def in_space(points: np.ndarray) -> np.ndarray:
