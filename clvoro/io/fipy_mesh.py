@@ -25,6 +25,8 @@ class _AtGenerators:
     generator's perpendicular. FiPy's two-point flux and its values on faces are exact there for linear functions.
     """
 
+    physicalFaces: dict[str, FaceVariable]  # noqa: N815  (as FiPy's meshes from Gmsh)
+
     def __init__(
         self, generators: np.ndarray, feet: np.ndarray, volumes: np.ndarray, **arrays: Any
     ) -> None:

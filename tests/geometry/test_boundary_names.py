@@ -121,7 +121,8 @@ def test_feature_size_does_not_depend_on_orientation(meshed) -> None:
     assert h == pytest.approx(plain, rel=1e-9)
 
 
-def test_openfoam_has_the_names(meshed, tmp_path) -> None:
+@pytest.mark.parametrize("walls", ["exact", "straight"])
+def test_openfoam_has_the_names(meshed, tmp_path, walls) -> None:
     _, edges, result = meshed
     domain = result.diagram.domain
     for patches, parts in (
@@ -129,15 +130,21 @@ def test_openfoam_has_the_names(meshed, tmp_path) -> None:
         ({"top": [2, 3]}, {"top": [2, 3], "in--let": [4], "island": [5, 6, 7], "part": [9], "outer": [0, 1],
                            "hole-2": [8, 10, 11]}),
     ):  # fmt: skip
-        result.save(tmp_path / "polyMesh", patches=patches)
+        result.save(tmp_path / "polyMesh", patches=patches, walls=walls)
         points, faces, *_, written = test_foam.read(tmp_path / "polyMesh")
         assert list(written)[:-2] == list(parts)
         for name, numbers in parts.items():
             shape = shapely.union_all([edges[k] for k in numbers])
             _, count, start = written[name]
             middles = [points[face].mean(axis=0)[:2] for face in faces[start : start + count]]
-            assert count >= len(numbers)
-            assert shapely.distance(shape, shapely.points(middles)).max() < 1e-14
+            off = shapely.distance(shape, shapely.points(middles))
+            if walls == "exact":
+                assert count >= len(numbers)
+                assert off.max() < 1e-14
+            else:  # chords cut corners that turn by little
+                assert count > 0
+                assert off.max() < 0.05
+                assert np.median(off) < 1e-14
 
 
 def test_netcdf_has_walls_and_names(meshed, tmp_path) -> None:
