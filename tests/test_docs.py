@@ -21,7 +21,16 @@ OWN = {
     **PAGES,
     **{n: (ROOT / n).read_text() for n in ("README.md", "CONTRIBUTING.md") if (ROOT / n).is_file()},
 }
+SOLVERS = ("fipy", "flopy")
+"""Programs that pages and examples import, of the extra `solvers`."""
 EXAMPLES = sorted((DOCS / "examples").rglob("*.py"))
+
+
+def needs(text):
+    """Skip the test if `text` imports a solver that is not installed."""
+    for name in SOLVERS:
+        if re.search(rf"^import {name}$", text, re.MULTILINE):
+            pytest.importorskip(name)
 
 
 def blocks(page, language):
@@ -39,6 +48,7 @@ def rows(page):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")])
 def test_python_on_pages_runs(page, tmp_path, monkeypatch):
+    needs(PAGES[page])
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     names = {}
@@ -60,6 +70,7 @@ def test_cases_on_pages_run(page, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda p: p.stem)
 def test_example_runs_and_draws(example, tmp_path):
+    needs(example.read_text())
     code = (
         "import matplotlib, runpy, sys, warnings; matplotlib.use('Agg'); from matplotlib import pyplot; "
         "import clvoro.errors as e; [warnings.simplefilter('error', w) for w in vars(e).values() "

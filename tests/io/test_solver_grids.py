@@ -13,6 +13,8 @@ import scipy.special
 import clvoro
 from clvoro import sizing
 from clvoro.errors import ClvoroError, InputError
+from clvoro.io.contents import Contents
+from clvoro.io.vtu import cell_data
 
 LAKE = clvoro.Polygon(
     [(0, 0), (2, 0.1), (2.2, 1.2), (1, 1.6), (-0.1, 1)],
@@ -260,14 +262,32 @@ def test_periodic_boxes_are_refused_for_fipy():
         torus.to_fipy()
 
 
-def test_vtu_has_the_names_of_boundaries(lake, tmp_path, meshio_for_vtu):
-    lake.save(tmp_path / "lake.vtu")
+@pytest.mark.parametrize("walls", [None, "straight"])
+def test_vtu_has_the_names_of_boundaries(lake, tmp_path, meshio_for_vtu, walls):
+    lake.save(tmp_path / "lake.vtu", walls=walls)
     read = meshio_for_vtu.read(tmp_path / "lake.vtu").cell_data
     assert {name for name in read if name.startswith("boundary:")} == {
         "boundary:inlet", "boundary:island",
     }  # fmt: skip
     label = np.concatenate(read["label"])
-    f = lake.diagram.faces
-    for k, name in enumerate(("inlet", "island")):
+    if walls is None:
+        f = lake.diagram.faces
+        owner, part = f.owner, f.boundary
+    else:
+        mesh = lake.solver_mesh()
+        owner = mesh.owner
+        part = np.where(
+            mesh.neighbor < 0, LAKE.boundary_index[np.maximum(-1 - mesh.neighbor, 0)], -1
+        )
+    for name in ("inlet", "island"):
         marked = label[np.concatenate(read[f"boundary:{name}"]) == 1]
-        assert set(marked) == set(f.owner[f.boundary == k].tolist())
+        assert set(marked) == set(owner[part == LAKE.boundary_names.index(name)].tolist())
+
+
+def test_named_cells_in_3d():
+    box = clvoro.Box((0, 0, 0), (1, 1, 1), names={"inlet": "xMin"})
+    d = clvoro.voronoi(box, np.random.default_rng(0).random((50, 3)))
+    data = cell_data(Contents.of(d))
+    touching = [i for i in range(50) if -1 in d.cell(i).neighbors]
+    assert np.flatnonzero(data["boundary:inlet"]).tolist() == touching
+    assert [name for name in data if name.startswith("boundary:")] == ["boundary:inlet"]
