@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -126,3 +127,16 @@ def test_scaling(tmp_path):
     assert {"diagram", "next diagram", "3D diagram", "Poisson", "fast run", "default run"} <= names
     assert all(len(r["cells"]) == len(r["seconds"]) == 2 and r["slope"] is None for r in rows)
     assert (tmp_path / "scaling.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="needs OpenFOAM")
+def test_cylinder():
+    rows = records(
+        "cylinder.py", "--cells", "1500", "--meshers", "clvoro; clvoro, layers; blockMesh"
+    )
+    assert [r["mesher"] for r in rows] == ["clvoro", "clvoro, layers", "blockMesh"]
+    # In percent: 0.1, 0.1 and 0.6 for drag, and at most 3 for the pressure difference.
+    assert all(abs(r["drag"][0]) < 0.8 for r in rows)
+    assert all(abs(r["pressure"][0]) < 4 for r in rows)
+    assert all(r["cells"][0] == pytest.approx(1500, rel=0.1) for r in rows)

@@ -1,0 +1,476 @@
+"""Flow around a cylinder with OpenFOAM on meshes of clvoro, Gmsh and blockMesh, against reference values.
+
+    python bench/cylinder.py [--reynolds 20|100] [--cells 3000,6000,13000] [--meshers NAMES] [--samples 3]
+                             [--convection linear|linearUpwind] [--pictures FOLDER] [--device NAME] [--json]
+
+The benchmark of Schaefer and Turek (1996): a channel of 2.2 x 0.41, a cylinder of diameter 0.1 at (0.2, 0.2), a
+parabolic inlet. At Re 20 the flow is steady (`simpleFoam`), at Re 100 it sheds vortices (`pimpleFoam`). All meshes
+have the same size field, scaled to nearly the same number of cells; blocks follow it as far as they can. All solvers
+have the same schemes. At Re 20 columns are errors in percent: of drag and lift by the function object `forceCoeffs`,
+and of the pressure difference between the front and the rear of the cylinder, for which a quadratic polynomial is
+fitted to the 48 nearest cells. At Re 100 they are the largest drag and lift of the last three periods, and the
+Strouhal number.
+
+With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds:
+shown are the median and the range. Without OpenFOAM the script ends with a message. Without Gmsh (pip install gmsh)
+its rows are left out.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _common import Report, counts, heading, make_adapter, parser, spread
+from _openfoam import Case, PlaneMesh, header, missing, nonuniform, text_of, write_prisms
+
+import clvoro
+
+LENGTH, HEIGHT = 2.2, 0.41
+CENTER, RADIUS = (0.2, 0.2), 0.05
+THICKNESS = 0.01
+VISCOSITY = 0.001
+PATCHES = {"walls": "wall", "outlet": "patch", "inlet": "patch", "cylinder": "wall"}
+REFERENCE = {"drag": 5.57953523384, "lift": 0.010618948146, "pressure": 0.11752016697}
+"""Coefficients and pressure difference at Re 20, of the site of FeatFlow (DFG benchmark 2D-1)."""
+RANGES = {"drag": (3.22, 3.24), "lift": (0.99, 1.01), "strouhal": (0.295, 0.305)}
+"""Largest coefficients and Strouhal number at Re 100, of Schaefer and Turek."""
+Size = Callable[[np.ndarray], np.ndarray]
+
+
+class MissingPeerError(Exception):
+    """A mesher is not there; says what to install."""
+
+
+# Sizes.
+
+
+def target_size(points: np.ndarray) -> np.ndarray:
+    """Return the target size at `points` (n, 2), before it is scaled to a number of cells.
+
+    Drag depends on the first cells at the cylinder, on the flow that arrives there, and on the walls of the channel up
+    to the cylinder. Sizes grow from there. The wake needs few cells at Re 20.
+    """
+    x, y = points.T
+    d = np.maximum(np.hypot(x - CENTER[0], y - CENTER[1]) - RADIUS, 0)
+    wall = np.minimum(y, HEIGHT - y)
+    behind = 0.15 * np.maximum(x - 0.35, 0)
+    sizes = [0.0012 + 0.1 * d, 0.003 + 0.05 * d, 0.009 + behind, 0.004 + 0.1 * wall + behind]
+    return np.minimum(np.minimum.reduce(sizes), 0.05)
+
+
+def wake_size(points: np.ndarray) -> np.ndarray:
+    """Return the target size for Re 100: vortices need fine cells behind the cylinder."""
+    x, y = points.T
+    d = np.maximum(np.hypot(x - CENTER[0], y - CENTER[1]) - RADIUS, 0)
+    behind = np.maximum(x - CENTER[0], 0)
+    wake = 0.006 + 0.006 * behind + 0.05 * np.maximum(np.abs(y - CENTER[1]) - 0.05, 0)
+    wake = np.where(x < CENTER[0], np.inf, wake + 0.1 * np.maximum(x - 0.6, 0))
+    wall = 0.006 + 0.15 * np.minimum(y, HEIGHT - y) + 0.1 * np.maximum(x - 0.35, 0)
+    return np.minimum(np.minimum.reduce([0.002 + 0.06 * d, wake, wall]), 0.03)
+
+
+def scaled(size: Size, n_cells: float) -> Size:
+    """Return `size` times the factor for which the integral of 1 / h^2 over the domain is `n_cells`."""
+    radius = np.sqrt(np.linspace(RADIUS**2, 0.15**2, 2001)[1:] - (0.15**2 - RADIUS**2) / 4000)
+    angle = 2 * np.pi * (np.arange(64) + 0.5) / 64
+    ring = np.add.outer(radius * 0, angle)
+    near = np.stack([0.2 + radius[:, None] * np.cos(ring), 0.2 + radius[:, None] * np.sin(ring)])
+    step = HEIGHT / 205
+    x, y = np.meshgrid(step * (np.arange(1100) + 0.5), step * (np.arange(205) + 0.5))
+    far = np.stack([x.ravel(), y.ravel()], axis=1)
+    far = far[np.hypot(far[:, 0] - 0.2, far[:, 1] - 0.2) > 0.15]
+    total = (size(near.reshape(2, -1).T) ** -2.0).mean() * np.pi * (0.15**2 - RADIUS**2)
+    factor = math.sqrt((total + (size(far) ** -2.0).sum() * step**2) / n_cells)
+    return lambda points: factor * size(points)
+
+
+# Meshers: each writes the polyMesh of a case.
+
+
+def mesh_clvoro(layers: bool, effort: str) -> Callable[..., None]:
+    def mesh(case: Case, adapter: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
+        cylinder = clvoro.curves.circle(CENTER, RADIUS, name="cylinder")
+        domain = clvoro.Polygon(
+            [(0, 0), (LENGTH, 0), (LENGTH, HEIGHT), (0, HEIGHT)],
+            [cylinder],
+            names={"walls": [0, 2], "outlet": 1, "inlet": 3},
+        )
+        field, rows = scaled(size, n_cells), []
+        if layers:
+            h = float(field(np.array([[CENTER[0] - RADIUS, CENTER[1]]]))[0])
+            rows = [clvoro.Layers(0.7 * h, 4, 1.15, spacing=1.4 * h, edges="cylinder")]
+        result = adapter.run(domain, field, effort=effort, layers=rows, seed=seed)
+        types = {name: "patch" for name, kind in PATCHES.items() if kind == "patch"}
+        result.save(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
+
+    return mesh
+
+
+def mesh_gmsh(quadrangles: bool) -> Callable[..., None]:
+    def mesh(case: Case, _: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
+        try:
+            import gmsh
+        except (ModuleNotFoundError, OSError) as error:
+            raise MissingPeerError(f"gmsh (pip install gmsh): {error}") from error
+        # An equilateral triangle of area h^2 has edges of 1.52 h.
+        factor, field = (1.0 if quadrangles else 1.52), scaled(size, n_cells)
+        for _ in range(4):
+            points, cells = _gmsh(gmsh, field, factor, quadrangles)
+            if abs(len(cells) / n_cells - 1) < 0.01:
+                break
+            factor *= math.sqrt(len(cells) / n_cells)
+        write_prisms(case.folder, points, cells, _patch_of, PATCHES, THICKNESS)
+
+    return mesh
+
+
+def _gmsh(
+    gmsh: Any, field: Size, factor: float, quadrangles: bool
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the points and cells of a mesh with edges `factor` times `field`."""
+    gmsh.initialize(interruptible=False)
+    try:
+        options = {
+            "General.Terminal": 0, "General.NumThreads": 1, "Mesh.Algorithm": 8 if quadrangles else 6,
+            "Mesh.MeshSizeFromPoints": 0, "Mesh.MeshSizeFromCurvature": 0,
+            "Mesh.MeshSizeExtendFromBoundary": 0, "Mesh.RecombineAll": int(quadrangles),
+        }  # fmt: skip
+        for name, value in options.items():
+            gmsh.option.setNumber(name, value)
+        gmsh.model.add("channel")
+        channel = gmsh.model.occ.addRectangle(0, 0, 0, LENGTH, HEIGHT)
+        disk = gmsh.model.occ.addDisk(*CENTER, 0, RADIUS, RADIUS)
+        gmsh.model.occ.cut([(2, channel)], [(2, disk)])
+        gmsh.model.occ.synchronize()
+        gmsh.model.mesh.setSizeCallback(
+            lambda dim, tag, x, y, z, h: factor * float(field(np.array([[x, y]]))[0])
+        )
+        gmsh.model.mesh.generate(2)
+        tags, coordinates, _ = gmsh.model.mesh.getNodes()
+        kinds, _, nodes = gmsh.model.mesh.getElements(2)
+    finally:
+        gmsh.finalize()
+    number = np.zeros(int(tags.max()) + 1, int)
+    number[tags.astype(int)] = np.arange(len(tags))
+    points = coordinates.reshape(-1, 3)[:, :2]
+    cells = []
+    for kind, rows in zip(kinds, nodes, strict=True):
+        for cell in number[rows.astype(int)].reshape(-1, {2: 3, 3: 4}[int(kind)]):
+            x, y = points[cell].T
+            area = x @ np.roll(y, -1) - y @ np.roll(x, -1)
+            cells.append(cell if area > 0 else cell[::-1])
+    used = np.unique(np.concatenate(cells))
+    return points[used], [np.searchsorted(used, cell) for cell in cells]
+
+
+def _patch_of(middles: np.ndarray) -> np.ndarray:
+    x, y = middles.T
+    sides = [np.minimum(y, HEIGHT - y) < 1e-9, x > LENGTH - 1e-9, x < 1e-9]
+    return np.select(sides, [0, 1, 2], 3)
+
+
+def mesh_blocks(case: Case, _: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
+    """Four blocks around the cylinder up to a square, and one behind them, by blockMesh."""
+    # Cells around a quarter, outward and along the channel, with the grading of the last two.
+    round_, out, along = (1, 0.9, 1.1) if size is target_size else (1, 0.9, 2.2)
+    k = math.sqrt(n_cells / (round_ * (4 * out + along)))
+    n, m, q = round(round_ * k), round(out * k), round(along * k)
+    h = [scaled(size, n_cells)(np.array([p]))[0] for p in ((0.15, 0.2), (0.0, 0.2))]
+    outward, onward = float(h[1] / h[0]), 4.0 if size is target_size else 2.0
+    s = float(RADIUS * math.sqrt(0.5))
+    square = [(0, 0), (HEIGHT, 0), (HEIGHT, HEIGHT), (0, HEIGHT)]
+    inner = [(0.2 - s, 0.2 - s), (0.2 + s, 0.2 - s), (0.2 + s, 0.2 + s), (0.2 - s, 0.2 + s)]
+    flat = [*square, *inner, (LENGTH, 0), (LENGTH, HEIGHT)]
+    bottoms = [(4 + (a + 1) % 4, 4 + a, a, (a + 1) % 4) for a in range(4)]
+    cells = [f"({n} {m} 1) simpleGrading (1 {outward} 1)"] * 4
+    bottoms.append((1, 8, 9, 2))
+    cells.append(f"({q} {n} 1) simpleGrading ({onward} 1 1)")
+    v = len(flat)
+
+    def joined(corners: tuple[int, ...], shift: int = 0) -> str:
+        return " ".join(str(c + shift) for c in corners)
+
+    def sides(*edges: tuple[int, int]) -> str:
+        return " ".join(f"({a} {b} {b + v} {a + v})" for a, b in edges)
+
+    arcs = []
+    for a, (x, y) in enumerate([(0.2, 0.15), (0.25, 0.2), (0.2, 0.25), (0.15, 0.2)]):
+        for z, shift in ((0.0, 0), (THICKNESS, v)):
+            arcs.append(f"arc {4 + a + shift} {4 + (a + 1) % 4 + shift} ({x} {y} {z})")
+    faces = {
+        "walls": sides((0, 1), (2, 3), (1, 8), (9, 2)), "outlet": sides((8, 9)), "inlet": sides((3, 0)),
+        "cylinder": sides((4, 5), (5, 6), (6, 7), (7, 4)),
+        "back": " ".join(f"({joined(b)})" for b in bottoms),
+        "front": " ".join(f"({joined(b, v)})" for b in bottoms),
+    }  # fmt: skip
+    kinds = {**PATCHES, "back": "empty", "front": "empty"}
+    patches = "".join(text_of({k: {"type": kinds[k], "faces": f"({f})"}}) for k, f in faces.items())
+    blocks = " ".join(
+        f"hex ({joined(b)} {joined(b, v)}) {c}" for b, c in zip(bottoms, cells, strict=True)
+    )
+    corners = " ".join(f"({x!r} {y!r} {z})" for z in (0.0, THICKNESS) for x, y in flat)
+    text = f"vertices ({corners});\nblocks ({blocks});\nedges ({' '.join(arcs)});\nboundary ({patches});\n"
+    case.write("system/controlDict", {"deltaT": 1, "endTime": 1, "writeInterval": 1})
+    path = case.folder / "system" / "blockMeshDict"
+    path.write_text(header("dictionary", "blockMeshDict") + "convertToMeters 1;\n" + text)
+    case.run("blockMesh")
+
+
+MESHERS: dict[str, Callable[..., None]] = {
+    "clvoro": mesh_clvoro(False, "default"),
+    "clvoro, best": mesh_clvoro(False, "best"),
+    "clvoro, layers": mesh_clvoro(True, "best"),
+    "Gmsh triangles": mesh_gmsh(False),
+    "Gmsh quadrangles": mesh_gmsh(True),
+    "blockMesh": mesh_blocks,
+}
+
+
+# Flow.
+
+
+def write_case(
+    case: Case,
+    mesh: PlaneMesh,
+    reynolds: int,
+    convection: str,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+    times: tuple[float, float] = (3000, 1),
+) -> None:
+    """Write fields and dictionaries for a Reynolds number; `times` are the end and the step."""
+    mean = reynolds * VISCOSITY / (2 * RADIUS)
+    steady = reynolds == 20
+    y = mesh.edges("inlet")[:, :, 1].T
+    # The mean of the parabola over each face, so that the flux is exact.
+    primitive = y**2 * HEIGHT / 2 - y**3 / 3
+    inlet = np.zeros((y.shape[1], 2))
+    inlet[:, 0] = 6 * mean / HEIGHT**2 * (primitive[1] - primitive[0]) / (y[1] - y[0])
+    flat, closed = {"type": "empty"}, {"type": "zeroGradient"}
+    fields = {
+        "U": ("[0 1 -1 0 0 0 0]", f"uniform ({mean} 0 0)", {
+            "inlet": {"type": "fixedValue", "value": nonuniform(inlet)}, "outlet": closed,
+            "walls": {"type": "noSlip"}, "cylinder": {"type": "noSlip"},
+        }),
+        "p": ("[0 2 -2 0 0 0 0]", "uniform 0", {
+            "inlet": closed, "outlet": {"type": "fixedValue", "value": "uniform 0"},
+            "walls": closed, "cylinder": closed,
+        }),
+    }  # fmt: skip
+    for k, (name, (dimensions, value, patches)) in enumerate(fields.items()):
+        values = value if start is None else nonuniform(start[k])
+        case.write(f"0/{name}", {
+            "dimensions": dimensions, "internalField": values,
+            "boundaryField": {**patches, "back": flat, "front": flat},
+        })  # fmt: skip
+    case.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": VISCOSITY})
+    case.write("constant/turbulenceProperties", {"simulationType": "laminar"})
+    scheme = {"linear": "Gauss linear", "linearUpwind": "Gauss linearUpwind grad(U)"}[convection]
+    case.write("system/fvSchemes", {
+        "ddtSchemes": {"default": "steadyState" if steady else "backward"},
+        # Forces on the body are exact only if the pressure's gradient conserves momentum.
+        "gradSchemes": {"default": "leastSquares", "grad(p)": "Gauss linear"},
+        "divSchemes": {
+            "default": "none", "div(phi,U)": f"bounded {scheme}" if steady else scheme,
+            "div((nuEff*dev2(T(grad(U)))))": "Gauss linear",
+        },
+        "laplacianSchemes": {"default": "Gauss linear corrected"},
+        "interpolationSchemes": {"default": "linear"},
+        "snGradSchemes": {"default": "corrected"},
+    })  # fmt: skip
+    tolerance = 1e-12 if steady else 1e-7
+    pressure = {"solver": "PCG", "preconditioner": "DIC", "tolerance": tolerance, "relTol": 0.05}
+    velocity = {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": tolerance, "relTol": 0.05}  # fmt: skip
+    case.write("system/fvSolution", {
+        "solvers": {
+            "p": pressure, "pFinal": {**pressure, "relTol": 0}, "U": velocity, "UFinal": {**velocity, "relTol": 0},
+        },
+        "SIMPLE": {"consistent": "yes", "residualControl": {"p": 1e-7, "U": 1e-7}},
+        "PIMPLE": {"nOuterCorrectors": 2, "nCorrectors": 2, "nNonOrthogonalCorrectors": 0},
+        "relaxationFactors": {"equations": {"U": 0.9}} if steady else {"equations": {'".*"': 1}},
+    })  # fmt: skip
+    end, step = times
+    case.write("system/controlDict", {
+        "startFrom": "startTime", "startTime": 0, "stopAt": "endTime", "endTime": end, "deltaT": step,
+        "writeControl": "runTime", "writeInterval": end, "writeFormat": "ascii", "writePrecision": 12,
+        "functions": {"forces": {
+            "type": "forceCoeffs", "libs": '("libforces.so")', "patches": "(cylinder)", "rho": "rhoInf", "rhoInf": 1,
+            "liftDir": "(0 1 0)", "dragDir": "(1 0 0)", "pitchAxis": "(0 0 1)", "CofR": "(0.2 0.2 0)",
+            "magUInf": mean, "lRef": 2 * RADIUS, "Aref": 2 * RADIUS * THICKNESS,
+        }},
+    })  # fmt: skip
+
+
+def value_at(point: tuple[float, float], centroids: np.ndarray, values: np.ndarray) -> float:
+    """Return the value at `point` of the quadratic polynomial that fits the nearest 48 cells."""
+    apart = centroids - np.array(point)
+    distance = np.hypot(*apart.T)
+    near = np.argsort(distance)[:48]
+    x, y = (apart[near] / distance[near].max()).T
+    terms = np.stack([np.ones(len(near)), x, y, x * x, x * y, y * y], axis=1)
+    weight = np.exp(-3 * (x * x + y * y))
+    return float(np.linalg.lstsq(terms * weight[:, None], values[near] * weight, rcond=None)[0][0])
+
+
+def steady_flow(case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float]:
+    """Solve at Re 20; return drag, lift, pressure difference and the number of iterations."""
+    write_case(case, mesh, 20, convection)
+    case.run("simpleFoam")
+    forces, pressure = case.table("forces", "coefficient.dat"), case.field("p")
+    front, rear = (
+        value_at((x, 0.2), mesh.centroids, pressure) for x in (0.2 - RADIUS, 0.2 + RADIUS)
+    )
+    return {
+        "drag": float(forces["Cd"][-1]), "lift": float(forces["Cl"][-1]), "pressure": front - rear,
+        "steps": float(forces["Time"][-1]),
+    }  # fmt: skip
+
+
+class Shedding:
+    """Flows at Re 100, each of which starts from the one before."""
+
+    def __init__(self) -> None:
+        self.before: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def flow(self, case: Case, mesh: PlaneMesh, convection: str) -> dict[str, float]:
+        """Solve until the flow is periodic; return largest drag and lift, and the Strouhal number."""
+        start, end = None, 6.0
+        if self.before is not None:
+            points, u, p = self.before
+            near = np.array([np.argmin(((points - c) ** 2).sum(axis=1)) for c in mesh.centroids])
+            start, end = (u[near], p[near]), 2.5
+        step = 0.0015 * math.sqrt(3000 / len(mesh))
+        write_case(case, mesh, 100, convection, start, (end, step))
+        case.run("pimpleFoam")
+        self.before = mesh.centroids, case.field("U"), case.field("p")
+        forces = case.table("forces", "coefficient.dat")
+        time_, lift = forces["Time"], forces["Cl"]
+        late = time_ > end - 1.05  # three periods
+        rises = np.flatnonzero((lift[:-1] < 0) & (lift[1:] >= 0) & late[:-1])
+        share = -lift[rises] / (lift[rises + 1] - lift[rises])
+        crossings = time_[rises] + share * (time_[rises + 1] - time_[rises])
+        period = float(np.diff(crossings).mean())
+        return {
+            "drag": float(forces["Cd"][late].max()), "lift": float(lift[late].max()),
+            "strouhal": 2 * RADIUS / period, "steps": float(len(time_)),
+        }  # fmt: skip
+
+
+def picture(case: Case, mesh: PlaneMesh, path: Path, title: str) -> None:
+    """Draw the mesh near the cylinder, colored by speed."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+    from matplotlib.collections import PolyCollection
+
+    speed = np.hypot(*case.field("U").T)
+    figure, (whole, near) = plt.subplots(2, 1, figsize=(9, 7), height_ratios=(2, 5))
+    for axes in (whole, near):
+        edge = "none" if axes is whole else "0.25"
+        drawn = PolyCollection(mesh.polygons, array=speed, edgecolor=edge, linewidth=0.3, cmap="viridis")  # fmt: skip
+        if axes is whole:
+            drawn.set_edgecolor("face")
+        axes.add_collection(drawn)
+        axes.set_aspect("equal")
+    whole.set(xlim=(0, LENGTH), ylim=(0, HEIGHT), title=f"{title}, {len(mesh):,} cells: speed")
+    near.set(xlim=(0.06, 0.5), ylim=(0.08, 0.32))
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+# Tables.
+
+
+def errors(values: dict[str, float]) -> dict[str, float]:
+    """Return the errors at Re 20 in percent of the reference."""
+    return {name: 100 * (values[name] / value - 1) for name, value in REFERENCE.items()}
+
+
+STEADY = {
+    "c_D %": lambda r: spread(r["drag"], "+.3f"),
+    "c_L %": lambda r: spread(r["lift"], "+.2f"),
+    "pressure difference %": lambda r: spread(r["pressure"], "+.2f"),
+    "iterations": lambda r: f"{np.median(r['steps']):.0f}",
+}
+UNSTEADY = {
+    "max c_D": lambda r: spread(r["drag"], ".4f"),
+    "max c_L": lambda r: spread(r["lift"], ".4f"),
+    "St": lambda r: spread(r["strouhal"], ".4f"),
+    "steps": lambda r: f"{np.median(r['steps']):.0f}",
+}
+
+
+def main() -> None:
+    """Run the bench."""
+    options_of = parser(__doc__)
+    options_of.add_argument("--reynolds", type=int, choices=(20, 100), default=20)
+    options_of.add_argument("--cells", type=counts, default=None, metavar="LIST")
+    options_of.add_argument(
+        "--meshers", default=";".join(MESHERS), metavar="NAMES", help="separated by semicolons"
+    )
+    options_of.add_argument("--samples", type=int, default=1)
+    options_of.add_argument(
+        "--convection", choices=("linear", "linearUpwind"), default="linearUpwind"
+    )
+    options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
+    options = options_of.parse_args()
+    re_ = options.reynolds
+    solver = "simpleFoam" if re_ == 20 else "pimpleFoam"
+    absent = missing(solver, "blockMesh")
+    if absent:
+        raise SystemExit(f"{absent[0]} is not installed; Debian has it in the package openfoam")
+    adapter = make_adapter(options)
+    convection = options.convection
+    size = target_size if re_ == 20 else wake_size
+    shown = {
+        "mesh": lambda r: r["mesher"],
+        "cells": lambda r: f"{np.median(r['cells']):,.0f}",
+        **(STEADY if re_ == 20 else UNSTEADY),
+        "s": lambda r: f"{np.median(r['seconds']):.1f}",
+    }
+    report = Report(options.json, shown)
+    shedding = Shedding()
+    for n in options.cells or ([3000, 6000, 13000] if re_ == 20 else [3000, 6000]):
+        for mesher in (part.strip() for part in options.meshers.split(";")):
+            record: dict[str, Any] = {"mesher": mesher, "reynolds": re_, "convection": convection}
+            kept: dict[str, list[float]] = {}
+            for sample in range(1 if mesher == "blockMesh" else options.samples):
+                with tempfile.TemporaryDirectory() as folder:
+                    case = Case(Path(folder))
+                    try:
+                        MESHERS[mesher](case, adapter, size, round(n * (1 + 0.01 * sample)), sample)
+                    except MissingPeerError as error:
+                        print(f"left out: {mesher}, needs {error}", file=sys.stderr)
+                        break
+                    mesh = PlaneMesh(case.folder)
+                    start = time.perf_counter()
+                    flow = (
+                        steady_flow(case, mesh, convection)
+                        if re_ == 20
+                        else shedding.flow(case, mesh, convection)
+                    )
+                    found = {**flow, **(errors(flow) if re_ == 20 else {}), "cells": len(mesh)}
+                    found["seconds"] = time.perf_counter() - start
+                    for key, value in found.items():
+                        kept.setdefault(key, []).append(value)
+                    if options.pictures and not sample:
+                        options.pictures.mkdir(parents=True, exist_ok=True)
+                        name = f"{mesher.replace(', ', '_').replace(' ', '_')}_{re_}_{n}.png"
+                        picture(case, mesh, options.pictures / name, mesher)
+            if kept:
+                report.add({**record, **kept}, f"{mesher}, {len(kept['drag'])} of {n}")
+    ranges = ", ".join(f"{name} {low} to {high}" for name, (low, high) in RANGES.items())
+    title = f"Flow around a cylinder at Re {re_}, {convection}"
+    report.finish(heading(adapter, title if re_ == 20 else f"{title}; reference: {ranges}"))
+
+
+if __name__ == "__main__":
+    main()
