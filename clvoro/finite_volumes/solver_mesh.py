@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arguments import check_choice
 from ..geometry.box import Domain
+from ..geometry.polygon import Polygon
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import Sealed
@@ -161,6 +162,7 @@ def make_solver_mesh(
     `parts` (k,) int is the index of the named part of the boundary of each wall, if it is not the domain's.
     """
     from .collapse import collapse_short
+    from .convex_corners import join_faces, move_concave_points
     from .short_edges import collapse_short_edges
     from .straight_walls import straight_walls
 
@@ -179,8 +181,8 @@ def make_solver_mesh(
         half_face=faces.rows,
     )
     parts = diagram.domain.boundaries.index if parts is None else parts
-    if walls == "straight" and mesh.dim == 2:
-        mesh = straight_walls(mesh, diagram, parts)
+    if walls == "straight" and isinstance(diagram.domain, Polygon):
+        mesh = move_concave_points(straight_walls(join_faces(mesh), diagram, parts))
     if collapse and mesh.dim == 2:
         mesh = collapse_short_edges(mesh, parts)
     if collapse and mesh.dim == 3:

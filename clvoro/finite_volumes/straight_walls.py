@@ -77,8 +77,6 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
     parts : (k,) int
         Index of the named part of the boundary for each wall. A straight face has walls of one part.
     """
-    if not isinstance(diagram.domain, Polygon):
-        return mesh
     mesh = _on_curves(mesh, diagram.domain)
     work = _Work(mesh, diagram, parts)
     while True:
