@@ -28,19 +28,28 @@ class _AtGenerators:
     physicalFaces: dict[str, FaceVariable]  # noqa: N815  (as FiPy's meshes from Gmsh)
 
     def __init__(
-        self, generators: np.ndarray, feet: np.ndarray, volumes: np.ndarray, **arrays: Any
+        self, generators: np.ndarray, volumes: np.ndarray, faces: TwoPointFaces, **arrays: Any
     ) -> None:
-        self._generators, self._feet, self._volumes = generators, feet, volumes
+        self._generators, self._volumes, self._faces = generators, volumes, faces
         super().__init__(**arrays)
 
     def _calcCellCenters(self) -> np.ndarray:  # noqa: N802
-        return self._generators
-
-    def _calcFaceCenters(self) -> np.ndarray:  # noqa: N802
-        return self._feet
+        return self._generators.T.astype(float)
 
     def _calcCellVolumes(self) -> np.ndarray:  # noqa: N802
         return self._volumes
+
+    def _calcFaceCenters(self) -> np.ndarray:  # noqa: N802
+        return self._faces.foot.T.copy()
+
+    def _calcFaceAreas(self) -> np.ndarray:  # noqa: N802
+        return self._faces.area.copy()
+
+    def _calcFaceNormals(self) -> np.ndarray:  # noqa: N802
+        # FiPy's normals come from the first three corners, which may be nearly in line, and point away from the first
+        # cell of `faceCellIDs`, which need not be the owner.
+        first = np.ma.filled(self.faceCellIDs[0], -1)  # type: ignore[attr-defined]
+        return np.where(first == self._faces.owner, 1.0, -1.0) * self._faces.normal.T
 
 
 class VoronoiMesh2D(_AtGenerators, Mesh2D):
@@ -49,18 +58,6 @@ class VoronoiMesh2D(_AtGenerators, Mesh2D):
 
 class VoronoiMesh3D(_AtGenerators, Mesh):
     """A mesh of FiPy in 3D, with ``physicalFaces`` by the names of the domain's boundaries."""
-
-    def __init__(self, normals: np.ndarray, areas: np.ndarray, **arrays: Any) -> None:
-        self._normals, self._areas = normals, areas
-        super().__init__(**arrays)
-
-    # FiPy takes normals from the first three corners, which may be nearly in line.
-
-    def _calcFaceNormals(self) -> np.ndarray:  # noqa: N802
-        return self._normals
-
-    def _calcFaceAreas(self) -> np.ndarray:  # noqa: N802
-        return self._areas
 
 
 def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | VoronoiMesh3D:
@@ -72,18 +69,15 @@ def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | Vorono
         )
     mesh = diagram.solver_mesh(walls, collapse=False)
     faces = two_point_faces(mesh, diagram.points)
-    arrays: dict[str, Any] = {
-        "generators": diagram.points.T.astype(float),
-        "feet": faces.foot.T.copy(),
-        "volumes": _volumes(mesh, faces, diagram.points),
-        "vertexCoords": mesh.points.T.copy(),
-        "faceVertexIDs": _padded(mesh.starts, mesh.corners),
-        "cellFaceIDs": _padded(*_cell_faces(mesh)),
-    }
-    if domain.dim == 2:
-        made = VoronoiMesh2D(**arrays)
-    else:
-        made = VoronoiMesh3D(faces.normal.T.copy(), faces.area.copy(), **arrays)
+    kind = VoronoiMesh2D if domain.dim == 2 else VoronoiMesh3D
+    made = kind(
+        diagram.points,
+        _volumes(mesh, faces, diagram.points),
+        faces,
+        vertexCoords=mesh.points.T.copy(),
+        faceVertexIDs=_padded(mesh.starts, mesh.corners),
+        cellFaceIDs=_padded(*_cell_faces(mesh)),
+    )
     made.physicalFaces = {
         name: FaceVariable(mesh=made, value=faces.boundary == k)
         for k, name in enumerate(domain.boundary_names)
