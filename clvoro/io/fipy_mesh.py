@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from fipy.variables.faceVariable import FaceVariable
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.two_point import TwoPointFaces, two_point_faces
+from ..mesh.connectivity import take_rows
 
 if TYPE_CHECKING:
     from ..finite_volumes.solver_mesh import SolverMesh, WallShape
@@ -23,18 +25,25 @@ class _AtGenerators:
 
     The center of a face is where the line between the generators crosses its plane, on walls the foot of the
     generator's perpendicular. FiPy's two-point flux and its values on faces are exact there for linear functions.
+    A face at the seam of a periodic box lies between its two cells. Its corners and center are those on the upper side.
     """
 
     physicalFaces: dict[str, FaceVariable]  # noqa: N815  (as FiPy's meshes from Gmsh)
 
     def __init__(
-        self, generators: np.ndarray, volumes: np.ndarray, faces: TwoPointFaces, **arrays: Any
+        self,
+        generators: np.ndarray,
+        volumes: np.ndarray,
+        faces: TwoPointFaces,
+        shift: np.ndarray,
+        **arrays: Any,
     ) -> None:
         self._generators, self._volumes, self._faces = generators, volumes, faces
+        self._shift = shift  # (f, d), of the neighbor to its image beside the owner
         super().__init__(**arrays)
 
     def _calcCellCenters(self) -> np.ndarray:  # noqa: N802
-        return self._generators.T.astype(float)
+        return self._generators.T.copy()
 
     def _calcCellVolumes(self) -> np.ndarray:  # noqa: N802
         return self._volumes
@@ -46,10 +55,34 @@ class _AtGenerators:
         return self._faces.area.copy()
 
     def _calcFaceNormals(self) -> np.ndarray:  # noqa: N802
-        # FiPy's normals come from the first three corners, which may be nearly in line, and point away from the first
-        # cell of `faceCellIDs`, which need not be the owner.
-        first = np.ma.filled(self.faceCellIDs[0], -1)  # type: ignore[attr-defined]
-        return np.where(first == self._faces.owner, 1.0, -1.0) * self._faces.normal.T
+        # FiPy's own come from the first three corners, which may be nearly in line.
+        return np.where(self._owner_first(), 1.0, -1.0) * self._faces.normal.T
+
+    # FiPy's own vectors from cell to cell do not know of periodic images.
+
+    def _calcFaceToCellDistAndVec(self) -> tuple[Any, Any]:  # noqa: N802
+        f = self._faces
+        here = f.foot - self._generators[f.owner]
+        beyond = f.foot - self._generators[np.maximum(f.neighbor, 0)] - self._shift
+        first = self._owner_first()[:, None]
+        arms = np.stack([np.where(first, here, beyond), np.where(first, beyond, here)])
+        mask = np.zeros(arms.shape, bool)
+        mask[1, f.neighbor < 0] = True
+        vectors = np.ma.array(arms, mask=mask).transpose(2, 0, 1)
+        return np.ma.sqrt((vectors**2).sum(axis=0)), vectors
+
+    def _calcCellDistAndVec(self) -> tuple[np.ndarray, np.ndarray]:  # noqa: N802
+        arms = self._cellToFaceDistanceVectors  # type: ignore[attr-defined]
+        vectors = np.ma.filled(arms[:, 0]) - np.ma.filled(arms[:, 1], 0.0)
+        return np.linalg.norm(vectors, axis=0), vectors
+
+    def _calcFaceCellToCellNormals(self) -> np.ndarray:  # noqa: N802
+        unit = self._cellDistanceVectors / self._cellDistances  # type: ignore[attr-defined]
+        return np.where((unit * self.faceNormals).sum(axis=0) < 0, -1.0, 1.0) * unit  # type: ignore[attr-defined]
+
+    def _owner_first(self) -> np.ndarray:
+        """Whether the first cell of ``faceCellIDs`` is the owner, (f,)."""
+        return np.ma.filled(self.faceCellIDs[0], -1) == self._faces.owner  # type: ignore[attr-defined]
 
 
 class VoronoiMesh2D(_AtGenerators, Mesh2D):
@@ -63,23 +96,35 @@ class VoronoiMesh3D(_AtGenerators, Mesh):
 def make_fipy_mesh(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | VoronoiMesh3D:
     """Return the mesh of FiPy of `diagram`; see `Diagram.to_fipy`."""
     domain = diagram.domain
-    if any(domain.periodic):
-        raise InputError(
-            "FiPy's meshes of polygons have no periodic sides, and this box has; use a box without periodic directions"
-        )
     mesh = diagram.solver_mesh(walls, collapse=False)
+    own = np.flatnonzero(mesh.owner == mesh.neighbor)
+    if own.size:
+        raise InputError(
+            f"cell {mesh.owner[own[0]]} borders on its own periodic image, and FiPy's faces lie between two different "
+            "cells; use more cells"
+        )
+    # A face at a seam is kept once, as that of the upper side.
+    rows = np.arange(len(mesh.owner))
+    kept = np.flatnonzero((mesh.twin < 0) | (mesh.twin > rows))
+    place = np.empty(len(rows), np.int64)
+    place[kept] = np.arange(len(kept))
+    seam = kept[mesh.twin[kept] >= 0]
+    place[mesh.twin[seam]] = place[seam]
+    starts, items = _cell_faces(mesh)
     faces = two_point_faces(mesh, diagram.points)
     kind = VoronoiMesh2D if domain.dim == 2 else VoronoiMesh3D
     made = kind(
-        diagram.points,
+        diagram.points.astype(float),
         _volumes(mesh, faces, diagram.points),
-        faces,
+        TwoPointFaces(*(getattr(faces, f.name)[kept] for f in fields(faces))),
+        mesh.shift[kept] * np.array(domain.extent),
         vertexCoords=mesh.points.T.copy(),
-        faceVertexIDs=_padded(mesh.starts, mesh.corners),
-        cellFaceIDs=_padded(*_cell_faces(mesh)),
+        faceVertexIDs=_padded(*take_rows(mesh.starts, mesh.corners, kept)),
+        cellFaceIDs=_padded(starts, place[items]),
     )
+    part = faces.boundary[kept]
     made.physicalFaces = {
-        name: FaceVariable(mesh=made, value=faces.boundary == k)
+        name: FaceVariable(mesh=made, value=part == k)
         for k, name in enumerate(domain.boundary_names)
     }
     return made

@@ -252,6 +252,7 @@ class MeshOutput:
 
         The cell centers are the generators. The center of a face is where the line between two generators crosses it,
         on walls the foot of the generator's perpendicular. There FiPy's two-point flux has no error of first order.
+        Cells on both sides of a periodic seam are neighbors; FiPy's viewers draw them across the box.
 
         Parameters
         ----------
@@ -269,7 +270,7 @@ class MeshOutput:
         ClvoroError
             If FiPy is not installed (``pip install "clvoro[solvers]"``).
         InputError
-            In a periodic box, and in 2D for a cell around an island.
+            For a cell that borders on its own periodic image, and in 2D for a cell around an island.
         """
         from ..io import to_fipy
 

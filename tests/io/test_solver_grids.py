@@ -273,12 +273,41 @@ def test_grids_that_solvers_lack_are_refused():
         alone.to_disv()
 
 
-def test_periodic_boxes_are_refused_for_fipy():
-    pytest.importorskip("fipy")
-    torus = clvoro.voronoi(
-        clvoro.Box((0, 0), (1, 1), periodic=(True, False)), [(0.2, 0.5), (0.7, 0.5)]
+@pytest.mark.parametrize("dim", [2, 3])
+def test_fipy_joins_the_sides_of_periodic_boxes(dim):
+    """The mean of cos(2 pi x) decays at its rate, and constants have no gradient."""
+    fipy = pytest.importorskip("fipy")
+    box = clvoro.Box((0,) * dim, (1,) * dim, periodic=(True, False, True)[:dim])
+    result = clvoro.adapt(box, 0.15, "fast")
+    d, mesh = result.diagram, result.to_fipy()
+    assert mesh.numberOfFaces == len(d.faces)
+    assert int(mesh.exteriorFaces.value.sum()) == int((d.faces.neighbor < 0).sum())
+    np.testing.assert_allclose(mesh.cellVolumes, d.volumes, rtol=1e-9)
+    constant = fipy.CellVariable(mesh=mesh, value=1.0)
+    np.testing.assert_allclose(constant.grad.value, 0, atol=1e-11)
+    # The matrix of a step, against that of the diagram.
+    u0 = np.cos(2 * np.pi * result.points[:, 0])
+    u = fipy.CellVariable(mesh=mesh, value=u0)
+    (fipy.TransientTerm() == fipy.DiffusionTerm(1.0)).solve(
+        u, dt=0.01, solver=fipy.LinearLUSolver()
     )
-    with pytest.raises(InputError, match="no periodic sides"):
+    f = d.faces
+    k, n = f.n_inner, len(d)
+    matrix = np.diag(d.volumes / 0.01)
+    for i, j, a in zip(f.owner, f.neighbor, f.area[:k] / f.distance[:k]):  # noqa: B905
+        matrix[i, i] += a
+        matrix[j, j] += a
+        matrix[i, j] -= a
+        matrix[j, i] -= a
+    expected = np.linalg.solve(matrix, d.volumes / 0.01 * u0)
+    assert n == len(u.value)
+    np.testing.assert_allclose(u.value, expected, atol=1e-9)
+
+
+def test_fipy_refuses_a_cell_beside_its_own_image():
+    pytest.importorskip("fipy")
+    torus = clvoro.voronoi(clvoro.Box((0, 0), (1, 1), periodic=(True, False)), [(0.2, 0.5)])
+    with pytest.raises(InputError, match="cell 0 borders on its own periodic image"):
         torus.to_fipy()
 
 
