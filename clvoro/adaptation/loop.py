@@ -197,6 +197,7 @@ class Loop:
             if self.position == self.last_step:
                 self.final = self.displacements()
             action.method.move(self.mesh)
+            self.mesh.share_corners()
         # The next row of the history checks the sizes, too, unless they are scaled before.
         self.mesh.update(check=self.fixed_count is not None)
         if self.fixed_count is not None:

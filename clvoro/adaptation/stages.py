@@ -7,6 +7,7 @@ from typing import ClassVar
 from ..solvers.poisson import Poisson
 from ..solvers.volume_projection import VolumeProjection
 from ..tessellation.stages import TessellationStages
+from .corners import Corners
 from .density import Density
 from .insertion_deletion import InsertionDeletion
 from .metric import Metric
@@ -24,11 +25,12 @@ class Stages(TessellationStages):
     volume_projection: VolumeProjection
     quality_descent: QualityDescent
     motion: Motion
+    corners: Corners
     refinement: Refinement
     insertion_deletion: InsertionDeletion
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson,
-        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion,
+        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners,
         "refinement": Refinement, "insertion_deletion": InsertionDeletion,
     }  # fmt: skip

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..geometry.box import Domain
+from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries, Summary
@@ -19,6 +21,7 @@ from ..tessellation.bins import BinnedPoints
 from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.diagram import fetch_diagram
 from ..tessellation.tessellator import Tessellator
+from .corners import PlacedCorners
 from .density import CellWeights, LloydWeights
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .stages import Stages
@@ -82,6 +85,8 @@ class Setup:
         Part of the domain, in its frame, in which generators may move.
     fixed : int
         Generators with labels below `fixed` do not move, and the size of their cells is their target size.
+    factor : float
+        Initial factor on the size field on the finest level.
     """
 
     stages: Stages
@@ -89,6 +94,13 @@ class Setup:
     sizing: Sizing
     free: Domain
     fixed: int = 0
+    factor: float = 1.0
+
+    @cached_property
+    def corner_sizes(self) -> np.ndarray:
+        """Target size on the finest level at the vertices of a polygon, (k,)."""
+        assert isinstance(self.domain, Polygon)
+        return self.factor * np.asarray(self.sizing(self.domain.oriented.vertices), float)
 
 
 class MeshState:
@@ -231,6 +243,24 @@ class MeshState:
     @multipliers.setter
     def multipliers(self, array: cla.Array) -> None:
         self._data.multipliers = array
+
+    @cached_property
+    def corners(self) -> PlacedCorners | None:
+        """Re-entrant corners in which faces have to end on this level; None if there are none."""
+        setup, domain = self.setup, self.domain
+        if not isinstance(domain, Polygon) or not (domain.oriented.turns < 0).any():
+            return None
+        # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
+        level = round(math.log2(self.size_factor / setup.factor))
+        free = self.free if isinstance(self.free, Polygon) else None
+        return self.stages.corners.place(domain, 2.0**level * setup.corner_sizes, free)
+
+    def share_corners(self) -> None:
+        """Move the generators beside re-entrant corners so that faces end there. The diagram is then out of date."""
+        if self.corners is not None:
+            self.stages.corners.share(
+                self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
+            )  # fmt: skip
 
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:
         """Return the target size at `points` (k, d) on this level, (k,)."""

@@ -1,0 +1,348 @@
+/* Faces that end in the re-entrant corners of a polygon. The face between i and j ends in corner c if
+
+       |x_i - c| = |x_j - c| = r,   |x_k - c| > r for all others that see c
+
+   and all cells at c are convex if consecutive faces and walls at c are less than 180 degrees apart.
+
+   corners[c]  position
+   shapes[c]   direction of the wall that begins in c, interior angle, h, extent of the corner
+   Group g has the corners group_starts[g] .. group_starts[g + 1]; only they may share generators. */
+#include "geometry/edges.h"
+
+#define PI R(3.14159265358979323846)
+#define MOST_CANDIDATES 96
+/* Nearest generators that a corner considers, the most that share it, and most sweeps over a group. */
+#define NEAREST 6
+#define MOST_SHARING 4
+#define SWEEPS 60
+/* Least distance of the others over that of the generators that share the corner, and their largest step over h. */
+#define OTHERS R(1.3)
+#define OTHERS_STEP R(0.15)
+/* Least distance over h of a generator from its corner, and largest distance over h of candidates. */
+#define LEAST_RADIUS R(0.15)
+#define REACH R(2.2)
+/* Margin to straight angles; angle above which three cells share the corner at least; largest turn in one step. */
+#define MARGIN R(0.15)
+#define THREE R(5.8)
+#define MOST_TURN R(0.15)
+/* Angle of a cell at the corner above which another choice of generators is better. */
+#define WIDE R(2.5)
+
+inline REAL distance_between(REAL2 a, REAL2 b)
+{
+    const REAL2 d = a - b;
+    return sqrt(dot(d, d));
+}
+
+/* Least distance of a cell at the wall from each corner nearby, as the bits of a float. `cells` are those that the
+   boundary crosses. */
+kernel void find_nearest_at_wall(const int size, global const int *cells, const int n, global const int *starts,
+                                 global const int *neighbors, global const REAL2 *points,
+                                 global const int2 *wall_corners, global const REAL2 *corners, global int *nearest,
+                                 global int *seeds)
+{
+    WORK_ITEM(p);
+    const int i = cells[p];
+    if (i >= n)
+        return;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        if (neighbors[k] >= 0)
+            continue;
+        const int2 near = wall_corners[-1 - neighbors[k]];
+        for (int side = 0; side < 2; ++side) {
+            const int c = side ? near.s1 : near.s0;
+            if (c >= 0)
+                atomic_min(nearest + c, as_int((float)distance_between(points[i], corners[c])));
+        }
+    }
+}
+
+/* The cell at that distance, the first of equal ones: the search for candidates starts there. */
+kernel void find_seeds(const int size, global const int *cells, const int n, global const int *starts,
+                       global const int *neighbors, global const REAL2 *points, global const int2 *wall_corners,
+                       global const REAL2 *corners, global int *nearest, global int *seeds)
+{
+    WORK_ITEM(p);
+    const int i = cells[p];
+    if (i >= n)
+        return;
+    for (int k = starts[i]; k < starts[i + 1]; ++k) {
+        if (neighbors[k] >= 0)
+            continue;
+        const int2 near = wall_corners[-1 - neighbors[k]];
+        for (int side = 0; side < 2; ++side) {
+            const int c = side ? near.s1 : near.s0;
+            if (c >= 0 && nearest[c] == as_int((float)distance_between(points[i], corners[c])))
+                atomic_min(seeds + c, i);
+        }
+    }
+}
+
+/* Whether i is in the list. */
+inline bool is_listed(int i, const int *list, int count)
+{
+    bool found = false;
+    for (int p = 0; p < count; ++p)
+        found = found || list[p] == i;
+    return found;
+}
+
+/* Cost of a choice (bits of `mask`) among generators at distances d and angles a from the first wall, in the order of
+   angles: squares of the displacements, and of the angles by which cells are too wide. */
+inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL angle)
+{
+    const REAL margin = fmin(MARGIN, (2 * PI - angle) / 4 + R(0.01)), widest = PI - margin;
+    REAL r = 0;
+    int sharing = 0;
+    for (int p = 0; p < count; ++p)
+        if (mask >> p & 1) {
+            r += d[p];
+            ++sharing;
+        }
+    r /= sharing;
+    REAL cost = 0, begin = 0, last = -1;
+    for (int p = 0; p <= count; ++p) {
+        const bool chosen = p < count && (mask >> p & 1);
+        if (p < count) {
+            const REAL off = chosen ? d[p] - r : fmax(OTHERS * r - d[p], R(0));
+            cost += off * off;
+        }
+        if (p < count && !chosen)
+            continue;
+        if (last >= 0 || p == count) {
+            const REAL end = p == count ? angle : (last + a[p]) / 2;
+            const REAL over = fmax(end - begin - widest, R(0)), wide = fmax(end - begin - WIDE, R(0));
+            cost += r * r * (4 * over * over + R(0.1) * wide * wide);
+            begin = end;
+        }
+        if (p < count)
+            last = a[p];
+    }
+    return cost;
+}
+
+/* Per group: choose the generators that share each corner, the nearest ones that see it, and move them to their mean
+   distance from it; move others away. A generator belongs to the group of its nearest corner. moved[] and targets[] are
+   the generators of the group that move, -1 for none, and their positions. */
+kernel void share_corners(const int size, global const int *starts, global const int *neighbors, const int n,
+                          global const REAL2 *points, global const int *labels, const int fixed,
+                          global const int *group_starts, global const REAL2 *corners, global const REAL4 *shapes,
+                          global const int *other_starts, global const int *others, global const int *seeds,
+                          DOMAIN_ARGS, global int *moved, global REAL2 *targets)
+{
+    WORK_ITEM(g);
+    const int first = group_starts[g], corner_count = group_starts[g + 1] - first;
+    int cells[MOST_CANDIDATES];
+    REAL2 at[MOST_CANDIDATES];
+    int count = 0;
+    for (int p = 0; p < MOST_MOVED; ++p)
+        moved[g * MOST_MOVED + p] = -1;
+    for (int c = 0; c < corner_count; ++c) {
+        const int i = seeds[first + c];
+        if (i < n && !is_listed(i, cells, count))
+            cells[count++] = i;
+    }
+    for (int p = 0; p < count; ++p)
+        for (int k = starts[cells[p]]; k < starts[cells[p] + 1]; ++k) {
+            const int j = neighbors[k];
+            bool near = false;
+            for (int c = first; c < first + corner_count && j >= 0; ++c)
+                near = near || distance_between(points[j], corners[c]) < REACH * shapes[c].s2;
+            if (near && count < MOST_CANDIDATES && !is_listed(j, cells, count))
+                cells[count++] = j;
+        }
+    /* Keep those that belong to this group and may move. */
+    int kept = 0;
+    for (int p = 0; p < count; ++p) {
+        const int i = cells[p];
+        REAL own = REAL_MAX;
+        for (int c = first; c < first + corner_count; ++c)
+            own = fmin(own, distance_between(points[i], corners[c]));
+        bool mine = labels[i] >= fixed;
+        for (int k = other_starts[g]; k < other_starts[g + 1]; ++k) {
+            const REAL d = distance_between(points[i], corners[others[k]]);
+            mine = mine && !(d < own || (d == own && others[k] < first));
+        }
+        if (mine)
+            cells[kept++] = i;
+    }
+    count = kept;
+
+    int near[MOST_IN_GROUP * NEAREST], found[MOST_IN_GROUP], masks[MOST_IN_GROUP];
+    REAL angles[MOST_IN_GROUP * NEAREST];
+    for (int c = 0; c < corner_count; ++c) {
+        const REAL2 corner = corners[first + c];
+        const REAL4 shape = shapes[first + c];
+        int *list = near + c * NEAREST;
+        REAL *a = angles + c * NEAREST;
+        REAL d[NEAREST];
+        int seen = 0;
+        REAL last = -1;
+        int last_place = -1;
+        while (seen < NEAREST) {
+            /* The next one by distance, equal ones by place. */
+            REAL best = REAL_MAX;
+            int next = -1;
+            for (int p = 0; p < count; ++p) {
+                const REAL far = distance_between(points[cells[p]], corner);
+                if ((far > last || (far == last && p > last_place)) && far < best) {
+                    best = far;
+                    next = p;
+                }
+            }
+            if (next < 0 || best > REACH * shape.s2)
+                break;
+            last = best;
+            last_place = next;
+            const REAL2 x = points[cells[next]];
+            const REAL from[2] = {x.s0, x.s1}, to[2] = {corner.s0, corner.s1};
+            int edge;
+            const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
+            if ((1 - t) * best > shape.s3 * R(1.01) + 64 * REAL_EPS)
+                continue;
+            /* Angle from the first wall; round-off, and the extent of the corner, may put it outside. */
+            REAL angle = atan2(x.s1 - corner.s1, x.s0 - corner.s0) - shape.s0;
+            angle -= 2 * PI * floor(angle / (2 * PI));
+            if (angle > shape.s1)
+                angle = angle > (shape.s1 + 2 * PI) / 2 ? 0 : shape.s1;
+            /* Sort by angle. */
+            int place = seen++;
+            for (; place > 0 && a[place - 1] > angle; --place) {
+                a[place] = a[place - 1];
+                d[place] = d[place - 1];
+                list[place] = list[place - 1];
+            }
+            a[place] = angle;
+            d[place] = best;
+            list[place] = next;
+        }
+        found[c] = seen;
+        masks[c] = 0;
+        REAL least = REAL_MAX;
+        for (int mask = 3; mask < 1 << seen; ++mask) {
+            const int sharing = popcount(mask);
+            if (sharing < (shape.s1 > THREE ? 3 : 2) || sharing > MOST_SHARING)
+                continue;
+            const REAL cost = choice_cost(mask, seen, d, a, shape.s1);
+            if (cost < least) {
+                least = cost;
+                masks[c] = mask;
+            }
+        }
+    }
+
+    /* First with mean distances. If that moves a generator outside, with the least ones. */
+    bool inside = false;
+    for (int attempt = 0; attempt < 2 && !inside; ++attempt) {
+        for (int p = 0; p < count; ++p)
+            at[p] = points[cells[p]];
+        for (int c = 0; c < corner_count && attempt == 0; ++c) {
+            /* Turn the generators of the first and the last face, so that cells beside the walls are convex. */
+            const REAL2 corner = corners[first + c];
+            const REAL angle = shapes[first + c].s1;
+            const REAL margin = fmin(MARGIN, (2 * PI - angle) / 4);
+            for (int side = 0; side < 2 && masks[c]; ++side) {
+                int pair[2], picked = 0;
+                for (int p = 0; p < found[c] && picked < 2; ++p) {
+                    const int q = side ? found[c] - 1 - p : p;
+                    if (masks[c] >> q & 1)
+                        pair[picked++] = c * NEAREST + q;
+                }
+                const REAL face = (angles[pair[0]] + angles[pair[1]]) / 2;
+                const REAL width = side ? angle - face : face;
+                REAL turn = fmin(fmax(width - (PI - margin), R(0)), MOST_TURN);
+                if (turn == 0)
+                    continue;
+                turn = side ? turn : -turn;
+                for (int k = 0; k < 2; ++k) {
+                    const int p = near[pair[k]];
+                    const REAL2 v = at[p] - corner;
+                    at[p] = corner + (REAL2)(cos(turn) * v.s0 - sin(turn) * v.s1, sin(turn) * v.s0 + cos(turn) * v.s1);
+                    angles[pair[k]] += turn;
+                }
+            }
+        }
+        REAL change = REAL_MAX;
+        for (int sweep = 0; sweep < SWEEPS && change > 2 * REAL_EPS; ++sweep) {
+            change = 0;
+            for (int c = 0; c < corner_count; ++c) {
+                if (masks[c] == 0)
+                    continue;
+                const REAL2 corner = corners[first + c];
+                REAL r = 0, least = REAL_MAX;
+                for (int p = 0; p < found[c]; ++p)
+                    if (masks[c] >> p & 1) {
+                        const REAL d = distance_between(at[near[c * NEAREST + p]], corner);
+                        r += d;
+                        least = fmin(least, d);
+                    }
+                r = fmax(attempt ? least : r / popcount(masks[c]), LEAST_RADIUS * shapes[first + c].s2);
+                for (int p = 0; p < found[c]; ++p)
+                    if (masks[c] >> p & 1) {
+                        const int q = near[c * NEAREST + p];
+                        const REAL d = distance_between(at[q], corner);
+                        if (fabs(d - r) > REAL_EPS / 2 && d > R(0.1) * r)
+                            at[q] = corner + (at[q] - corner) * (r / d);
+                        change = fmax(change, fabs(d - r));
+                    }
+            }
+        }
+        /* Generators that share no corner of the group stay away from its corners. */
+        for (int c = 0; c < corner_count; ++c) {
+            if (masks[c] == 0)
+                continue;
+            const REAL2 corner = corners[first + c];
+            REAL r = 0;
+            for (int p = 0; p < found[c]; ++p)
+                if (masks[c] >> p & 1)
+                    r = fmax(r, distance_between(at[near[c * NEAREST + p]], corner));
+            for (int p = 0; p < found[c]; ++p) {
+                const int q = near[c * NEAREST + p];
+                bool shares = false;
+                for (int b = 0; b < corner_count; ++b)
+                    for (int k = 0; k < found[b]; ++k)
+                        shares = shares || ((masks[b] >> k & 1) && near[b * NEAREST + k] == q);
+                const REAL d = distance_between(at[q], corner);
+                if (!shares && d < OTHERS * r && d > 0)
+                    at[q] = corner + (at[q] - corner) * (fmin(OTHERS * r, d + OTHERS_STEP * shapes[first + c].s2) / d);
+            }
+        }
+        inside = true;
+        for (int p = 0; p < count; ++p) {
+            const REAL2 x = points[cells[p]];
+            if (x.s0 == at[p].s0 && x.s1 == at[p].s1)
+                continue;
+            const REAL from[2] = {x.s0, x.s1}, to[2] = {at[p].s0, at[p].s1};
+            int edge;
+            if (exit_over_edge(from, to, &edge, DOMAIN) <= 1) {
+                bool shares = false;
+                for (int b = 0; b < corner_count; ++b)
+                    for (int k = 0; k < found[b]; ++k)
+                        shares = shares || ((masks[b] >> k & 1) && near[b * NEAREST + k] == p);
+                inside = inside && !shares;
+                at[p] = x;
+            }
+        }
+    }
+    int written = 0;
+    for (int p = 0; p < count; ++p) {
+        const REAL2 x = points[cells[p]];
+        if ((x.s0 != at[p].s0 || x.s1 != at[p].s1) && written < MOST_MOVED) {
+            moved[g * MOST_MOVED + written] = cells[p];
+            targets[g * MOST_MOVED + written] = at[p];
+            ++written;
+        }
+    }
+}
+
+/* Move each generator to its target. No two groups move the same one. */
+kernel void move_to_corners(const int size, global const int *moved, global const REAL2 *targets, global REAL2 *points,
+                            global REAL2 *velocity)
+{
+    WORK_ITEM(p);
+    const int i = moved[p];
+    if (i < 0)
+        return;
+    velocity[i] += targets[p] - points[i];
+    points[i] = targets[p];
+}

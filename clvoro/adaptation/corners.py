@@ -1,0 +1,311 @@
+"""Faces that end in the re-entrant corners of polygonal domains (`corners.cl`).
+
+A cell that contains a re-entrant corner of the boundary in the middle of its side is concave. The face between two
+generators ends in the corner if both have the same distance from it and no other generator is nearer. After each step
+the generators that share a corner move to their mean distance from it, and nearer ones move away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pyopencl.array as cla
+from scipy.spatial import KDTree
+
+from ..geometry.polygon import Polygon
+from ..opencl.engine import Engine
+from ..tessellation.device_diagram import Tessellation
+
+SHARP_TURN = np.radians(20)
+"""Least turn of a corner, in sum over the vertices within `SHARP_REACH` h."""
+SHARP_REACH, REACH = 0.05, 0.35
+"""Distances over h along the boundary: over the first the turns of a corner are added, over the second the directions
+of its walls are taken."""
+SPACING, LEAST_SPACING, FAN = 0.6, 0.15, 0.45
+"""Spacing of corners over h: ``SPACING - FAN * turn``, where the turn is that of one of the two corners, but at least
+`LEAST_SPACING`. Cells fan out around a corner, so sharp corners may be close to each other."""
+JOINED = 1.6
+"""Distance over h up to which two corners may share a generator. They belong to the same group then."""
+NEAR = 4.0
+"""Distance over h up to which a group has to know the corners of other groups."""
+WALL_REACH = 0.5
+"""Distance over h along the boundary from a corner up to which cells at the wall are candidates."""
+MOST_IN_GROUP, MOST_MOVED = 8, 48
+"""Corners of a group, and generators that it moves at once."""
+
+
+@dataclass(frozen=True)
+class CornerGroups:
+    """The re-entrant corners of a polygon that matter for cells of size h, in groups that may share generators.
+
+    Attributes
+    ----------
+    vertices : (c,) int
+        Vertices in `Polygon.oriented`, group by group.
+    starts : (g + 1,) int32
+        Group i has the corners ``starts[i]`` to ``starts[i + 1]``.
+    directions : (c,) float
+        Angle from the x axis to the wall that begins in the corner.
+    angles : (c,) float
+        Interior angle, in radians.
+    slack : (c,) float
+        Extent of the vertices around the corner that count as a part of it.
+    sizes : (c,) float
+        h at the corner.
+    other_starts, others : (g + 1,), (k,) int32
+        Corners of other groups near each group.
+    wall_corners : (edges, 2) int32
+        The nearest corner behind the begin and beyond the end of each edge, along the boundary; -1 for none.
+    """
+
+    vertices: np.ndarray
+    starts: np.ndarray
+    directions: np.ndarray
+    angles: np.ndarray
+    slack: np.ndarray
+    sizes: np.ndarray
+    other_starts: np.ndarray
+    others: np.ndarray
+    wall_corners: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+
+def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) -> CornerGroups:
+    """Return the re-entrant corners of `domain` that matter for cells of size `h` (k,) at its vertices.
+
+    Corners that are not on the boundary of `free`, the part of the domain without layers, are left out. Of corners
+    nearer to each other than `SPACING` the sharper one is kept.
+    """
+    oriented = domain.oriented
+    x, turns = oriented.vertices, oriented.turns
+    turned = np.empty(len(x))
+    for a, b in pairwise(oriented.ring_starts.tolist()):
+        turned[a:b] = _turned(x[a:b], turns[a:b], SHARP_REACH * h[a:b])
+    # The vertex that turns most stands for its neighbors.
+    sharp = np.flatnonzero((turned < -SHARP_TURN) & (turns < 0))
+    if free is not None and free is not domain and len(sharp):
+        edge = free.nearest_edge(x[sharp])[1]
+        sharp = sharp[np.hypot(*(edge - x[sharp]).T) < 1e-6 * float(domain.extent.max())]
+    order = sharp[np.lexsort((sharp, turns[sharp].round(9), turned[sharp].round(9)))]
+    kept = np.sort(_spaced(x, turned, h, order))
+    directions, angles, slack = _walls(domain, kept, h)
+    groups = _grouped(x[kept], h[kept])
+    sizes = [len(g) for g in groups]
+    order = np.concatenate([np.empty(0, int), *groups]).astype(int)
+    starts = np.cumsum([0, *sizes]).astype(np.int32)
+    vertices = kept[order]
+    other_starts, others = _others(x[vertices], h[vertices], starts)
+    return CornerGroups(
+        vertices, starts, directions[order], angles[order], slack[order], h[vertices], other_starts, others,
+        _wall_corners(domain, vertices, WALL_REACH * h),
+    )  # fmt: skip
+
+
+def _lengths(ring: np.ndarray) -> np.ndarray:
+    """Return the positions along a ring (k, 2) of its vertices, and its length, (k + 1,)."""
+    return np.concatenate([[0], np.cumsum(np.hypot(*(np.roll(ring, -1, axis=0) - ring).T))])
+
+
+def _turned(ring: np.ndarray, turns: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Return the sums of `turns` over the vertices within `reach` along the ring, (k,)."""
+    s = _lengths(ring)
+    length, k = s[-1], len(ring)
+    reach = np.minimum(reach, 0.1 * length)
+    three = np.concatenate([s[:-1] - length, s[:-1], s[:-1] + length])
+    total = np.concatenate([[0], np.cumsum(np.tile(turns, 3))])
+    middle = three[k : 2 * k]
+    return (
+        total[np.searchsorted(three, middle + reach, side="right")]
+        - total[np.searchsorted(three, middle - reach, side="left")]
+    )
+
+
+def _spaced(x: np.ndarray, turned: np.ndarray, h: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Return those of the vertices `order` that are far enough from all earlier ones that are kept."""
+    if not len(order):
+        return order
+    tree = KDTree(x[order])
+    near = tree.query_ball_point(x[order], SPACING * h[order])
+    kept = np.zeros(len(order), bool)
+    for k, (i, others) in enumerate(zip(order, near, strict=True)):
+        kept[k] = True
+        for m in others:
+            j = order[m]
+            if kept[m] and m != k:
+                fan = SPACING + FAN * (turned[i] + turned[j]) / 2
+                limit = max(fan, LEAST_SPACING) * min(h[i], h[j])
+                if np.hypot(*(x[i] - x[j])) < limit:
+                    kept[k] = False
+                    break
+    return order[kept]
+
+
+def _walls(
+    domain: Polygon, corners: np.ndarray, h: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return direction, interior angle and slack of each corner."""
+    oriented = domain.oriented
+    ring_of = np.searchsorted(oriented.ring_starts, corners, side="right") - 1
+    found = np.zeros((3, len(corners)))
+    chosen = set(corners.tolist())
+    for row, (v, r) in enumerate(zip(corners.tolist(), ring_of.tolist(), strict=True)):
+        a, b = oriented.ring_starts[r : r + 2].tolist()
+        ends, slack = [], 0.0
+        for way in (1, -1):
+            here, left, at = oriented.vertices[v], REACH * h[v], v
+            for _ in range(b - a):
+                after = a + (at - a + way) % (b - a)
+                step = oriented.vertices[after] - here
+                length = float(np.hypot(*step))
+                if length >= left or after in chosen:
+                    ends.append(here + step * min(1.0, left / length))
+                    break
+                left -= length
+                here, at = oriented.vertices[after], after
+                slack = max(slack, float(np.hypot(*(here - oriented.vertices[v]))))
+            else:
+                ends.append(here)
+        d = [np.arctan2(*(end - oriented.vertices[v])[::-1]) for end in ends]
+        angle = (d[1] - d[0]) % (2 * np.pi)
+        if angle < np.pi / 2:  # both walls of a thin hole
+            angle = 2 * np.pi
+        found[:, row] = d[0], max(angle, np.pi + 0.1), slack
+    return found[0], found[1], found[2]
+
+
+def _grouped(x: np.ndarray, h: np.ndarray) -> list[list[int]]:
+    """Return groups of at most `MOST_IN_GROUP` points; near points are joined first."""
+    group: list[list[int]] = [[k] for k in range(len(x))]
+    if len(x) < 2:
+        return group
+    pairs = KDTree(x).query_pairs(JOINED * float(h.max()), output_type="ndarray")
+    gaps = np.hypot(*(x[pairs[:, 0]] - x[pairs[:, 1]]).T)
+    close = gaps < JOINED * np.minimum(h[pairs[:, 0]], h[pairs[:, 1]])
+    pairs, gaps = pairs[close], gaps[close]
+    for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0], gaps.round(12)))].tolist():
+        a, b = group[i], group[j]
+        if a is not b and len(a) + len(b) <= MOST_IN_GROUP:
+            a += b
+            for k in b:
+                group[k] = a
+    unique = {id(g): sorted(g) for g in group}
+    return sorted(unique.values())
+
+
+def _others(x: np.ndarray, h: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of other groups near each group."""
+    found: list[np.ndarray] = []
+    if len(x):
+        near = KDTree(x).query_ball_point(x, NEAR * h)
+        for a, b in pairwise(starts.tolist()):
+            rows = np.unique(np.concatenate(near[a:b])).astype(int)
+            found.append(rows[(rows < a) | (rows >= b)])
+    counts = [len(f) for f in found]
+    return (
+        np.cumsum([0, *counts]).astype(np.int32),
+        np.concatenate([np.empty(0, int), *found]).astype(np.int32),
+    )
+
+
+def _wall_corners(domain: Polygon, corners: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Return for each edge the nearest of `corners` behind its begin and beyond its end, (k, 2) int32; -1 for none."""
+    oriented = domain.oriented
+    found = np.full((len(oriented.vertices), 2), -1, np.int32)
+    number = np.full(len(oriented.vertices), -1)
+    number[corners] = np.arange(len(corners))
+    for a, b in pairwise(oriented.ring_starts.tolist()):
+        own = np.flatnonzero(number[a:b] >= 0)
+        if not len(own):
+            continue
+        s, k = _lengths(oriented.vertices[a:b]), b - a
+        edges = np.arange(k)
+        before = own[np.searchsorted(own, edges, side="right") - 1]
+        place = np.searchsorted(own, (edges + 1) % k, side="left")
+        after = own[place % len(own)]
+        behind = (s[edges] - s[before]) % s[-1]
+        ahead = (s[after] - s[(edges + 1) % k]) % s[-1]
+        for side, (corner, gap) in enumerate(((before, behind), (after, ahead))):
+            near = gap <= reach[a + corner]
+            found[a:b, side][near] = number[a + corner[near]]
+    return found
+
+
+class PlacedCorners:
+    """Corner groups on the device, in the frame of a domain."""
+
+    def __init__(self, engine: Engine, domain: Polygon, groups: CornerGroups) -> None:
+        origin, scale = domain.frame
+        at = (domain.oriented.vertices[groups.vertices] - origin) / scale
+        measures = (groups.directions, groups.angles, groups.sizes / scale, groups.slack / scale)
+        self.count, self.groups = len(groups.vertices), len(groups)
+        self.corners = engine.upload(at.ravel())
+        self.shapes = engine.upload(np.column_stack(measures).ravel())
+        self.starts = engine.upload(groups.starts, np.int32)
+        self.other_starts = engine.upload(groups.other_starts, np.int32)
+        self.others = engine.upload(np.append(groups.others, 0), np.int32)
+        self.wall_corners = engine.upload(groups.wall_corners.ravel(), np.int32)
+        self.nearest = engine.empty(self.count, np.int32)
+        self.seeds = engine.empty(self.count, np.int32)
+        self.moved = engine.empty(self.groups * MOST_MOVED, np.int32)
+        self.targets = engine.empty(2 * self.groups * MOST_MOVED)
+
+
+class Corners:
+    """The kernels of `corners.cl`."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._kernels = engine.kernels(
+            "adaptation/corners", {"MOST_IN_GROUP": MOST_IN_GROUP, "MOST_MOVED": MOST_MOVED}
+        )
+
+    def place(
+        self, domain: Polygon, h: np.ndarray, free: Polygon | None = None
+    ) -> PlacedCorners | None:
+        """Return the corners of `domain` for cells of size `h` (k,) at its vertices; None if there are none."""
+        groups = find_corners(domain, h, free)
+        return PlacedCorners(self.engine, domain, groups) if len(groups) else None
+
+    def share(
+        self,
+        placed: PlacedCorners,
+        domain: Polygon,
+        t: Tessellation,
+        points: cla.Array,
+        velocity: cla.Array,
+        labels: cla.Array,
+        fixed: int,
+    ) -> None:
+        """Move generators so that a face ends in every corner.
+
+        Parameters
+        ----------
+        t : Tessellation
+            Diagram of the same generators before their last displacement.
+        points, velocity : (n, 2) real
+            Both change by the same displacement.
+        labels, fixed : (n,) int32, int
+            Generators with labels below `fixed` do not move.
+        """
+        engine, k, p = self.engine, self._kernels, placed
+        assert t.trimmed is not None
+        chords = t.trimmed.chords
+        p.nearest.fill(0x7FFFFFFF)
+        p.seeds.fill(0x7FFFFFFF)
+        for find in (k.find_nearest_at_wall, k.find_seeds):
+            engine.run_each(
+                find, chords.touched_count, chords.touched, np.int32(t.n), t.starts, t.neighbors, t.points,
+                p.wall_corners, p.corners, p.nearest, p.seeds,
+            )  # fmt: skip
+        engine.run_each(
+            k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), points, labels, np.int32(fixed),
+            p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds, *domain.device_args(engine),
+            p.moved, p.targets,
+        )  # fmt: skip
+        engine.run_each(
+            k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, points, velocity
+        )
