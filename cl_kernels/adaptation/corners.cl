@@ -21,6 +21,10 @@
 /* Least distance over h of a generator from its corner, and largest distance over h of candidates. */
 #define LEAST_RADIUS R(0.15)
 #define REACH R(2.2)
+/* Distance over h from a corner at which a path to it may cross the boundary because of round-off. */
+#define THICKNESS R(1e-3)
+/* Least distance over h of a generator that moves from the others. */
+#define SEPARATION R(0.1)
 /* Margin to straight angles; angle above which three cells share the corner at least; largest turn in one step. */
 #define MARGIN R(0.15)
 #define THREE R(5.8)
@@ -87,6 +91,16 @@ inline bool is_listed(int i, const int *list, int count)
     return found;
 }
 
+/* Whether candidate p shares one of the corners of the group. */
+inline bool is_shared(int p, int corner_count, const int *masks, const int *near, const int *found)
+{
+    bool shares = false;
+    for (int c = 0; c < corner_count; ++c)
+        for (int k = 0; k < found[c]; ++k)
+            shares = shares || ((masks[c] >> k & 1) && near[c * NEAREST + k] == p);
+    return shares;
+}
+
 /* Cost of a choice (bits of `mask`) among generators at distances d and angles a from the first wall, in the order of
    angles: squares of the displacements, and of the angles by which cells are too wide. */
 inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL angle)
@@ -119,6 +133,25 @@ inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL 
             last = a[p];
     }
     return cost;
+}
+
+/* Whether the generators that share corner b (bits of mask_b in list_b) and those that share corner c can have equal
+   distances from both: at most two have the same distances from two points, one on each side of the line through them.
+   */
+inline bool may_share_both(int mask_b, const int *list_b, int count_b, REAL2 b, int mask_c, const int *list_c,
+                           int count_c, REAL2 c, const int *cells, global const REAL2 *points)
+{
+    int left = 0, right = 0;
+    for (int p = 0; p < count_b; ++p)
+        for (int q = 0; q < count_c; ++q)
+            if ((mask_b >> p & 1) && (mask_c >> q & 1) && list_b[p] == list_c[q]) {
+                const REAL2 e = c - b, v = points[cells[list_c[q]]] - b;
+                if (e.s0 * v.s1 - e.s1 * v.s0 > 0)
+                    ++left;
+                else
+                    ++right;
+            }
+    return left < 2 && right < 2;
 }
 
 /* Per group: choose the generators that share each corner, the nearest ones that see it, and move them to their mean
@@ -198,7 +231,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             const REAL from[2] = {x.s0, x.s1}, to[2] = {corner.s0, corner.s1};
             int edge;
             const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
-            if ((1 - t) * best > shape.s3 * R(1.01) + 64 * REAL_EPS)
+            if ((1 - t) * best > R(1.01) * shape.s3 + THICKNESS * shape.s2 + 64 * REAL_EPS)
                 continue;
             /* Angle from the first wall; round-off, and the extent of the corner, may put it outside. */
             REAL angle = atan2(x.s1 - corner.s1, x.s0 - corner.s0) - shape.s0;
@@ -222,6 +255,12 @@ kernel void share_corners(const int size, global const int *starts, global const
         for (int mask = 3; mask < 1 << seen; ++mask) {
             const int sharing = popcount(mask);
             if (sharing < (shape.s1 > THREE ? 3 : 2) || sharing > MOST_SHARING)
+                continue;
+            bool possible = true;
+            for (int b = 0; b < c; ++b)
+                possible = possible && may_share_both(masks[b], near + b * NEAREST, found[b], corners[first + b], mask,
+                                                      list, seen, corner, cells, points);
+            if (!possible)
                 continue;
             const REAL cost = choice_cost(mask, seen, d, a, shape.s1);
             if (cost < least) {
@@ -298,12 +337,8 @@ kernel void share_corners(const int size, global const int *starts, global const
                     r = fmax(r, distance_between(at[near[c * NEAREST + p]], corner));
             for (int p = 0; p < found[c]; ++p) {
                 const int q = near[c * NEAREST + p];
-                bool shares = false;
-                for (int b = 0; b < corner_count; ++b)
-                    for (int k = 0; k < found[b]; ++k)
-                        shares = shares || ((masks[b] >> k & 1) && near[b * NEAREST + k] == q);
                 const REAL d = distance_between(at[q], corner);
-                if (!shares && d < OTHERS * r && d > 0)
+                if (!is_shared(q, corner_count, masks, near, found) && d < OTHERS * r && d > 0)
                     at[q] = corner + (at[q] - corner) * (fmin(OTHERS * r, d + OTHERS_STEP * shapes[first + c].s2) / d);
             }
         }
@@ -314,12 +349,11 @@ kernel void share_corners(const int size, global const int *starts, global const
                 continue;
             const REAL from[2] = {x.s0, x.s1}, to[2] = {at[p].s0, at[p].s1};
             int edge;
-            if (exit_over_edge(from, to, &edge, DOMAIN) <= 1) {
-                bool shares = false;
-                for (int b = 0; b < corner_count; ++b)
-                    for (int k = 0; k < found[b]; ++k)
-                        shares = shares || ((masks[b] >> k & 1) && near[b * NEAREST + k] == p);
-                inside = inside && !shares;
+            bool good = exit_over_edge(from, to, &edge, DOMAIN) > 1;
+            for (int q = 0; q < count; ++q)
+                good = good && (q == p || distance_between(at[p], at[q]) > SEPARATION * shapes[first].s2);
+            if (!good) {
+                inside = inside && !is_shared(p, corner_count, masks, near, found);
                 at[p] = x;
             }
         }

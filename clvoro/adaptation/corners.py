@@ -18,14 +18,14 @@ from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 
-SHARP_TURN = np.radians(20)
-"""Least turn of a corner, in sum over the vertices within `SHARP_REACH` h."""
 SHARP_REACH, REACH = 0.05, 0.35
-"""Distances over h along the boundary: over the first the turns of a corner are added, over the second the directions
-of its walls are taken."""
-SPACING, LEAST_SPACING, FAN = 0.6, 0.15, 0.45
-"""Spacing of corners over h: ``SPACING - FAN * turn``, where the turn is that of one of the two corners, but at least
-`LEAST_SPACING`. Cells fan out around a corner, so sharp corners may be close to each other."""
+"""Distances over h along the boundary from a corner: over the first its turns are added, over the second the boundary
+is a straight line."""
+SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(25)
+"""Least turns of a corner over both distances."""
+SPACING, LEAST_SPACING, FAN = 0.9, 0.15, 0.45
+"""Spacing of corners over h: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`.
+Cells fan out around a corner, so sharp corners may be close to each other."""
 JOINED = 1.6
 """Distance over h up to which two corners may share a generator. They belong to the same group then."""
 NEAR = 4.0
@@ -82,16 +82,17 @@ def find_corners(domain: Polygon, h: np.ndarray, free: Polygon | None = None) ->
     """
     oriented = domain.oriented
     x, turns = oriented.vertices, oriented.turns
-    turned = np.empty(len(x))
+    turned, bend = np.empty(len(x)), np.empty(len(x))
     for a, b in pairwise(oriented.ring_starts.tolist()):
         turned[a:b] = _turned(x[a:b], turns[a:b], SHARP_REACH * h[a:b])
-    # The vertex that turns most stands for its neighbors.
-    sharp = np.flatnonzero((turned < -SHARP_TURN) & (turns < 0))
+        bend[a:b] = _bend(x[a:b], turned[a:b], REACH * h[a:b])
+    sharp = np.flatnonzero((turned < -SHARP_TURN) & (turns < 0) & (bend > LEAST_TURN))
     if free is not None and free is not domain and len(sharp):
         edge = free.nearest_edge(x[sharp])[1]
         sharp = sharp[np.hypot(*(edge - x[sharp]).T) < 1e-6 * float(domain.extent.max())]
-    order = sharp[np.lexsort((sharp, turns[sharp].round(9), turned[sharp].round(9)))]
-    kept = np.sort(_spaced(x, turned, h, order))
+    # The vertex that turns most stands for its neighbors.
+    order = sharp[np.lexsort((sharp, turns[sharp].round(9), -bend[sharp].round(9)))]
+    kept = np.sort(_spaced(x, bend, h, order))
     directions, angles, slack = _walls(domain, kept, h)
     groups = _grouped(x[kept], h[kept])
     sizes = [len(g) for g in groups]
@@ -124,7 +125,22 @@ def _turned(ring: np.ndarray, turns: np.ndarray, reach: np.ndarray) -> np.ndarra
     )
 
 
-def _spaced(x: np.ndarray, turned: np.ndarray, h: np.ndarray, order: np.ndarray) -> np.ndarray:
+def _bend(ring: np.ndarray, turned: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Return the interior angle minus pi between the points at `reach` along the ring on both sides, (k,)."""
+    s = _lengths(ring)
+    reach = np.minimum(reach, 0.3 * s[-1])
+    closed = np.concatenate([ring, ring[:1]])
+    ways = []
+    for way in (1, -1):
+        place = (s[:-1] + way * reach) % s[-1]
+        ends = np.column_stack([np.interp(place, s, closed[:, axis]) for axis in (0, 1)])
+        ways.append(np.arctan2(*(ends - ring).T[::-1]))
+    angle = (ways[1] - ways[0]) % (2 * np.pi)
+    # Both walls of a thin hole may cross by round-off, or by the extent of its tip.
+    return np.where((angle < np.pi / 2) & (turned < -np.pi / 3), 2 * np.pi, angle) - np.pi
+
+
+def _spaced(x: np.ndarray, bend: np.ndarray, h: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Return those of the vertices `order` that are far enough from all earlier ones that are kept."""
     if not len(order):
         return order
@@ -136,7 +152,7 @@ def _spaced(x: np.ndarray, turned: np.ndarray, h: np.ndarray, order: np.ndarray)
         for m in others:
             j = order[m]
             if kept[m] and m != k:
-                fan = SPACING + FAN * (turned[i] + turned[j]) / 2
+                fan = SPACING - FAN * (bend[i] + bend[j]) / 2
                 limit = max(fan, LEAST_SPACING) * min(h[i], h[j])
                 if np.hypot(*(x[i] - x[j])) < limit:
                     kept[k] = False
