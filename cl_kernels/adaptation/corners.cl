@@ -11,15 +11,14 @@
 
 #define PI R(3.14159265358979323846)
 #define MOST_CANDIDATES 96
-/* Nearest generators that a corner considers, the most that share it, and most sweeps over a group. */
+/* Nearest generators that a corner considers, and most sweeps over a group. */
 #define NEAREST 6
-#define MOST_SHARING 4
 #define SWEEPS 60
 /* Least distance of the others over that of the generators that share the corner, and their largest step over h. */
 #define OTHERS R(1.3)
 #define OTHERS_STEP R(0.15)
 /* Least distance over h of a generator from its corner, and largest distance over h of candidates. */
-#define LEAST_RADIUS R(0.15)
+#define LEAST_RADIUS R(0.3)
 #define REACH R(2.2)
 /* Distance over h from a corner at which a path to it may cross the boundary because of round-off. */
 #define THICKNESS R(1e-3)
@@ -29,8 +28,10 @@
 #define MARGIN R(0.15)
 #define THREE R(5.8)
 #define MOST_TURN R(0.15)
-/* Angle of a cell at the corner above which another choice of generators is better. */
+/* Angles of cells at the corner beyond which another choice of generators is better, and their weight. */
+#define NARROW R(1.3)
 #define WIDE R(2.5)
+#define SHAPE_WEIGHT R(0.3)
 
 inline REAL distance_between(REAL2 a, REAL2 b)
 {
@@ -125,8 +126,9 @@ inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL 
             continue;
         if (last >= 0 || p == count) {
             const REAL end = p == count ? angle : (last + a[p]) / 2;
-            const REAL over = fmax(end - begin - widest, R(0)), wide = fmax(end - begin - WIDE, R(0));
-            cost += r * r * (4 * over * over + R(0.1) * wide * wide);
+            const REAL width = end - begin, over = fmax(width - widest, R(0));
+            const REAL off = fmax(width - WIDE, NARROW - width);
+            cost += r * r * (4 * over * over + (off > 0 ? SHAPE_WEIGHT * off * off : 0));
             begin = end;
         }
         if (p < count)
@@ -254,7 +256,7 @@ kernel void share_corners(const int size, global const int *starts, global const
         REAL least = REAL_MAX;
         for (int mask = 3; mask < 1 << seen; ++mask) {
             const int sharing = popcount(mask);
-            if (sharing < (shape.s1 > THREE ? 3 : 2) || sharing > MOST_SHARING)
+            if (sharing < (shape.s1 > THREE ? 3 : 2) || sharing > (shape.s1 > THREE ? 4 : 3))
                 continue;
             bool possible = true;
             for (int b = 0; b < c; ++b)
