@@ -83,6 +83,14 @@ kernel void find_seeds(const int size, global const int *cells, const int n, glo
     }
 }
 
+/* x turned about the corner by an angle. */
+inline REAL2 turned(REAL2 x, REAL2 corner, REAL angle)
+{
+    const REAL2 v = x - corner;
+    const REAL c = cos(angle), s = sin(angle);
+    return corner + (REAL2)(c * v.s0 - s * v.s1, s * v.s0 + c * v.s1);
+}
+
 /* Whether i is in the list. */
 inline bool is_listed(int i, const int *list, int count)
 {
@@ -115,7 +123,7 @@ inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL 
             ++sharing;
         }
     r /= sharing;
-    REAL cost = 0, begin = 0, last = -1;
+    REAL cost = 0, begin = 0, last = -1, lowest = -1;
     for (int p = 0; p <= count; ++p) {
         const bool chosen = p < count && (mask >> p & 1);
         if (p < count) {
@@ -131,10 +139,13 @@ inline REAL choice_cost(int mask, int count, const REAL *d, const REAL *a, REAL 
             cost += r * r * (4 * over * over + (off > 0 ? SHAPE_WEIGHT * off * off : 0));
             begin = end;
         }
-        if (p < count)
+        if (p < count) {
             last = a[p];
+            lowest = lowest < 0 ? last : lowest;
+        }
     }
-    return cost;
+    const REAL mean = (lowest + last) / 2, over = mean - clamp(mean, angle - widest, widest);
+    return cost + 4 * r * r * over * over;
 }
 
 /* Whether the generators that share corner b (bits of mask_b in list_b) and those that share corner c can have equal
@@ -278,11 +289,29 @@ kernel void share_corners(const int size, global const int *starts, global const
         for (int p = 0; p < count; ++p)
             at[p] = points[cells[p]];
         for (int c = 0; c < corner_count && attempt == 0; ++c) {
-            /* Turn the generators of the first and the last face, so that cells beside the walls are convex. */
             const REAL2 corner = corners[first + c];
             const REAL angle = shapes[first + c].s1;
             const REAL margin = fmin(MARGIN, (2 * PI - angle) / 4);
-            for (int side = 0; side < 2 && masks[c]; ++side) {
+            if (masks[c] == 0)
+                continue;
+            /* Turn all, so that the bisector of the first and the last one lies behind the walls: neither has a part of
+               its cell on the other side of a sharp corner. */
+            int outer[2] = {-1, -1};
+            for (int p = 0; p < found[c]; ++p)
+                if (masks[c] >> p & 1) {
+                    outer[0] = outer[0] < 0 ? c * NEAREST + p : outer[0];
+                    outer[1] = c * NEAREST + p;
+                }
+            const REAL mean = (angles[outer[0]] + angles[outer[1]]) / 2;
+            const REAL back = clamp(mean, angle - PI + margin, PI - margin) - mean;
+            if (back != 0)
+                for (int p = outer[0]; p <= outer[1]; ++p)
+                    if (masks[c] >> (p - c * NEAREST) & 1) {
+                        angles[p] += clamp(back, -MOST_TURN, MOST_TURN);
+                        at[near[p]] = turned(at[near[p]], corner, clamp(back, -MOST_TURN, MOST_TURN));
+                    }
+            /* Turn the generators of the first and the last face, so that cells beside the walls are convex. */
+            for (int side = 0; side < 2; ++side) {
                 int pair[2], picked = 0;
                 for (int p = 0; p < found[c] && picked < 2; ++p) {
                     const int q = side ? found[c] - 1 - p : p;
@@ -296,9 +325,7 @@ kernel void share_corners(const int size, global const int *starts, global const
                     continue;
                 turn = side ? turn : -turn;
                 for (int k = 0; k < 2; ++k) {
-                    const int p = near[pair[k]];
-                    const REAL2 v = at[p] - corner;
-                    at[p] = corner + (REAL2)(cos(turn) * v.s0 - sin(turn) * v.s1, sin(turn) * v.s0 + cos(turn) * v.s1);
+                    at[near[pair[k]]] = turned(at[near[pair[k]]], corner, turn);
                     angles[pair[k]] += turn;
                 }
             }

@@ -21,9 +21,9 @@ from ..tessellation.device_diagram import Tessellation
 SHARP_REACH, REACH = 0.05, 0.35
 """Distances over h along the boundary from a corner: over the first its turns are added, over the second the boundary
 is a straight line."""
-SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(25)
+SHARP_TURN, LEAST_TURN = np.radians(20), np.radians(30)
 """Least turns of a corner over both distances."""
-SPACING, LEAST_SPACING, FAN = 0.9, 0.15, 0.45
+SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
 """Spacing of corners over h: ``SPACING - FAN * turn``, for the mean turn of two corners, but at least `LEAST_SPACING`.
 Cells fan out around a corner, so sharp corners may be close to each other."""
 JOINED = 1.6
