@@ -262,6 +262,17 @@ class MeshState:
                 self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
             )  # fmt: skip
 
+    def constrain(self, displacement: cla.Array) -> None:
+        """Change `displacement` (n, d) so that faces end in re-entrant corners after it."""
+        if self.corners is not None:
+            with self.engine.workspace.frame():
+                ahead = self.engine.scratch(self.points.shape)
+                ahead[:] = self.points
+                self.stages.motion.add_momentum(1.0, ahead, displacement, 1.0)
+                self.stages.corners.share(
+                    self.corners, self.domain, self.t, ahead, displacement, self.labels, self.fixed
+                )  # fmt: skip
+
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:
         """Return the target size at `points` (k, d) on this level, (k,)."""
         return self.size_factor * np.asarray(self.sizing(points))
