@@ -20,8 +20,6 @@
 /* Least distance over h of a generator from its corner, and largest distance over h of candidates. */
 #define LEAST_RADIUS R(0.3)
 #define REACH R(2.2)
-/* Distance over h from a corner at which a path to it may cross the boundary because of round-off. */
-#define THICKNESS R(1e-3)
 /* Least distance over h of a generator that moves from the others. */
 #define SEPARATION R(0.1)
 /* Margin to straight angles; angle above which three cells share the corner at least; largest turn in one step. */
@@ -81,6 +79,11 @@ kernel void find_seeds(const int size, global const int *cells, const int n, glo
                 atomic_min(seeds + c, i);
         }
     }
+}
+
+inline bool is_at(REAL2 a, REAL2 b)
+{
+    return a.s0 == b.s0 && a.s1 == b.s1;
 }
 
 /* x turned about the corner by an angle. */
@@ -244,7 +247,10 @@ kernel void share_corners(const int size, global const int *starts, global const
             const REAL from[2] = {x.s0, x.s1}, to[2] = {corner.s0, corner.s1};
             int edge;
             const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
-            if ((1 - t) * best > R(1.01) * shape.s3 + THICKNESS * shape.s2 + 64 * REAL_EPS)
+            /* The walls that meet in the corner hide it from nothing, but round-off may find them crossed. */
+            const bool ends_here =
+                t <= 1 && (is_at(edge_ends[edge].s01, corner) || is_at(edge_ends[edge].s23, corner));
+            if (!ends_here && (1 - t) * best > R(1.01) * shape.s3 + 64 * REAL_EPS)
                 continue;
             /* Angle from the first wall; round-off, and the extent of the corner, may put it outside. */
             REAL angle = atan2(x.s1 - corner.s1, x.s0 - corner.s0) - shape.s0;

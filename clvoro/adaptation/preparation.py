@@ -114,9 +114,7 @@ class Preparation:
     @property
     def setup(self) -> Setup:
         """What all levels have in common."""
-        return Setup(
-            self.stages, self.domain, self.sizing, self.free, len(self.rows), self.factor
-        )
+        return Setup(self.stages, self.domain, self.sizing, self.free, len(self.rows), self.factor)
 
     def _place_layers(self, field: Field) -> Field:
         """Place the generators of the layers, and return the size field limited beside them."""

@@ -1,0 +1,250 @@
+"""Faces that end in re-entrant corners: which corners, the projection against NumPy, and whole runs."""
+
+from itertools import combinations
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from scipy.spatial import KDTree
+
+import clvoro
+from clvoro.adaptation.corners import find_corners
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import MeshState
+from clvoro.mesh.connectivity import face_ends
+from clvoro.opencl.engine import Engine
+from clvoro.sizing import Sizing, as_field
+
+H = 0.1
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+L = clvoro.Polygon([(0, 0), (1, 0), (1, 0.5), (0.5, 0.5), (0.5, 1), (0, 1)])
+WEDGE = clvoro.Polygon([(0, 0), (1, 0), (1, 0.42), (0.5, 0.5), (1, 0.55), (1, 1), (0, 1)])
+ISLAND = clvoro.Polygon(SQUARE, [[(0.42, 0.45), (0.6, 0.42), (0.52, 0.6)]])
+POST = clvoro.Polygon(SQUARE, [[(0.45, 0.3), (0.53, 0.3), (0.53, 0.7), (0.45, 0.7)]])
+TWO = clvoro.Polygon.from_pieces(
+    [[L.vertices], [np.array([(1.2, 0), (2, 0), (1.8, 0.3), (2, 1), (1.2, 1)])]]
+)
+
+
+def ring(k, r):
+    angle = np.arange(k) * (2 * np.pi / k)
+    return 0.5 + r * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def corners_of(domain, h=H):
+    groups = find_corners(domain, np.full(len(domain.oriented.vertices), h))
+    return groups, domain.oriented.vertices[groups.vertices]
+
+
+@pytest.mark.parametrize(
+    ("domain", "expected"),
+    [
+        (clvoro.Polygon(SQUARE), []),
+        (L, [(0.5, 0.5)]),
+        (WEDGE, [(0.5, 0.5)]),
+        (POST, [(0.45, 0.3), (0.53, 0.3), (0.53, 0.7), (0.45, 0.7)]),
+        (clvoro.Polygon(SQUARE, [ring(180, 0.2)]), []),
+        # A turn of 6 degrees is none.
+        (clvoro.Polygon([(0, 0), (0.5, 0.05), (1, 0), (1, 1), (0, 1)]), []),
+    ],
+)
+def test_corners_that_matter(domain, expected):
+    _, found = corners_of(domain)
+    assert sorted(map(tuple, found.tolist())) == sorted(expected)
+
+
+def test_blunt_tip_is_one_corner():
+    slit = [(0.499, 1), (0.499, 0.4), (0.501, 0.4), (0.501, 1)]
+    groups, found = corners_of(clvoro.Polygon([(0, 0), (1, 0), (1, 1), *slit[::-1], (0, 1)]))
+    assert len(found) == 1
+    assert np.degrees(groups.angles[0]) > 350
+
+
+def test_shape_of_a_corner():
+    groups, found = corners_of(WEDGE)
+    walls = np.array([(1, 0.55), (1, 0.42)]) - found[0]
+    toward, back = (np.arctan2(y, x) for x, y in walls)
+    assert groups.directions[0] == pytest.approx(toward)
+    assert groups.angles[0] == pytest.approx((back - toward) % (2 * np.pi))
+
+
+def test_crowded_corners():
+    """Of corners that are nearer than cells fit between them, the sharper ones remain."""
+    k = np.arange(40)
+    saw = np.column_stack([1 - k / 40, 0.8 + 0.01 * (k % 2)])
+    domain = clvoro.Polygon([(0, 0), (1, 0), *saw, (0, 0.8)])
+    for h, gap, most in ((0.05, 0.05, 20), (0.076, 0.1, 10)):
+        _, found = corners_of(domain, h)
+        assert most - 2 <= len(found) <= most
+        assert KDTree(found).query(found, k=2)[0][:, 1].min() == pytest.approx(gap)
+
+
+# The projection at a single corner in NumPy.
+
+NEAREST, REACH, OTHERS, OTHERS_STEP = 6, 2.2, 1.3, 0.15
+MARGIN, MOST_TURN, LEAST_RADIUS = 0.15, 0.15, 0.3
+
+
+def over(x, most):
+    return max(x - most, 0.0)
+
+
+def cost_of(chosen, d, a, angle):
+    margin = min(MARGIN, (2 * np.pi - angle) / 4 + 0.01)
+    widest, r = np.pi - margin, d[list(chosen)].mean()
+    cost = sum(
+        (d[p] - r) ** 2 if p in chosen else over(OTHERS * r, d[p]) ** 2 for p in range(len(d))
+    )
+    own = a[list(chosen)]
+    faces = np.concatenate([[0], (own[1:] + own[:-1]) / 2, [angle]])
+    for width in np.diff(faces):
+        off = max(width - 2.5, 1.3 - width, 0.0)
+        cost += r * r * (4 * over(width, widest) ** 2 + 0.3 * off * off)
+    mean = (own[0] + own[-1]) / 2
+    return cost + 4 * (r * (mean - np.clip(mean, angle - widest, widest))) ** 2
+
+
+def turn_all(x, corner, turn):
+    c, s = np.cos(turn), np.sin(turn)
+    return corner + (x - corner) @ np.array([[c, s], [-s, c]])
+
+
+def shared(domain, points, h):
+    """Return `points` after the projection at the single corner of `domain`, far from other walls."""
+    groups, (corner,) = corners_of(domain, h)
+    angle = groups.angles[0]
+    away = np.hypot(*(points - corner).T)
+    near = np.argsort(away)[:NEAREST]
+    near = near[away[near] < REACH * h]
+    v = points[near] - corner
+    a = (np.arctan2(v[:, 1], v[:, 0]) - groups.directions[0]) % (2 * np.pi)
+    near, a = near[np.argsort(a)], np.sort(a)
+    d = away[near]
+    sizes = (3, 4) if angle > 5.8 else (2, 3)
+    choices = [c for m in sizes for c in combinations(range(len(near)), m)]
+    chosen = list(min(choices, key=lambda c: cost_of(c, d, a, angle)))
+    new, margin = points.copy(), min(MARGIN, (2 * np.pi - angle) / 4)
+    mean = (a[chosen[0]] + a[chosen[-1]]) / 2
+    turn = np.clip(
+        np.clip(mean, angle - np.pi + margin, np.pi - margin) - mean, -MOST_TURN, MOST_TURN
+    )
+    a[chosen] += turn
+    new[near[chosen]] = turn_all(new[near[chosen]], corner, turn)
+    for side, pair in ((0, chosen[:2]), (1, chosen[-2:])):
+        face = a[pair].mean()
+        turn = min(over(angle - face if side else face, np.pi - margin), MOST_TURN)
+        turn = turn if side else -turn
+        a[pair] += turn
+        new[near[pair]] = turn_all(new[near[pair]], corner, turn)
+    own = near[chosen]
+    r = max(d[chosen].mean(), LEAST_RADIUS * h)
+    new[own] = corner + (new[own] - corner) * (r / away[own])[:, None]
+    for p in set(near.tolist()) - set(own.tolist()):
+        if away[p] < OTHERS * r:
+            far = min(OTHERS * r, away[p] + OTHERS_STEP * h)
+            new[p] = corner + (points[p] - corner) * (far / away[p])
+    return new, own
+
+
+def make_mesh(ctx, domain, points, real, fixed=0):
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
+    sizing = Sizing(engine, domain, as_field(H))
+    on_device = engine.upload(domain.place(points, engine.real))
+    return MeshState.create(Stages(engine), domain, sizing, on_device, fixed=fixed)
+
+
+def lattice(domain, seed):
+    """Return generators about H apart, all off the walls."""
+    rng = np.random.default_rng(seed)
+    x = (np.indices((12, 12)).reshape(2, -1).T + 0.5) / 12 + rng.uniform(-0.03, 0.03, (144, 2))
+    return x[domain.contains_well(x, 0.01)]
+
+
+def project(ctx, domain, points, real="float64", fixed=0):
+    mesh = make_mesh(ctx, domain, points, real, fixed)
+    mesh.share_corners()
+    origin, scale = domain.frame
+    return origin + mesh.to_host(mesh.points, scale), mesh.to_host(mesh.velocity, scale)
+
+
+@pytest.mark.parametrize("domain", [L, WEDGE], ids=["L", "wedge"])
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_projection(ctx, domain, real):
+    for seed in range(4):
+        points = lattice(domain, seed)
+        expected, own = shared(domain, points, H)
+        found, velocity = project(ctx, domain, points, real)
+        eps = float(np.finfo(real).eps)
+        assert found == pytest.approx(expected, abs=40 * eps)
+        assert velocity == pytest.approx(found - points, abs=40 * eps)
+        away = np.hypot(*(found[own] - 0.5).T)
+        assert len(own) >= (3 if domain is WEDGE else 2)
+        assert np.ptp(away) < 8 * eps
+
+
+def test_generators_that_sit_still_stay(ctx):
+    """What is shared already, and generators of layers, do not move."""
+    points = lattice(L, 1)
+    once, _ = project(ctx, L, points)
+    twice, _ = project(ctx, L, once)
+    assert twice == pytest.approx(once, abs=1e-14)
+    still, _ = project(ctx, L, points, fixed=len(points))
+    assert still == pytest.approx(points, abs=1e-15)
+    assert not np.allclose(once, points)
+
+
+def test_shared_by_two_corners(ctx):
+    """A generator in front of a blunt post lies at equal distances with others from both of its corners."""
+    points = np.concatenate([lattice(POST, 2), [(0.49, 0.23)]])
+    for _ in range(8):
+        points, _ = project(ctx, POST, points)
+    tree = KDTree(points)
+    for corner in corners_of(POST)[1]:
+        d = tree.query(corner, k=2)[0]
+        assert np.ptp(d) < 1e-14
+
+
+def test_domains_without_corners_have_no_kernel(ctx):
+    for domain in (clvoro.Polygon(SQUARE), clvoro.Box((0, 0), (1, 1))):
+        mesh = make_mesh(ctx, domain, lattice(L, 3), "float64")
+        assert mesh.corners is None
+        assert "corners" not in mesh.stages.__dict__
+
+
+def gaps(diagram, h):
+    """Return the distance over h of the nearest face end from each corner."""
+    _, found = corners_of(diagram.domain, h)
+    ends = face_ends(diagram)[diagram.neighbors >= 0]
+    return KDTree(diagram.vertices[np.unique(ends)]).query(found)[0] / h
+
+
+def concavity(diagram):
+    """Return the largest interior angle of a cell with straightened walls beyond 180 degrees, in degrees."""
+    return float(diagram.solver_mesh().measures.concavity.max())
+
+
+RUNS = [
+    ("adaptive", "float64", ISLAND, {}),
+    ("adaptive", "float32", POST, {}),
+    ("adaptive", "float64", TWO, {"levels": 1}),
+    ("exact", "float64", L, {}),
+    ("adaptive", "float64", WEDGE, {"n_cells": 400}),
+    ("lloyd", "float64", ISLAND, {"max_steps": 20}),
+    ("coupled", "float32", L, {"max_steps": 20}),
+    ("weighted", "float64", POST, {"max_steps": 30}),
+]
+
+
+@pytest.mark.parametrize(("method", "real", "domain", "more"), RUNS)
+def test_faces_end_in_corners(method, real, domain, more, adapter, adapter32):
+    h, more = 0.045, dict(more)
+    if "levels" in more:
+        more["options"] = clvoro.MultilevelOptions(levels=more.pop("levels"))
+    used = adapter if real == "float64" else adapter32
+    result = used.run(domain, h, method=method, seed=4, **more)
+    own = h * result.size_factor
+    found = gaps(result.diagram, own)
+    assert len(found) > 0
+    assert found.max() < 1e3 * np.finfo(real).eps / own
+    if method in ("adaptive", "exact"):
+        assert concavity(result.diagram) < 1
