@@ -248,8 +248,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             int edge;
             const REAL t = exit_over_edge(from, to, &edge, DOMAIN);
             /* The walls that meet in the corner hide it from nothing, but round-off may find them crossed. */
-            const bool ends_here =
-                t <= 1 && (is_at(edge_ends[edge].s01, corner) || is_at(edge_ends[edge].s23, corner));
+            const bool ends_here = t <= 1 && (is_at(edge_ends[edge].s01, corner) || is_at(edge_ends[edge].s23, corner));
             if (!ends_here && (1 - t) * best > R(1.01) * shape.s3 + 64 * REAL_EPS)
                 continue;
             /* Angle from the first wall; round-off, and the extent of the corner, may put it outside. */
