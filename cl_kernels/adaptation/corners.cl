@@ -31,7 +31,7 @@
 #define WIDE R(2.5)
 #define SHAPE_WEIGHT R(0.3)
 
-inline REAL distance_between(REAL2 a, REAL2 b)
+inline REAL gap_between(REAL2 a, REAL2 b)
 {
     const REAL2 d = a - b;
     return sqrt(dot(d, d));
@@ -55,7 +55,7 @@ kernel void find_nearest_at_wall(const int size, global const int *cells, const 
         for (int side = 0; side < 2; ++side) {
             const int c = side ? near.s1 : near.s0;
             if (c >= 0)
-                atomic_min(nearest + c, as_int((float)distance_between(points[i], corners[c])));
+                atomic_min(nearest + c, as_int((float)gap_between(points[i], corners[c])));
         }
     }
 }
@@ -75,7 +75,7 @@ kernel void find_seeds(const int size, global const int *cells, const int n, glo
         const int2 near = wall_corners[-1 - neighbors[k]];
         for (int side = 0; side < 2; ++side) {
             const int c = side ? near.s1 : near.s0;
-            if (c >= 0 && nearest[c] == as_int((float)distance_between(points[i], corners[c])))
+            if (c >= 0 && nearest[c] == as_int((float)gap_between(points[i], corners[c])))
                 atomic_min(seeds + c, i);
         }
     }
@@ -196,7 +196,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             const int j = neighbors[k];
             bool near = false;
             for (int c = first; c < first + corner_count && j >= 0; ++c)
-                near = near || distance_between(points[j], corners[c]) < REACH * shapes[c].s2;
+                near = near || gap_between(points[j], corners[c]) < REACH * shapes[c].s2;
             if (near && count < MOST_CANDIDATES && !is_listed(j, cells, count))
                 cells[count++] = j;
         }
@@ -206,10 +206,10 @@ kernel void share_corners(const int size, global const int *starts, global const
         const int i = cells[p];
         REAL own = REAL_MAX;
         for (int c = first; c < first + corner_count; ++c)
-            own = fmin(own, distance_between(points[i], corners[c]));
+            own = fmin(own, gap_between(points[i], corners[c]));
         bool mine = labels[i] >= fixed;
         for (int k = other_starts[g]; k < other_starts[g + 1]; ++k) {
-            const REAL d = distance_between(points[i], corners[others[k]]);
+            const REAL d = gap_between(points[i], corners[others[k]]);
             mine = mine && !(d < own || (d == own && others[k] < first));
         }
         if (mine)
@@ -233,7 +233,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             REAL best = REAL_MAX;
             int next = -1;
             for (int p = 0; p < count; ++p) {
-                const REAL far = distance_between(points[cells[p]], corner);
+                const REAL far = gap_between(points[cells[p]], corner);
                 if ((far > last || (far == last && p > last_place)) && far < best) {
                     best = far;
                     next = p;
@@ -345,7 +345,7 @@ kernel void share_corners(const int size, global const int *starts, global const
                 REAL r = 0, least = REAL_MAX;
                 for (int p = 0; p < found[c]; ++p)
                     if (masks[c] >> p & 1) {
-                        const REAL d = distance_between(at[near[c * NEAREST + p]], corner);
+                        const REAL d = gap_between(at[near[c * NEAREST + p]], corner);
                         r += d;
                         least = fmin(least, d);
                     }
@@ -353,7 +353,7 @@ kernel void share_corners(const int size, global const int *starts, global const
                 for (int p = 0; p < found[c]; ++p)
                     if (masks[c] >> p & 1) {
                         const int q = near[c * NEAREST + p];
-                        const REAL d = distance_between(at[q], corner);
+                        const REAL d = gap_between(at[q], corner);
                         if (fabs(d - r) > REAL_EPS / 2 && d > R(0.1) * r)
                             at[q] = corner + (at[q] - corner) * (r / d);
                         change = fmax(change, fabs(d - r));
@@ -368,10 +368,10 @@ kernel void share_corners(const int size, global const int *starts, global const
             REAL r = 0;
             for (int p = 0; p < found[c]; ++p)
                 if (masks[c] >> p & 1)
-                    r = fmax(r, distance_between(at[near[c * NEAREST + p]], corner));
+                    r = fmax(r, gap_between(at[near[c * NEAREST + p]], corner));
             for (int p = 0; p < found[c]; ++p) {
                 const int q = near[c * NEAREST + p];
-                const REAL d = distance_between(at[q], corner);
+                const REAL d = gap_between(at[q], corner);
                 if (!is_shared(q, corner_count, masks, near, found) && d < OTHERS * r && d > 0)
                     at[q] = corner + (at[q] - corner) * (fmin(OTHERS * r, d + OTHERS_STEP * shapes[first + c].s2) / d);
             }
@@ -385,7 +385,7 @@ kernel void share_corners(const int size, global const int *starts, global const
             int edge;
             bool good = exit_over_edge(from, to, &edge, DOMAIN) > 1;
             for (int q = 0; q < count; ++q)
-                good = good && (q == p || distance_between(at[p], at[q]) > SEPARATION * shapes[first].s2);
+                good = good && (q == p || gap_between(at[p], at[q]) > SEPARATION * shapes[first].s2);
             if (!good) {
                 inside = inside && !is_shared(p, corner_count, masks, near, found);
                 at[p] = x;
