@@ -58,10 +58,11 @@ def join_faces(mesh: SolverMesh) -> SolverMesh:
 
 
 def move_concave_points(mesh: SolverMesh) -> SolverMesh:
-    """Return `mesh` with points away from walls and seams moved out of cells that have a concave corner there.
+    """Return `mesh` with points away from walls and seams moved so that cells with a concave corner become convex.
 
-    Such a point moves onto the line between the corners before and after it. The sum of the angles beyond 180 degrees
-    of the cells around it must become less, and their areas stay positive.
+    The point in that corner moves onto the line between the corners before and after it. If it is on a wall, one of
+    these two moves instead, onto the line through the corner. The sum of the angles beyond 180 degrees of the cells
+    around the point must become less, and their areas stay positive.
     """
     points = mesh.points.copy()
     held = np.zeros(len(points), bool)
@@ -69,48 +70,69 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
     starts, loops, broken = simple_loops(mesh)
     after = following(starts)
     cell = np.repeat(np.arange(len(mesh)), np.diff(starts))
-    held[loops[np.isin(cell, broken)]] = True
+    in_broken = np.isin(cell, broken)
+    held[loops[in_broken]] = True
     by_point = np.argsort(loops, kind="stable")
     first = np.searchsorted(loops[by_point], np.arange(len(points) + 1))
+
+    def moves(p: int, target: np.ndarray) -> bool:
+        """Move point p if that makes the cells around it less concave; return whether it does."""
+        cells = cell[by_point[first[p] : first[p + 1]]]
+        rows = [loops[starts[c] : starts[c + 1]] for c in cells]
+        now, old = sum(_bent(points[row]) for row in rows), points[p].copy()
+        points[p] = target
+        if sum(_bent(points[row]) for row in rows) < now:
+            return True
+        points[p] = old
+        return False
+
     for _ in range(_ROUNDS):
         ahead = points[loops[after]] - points[loops]
         behind = np.empty_like(ahead)
         behind[after] = ahead
-        turn = behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0]
-        size = (behind * ahead).sum(axis=1)
-        places = np.flatnonzero((np.arctan2(turn, size) < _STRAIGHT) & ~held[loops])
+        turn = np.arctan2(_cross(behind, ahead), (behind * ahead).sum(axis=1))
         moved = False
-        for place in places.tolist():
-            p, at = int(loops[place]), int(starts[cell[place]])
-            row = loops[at : starts[cell[place] + 1]]
-            k = place - at
-            a, b = points[row[k - 1]], points[row[(k + 1) % len(row)]]
-            along = b - a
-            length = np.hypot(*along)
-            outward = np.array([along[1], -along[0]]) / length
-            share = np.clip((points[p] - a) @ along / length**2, 0.1, 0.9)
-            target = a + share * along + _ASIDE * share * (1 - share) * length * outward
-            cells = cell[by_point[first[p] : first[p + 1]]]
-            rows = [loops[starts[c] : starts[c + 1]] for c in cells]
-            now = sum(_bent(points[row]) for row in rows)
-            old = points[p].copy()
-            points[p] = target
-            if sum(_bent(points[row]) for row in rows) < now:
-                moved = True
-            else:
-                points[p] = old
+        for place in np.flatnonzero((turn < _STRAIGHT) & ~in_broken).tolist():
+            at, end = starts[cell[place]], starts[cell[place] + 1]
+            p = int(loops[place])
+            a = int(loops[place - 1 if place > at else end - 1])
+            b = int(loops[place + 1 if place + 1 < end else at])
+            if not held[p]:
+                moved |= moves(p, _onto_line(points[p], points[a], points[b]))
+                continue
+            for x, y, side in ((b, a, 1), (a, b, -1)):
+                if not held[x] and moves(x, _beyond(points[x], points[p], points[y], side)):
+                    moved = True
+                    break
         if not moved:
             break
     return replace(mesh, points=points)
+
+
+def _onto_line(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the place of p on the line from a to b, a little to the right of it."""
+    along = b - a
+    square = along @ along
+    share = np.clip((p - a) @ along / square, 0.1, 0.9)
+    outward = np.array([along[1], -along[0]])
+    return a + share * along + _ASIDE * share * (1 - share) * outward
+
+
+def _beyond(x: np.ndarray, p: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
+    """Return the place of x on the line from y through p, a little to the left of it, or to the right (side -1)."""
+    along = (p - y) / np.hypot(*(p - y)) * np.hypot(*(x - p))
+    return p + along + side * _ASIDE * np.array([-along[1], along[0]])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _bent(corners: np.ndarray) -> float:
     """Return the sum of the angles of a polygon beyond 180 degrees, infinite if it is not simple."""
     ahead = np.roll(corners, -1, axis=0) - corners
     behind = np.roll(ahead, 1, axis=0)
-    turn = np.arctan2(
-        behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0], (behind * ahead).sum(axis=1)
-    )
+    turn = np.arctan2(_cross(behind, ahead), (behind * ahead).sum(axis=1))
     if len(corners) < 3 or abs(turn.sum() - 2 * np.pi) > 1:
         return np.inf
     return float(np.maximum(_STRAIGHT - turn, 0).sum())

@@ -116,6 +116,7 @@ class _Work:
         self.at = self._single_faces()
         self.starts, self.loops, broken = simple_loops(mesh)
         self.broken = set(broken.tolist())
+        self.costs: dict[tuple[int, int, int], float] = {}
 
     def _following(self, diagram: Diagram) -> list[int]:
         """Return the next wall face on the ring for each one, counted from the first; -1 at an end."""
@@ -207,6 +208,12 @@ class _Work:
 
     def cost(self, run: _Run, faces: Sequence[int], point: int) -> float:
         """Return the cost of a run if it had these faces, or only this point if there are none."""
+        key = (run.cell, *((faces[0], faces[-1]) if faces else (-1, point)))
+        if key not in self.costs:
+            self.costs[key] = self._cost_of(run, faces, point)
+        return self.costs[key]
+
+    def _cost_of(self, run: _Run, faces: Sequence[int], point: int) -> float:
         size = self.sizes[run.cell]
         if faces:
             line, fixed = self.line(faces), self.fixed(faces)

@@ -105,6 +105,26 @@ def test_a_point_across_its_cell_moves_to_the_line():
     assert moved.points[4] == pytest.approx((0.5, 0.6), abs=1e-3)
 
 
+def test_beside_a_corner_on_a_wall_the_next_point_moves():
+    """The upper cell has a corner of 184.6 degrees in (1, 0.5), on the wall; the lower one is right of x = 1."""
+    points = [(0, 0.5), (1, 0.5), (1, 0), (2, 0), (2, 0.55), (2, 1), (0, 1), (1.5, 0.46)]
+    inner = [(1, 7, 0, 1), (7, 4, 0, 1)]
+    walls = [
+        (0, 1, 0, -1),
+        (1, 2, 1, -1),
+        (2, 3, 1, -3),
+        (3, 4, 1, -2),
+        (4, 5, 0, -2),
+        (5, 6, 0, -4),
+        (6, 0, 0, -1),
+    ]
+    mesh = mesh_of(points, inner, walls, 2)
+    assert concave_by(polygons(mesh)[0]) == pytest.approx(np.degrees(np.arctan(0.08)))
+    moved = move_concave_points(mesh)
+    assert concave_by(polygons(moved)[0]) < 0
+    assert np.array_equal(moved.points[:7], mesh.points[:7])
+
+
 def test_cells_beside_a_slit_become_convex(slit):
     exact, mesh = slit.solver_mesh("exact", collapse=False), slit.solver_mesh()
     before = np.array([concave_by(p) for p in polygons(exact)])
