@@ -132,12 +132,14 @@ def _unfold(mesh: SolverMesh, cells: Cells, upper: np.ndarray) -> SolverMesh:
     _, where = take_rows(starts, where, np.arange(len(left)), lower)
     shift = np.repeat(np.where(lower, cells.face_codes[source], 0), counts)
     vertices, codes = cells.corners[where], cells.codes[where] - shift
-    order = np.lexsort((codes, vertices))
-    new = np.ones(len(order), bool)
-    new[1:] = (np.diff(vertices[order]) != 0) | (np.diff(codes[order]) != 0)
-    corners = np.empty(len(order), np.int64)
-    corners[order] = np.cumsum(new) - 1
-    points = cells.positions(vertices[order][new], codes[order][new])
+    corners, points = vertices, cells.points
+    if codes.any():
+        order = np.lexsort((codes, vertices))
+        new = np.ones(len(order), bool)
+        new[1:] = (np.diff(vertices[order]) != 0) | (np.diff(codes[order]) != 0)
+        corners = np.empty(len(order), np.int64)
+        corners[order] = np.cumsum(new) - 1
+        points = cells.positions(vertices[order][new], codes[order][new])
     faces = np.full(len(mesh.owner) + 1, -1)
     faces[left] = np.arange(len(left))
     return mesh.changed(

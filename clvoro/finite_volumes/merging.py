@@ -272,32 +272,34 @@ class Cells:
     def _try_some(self, merges: Merges, sets: np.ndarray, cells: np.ndarray) -> int:
         """Merge those of the sets that leave their cells valid, given pairs of set and cell."""
         targets = self._targets(merges)
+        finite = np.ones(len(merges.priority), bool)
+        finite[merges.sets[~np.isfinite(targets[:, 0, 0])]] = False
         region = Region(self, merges, cells, sets)
-        left = region.is_manifold()
-        most = Region(self, merges, cells, sets, merged=False).assess()
-        most.angle[:] = np.maximum(most.angle + _WORSE, self.limits.non_orthogonality)
-        most.skewness[:] = np.maximum(most.skewness * (1 + _WORSE), self.limits.skewness)
-        done = 0
+        good = region.is_manifold() & finite
+        most = _Defects.allowed(region.k, self.limits)
+        fits = good & (region.assess(targets[:, 0]) <= most)
+        self._commit(merges, region, fits, targets[:, 0])
+        done = int(np.count_nonzero(fits))
+        rows = np.flatnonzero(good & ~fits)
+        if not len(rows):
+            return done
+        # Few sets are left. Other targets may do, and cells that had defects before may keep them.
+        targets = targets[np.isin(merges.sets, rows)]
+        rank = np.full(region.k, -1)
+        rank[rows] = np.arange(len(rows))
+        merges, cells, sets = merges.take(rows), cells[rank[sets] >= 0], rank[sets]
+        sets = sets[sets >= 0]
+        before = Region(self, merges, cells, sets, merged=False).assess()
+        most = before.worsened(_Defects.allowed(len(rows), self.limits))
+        region, left = Region(self, merges, cells, sets), np.ones(len(rows), bool)
         for attempt in range(targets.shape[1]):
             tried = left.copy()
             tried[merges.sets[~np.isfinite(targets[:, attempt, 0])]] = False
-            rows = np.flatnonzero(tried)
-            if not len(rows):
-                continue
-            if 2 * len(rows) < region.k:
-                # The sets that are left become those of the region.
-                kept = np.isin(merges.sets, rows)
-                merges, targets, most = merges.take(rows), targets[kept], most.take(rows)
-                rank = np.full(region.k, -1)
-                rank[rows] = np.arange(len(rows))
-                cells, sets = cells[rank[sets] >= 0], rank[sets]
-                sets = sets[sets >= 0]
-                region = Region(self, merges, cells, sets)
-                left = tried = np.ones(len(rows), bool)
-            fits = tried & (region.assess(targets[:, attempt]) <= most)
-            self._commit(merges, region, fits, targets[:, attempt])
-            left = left & ~fits
-            done += int(np.count_nonzero(fits))
+            if tried.any():
+                fits = tried & (region.assess(targets[:, attempt]) <= most)
+                self._commit(merges, region, fits, targets[:, attempt])
+                done += int(np.count_nonzero(fits))
+                left &= ~fits
         return done
 
     def _targets(self, merges: Merges) -> np.ndarray:
@@ -377,9 +379,17 @@ class _Defects:
     angle: np.ndarray
     skewness: np.ndarray
 
-    def take(self, rows: np.ndarray) -> _Defects:
-        """Return those of some of the sets."""
-        return _Defects(self.count[rows], self.serious[rows], self.angle[rows], self.skewness[rows])
+    @classmethod
+    def allowed(cls, k: int, limits: Limits) -> _Defects:
+        """Return what is allowed anywhere."""
+        none = np.zeros(k, np.int64)
+        return cls(none, none, np.full(k, limits.non_orthogonality), np.full(k, limits.skewness))
+
+    def worsened(self, allowed: _Defects) -> _Defects:
+        """Return the defects that are there already, a little increased, or those that are allowed anywhere."""
+        angle = np.maximum(self.angle + _WORSE, allowed.angle)
+        skewness = np.maximum(self.skewness * (1 + _WORSE), allowed.skewness)
+        return _Defects(self.count, self.serious, angle, skewness)
 
     def __le__(self, other: _Defects) -> np.ndarray:
         return (
