@@ -21,7 +21,6 @@ _WIDEST = 0.15
 """Most extent of vertices that become one, as a share of h."""
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
-_SWEEPS = 8
 _CHUNK = 1 << 16
 """Faces that are scanned at a time."""
 
@@ -75,18 +74,17 @@ def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = 
         By default those of `LIMITS` in turn.
     """
     cells, faces = _fold(mesh, sizes)
-    active = _flagged(cells, np.arange(len(cells.owner)))
+    pending = _flagged(cells, np.arange(len(cells.owner)))
     for cells.limits in LIMITS if limits is None else (limits,):
-        for _ in range(_SWEEPS):
+        active = pending
+        while len(active):
             cells.touched[:] = False
-            done = sum(
+            for kind in (_Scan.clusters, _Scan.small_faces, _Scan.slivers, _Scan.edges):
                 cells.merge(kind(_Scan(cells, active)))
-                for kind in (_Scan.clusters, _Scan.small_faces, _Scan.slivers, _Scan.edges)
-            )
-            near = cells.faces_of(np.flatnonzero(cells.touched))
-            active = _flagged(cells, np.union1d(active, near))
-            if not done:
-                break
+            # Where nothing has changed, another try is in vain.
+            active = _flagged(cells, cells.faces_of(np.flatnonzero(cells.touched)))
+            pending = np.union1d(pending, active)
+        pending = _flagged(cells, pending)
     return mesh if (cells.now == np.arange(len(cells.now))).all() else _unfold(mesh, cells, faces)
 
 

@@ -198,7 +198,7 @@ class Cells:
     # Merging.
 
     def merge(self, merges: Merges) -> int:
-        """Merge each set that leaves all cells valid; return how many do."""
+        """Merge each set that leaves all cells valid; return how many do. Each merge removes a vertex."""
         done = 0
         while len((merges := self._current(merges)).sets):
             sets, faces = self._star(merges)
