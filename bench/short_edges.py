@@ -1,0 +1,106 @@
+"""Short edges and small faces of 3D meshes: how many there are, and what their collapse costs.
+
+    python bench/short_edges.py [--fields S1,S2] [--rows default,best] [--device NAME] [--dtype float32] [--json]
+
+A row is a mesh of one field with one effort, or exact. It has the shares of edges shorter than 0.02 h and of faces
+smaller than 0.001 h^2 in the diagram, how many are left in the mesh for solvers, and the seconds of the collapse. Of
+the mesh for solvers it has the least flatness of a face, the largest relative change of a cell's volume, and the
+error of the sum of all volumes; then the largest non-orthogonality and skewness as OpenFOAM defines them, of the
+diagram and of the mesh for solvers. The last column is the verdict on the latter by the criteria of OpenFOAM's
+checkMesh.
+
+Fields: S1, S2 and S3 of the other benches; `spheres`, sizes by the distance to the nearer of two spheres, with a kink;
+`ridge`, the distance to a plane; `periodic`, waves in a periodic box. S3 has 1e5 cells.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from _common import CUBE, FIRST_SEED, Report, heading, make_adapter, names, parser, test_field
+
+import clvoro
+from clvoro import sizing
+from clvoro.finite_volumes.collapse import collapse_short, find_short
+
+ROWS: dict[str, dict[str, Any]] = {
+    "fast": {"effort": "fast"}, "default": {}, "best": {"effort": "best"}, "exact": {"method": "exact"},
+}  # fmt: skip
+
+
+def setup(name: str) -> tuple[clvoro.Box, Any]:
+    """Return domain and size field."""
+    if name == "spheres":
+        centers = (0.3, 0.3, 0.5), (0.7, 0.6, 0.5)
+        both = [sizing.Distance(sizing.Sphere(c, 0.2), h_min=0.04, slope=0.3) for c in centers]
+        return CUBE, sizing.minimum(*both)
+    if name == "ridge":
+        return CUBE, sizing.Expression("0.035 + 0.2 * fabs(x + 0.3 * y - 0.6)")
+    if name == "periodic":
+        waves = "0.06 + 0.03 * sin(2 * pi * x) * sin(2 * pi * y) * cos(2 * pi * z)"
+        return clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), sizing.Expression(waves)
+    return CUBE, test_field(name)
+
+
+FIELDS = ("S1", "S2", "S3", "spheres", "ridge", "periodic")
+
+
+def measure(diagram: clvoro.Diagram) -> dict[str, Any]:
+    """Collapse the short edges of a diagram; return the figures."""
+    before, h = diagram.solver_mesh(collapse=False), np.cbrt(diagram.volumes)
+    begin = time.perf_counter()
+    after = collapse_short(before, h)
+    seconds = time.perf_counter() - begin
+    was, left = find_short(before, h), find_short(after, h)
+    volumes = after.measures.geometry.volumes
+    edges = len(before.corners) / 3  # nearly all have three faces
+    return {
+        "cells": len(diagram), "seconds": seconds, "edges": len(was.edges) / edges,
+        "faces": len(was.faces) / len(before.owner),
+        "edges_left": len(left.edges), "faces_left": len(left.faces),
+        "flatness": float(after.measures.flatness.min()),
+        "change": float(np.abs(volumes / diagram.volumes - 1).max()),
+        "total": float(abs(volumes.sum() / diagram.domain.measure - 1)),
+        "angles": [float(m.measures.non_orthogonality.max()) for m in (before, after)],
+        "skewness": [float(m.measures.skewness.max()) for m in (before, after)],
+        "ok": bool(diagram.check(solver="openfoam")),
+    }  # fmt: skip
+
+
+COLUMNS = {
+    "field": lambda r: r["field"],
+    "row": lambda r: r["row"],
+    "cells": lambda r: r["cells"],
+    "short edges": lambda r: f"{r['edges']:.2%}",
+    "small faces": lambda r: f"{r['faces']:.2%}",
+    "left": lambda r: f"{r['edges_left']}, {r['faces_left']}",
+    "s": lambda r: f"{r['seconds']:.2f}",
+    "flatness": lambda r: f"{r['flatness']:.4f}",
+    "change of volume": lambda r: f"{r['change']:.3f}",
+    "of all": lambda r: f"{r['total']:.0e}",
+    "non-orth.": lambda r: " to ".join(f"{x:.1f}" for x in r["angles"]),
+    "skewness": lambda r: " to ".join(f"{x:.2f}" for x in r["skewness"]),
+    "OpenFOAM": lambda r: "accepts" if r["ok"] else "rejects",
+}
+
+
+def main() -> None:
+    """Run the bench."""
+    options_of = parser(__doc__)
+    options_of.add_argument("--fields", default="S1,S2,spheres,ridge,periodic", metavar="NAMES")
+    options_of.add_argument("--rows", default=",".join(ROWS), metavar="NAMES")
+    options = options_of.parse_args()
+    adapter = make_adapter(options)
+    report = Report(options.json, COLUMNS)
+    for name in names(options.fields):
+        box, size = setup(name)
+        for row in names(options.rows):
+            diagram = adapter.run(box, size, seed=FIRST_SEED, **ROWS[row]).diagram
+            report.add({"field": name, "row": row, **measure(diagram)}, f"{name}, {row}")
+    report.finish(heading(adapter, "Short edges and small faces of 3D meshes"))
+
+
+if __name__ == "__main__":
+    main()
