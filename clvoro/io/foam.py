@@ -41,7 +41,7 @@ def write_foam(
         The folder ``.../constant/polyMesh``, which is created if it does not exist; its five files are replaced, others
         are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in ``CASE/constant/polyMesh``.
     patches, types, thickness, walls : optional
-        See `poly_mesh`.
+        See `poly_mesh`. The note in the file `points` says by how much straight walls change the area.
     """
     mesh = poly_mesh(contents.diagram, patches, types, thickness, walls or "straight")
     marker = path if path.suffix.lower() == ".foam" else None
@@ -55,6 +55,8 @@ def write_foam(
         f"nPoints:{len(mesh.points)} nCells:{len(contents.diagram)} nFaces:{len(mesh.owner)} "
         f"nInternalFaces:{len(mesh.neighbor)}"
     )
+    changed = f"straight walls: {mesh.area_change:+.3g} of the domain" if mesh.area_change else ""
+    notes = {"owner": note, "neighbour": note, "points": changed}
     bodies = {
         "points": (len(mesh.points), _vectors(mesh.points)),
         "faces": (len(mesh.owner), _faces(mesh.starts, mesh.corners)),
@@ -66,7 +68,7 @@ def write_foam(
     with atomic_folder(folder / "faces") as target:
         for name, kind in _FILES.items():
             count, body = bodies[name]
-            head = _header(name, kind, note if name in ("owner", "neighbour") else "")
+            head = _header(name, kind, notes.get(name, ""))
             with open(target.with_name(name), "w", encoding="ascii", newline="\n") as file:
                 file.write(f"{head}{count}\n(\n")
                 file.writelines(body)

@@ -40,6 +40,8 @@ class PolyMesh:
         by neighbor.
     patches : list of Patch
         The faces of the patches follow the inner faces, patch by patch.
+    area_change : float
+        As in `SolverMesh`.
     """
 
     points: np.ndarray
@@ -48,6 +50,7 @@ class PolyMesh:
     owner: np.ndarray
     neighbor: np.ndarray
     patches: list[Patch]
+    area_change: float = 0.0
 
 
 def poly_mesh(
@@ -102,8 +105,9 @@ def poly_mesh(
     order[mesh.inner : mesh.outer] = mesh.inner + np.argsort(groups, kind="stable")
     starts, corners = take_rows(cells.starts, cells.corners, order)
     return PolyMesh(
-        cells.points, starts, corners, cells.owner[order], mesh.neighbor[: mesh.inner], made
-    )
+        cells.points, starts, corners, cells.owner[order], mesh.neighbor[: mesh.inner], made,
+        mesh.area_change,
+    )  # fmt: skip
 
 
 def _kinds(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[str]:

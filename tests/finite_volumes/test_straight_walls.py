@@ -68,7 +68,7 @@ def test_exact_walls_are_those_of_the_diagram(ring):
         ring.solver_mesh("round")
 
 
-def test_cells_on_a_circle_have_one_straight_face_there(ring):
+def test_cells_on_a_circle_have_one_straight_face_there(ring, tmp_path):
     mesh = ring.solver_mesh()
     on_circle = [face for face in wall_faces(mesh) if face[1] >= 4]
     assert len({face[0] for face in on_circle}) == len(on_circle)
@@ -83,6 +83,9 @@ def test_cells_on_a_circle_have_one_straight_face_there(ring):
     assert mesh.area_change == pytest.approx(grown / ring.diagram.domain.measure, rel=1e-9)
     assert sum(p.area for p in cells) == pytest.approx(1 - loop.area, rel=1e-12)
     assert "of the domain" in repr(mesh)
+    ring.save(tmp_path / "polyMesh")
+    noted = f"straight walls: {mesh.area_change:+.3g} of the domain"
+    assert noted in (tmp_path / "polyMesh" / "points").read_text()
 
 
 def test_cells_do_not_overlap(ring):
