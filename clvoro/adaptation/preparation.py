@@ -100,10 +100,10 @@ class Preparation:
         self.target = n_cells if n_cells is not None else max(1, round(required))
         if n_cells is None and required < 0.5:
             self._warn_of_coarse_size(required)
-        elif self._tree is not None:
-            warn_of_narrow_parts(domain, self.sizing)
         scaled = options.multilevel and n_cells is not None
         self.factor = (required / self.target) ** (1 / domain.dim) if scaled else 1.0
+        if self._tree is not None and required * self.factor**-domain.dim >= 0.5:
+            warn_of_narrow_parts(domain, lambda x: self.factor * self.sizing(x))
         self.levels = 0
         if options.multilevel:
             self.levels = self._count_levels()

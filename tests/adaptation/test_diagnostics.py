@@ -327,5 +327,6 @@ def test_narrow_parts_are_those_of_the_size_field():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_narrow_parts(domain, size)
+        clvoro.adapt(BOX, 9.0, "fast", n_cells=20)  # scaled
     with pytest.warns(MismatchWarning, match=r"0.01\d* wide at \(1.0"):
         clvoro.adapt(domain, 0.1, "fast")
