@@ -178,6 +178,8 @@ class Loop:
             self.refine()
         self.correct_count()
         if not self.is_recorded():
+            if self.steps:
+                self.mesh.settle_corners()
             self.solution = None
             self.add_row(float(self.rows[-1]["progress"][0]) if self.rows else 0.0)
         return self.result(reason in (COMPLETED, STALLED), reason, settings)

@@ -26,6 +26,8 @@ from .density import CellWeights, LloydWeights
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .stages import Stages
 
+SETTLING = 3
+"""Projections at corners if a run does not end with a step: each turns generators by a small angle only."""
 SUMMARIES = (
     "error", "quality", "energy", "lloyd", "correction", "changed", "ever_changed", "log_ratio",
     "weight",
@@ -261,6 +263,12 @@ class MeshState:
             self.stages.corners.share(
                 self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
             )  # fmt: skip
+
+    def settle_corners(self) -> None:
+        """Let faces end in re-entrant corners without another step, and update the mesh."""
+        for _ in range(SETTLING if self.corners is not None else 0):
+            self.share_corners()
+            self.update()
 
     def constrain(self, displacement: cla.Array) -> None:
         """Change `displacement` (n, d) so that faces end in re-entrant corners after it."""
