@@ -14,6 +14,7 @@ from .metric import Metric
 from .motion import Motion
 from .quality_descent import QualityDescent
 from .refinement import Refinement
+from .thin_walls import ThinWalls
 
 
 class Stages(TessellationStages):
@@ -26,11 +27,12 @@ class Stages(TessellationStages):
     quality_descent: QualityDescent
     motion: Motion
     corners: Corners
+    thin_walls: ThinWalls
     refinement: Refinement
     insertion_deletion: InsertionDeletion
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson,
-        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners,
+        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners, "thin_walls": ThinWalls,
         "refinement": Refinement, "insertion_deletion": InsertionDeletion,
     }  # fmt: skip

@@ -260,6 +260,9 @@ class MeshState:
     def share_corners(self) -> None:
         """Move the generators beside re-entrant corners so that faces end there. The diagram is then out of date."""
         if self.corners is not None:
+            self.stages.thin_walls.pair(
+                self.domain, self.t, self.h, self.points, self.velocity, self.labels, self.fixed
+            )  # fmt: skip
             self.stages.corners.share(
                 self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
             )  # fmt: skip
