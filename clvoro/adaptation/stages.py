@@ -33,6 +33,6 @@ class Stages(TessellationStages):
 
     CLASSES: ClassVar[dict[str, type]] = {
         **TessellationStages.CLASSES, "metric": Metric, "density": Density, "poisson": Poisson,
-        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners, "thin_walls": ThinWalls,
-        "refinement": Refinement, "insertion_deletion": InsertionDeletion,
+        "volume_projection": VolumeProjection, "quality_descent": QualityDescent, "motion": Motion, "corners": Corners,
+        "thin_walls": ThinWalls, "refinement": Refinement, "insertion_deletion": InsertionDeletion,
     }  # fmt: skip

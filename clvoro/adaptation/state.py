@@ -257,8 +257,8 @@ class MeshState:
         free = self.free if isinstance(self.free, Polygon) else None
         return self.stages.corners.place(domain, 2.0**level * setup.corner_sizes, free)
 
-    def share_corners(self) -> None:
-        """Move the generators beside re-entrant corners so that faces end there. The diagram is then out of date."""
+    def adjust_at_walls(self) -> None:
+        """Pair generators across thin walls, and let faces end in corners. The diagram is then out of date."""
         if self.corners is not None:
             self.stages.thin_walls.pair(
                 self.domain, self.t, self.h, self.points, self.velocity, self.labels, self.fixed
@@ -267,10 +267,10 @@ class MeshState:
                 self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
             )  # fmt: skip
 
-    def settle_corners(self) -> None:
+    def settle_at_walls(self) -> None:
         """Let faces end in re-entrant corners without another step, and update the mesh."""
         for _ in range(SETTLING if self.corners is not None else 0):
-            self.share_corners()
+            self.adjust_at_walls()
             self.update()
 
     def constrain(self, displacement: cla.Array) -> None:

@@ -50,6 +50,15 @@ class ThinWalls:
                 h, labels, np.int32(fixed), *args, partners,
             )  # fmt: skip
             engine.run_each(
-                k.place_pairs, u, chords.touched, n, chords.slots, partners, points, h, *args, targets
+                k.place_pairs,
+                u,
+                chords.touched,
+                n,
+                chords.slots,
+                partners,
+                points,
+                h,
+                *args,
+                targets,
             )
             engine.run_each(k.move_pairs, u, chords.touched, n, targets, points, velocity)

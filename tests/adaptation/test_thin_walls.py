@@ -1,0 +1,82 @@
+"""Pairs of generators on both sides of thin walls, against NumPy, and a run."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import clvoro
+from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import MeshState
+from clvoro.opencl.engine import Engine
+from clvoro.sizing import Sizing, as_field
+from tests.reference import patch
+
+H = 0.1
+HALF = 0.001  # of the wall's thickness
+TOP = 0.7
+SLIT = clvoro.Polygon(
+    [(0, 0), (0.5 - HALF, 0), (0.5 - HALF, TOP), (0.5 + HALF, TOP), (0.5 + HALF, 0), (1, 0), (1, 1), (0, 1)]
+)  # fmt: skip
+
+
+def rows_of(t, order):
+    """Return the neighbors of each generator, by label."""
+    host = patch.fetch(t)
+    rows = [set() for _ in order]
+    for i, j in zip(host.owners, host.neighbors, strict=True):
+        if max(i, j) < len(order) and j >= 0:
+            rows[order[i]].add(int(order[j]))
+    return rows
+
+
+def nearest_images(points, convex, neighbors, at_wall):
+    """Return the generator beyond the slit whose mirror image is nearest to each point at the wall; -1 for none."""
+    partners = np.full(len(points), -1)
+    for i in at_wall:
+        x, least = points[i], 0.45 * H
+        for j in sorted(convex[i] - neighbors[i]):
+            y = points[j]
+            if (x[0] < 0.5) == (y[0] < 0.5):
+                continue
+            share = (0.5 - x[0]) / (y[0] - x[0])
+            if x[1] + share * (y[1] - x[1]) > TOP:
+                continue
+            away = np.hypot(1 - y[0] - x[0], y[1] - x[1])
+            if away < least:
+                least, partners[i] = away, j
+    return partners
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_pairs(ctx, real):
+    rng = np.random.default_rng(5)
+    x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10 + rng.uniform(-0.03, 0.03, (100, 2))
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), SLIT.kind(np.dtype(real)))
+    mesh = MeshState.create(
+        Stages(engine), SLIT, Sizing(engine, SLIT, as_field(H)), engine.upload(SLIT.place(x, engine.real))
+    )  # fmt: skip
+    origin, scale = SLIT.frame
+    order = mesh.labels.get()
+    rows = [rows_of(t, order) for t in (mesh.t.trimmed.convex, mesh.t)]
+    chords = mesh.t.trimmed.chords
+    at_wall = order[chords.touched.get()[: chords.touched_count]]
+    mesh.stages.thin_walls.pair(
+        SLIT, mesh.t, mesh.h, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
+    )
+    partners, expected = nearest_images(x, *rows, at_wall), x.copy()
+    for i, j in enumerate(partners):
+        if j >= 0 and partners[j] == i:
+            expected[i] = (x[i] + (1 - x[j, 0], x[j, 1])) / 2
+    moved = (expected != x).any(axis=1)
+    assert moved.sum() >= 8
+    tolerance = 200 * float(np.finfo(real).eps)
+    assert origin + mesh.to_host(mesh.points, scale) == pytest.approx(expected, abs=tolerance)
+    assert mesh.to_host(mesh.velocity, scale) == pytest.approx(expected - x, abs=tolerance)
+
+
+def test_cells_beside_a_slit():
+    """They are as good as elsewhere; without pairs some reach through the wall."""
+    result = clvoro.adapt(SLIT, 0.04, seed=1)
+    assert result.quality.min() > 0.7
+    assert np.abs(result.size_error).max() < 0.06
+    assert result.diagram.solver_mesh().measures.concavity.max() < 1
