@@ -181,10 +181,12 @@ def make_solver_mesh(
         half_face=faces.rows,
     )
     parts = diagram.domain.boundaries.index if parts is None else parts
-    if walls == "straight" and isinstance(diagram.domain, Polygon):
+    straight = walls == "straight" and isinstance(diagram.domain, Polygon)
+    if straight:
         mesh = move_concave_points(straight_walls(join_faces(mesh), diagram, parts))
     if collapse and mesh.dim == 2:
         mesh = collapse_short_edges(mesh, parts)
+        mesh = move_concave_points(mesh) if straight else mesh
     if collapse and mesh.dim == 3:
         mesh = collapse_short(mesh, np.cbrt(diagram.volumes))
     return compact(mesh)
