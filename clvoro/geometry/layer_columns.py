@@ -10,6 +10,7 @@ import numpy as np
 from .polygon import Polygon
 
 _SHARP = math.radians(50)  # turn of the boundary at which one row ends and another one begins
+_EDGE = math.radians(120)  # turn at a sharp edge, as the trailing edge of a wing
 _MOST = 2.0**62  # columns, more than fit on any device: keeps their number finite
 _LONG = 1.5  # widths: an edge of this length has columns that no other edge shares
 _EQUAL = 1e-6  # of their length: tolerance for edges of regular polygons
@@ -78,9 +79,11 @@ def count_columns(chain: Chain, width: float) -> int:
 def count_fan(chain: Chain, width: float, height: float) -> int:
     """Return the number of generators at the distance `height` around the corner at the end of the chain.
 
-    There are at least two. Faces between them end in the corner; the cell of a single one would go around it.
+    There are at least two. Faces between them end in the corner; the cell of a single one would go around it. At a
+    sharp edge there are at least three: a face between only two long cells is much shorter than they are, and skew.
     """
-    return max(2, round(min(chain.fan * height / width, _MOST))) if chain.fan else 0
+    least = 3 if chain.fan > _EDGE else 2
+    return max(least, round(min(chain.fan * height / width, _MOST))) if chain.fan else 0
 
 
 def place_fan(chain: Chain, width: float, height: float) -> np.ndarray:
