@@ -106,7 +106,7 @@ def mesh_clvoro(layers: bool, effort: str) -> Callable[..., None]:
         if layers:
             h = float(field(np.array([[CENTER[0] - RADIUS, CENTER[1]]]))[0])
             rows = [clvoro.Layers(0.7 * h, 4, 1.15, spacing=1.4 * h, edges="cylinder")]
-        result = adapter.run(domain, field, effort=effort, layers=rows, seed=seed)
+        result = adapter.run(domain, field, n_cells=n_cells, effort=effort, layers=rows, seed=seed)
         types = {name: "patch" for name, kind in PATCHES.items() if kind == "patch"}
         result.save(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
 
