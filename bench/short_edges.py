@@ -51,7 +51,7 @@ def measure(diagram: clvoro.Diagram) -> dict[str, Any]:
     """Collapse the short edges of a diagram; return the figures."""
     before, h = diagram.solver_mesh(collapse=False), np.cbrt(diagram.volumes)
     begin = time.perf_counter()
-    after = collapse_short(before, h)
+    after = collapse_short(before, h, diagram.centroids)
     seconds = time.perf_counter() - begin
     was, left = find_short(before, h), find_short(after, h)
     volumes = after.measures.geometry.volumes

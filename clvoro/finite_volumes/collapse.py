@@ -10,13 +10,17 @@ import scipy.sparse.csgraph
 
 from ..mesh.connectivity import following, take_rows
 from .geometry import face_geometry, sum_rows
-from .merging import Cells, Limits, Merges, pack, ranges, smaller_size
+from .merging import Cells, Limits, Merges, pack, ranges, smaller_size, unpack
 from .solver_mesh import SolverMesh
 
 SHORT_EDGE = 0.02
 """Edges shorter than this share of h, the cube root of a cell's volume, are collapsed."""
 SMALL_FACE = 1e-3
 """Faces smaller than this share of h^2 are collapsed."""
+SKEWED = 1.8
+"""Faces of a greater skewness are collapsed, if they are small."""
+_SKEWED_FACE = 1e-2
+"""How small, as a share of h^2."""
 _WIDEST = 0.15
 """Most extent of vertices that become one, as a share of h."""
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
@@ -56,7 +60,12 @@ def find_short(mesh: SolverMesh, sizes: np.ndarray) -> Shortness:
     return Shortness(np.unique(ends, axis=0), np.flatnonzero(areas < SMALL_FACE * h**2))
 
 
-def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = None) -> SolverMesh:
+def collapse_short(
+    mesh: SolverMesh,
+    sizes: np.ndarray,
+    centroids: np.ndarray | None = None,
+    limits: Limits | None = None,
+) -> SolverMesh:
     """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
 
     The ends of an edge, or the corners of a face, become one point: their mean, or one of them. Points on walls, edges
@@ -70,10 +79,13 @@ def collapse_short(mesh: SolverMesh, sizes: np.ndarray, limits: Limits | None = 
         In 3D.
     sizes : (n,) float
         h of each cell, in the domain's unit of length.
+    centroids : (n, 3) float, optional
+        Of the cells. If given, faces smaller than 0.01 h^2 whose skewness exceeds 1.8 are collapsed, too.
     limits : Limits, optional
         By default those of `LIMITS` in turn.
     """
     cells, faces = _fold(mesh, sizes)
+    cells.centroids = centroids
     pending = _flagged(cells, np.arange(len(cells.owner)))
     for cells.limits in LIMITS if limits is None else (limits,):
         active = pending
@@ -177,6 +189,7 @@ class _Scan:
         Packed offset of the end from the beginning.
     length, h : (k,) float
     small : (f,) bool
+        Skewed faces count as small.
     """
 
     def __init__(self, cells: Cells, faces: np.ndarray) -> None:
@@ -194,6 +207,30 @@ class _Scan:
         away = x - x[self.starts[face]]
         twice = sum_rows(face, np.cross(away, away[after]), len(self.faces))
         self.small = np.linalg.norm(twice, axis=1) < 2 * SMALL_FACE * h**2
+        if cells.centroids is not None:
+            rows = ~self.small & (np.linalg.norm(twice, axis=1) < 2 * _SKEWED_FACE * h**2)
+            rows &= cells.neighbor[self.faces] >= 0
+            skewness = self._skewness(np.flatnonzero(rows), x, twice, cells.centroids)
+            self.small[rows] = skewness > SKEWED
+
+    def _skewness(
+        self, rows: np.ndarray, x: np.ndarray, normals: np.ndarray, centroids: np.ndarray
+    ) -> np.ndarray:
+        """Return the approximate skewness of some of the faces, all between two cells."""
+        c, faces = self.cells, self.faces[rows]
+        starts, places = take_rows(self.starts, np.arange(len(x)), rows)
+        face = np.repeat(np.arange(len(rows)), np.diff(starts))
+        center = sum_rows(face, x[places], len(rows)) / np.diff(starts)[:, None]
+        own, other = centroids[c.owner[faces]], centroids[c.neighbor[faces]]
+        line = other + unpack(c.face_codes[faces]) * c.extent - own
+        arm, n = center - own, normals[rows]
+        share = np.einsum("ij,ij->i", n, arm) / np.einsum("ij,ij->i", n, line)
+        off = arm - share[:, None] * line
+        size = np.maximum(np.linalg.norm(off, axis=1), 1e-300)
+        along = np.einsum("ij,ij->i", x[places] - center[face], (off / size[:, None])[face])
+        reach = 0.2 * np.linalg.norm(line, axis=1)
+        np.maximum.at(reach, face, np.abs(along))
+        return size / reach
 
     def clusters(self) -> Merges:
         """Return the vertices that short sides connect."""

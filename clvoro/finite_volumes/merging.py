@@ -135,6 +135,8 @@ class Cells:
         Packed offset of the neighbor's image.
     touched : (n,) bool
         Cells that a merge has changed.
+    centroids : (n, 3) float, or None
+        Where the cells had their centroids before all merges.
     """
 
     def __init__(
@@ -157,6 +159,7 @@ class Cells:
         self.face_codes, self.n = face_codes, len(sizes)
         self.sizes, self.small = sizes, small
         self.limits = Limits()
+        self.centroids: np.ndarray | None = None
         v, f = len(points), len(owner)
         rows = np.repeat(np.arange(f), self.count)
         self.walls = np.zeros(v, np.int64)

@@ -188,7 +188,7 @@ def make_solver_mesh(
         mesh = collapse_short_edges(mesh, parts)
         mesh = move_concave_points(mesh) if straight else mesh
     if collapse and mesh.dim == 3:
-        mesh = collapse_short(mesh, np.cbrt(diagram.volumes))
+        mesh = collapse_short(mesh, np.cbrt(diagram.volumes), diagram.centroids)
     return compact(mesh)
 
 

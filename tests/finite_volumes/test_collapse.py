@@ -62,11 +62,24 @@ def test_short_edges_and_small_faces_are_gone(meshes):
     assert len(left.faces) <= 0.03 * len(was.faces)
 
 
+def test_skewed_faces_are_rarer(meshes):
+    """Small faces between two cells, far from the line between the centroids."""
+    diagram, *both = meshes
+    skewed = []
+    for mesh in both:
+        areas = np.linalg.norm(mesh.measures.geometry.areas, axis=1)
+        i, j = mesh.owner, np.where(mesh.neighbor < 0, mesh.owner, mesh.neighbor)
+        h = np.cbrt(np.minimum(diagram.volumes[i], diagram.volumes[j]))
+        small = (mesh.neighbor >= 0) & (areas < 5e-3 * h**2)
+        skewed.append(np.count_nonzero(small & (mesh.measures.skewness > 1.8)))
+    assert skewed[1] <= 0.2 * skewed[0]
+
+
 def test_cells_fill_the_domain(meshes):
     diagram, _, after = meshes
     volumes = after.measures.geometry.volumes
     assert volumes.sum() == pytest.approx(diagram.domain.measure, rel=1e-13)
-    assert volumes == pytest.approx(diagram.volumes, rel=0.05)
+    assert volumes == pytest.approx(diagram.volumes, rel=0.08)
     assert after.measures.openness.max() < 1e-13
     assert len(after) == len(diagram)
 
