@@ -170,9 +170,9 @@ inline bool may_share_both(int mask_b, const int *list_b, int count_b, REAL2 b, 
     return left < 2 && right < 2;
 }
 
-/* Per group: choose the generators that share each corner, the nearest ones that see it, and move them to their mean
-   distance from it; move others away. A generator belongs to the group of its nearest corner. moved[] and targets[] are
-   the generators of the group that move, -1 for none, and their positions. */
+/* Per group: choose the generators that share each corner, the nearest one that sees it and others, and move them to
+   their mean distance from it; move others away. A generator belongs to the group of its nearest corner. moved[] and
+   targets[] are the generators of the group that move, -1 for none, and their positions. */
 kernel void share_corners(const int size, global const int *starts, global const int *neighbors, const int n,
                           global const REAL2 *points, global const int *labels, const int fixed,
                           global const int *group_starts, global const REAL2 *corners, global const REAL4 *shapes,
@@ -269,10 +269,13 @@ kernel void share_corners(const int size, global const int *starts, global const
         }
         found[c] = seen;
         masks[c] = 0;
+        int closest = 0;
+        for (int p = 1; p < seen; ++p)
+            closest = d[p] < d[closest] ? p : closest;
         REAL least = REAL_MAX;
         for (int mask = 3; mask < 1 << seen; ++mask) {
             const int sharing = popcount(mask);
-            if (sharing < (shape.s1 > THREE ? 3 : 2) || sharing > (shape.s1 > THREE ? 4 : 3))
+            if (!(mask >> closest & 1) || sharing < (shape.s1 > THREE ? 3 : 2) || sharing > (shape.s1 > THREE ? 4 : 3))
                 continue;
             bool possible = true;
             for (int b = 0; b < c; ++b)

@@ -32,6 +32,8 @@ NEAR = 4.0
 """Distance over h up to which a group has to know the corners of other groups."""
 WALL_REACH = 0.5
 """Distance over h along the boundary from a corner up to which cells at the wall are candidates."""
+GROUP = 4
+"""Work-items per work-group: they are few and each has much to do."""
 MOST_IN_GROUP, MOST_MOVED = 8, 48
 """Corners of a group, and generators that it moves at once."""
 
@@ -320,7 +322,7 @@ class Corners:
         engine.run_each(
             k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), points, labels, np.int32(fixed),
             p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds, *domain.device_args(engine),
-            p.moved, p.targets,
+            p.moved, p.targets, group=GROUP,
         )  # fmt: skip
         engine.run_each(
             k.move_to_corners, p.groups * MOST_MOVED, p.moved, p.targets, points, velocity

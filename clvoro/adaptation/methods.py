@@ -218,7 +218,8 @@ class ProjectedMethod:
                 )  # fmt: skip
             stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
             mesh.zero_fixed(mesh.lloyd)
-            mesh.constrain(mesh.lloyd)
+            if self.descent == "quality":
+                mesh.constrain(mesh.lloyd)
             if not self.correct_mean:
                 stages.density.subtract_mean_log_ratio(w)
         warm = mesh.multipliers is not None

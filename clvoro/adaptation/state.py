@@ -25,6 +25,7 @@ from .corners import PlacedCorners
 from .density import CellWeights, LloydWeights
 from .insertion_deletion import CLIMB_STRAIN, CellSizes, Change, Generators, Outcome
 from .stages import Stages
+from .thin_walls import has_thin_walls
 
 SETTLING = 3
 """Projections at corners if a run does not end with a step: each turns generators by a small angle only."""
@@ -249,23 +250,36 @@ class MeshState:
     @cached_property
     def corners(self) -> PlacedCorners | None:
         """Re-entrant corners in which faces have to end on this level; None if there are none."""
-        setup, domain = self.setup, self.domain
+        domain = self.domain
         if not isinstance(domain, Polygon) or not (domain.oriented.turns < 0).any():
             return None
-        # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
-        level = round(math.log2(self.size_factor / setup.factor))
         free = self.free if isinstance(self.free, Polygon) else None
-        return self.stages.corners.place(domain, 2.0**level * setup.corner_sizes, free)
+        return self.stages.corners.place(domain, self._sizes_at_vertices, free)
+
+    @cached_property
+    def _has_thin_walls(self) -> bool:
+        return self.corners is not None and has_thin_walls(
+            self.setup.domain, self._sizes_at_vertices
+        )
+
+    @property
+    def _sizes_at_vertices(self) -> np.ndarray:
+        """Target size on this level at the vertices of a polygon, (k,)."""
+        # `normalize_sizes` changes the factor by little: all of a level, also resumed, has the same corners.
+        level = round(math.log2(self.size_factor / self.setup.factor))
+        return 2.0**level * self.setup.corner_sizes
 
     def adjust_at_walls(self) -> None:
         """Pair generators across thin walls, and let faces end in corners. The diagram is then out of date."""
-        if self.corners is not None:
+        if self.corners is None:
+            return
+        if self._has_thin_walls:
             self.stages.thin_walls.pair(
                 self.domain, self.t, self.h, self.points, self.velocity, self.labels, self.fixed
             )  # fmt: skip
-            self.stages.corners.share(
-                self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
-            )  # fmt: skip
+        self.stages.corners.share(
+            self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
+        )  # fmt: skip
 
     def settle_at_walls(self) -> None:
         """Let faces end in re-entrant corners without another step, and update the mesh."""

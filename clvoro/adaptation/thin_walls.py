@@ -9,6 +9,28 @@ from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 
+THICKNESS = (0.1, 0.2, 0.3)
+"""Depths over h at which the domain is looked for behind its walls; the last is THIN in the kernels."""
+MOST_SAMPLES = 64
+
+
+def has_thin_walls(domain: Polygon, h: np.ndarray) -> bool:
+    """Return whether walls of `domain` are thin for cells of size `h` (k,) at its vertices.
+
+    Samples along the edges are half a cell apart, at most `MOST_SAMPLES` on an edge.
+    """
+    oriented = domain.oriented
+    begin, edge = oriented.vertices, oriented.vertices[oriented.next_vertex] - oriented.vertices
+    length = np.hypot(*edge.T)
+    least = np.minimum(h, h[oriented.next_vertex])
+    counts = np.ceil(length / (0.5 * least)).clip(1, MOST_SAMPLES).astype(int)
+    rows = np.repeat(np.arange(len(begin)), counts)
+    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = ((place + 0.5) / counts[rows])[:, None]
+    at = begin[rows] + share * edge[rows]
+    outward = np.column_stack([edge[:, 1], -edge[:, 0]])[rows] * (least / length)[rows, None]
+    return any(domain.contains(at + depth * outward).any() for depth in THICKNESS)
+
 
 class ThinWalls:
     """The kernels of `thin_walls.cl`."""

@@ -121,7 +121,7 @@ def shared(domain, points, h):
     near, a = near[np.argsort(a)], np.sort(a)
     d = away[near]
     sizes = (3, 4) if angle > 5.8 else (2, 3)
-    choices = [c for m in sizes for c in combinations(range(len(near)), m)]
+    choices = [c for m in sizes for c in combinations(range(len(near)), m) if d.argmin() in c]
     chosen = list(min(choices, key=lambda c: cost_of(c, d, a, angle)))
     new, margin = points.copy(), min(MARGIN, (2 * np.pi - angle) / 4)
     mean = (a[chosen[0]] + a[chosen[-1]]) / 2
