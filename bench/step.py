@@ -77,7 +77,7 @@ NEEDS = {
     "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4, 1 + 6, 60),
     "metric.compare_neighbors": (2 + 2 + 2, 6 + 1 + 1, 6 * 12),
     "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
-    "quality_descent.descend_quality": (2 + 2 + 1 + 2, 6 + 1 + 6 + 12, 6 * 60),
+    "quality_descent.descend_quality": (2 + 4 + 2, 6 + 1 + 6 + 12, 6 * 60),
     "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
     "poisson.assemble_laplacian": (2 + 1, 6 + 1 + 6 + 12, 3 * 20),
     "volume_projection.assemble_projection": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),

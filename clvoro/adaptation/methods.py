@@ -153,9 +153,10 @@ class ProjectedMethod:
 
     Attributes
     ----------
-    descent : "lloyd" or "quality"
-        Displacement to the weighted centroid, with which lattice defects glide and annihilate, or descent of the cell
-        quality, which improves cells and pins defects.
+    descent : "lloyd", "quality" or "edges"
+        Displacement to the weighted centroid, with which lattice defects glide and annihilate; descent of the cell
+        quality, which improves cells and pins defects, and of an energy against short edges; or descent of this energy
+        alone.
     relaxation : float
         Factor on the descent.
     momentum : float
@@ -182,7 +183,7 @@ class ProjectedMethod:
         Steps done.
     """
 
-    descent: Literal["lloyd", "quality"] = "lloyd"
+    descent: Literal["lloyd", "quality", "edges"] = "lloyd"
     relaxation: float = 1.0
     momentum: float = 0.7
     penalty: float = 0.1
@@ -211,10 +212,11 @@ class ProjectedMethod:
             if self.gradient_from_field:
                 sizes = mesh.engine.scratch(mesh.n)
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
-            if self.descent == "quality":
+            if self.descent != "lloyd":
                 stages.quality_descent.descend(
                     t, mesh.local_length, mesh.quality, mesh.lloyd,
-                    bad_cell_weight=self.bad_cell_weight, rate=self.rate,
+                    quality_weight=float(self.descent == "quality"), bad_cell_weight=self.bad_cell_weight,
+                    rate=self.rate,
                 )  # fmt: skip
             stages.motion.add_momentum(self.relaxation, mesh.lloyd, mesh.velocity, self.momentum)
             mesh.zero_fixed(mesh.lloyd)

@@ -7,8 +7,8 @@
 *insert/delete*  dislocations climb, and the number of cells follows the field
 *glide*          weighted Lloyd with momentum and a soft projection: lattice defects move and annihilate
 *correct count*  to a fixed number of cells, if there is one
-*polish*         projected descent of the cell quality; the penalty is controlled to reach the error target; some of the
-                 worst cells are deleted or split
+*polish*         projected descent of the cell quality and of short edges; the penalty is controlled to reach the error
+                 target; some of the worst cells are deleted or split
 *project*        the same with a very small penalty: all cells get their target size
 
 In 3D there is no lattice with dislocations, and a mesh that has been coupled long enough hardly loses quality in the
@@ -387,8 +387,8 @@ def _finish_2d(
             "quality", penalty=1e-3, iterations=EXACT_ITERATIONS, tolerance=1e-3, k=0.3, gradient_from_field=True,
             correct_mean=True,
         )  # fmt: skip
-        # The last two steps only project: Newton's method for the sizes.
-        newton = replace(project, relaxation=0.0, momentum=0.0)
+        # The last two steps only project and separate vertices: Newton's method for the sizes.
+        newton = replace(project, descent="edges", momentum=0.0)
         yield from [Step(project)] * (EXACT_STEPS - 2)
         yield from [Step(newton)] * 2
 

@@ -1,4 +1,6 @@
-"""The gradient of quality against finite differences of the energy, by diagrams from Qhull."""
+"""The gradients of quality and of short edges against finite differences of the energy, by diagrams from Qhull."""
+
+import itertools
 
 import numpy as np
 import pyopencl as cl
@@ -7,6 +9,7 @@ import pytest
 import clvoro
 from clvoro.adaptation.quality_descent import QualityDescent
 from clvoro.adaptation.stages import Stages
+from clvoro.mesh.connectivity import face_ends
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import diagrams as reference
@@ -32,7 +35,9 @@ def energy(points, omega):
     return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
 
 
-def descend(engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None):
+def descend(
+    engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None, stiffness=0.0
+):
     t = patch.tessellate(engine, points)
     quality = engine.upload(qualities(points)[:, 0] if quality is None else quality)
     out = engine.empty((len(points), 2))
@@ -44,6 +49,7 @@ def descend(engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, 
         bad_cell_weight=bad_cell_weight,
         rate=rate,
         max_displacement=max_displacement,
+        edge_stiffness=stiffness,
     )
     return out.get()
 
@@ -100,6 +106,7 @@ def test_gradient_in_a_polygon(ctx):
         bad_cell_weight=5.0,
         rate=0.3,
         max_displacement=1e9,
+        edge_stiffness=0,
     )
     # E is the same in any unit.
     unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
@@ -138,6 +145,7 @@ def test_gradient_across_seams(ctx, periodic):
         bad_cell_weight=5.0,
         rate=0.3,
         max_displacement=1e9,
+        edge_stiffness=0,
     )
     omega = 1 - 5 * np.log(q)
 
@@ -150,6 +158,117 @@ def test_gradient_across_seams(ctx, periodic):
     # As above; what is known of faces while generators move is in single precision.
     scale = np.abs(expected).max()
     assert out.get()[some] == pytest.approx(expected[some], rel=1e-5, abs=2e-6 * scale)
+
+
+DOMAINS = {
+    "box": clvoro.Box((0, 0), (1, 0.75)),
+    "periodic": clvoro.Box((0, 0), (1, 0.75), periodic=True),
+    "channel": clvoro.Box((0, 0), (1, 0.75), periodic=(False, True)),
+    # Small turns, a convex corner of 48 degrees, and a re-entrant one.
+    "polygon": clvoro.Polygon(
+        [(0, 0.05), (0.45, 0), (1, 0.02), (1.05, 0.4), (1, 0.7), (0.6, 0.8), (0.45, 0.7), (0.25, 0.85), (0, 0.8)]
+    ),
+}  # fmt: skip
+
+
+def edges_of(d):
+    """Yield the cells of each edge, (i, i) at the boundary, and its length; none beside re-entrant corners."""
+    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
+    ends, polygon = face_ends(d), isinstance(d.domain, clvoro.Polygon)
+    turns = {}
+    if polygon:
+        turns = dict(
+            zip(map(tuple, d.domain.oriented.vertices), d.domain.oriented.turns, strict=True)
+        )
+    walls = {}
+    for k, (i, j) in enumerate(zip(owner.tolist(), d.neighbors.tolist(), strict=True)):
+        if j >= 0:
+            yield i, j, d.face_measures[k] / 2  # twice
+        else:
+            begin, end = map(tuple, d.vertices[ends[k]])
+            walls.setdefault(i, []).append([begin, end, d.face_measures[k]])
+    for i, parts in walls.items():
+        joined = True
+        while joined:
+            joined = False
+            for a, b in itertools.permutations(parts, 2):
+                if a[1] == b[0] and polygon and abs(turns.get(a[1], 0)) < np.pi / 6:
+                    parts.remove(b)
+                    a[1:] = [b[1], a[2] + b[2]]
+                    joined = True
+                    break
+        for begin, end, length in parts:
+            if min(turns.get(begin, 0), turns.get(end, 0)) > -np.pi / 6:
+                yield i, i, length
+
+
+def edge_energy(d, h, short):
+    """E = 1/2 sum max(0, short - l / h)^2 over all edges."""
+    total = 0.0
+    for i, j, length in edges_of(d):
+        share = 1 if i == j else 2  # half-faces
+        unit = (h[i] + h[j]) / 2
+        total += max(0, short - share * length / unit) ** 2 / 2 / share
+    return total
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_gradient_of_short_edges(ctx, name):
+    """Faces, parts of the boundary, and those that end in a corner; diagrams are the device's own."""
+    domain, adapter = DOMAINS[name], clvoro.Adapter(ctx)
+    rng = np.random.default_rng(2117)
+    grid = np.stack(np.meshgrid(np.arange(7) / 7, np.arange(6) / 8.5, indexing="ij"), -1)
+    points = grid.reshape(-1, 2) + rng.uniform(0.01, 0.12, (42, 2))
+    if name == "polygon":
+        points = points[domain.contains_well(points, 0.01)]
+    n, short = len(points), 1.1
+    h = rng.uniform(0.1, 0.14, n)
+    real = np.dtype("float64")
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, real, domain.kind(real))
+    placed = domain.place(points, real)
+    unit = domain.frame[1]
+    t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
+    out = engine.empty((n, 2))
+    QualityDescent(engine).descend(
+        t, engine.upload(h / unit), engine.upload(np.full(n, 0.5)), out, quality_weight=0, rate=0.3,
+        max_displacement=1e9, short_edge=short, edge_stiffness=2,
+    )  # fmt: skip
+    some = rng.permutation(n)[:16]
+    gradient = gradient_of(
+        lambda x: 2 * edge_energy(adapter.diagram(domain, x), h, short), points, some
+    )
+    expected = -0.3 * h[:, None] ** 2 * gradient / unit
+    scale = np.abs(expected).max()
+    assert (np.abs(expected[some]) > 1e-3 * scale).all(axis=1).sum() > 8
+    assert out.get()[some] == pytest.approx(expected[some], rel=1e-4, abs=1e-5 * scale)
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_short_edges_grow(ctx, real):
+    """Four generators on a square, nearly: the edge between them grows, whichever way it lies."""
+    points = np.array([[0.4, 0.375], [0.6, 0.375], [0.5, 0.273], [0.5, 0.477]])
+    engine = patch.make_engine(ctx, real)
+    adapter = clvoro.Adapter(ctx, dtype=real)
+
+    def length(points):
+        d = adapter.diagram(patch.BOX, points)
+        return d.face_measures[d.neighbors >= 0].min()
+
+    u = descend(engine, points, np.full(4, 0.2), 0.0, quality=np.full(4, 0.9), stiffness=50)
+    assert 1e-3 < length(points) < 0.05 * 0.2
+    assert length(points + u) > 2 * length(points)
+
+
+@pytest.mark.parametrize("settings", [{}, {"method": "exact"}], ids=str)
+def test_runs_have_no_short_edges(ctx, settings):
+    """A steep field: without the energy about one run of five has an edge of 0.04 h or less."""
+    field = clvoro.sizing.Distance(clvoro.sizing.Circle((0.5, 0.4), 0.2), h_min=0.012, slope=0.3)
+    adapter = clvoro.Adapter(ctx)
+    for seed in range(4):
+        result = adapter.run(patch.BOX, field, seed=seed, **settings)
+        h, d = result.target_size, result.diagram
+        for i, j, length in edges_of(d):
+            assert (1 if i == j else 2) * length > 0.05 * (h[i] + h[j]) / 2
 
 
 def test_descends(ctx):
