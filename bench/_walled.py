@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from _common import CUBE, test_field
 
 import clvoro
 from clvoro import sizing
+from clvoro.curves import Curve
 
 
 class Setup(NamedTuple):
@@ -93,44 +93,34 @@ def channel(layers: bool = False) -> Setup:
     return Setup(domain, size, {"layers": rows} if layers else {})
 
 
-def _wing(
-    thickness: float, chord: float, place: tuple[float, float], degrees: float, half: int = 60
-) -> np.ndarray:
-    """Return a NACA 4-digit section without camber, of 2 `half` edges; its trailing edge is sharp."""
-    x = 0.5 * (1 - np.cos(np.linspace(0, np.pi, half + 1)))
-    y = 5 * thickness * np.polyval([-0.1036, 0.2843, -0.3516, -0.1260, 0.0], x)
-    y += 5 * thickness * 0.2969 * np.sqrt(x)
-    y[-1] = 0
-    upper, lower = np.column_stack([x, y])[::-1], np.column_stack([x, -y])[1:-1]
-    a = np.radians(degrees)
-    turn = np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
-    return chord * np.concatenate([upper, lower]) @ turn.T + place
-
-
-def _far_field(sections: list[np.ndarray], first_layer: float, count: int) -> Setup:
-    c, s = _turned(120)
-    outer = 6 * np.column_stack([c, s]) + (0.5, 0)
-    starts = np.cumsum([120, *(len(w) for w in sections)])
-    names = {f"wing-{k}": range(a, b) for k, (a, b) in enumerate(pairwise(starts), 1)}
-    domain = clvoro.Polygon(outer, sections, names={"far": range(120), **names})
-    size = sizing.Distance(domain.boundary(list(names)), h_min=0.01, slope=0.15, h_max=0.6)
+def _far_field(sections: list[Curve], first_layer: float, count: int) -> Setup:
+    """Return wing sections in a disc; the spacing of layers is .6 of the radius of the nose, at most .004."""
+    far = clvoro.curves.circle((0.5, 0), 6, name="far")
+    domain = clvoro.Polygon(far, sections)
+    size = sizing.Distance(sections, h_min=0.01, slope=0.15, h_max=0.6)
     if not first_layer:
         return Setup(domain, size, {})
-    rows = clvoro.Layers(first_layer, count=count, growth=1.35, spacing=0.01, edges=list(names))
+    rows = []
+    for wing in sections:
+        chord, thickness = wing.arguments["chord"], int(wing.arguments["code"]) / 100
+        spacing = min(0.004, 0.6 * 1.1 * thickness**2 * chord)
+        rows.append(
+            clvoro.Layers(first_layer, count=count, growth=1.35, spacing=spacing, edges=wing.name)
+        )
     return Setup(domain, size, {"layers": rows})
 
 
 def wing(first_layer: float = 0.0) -> Setup:
-    """Return nACA 0012 in a far field."""
-    return _far_field([_wing(0.12, 1.0, (0, 0), 0)], first_layer, 12)
+    """Return a NACA 0012 section in a far field."""
+    return _far_field([clvoro.curves.naca("0012", name="wing")], first_layer, 8)
 
 
 def three_wings(first_layer: float = 0.0) -> Setup:
     """Return a slat, a main wing and a flap in a far field."""
     sections = [
-        _wing(0.10, 0.18, (-0.2, -0.1), 25),
-        _wing(0.12, 0.8, (0.0, 0.0), 0),
-        _wing(0.10, 0.3, (0.83, -0.05), -30),
+        clvoro.curves.naca("0010", 0.18, (-0.2, -0.1), 25, name="slat"),
+        clvoro.curves.naca("0012", 0.8, name="main"),
+        clvoro.curves.naca("0010", 0.3, (0.83, -0.05), -30, name="flap"),
     ]
     return _far_field(sections, first_layer, 8)
 
