@@ -19,10 +19,12 @@ SMALL_FACE = 1e-3
 """Faces smaller than this share of h^2 are collapsed."""
 SKEWED = 1.8
 """Faces of a greater skewness are collapsed, if they are small."""
-_SKEWED_FACE = 1e-2
+_SKEWED_FACE = 2e-2
 """How small, as a share of h^2."""
 _WIDEST = 0.15
 """Most extent of vertices that become one, as a share of h."""
+_LONGEST = 0.25
+"""Longest edge that is collapsed, if it is the shortest of a small face."""
 LIMITS = (Limits(), Limits(non_orthogonality=20), Limits(non_orthogonality=40, skewness=3))
 """Tried in turn, the later ones where short edges or small faces are left."""
 _CHUNK = 1 << 16
@@ -80,7 +82,7 @@ def collapse_short(
     sizes : (n,) float
         h of each cell, in the domain's unit of length.
     centroids : (n, 3) float, optional
-        Of the cells. If given, faces smaller than 0.01 h^2 whose skewness exceeds 1.8 are collapsed, too.
+        Of the cells. If given, faces smaller than 0.02 h^2 whose skewness exceeds 1.8 are collapsed, too.
     limits : Limits, optional
         By default those of `LIMITS` in turn.
     """
@@ -263,7 +265,8 @@ class _Scan:
         i, j = np.minimum(i, j), np.maximum(i, j)
         _, first = np.unique(i * len(self.cells.points) + j, return_index=True)
         pairs = np.stack([i[first], j[first]], axis=1)
-        return self._sets(2 * np.arange(len(pairs) + 1), pairs.ravel(), self.h[wanted][first])
+        starts = 2 * np.arange(len(pairs) + 1)
+        return self._sets(starts, pairs.ravel(), self.h[wanted][first], widest=_LONGEST)
 
     def slivers(self) -> Merges:
         """Return the ends of the short sides of faces that vanish if all of them become points."""
@@ -287,6 +290,7 @@ class _Scan:
         vertices: np.ndarray,
         h: np.ndarray,
         sets: np.ndarray | None = None,
+        widest: float = _WIDEST,
     ) -> Merges:
         """Return those groups of vertices that are close together; each is a set, or has its place in `sets`."""
         g = len(starts) - 1
@@ -304,4 +308,4 @@ class _Scan:
         np.minimum.at(size, sets, h)
         reach = 1.2 * np.maximum(extent, SHORT_EDGE * size)
         merges = Merges(starts, vertices, -pack(steps), sets, extent / size, reach)
-        return merges.take(np.flatnonzero(extent <= _WIDEST * size))
+        return merges.take(np.flatnonzero(extent <= widest * size))
