@@ -259,7 +259,7 @@ def test_short_edges_grow(ctx, real):
     assert length(points + u) > 2 * length(points)
 
 
-@pytest.mark.parametrize("settings", [{}, {"method": "exact"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"effort": "fast"}, {"method": "exact"}], ids=str)
 def test_runs_have_no_short_edges(ctx, settings):
     """A steep field: without the energy about one run of five has an edge of 0.04 h or less."""
     field = clvoro.sizing.Distance(clvoro.sizing.Circle((0.5, 0.4), 0.2), h_min=0.012, slope=0.3)
