@@ -94,19 +94,14 @@ def channel(layers: bool = False) -> Setup:
 
 
 def _far_field(sections: list[Curve], first_layer: float, count: int) -> Setup:
-    """Return wing sections in a disc; the spacing of layers is .6 of the radius of the nose, at most .004."""
+    """Return wing sections in a disc, with layers if the first one has a height."""
     far = clvoro.curves.circle((0.5, 0), 6, name="far")
     domain = clvoro.Polygon(far, sections)
     size = sizing.Distance(sections, h_min=0.01, slope=0.15, h_max=0.6)
     if not first_layer:
         return Setup(domain, size, {})
-    rows = []
-    for wing in sections:
-        chord, thickness = wing.arguments["chord"], int(wing.arguments["code"]) / 100
-        spacing = min(0.004, 0.6 * 1.1 * thickness**2 * chord)
-        rows.append(
-            clvoro.Layers(first_layer, count=count, growth=1.35, spacing=spacing, edges=wing.name)
-        )
+    edges = [wing.name for wing in sections]
+    rows = clvoro.Layers(first_layer, count=count, growth=1.35, spacing=0.004, edges=edges)
     return Setup(domain, size, {"layers": rows})
 
 

@@ -183,10 +183,11 @@ def make_solver_mesh(
     parts = diagram.domain.boundaries.index if parts is None else parts
     straight = walls == "straight" and isinstance(diagram.domain, Polygon)
     if straight:
-        mesh = move_concave_points(straight_walls(join_faces(mesh), diagram, parts))
+        mesh = straight_walls(join_faces(mesh), diagram, parts)
     if collapse and mesh.dim == 2:
         mesh = collapse_short_edges(mesh, parts)
-        mesh = move_concave_points(mesh) if straight else mesh
+    if straight:
+        mesh = move_concave_points(mesh)
     if collapse and mesh.dim == 3:
         mesh = collapse_short(mesh, np.cbrt(diagram.volumes), diagram.centroids)
     return compact(mesh)

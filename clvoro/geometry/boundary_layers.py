@@ -29,8 +29,8 @@ class Layers:
 
     Generators stand in columns normal to the wall and do not move. Where the wall is straight, their cells are
     rectangles, and layer k has the height ``height * growth**k``. One more row beyond the last layer makes the outer
-    faces of that layer straight, too. Beyond it sizes grow from `spacing` by the factor `growth` per cell (see
-    `sizing.Distance`), up to the size field.
+    faces of that layer straight, too. Beyond it sizes grow from the width of the columns by the factor `growth` per
+    cell (see `sizing.Distance`), up to the size field.
 
     Parameters
     ----------
@@ -41,7 +41,8 @@ class Layers:
     growth : float
         Ratio of the heights of neighboring layers, at least 1.
     spacing : float, optional
-        Width of the cells along the wall; by default the height of the last layer.
+        Largest width of the cells along the wall; by default the height of the last layer. OpenFOAM's `checkMesh`
+        refuses cells that are more than 89 times as wide as high.
     edges : int, str, or sequence of them, optional
         Numbers or names of edges of the `Polygon`, or of sides of the `Box`; by default all that are not periodic.
 
@@ -54,6 +55,11 @@ class Layers:
     -----
     Where edges are at least 1.5 widths long, or all equal, each corner of the wall is a corner of cells, so no face on
     the wall is a sliver. Along shorter edges cells have the width `spacing`, independent of the corners of the wall.
+
+    Columns become narrower towards corners where the wall turns away from the domain, such as trailing edges, down to 8
+    heights of the first layer. The rows go around these corners. Columns are narrower on curved walls, too: between the
+    two ends of a cell the wall leaves their chord by at most a quarter of the first layer's height. So `spacing` need
+    not follow the radius of a nose.
 
     Examples
     --------
@@ -132,11 +138,11 @@ def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
     found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
     for layer in layers:
         for chain in find_chains(polygon, _chosen(domain, layer)):
-            feet, normals = place_columns(chain, layer.width)
+            feet, normals = place_columns(chain, layer.width, layer.height)
             near = min(layer.width, layer.heights.min())
             for y in layer.rows:
                 fan = place_fan(chain, layer.width, y)
-                apart = chain.fan * y / max(len(fan), 1)
+                apart = chain.fan * y / max(len(fan) - 1, 1)
                 found += [feet + y * normals, fan]
                 limits += [
                     np.full(len(feet), _NEAR * near),
@@ -189,7 +195,7 @@ def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
         chains = find_chains(polygon, _chosen(domain, layer))
         if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
             raise InputError(_NO_ROOM)
-        columns = sum(count_columns(chain, layer.width) for chain in chains)
+        columns = sum(count_columns(chain, layer.width, layer.height) for chain in chains)
         total += columns * (layer.count + 1)
         total += sum(count_fan(chain, layer.width, y) for chain in chains for y in layer.rows)
     return total
@@ -231,9 +237,33 @@ def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
     """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
     polygon, _ = as_polygon(domain)
     chains = find_chains(polygon, _chosen(domain, layer))
-    made = [place_columns(chain, layer.width) for chain in chains]
+    made = [place_columns(chain, layer.width, layer.height) for chain in chains]
     feet, normals = zip(*made, strict=True)
     return np.concatenate(feet), np.concatenate(normals)
+
+
+def outer_segments(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parts (k, 2, 2) of the last row of `layer` between neighboring columns, and their lengths (k,).
+
+    Parts that are outside of the domain, or nearer to another wall, are left out.
+    """
+    polygon, _ = as_polygon(domain)
+    y, found = float(layer.rows[-1]), [np.empty((0, 2, 2))]
+    for chain in find_chains(polygon, _chosen(domain, layer)):
+        feet, normals = place_columns(chain, layer.width, layer.height)
+        row = feet + y * normals
+        for part in (row, place_fan(chain, layer.width, y)):
+            found.append(np.stack([part[:-1], part[1:]], axis=1))
+        if chain.closed:
+            found.append(np.stack([row[-1:], row[:1]], axis=1))
+    segments = np.concatenate(found)
+    middles = segments.mean(axis=1)
+    kept = polygon.contains(middles)
+    walls = shapely.multilinestrings(chosen_segments(domain, layer))
+    shapely.prepare(walls)
+    kept[kept] = shapely.distance(shapely.points(middles[kept]), walls) >= _OWN * y
+    segments = segments[kept]
+    return segments, np.hypot(*(segments[:, 1] - segments[:, 0]).T)
 
 
 def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:

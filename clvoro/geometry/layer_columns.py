@@ -10,10 +10,15 @@ import numpy as np
 from .polygon import Polygon
 
 _SHARP = math.radians(50)  # turn of the boundary at which one row ends and another one begins
-_EDGE = math.radians(120)  # turn at a sharp edge, as the trailing edge of a wing
+_STEP = math.radians(36)  # largest angle between generators of a row around a corner
 _MOST = 2.0**62  # columns, more than fit on any device: keeps their number finite
 _LONG = 1.5  # widths: an edge of this length has columns that no other edge shares
 _EQUAL = 1e-6  # of their length: tolerance for edges of regular polygons
+_BULGE = 0.25  # of the first layer's height: largest distance between a curved wall and the chord of a cell
+_WINDOW = 0.2  # of a width: part of the wall over which its curvature is a mean
+_FLAT = 8  # heights of the first layer: width of columns beside a corner with a fan, whose first cell is as small
+_WIDENING = 0.3  # change of the width of columns per length along the wall
+_FINEST = 1e-6  # of the width: the narrowest columns
 
 
 @dataclass(frozen=True)
@@ -28,11 +33,14 @@ class Chain:
         Whether the last vertex is the first one, without a sharp turn there.
     fan : float
         Angle at the end by which the boundary turns away from the domain, towards the next chain; 0 for other turns.
+    after_fan : bool
+        Whether the chain before ends in such a turn.
     """
 
     corners: np.ndarray
     closed: bool
     fan: float
+    after_fan: bool
 
 
 def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
@@ -47,6 +55,9 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
     onward = chosen & chosen[following] & (np.abs(turn) < _SHARP)
     starts = chosen.copy()
     starts[following[onward]] = False
+    fans = np.where(chosen & chosen[following] & ~onward & (turn < 0), -turn, 0.0)
+    before = np.empty_like(following)
+    before[following] = np.arange(len(following))
     chains, seen = [], np.zeros(len(chosen), bool)
     for e in [*np.flatnonzero(starts).tolist(), *np.flatnonzero(chosen).tolist()]:
         if seen[e]:
@@ -56,43 +67,145 @@ def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
             edges.append(int(following[edges[-1]]))
         seen[edges] = True
         last = edges[-1]
-        fan = (
-            -turn[last] if chosen[following[last]] and not onward[last] and turn[last] < 0 else 0.0
-        )
         chains.append(
             Chain(
                 np.vstack([vertices[edges], vertices[following[last]]]),
                 bool(onward[last]),
-                float(fan),
+                float(fans[last]),
+                bool(fans[before[e]]),
             )
         )
     return chains
 
 
-def count_columns(chain: Chain, width: float) -> int:
-    """Return the number of columns along the chain."""
-    corners, _ = _begun(chain, width)
-    _, counts = _runs(np.hypot(*np.diff(corners, axis=0).T), width)
+def count_columns(chain: Chain, width: float, height: float) -> int:
+    """Return the number of columns along the chain, at most `width` wide; `height` is that of the first layer."""
+    _, counts = _runs(_Wall.of(chain, width, height).lengths, width, chain)
     return sum(map(int, counts.tolist()))
 
 
-def count_fan(chain: Chain, width: float, height: float) -> int:
-    """Return the number of generators at the distance `height` around the corner at the end of the chain.
+def count_fan(chain: Chain, width: float, distance: float) -> int:
+    """Return the number of generators at a distance from the corner at the end of the chain.
 
-    There are at least two. Faces between them end in the corner; the cell of a single one would go around it. At a
-    sharp edge there are at least three: a face between only two long cells is much shorter than they are, and skew.
+    They are at most 36 degrees apart. Rows farther away have twice, four times, ... as many steps.
     """
-    least = 3 if chain.fan > _EDGE else 2
-    return max(least, round(min(chain.fan * height / width, _MOST))) if chain.fan else 0
+    if not chain.fan:
+        return 0
+    least = math.ceil(chain.fan / _STEP)
+    more = min(chain.fan * distance / width, _MOST) / least
+    return 1 + least * 2 ** max(0, round(math.log2(max(more, 1.0))))
 
 
-def place_fan(chain: Chain, width: float, height: float) -> np.ndarray:
-    """Return generators (m, 2) at the distance `height` around the corner at the end of the chain."""
-    count = count_fan(chain, width, height)
+def place_fan(chain: Chain, width: float, distance: float) -> np.ndarray:
+    """Return generators (m, 2) at a distance from the corner at the end of the chain.
+
+    The first and the last one are above the corner on the normals of the two walls, so that their rows continue those
+    of the walls. Faces between them end in the corner.
+    """
+    count = count_fan(chain, width, distance)
     along = chain.corners[-1] - chain.corners[-2]
-    normal = math.atan2(along[0], -along[1])
-    angles = normal - chain.fan * (np.arange(count) + 0.5) / max(count, 1)
-    return chain.corners[-1] + height * np.column_stack([np.cos(angles), np.sin(angles)])
+    angles = math.atan2(along[0], -along[1]) - chain.fan * np.linspace(0, 1, count)
+    return chain.corners[-1] + distance * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+@dataclass(frozen=True)
+class _Wall:
+    """The edges of a chain, and lengths along it in which all columns are equally wide.
+
+    Columns are narrower where the wall is curved, so that the wall within a cell is flat beside the height of the first
+    layer: a cell of width w bulges by w^2 / (8 r) on a wall of radius r. They are narrower beside corners with a fan,
+    too, where the first cell of the fan is as small as the layer is high.
+
+    Attributes
+    ----------
+    corners : (k + 1, 2) float
+    joined : bool
+        Whether the chain is closed and begins between two long edges.
+    lengths : (k,) float
+        Lengths of the edges, stretched: integrals of ``width / w``.
+    reached, stretched : (m,) float
+        Lengths along the chain, and the same stretched.
+    """
+
+    corners: np.ndarray
+    joined: bool
+    lengths: np.ndarray
+    reached: np.ndarray
+    stretched: np.ndarray
+
+    @classmethod
+    def of(cls, chain: Chain, width: float, height: float) -> _Wall:
+        corners, joined = _begun(chain, width)
+        along = np.diff(corners, axis=0)
+        lengths = np.hypot(*along.T)
+        ends = np.concatenate([[0], np.cumsum(lengths)])
+        widths = _bounds(chain, along, lengths, width, height)
+        if (widths == width).all():
+            return cls(corners, joined, lengths, ends, ends)
+        places, widths = _widened(ends, widths, width, chain.closed)
+        # 1 / w integrated over a linear w.
+        ratio = np.log(widths[1:] / widths[:-1])
+        slight = np.abs(ratio) < 1e-3
+        mean = (widths[1:] + widths[:-1]) / 2
+        np.divide(np.diff(widths), ratio, out=mean, where=~slight)
+        stretched = np.concatenate([[0], np.cumsum(np.diff(places) * width / mean)])
+        lengths = np.diff(np.interp(ends, places, stretched))
+        return cls(corners, joined, lengths, places, stretched)
+
+
+def _bounds(
+    chain: Chain, along: np.ndarray, lengths: np.ndarray, width: float, height: float
+) -> np.ndarray:
+    """Return the largest width of columns at each corner of the chain, (k + 1,)."""
+    long = lengths >= _LONG * width
+    turn = np.arctan2(
+        along[:-1, 0] * along[1:, 1] - along[:-1, 1] * along[1:, 0],
+        (along[:-1] * along[1:]).sum(axis=1),
+    )
+    turn[long[:-1] & long[1:]] = 0  # such a corner is one of cells
+    # The direction of the wall, linear between the middles of edges; its change over a part of a width.
+    direction = np.concatenate([[0], np.cumsum(turn)])
+    ends = np.concatenate([[0], np.cumsum(lengths)])
+    middles = (ends[1:] + ends[:-1]) / 2
+    if chain.closed:
+        closing = 2 * np.pi * round(direction[-1] / (2 * np.pi)) or direction[-1]
+        direction = np.concatenate([direction + c for c in (-closing, 0, closing)])
+        middles = np.concatenate([middles + c for c in (-ends[-1], 0, ends[-1])])
+    window = np.array([[-_WINDOW], [_WINDOW]]) / 2 * width
+    before, after = np.interp(ends + window, middles, direction)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        radius = _WINDOW * width / np.abs(after - before)
+        bounds = np.fmin(width, np.sqrt(8 * _BULGE * height * radius))
+    at_fans = min(width, _FLAT * height)
+    if chain.after_fan:
+        bounds[0] = min(bounds[0], at_fans)
+    if chain.fan:
+        bounds[-1] = min(bounds[-1], at_fans)
+    return np.maximum(bounds, _FINEST * width)
+
+
+def _widened(
+    ends: np.ndarray, bounds: np.ndarray, width: float, closed: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return places along the chain, and the widths there: they grow from their bounds by `_WIDENING`."""
+    narrow = bounds < width
+    growth = 1.4 ** np.arange(1, 1 + math.ceil(math.log(width / bounds.min(), 1.4)))
+    reach = (bounds[narrow] / _WIDENING)[:, None] * (growth - 1)
+    around = np.concatenate([ends[narrow, None] - reach, ends[narrow, None] + reach]).ravel()
+    length = ends[-1]
+    if closed:
+        around %= length
+    places = np.unique(np.concatenate([ends, around[(around > 0) & (around < length)]]))
+    known, given = ends, bounds
+    if closed:
+        known = np.concatenate([ends + c for c in (-length, 0, length)])
+        given = np.tile(bounds, 3)
+    after = np.minimum.accumulate(given - _WIDENING * known)
+    before = np.minimum.accumulate((given + _WIDENING * known)[::-1])[::-1]
+    left = np.clip(np.searchsorted(known, places, side="right") - 1, 0, len(known) - 1)
+    right = np.clip(np.searchsorted(known, places, side="left"), 0, len(known) - 1)
+    widths = np.minimum(after[left] + _WIDENING * places, before[right] - _WIDENING * places)
+    return places, np.minimum(widths, width)
 
 
 def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
@@ -105,8 +218,10 @@ def _begun(chain: Chain, width: float) -> tuple[np.ndarray, bool]:
     return np.vstack([chain.corners[first:-1], chain.corners[: first + 1]]), True
 
 
-def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+def _runs(lengths: np.ndarray, width: float, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Cut a chain at the corners between long edges. These are corners of cells, too, so no face is a sliver.
+
+    Beside a corner with a fan, half a width belongs to the fan.
 
     Returns
     -------
@@ -118,7 +233,10 @@ def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     reached = np.concatenate([[0], np.cumsum(lengths)])
     runs = np.diff(reached[first])
     with np.errstate(over="ignore"):
-        counts = np.maximum(np.rint(np.minimum(runs / width, _MOST)), 1)
+        counts = np.minimum(runs / width, _MOST)
+    counts[0] -= chain.after_fan / 2
+    counts[-1] -= bool(chain.fan) / 2
+    counts = np.maximum(np.rint(counts), 1)
     edges = len(lengths)
     if len(runs) == 1 and np.ptp(lengths) <= _EQUAL * lengths[0]:
         # On a regular polygon: equally many columns per edge, or equally many edges per column.
@@ -131,18 +249,20 @@ def _runs(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     return runs, counts
 
 
-def _places(lengths: np.ndarray, width: float, joined: bool) -> np.ndarray:
+def _places(lengths: np.ndarray, width: float, joined: bool, chain: Chain) -> np.ndarray:
     """Return the places of columns along the chain. They are symmetric about each corner between runs.
 
     `joined` says whether the first run begins at such a corner, too.
     """
-    runs, counts = _runs(lengths, width)
+    runs, counts = _runs(lengths, width, chain)
     starts = np.cumsum(runs) - runs
-    half = 0.5 * runs / counts
+    fans = np.zeros((2, len(runs)))
+    fans[0, 0], fans[1, -1] = chain.after_fan, bool(chain.fan)
+    half = 0.5 * runs / (counts + fans.sum(axis=0) / 2)
     meet = 0.5 * (half[1:] + half[:-1])
     ends = 0.5 * (half[0] + half[-1]) if joined else None
-    before = np.concatenate([[half[0] if ends is None else ends], meet])
-    after = np.concatenate([meet, [half[-1] if ends is None else ends]])
+    before = np.concatenate([[half[0] if ends is None else ends], meet]) * (1 + fans[0])
+    after = np.concatenate([meet, [half[-1] if ends is None else ends]]) * (1 + fans[1])
     steps = (runs - before - after) / np.maximum(counts - 1, 1)
     n = counts.astype(np.int64)
     run = np.repeat(np.arange(len(runs)), n)
@@ -150,13 +270,16 @@ def _places(lengths: np.ndarray, width: float, joined: bool) -> np.ndarray:
     return starts[run] + before[run] + number * steps[run]
 
 
-def place_columns(chain: Chain, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return feet (c, 2) on the wall, about `width` apart, and unit normals (c, 2) into the domain of the columns."""
-    corners, joined = _begun(chain, width)
+def place_columns(chain: Chain, width: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return feet (c, 2) on the wall, about `width` apart or less, and unit normals (c, 2) into the domain."""
+    wall = _Wall.of(chain, width, height)
+    corners = wall.corners
     along = np.diff(corners, axis=0)
     lengths = np.hypot(*along.T)
     reached = np.concatenate([[0], np.cumsum(lengths)])
-    at = _places(lengths, width, joined)
+    at = _places(wall.lengths, width, wall.joined, chain)
+    if wall.stretched is not wall.reached:
+        at = np.interp(at, wall.stretched, wall.reached)
     edge = np.minimum(np.searchsorted(reached, at, side="right") - 1, len(lengths) - 1)
     share = ((at - reached[edge]) / lengths[edge])[:, None]
     normal = np.column_stack([-along[:, 1], along[:, 0]]) / lengths[:, None]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..geometry.boundary_layers import Layers, chosen_segments
+from ..geometry.boundary_layers import Layers, chosen_segments, outer_segments
 from ..geometry.box import Domain
 from ..geometry.shapes import Edges
 from .distance import Distance
@@ -15,13 +15,22 @@ from .field import Field, as_field, minimum
 
 _GROWTH = 1.2
 """Growth of sizes beyond layers of constant height."""
+_CLASS = 1.4
+"""Columns whose widths differ by less than this factor have one distance field."""
 
 
 def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
-    """Return `size`, limited to sizes that grow from the width of the layers into the domain."""
+    """Return `size`, limited to sizes that grow into the domain from the widths of the columns at the last row."""
     field = as_field(size)
     for layer in layers:
-        walls = Edges(*np.moveaxis(chosen_segments(domain, layer), 1, 0))
         slope = math.log(layer.growth if layer.growth > 1 else _GROWTH)
-        field = minimum(field, Distance(walls, h_min=layer.width, slope=slope))
+        segments, widths = outer_segments(domain, layer)
+        if not len(segments):
+            segments = chosen_segments(domain, layer)
+            widths = np.full(len(segments), layer.width)
+        classes = np.floor(np.log(widths / layer.width) / math.log(_CLASS) + 0.5)
+        for one in np.unique(classes):
+            row = Edges(*np.moveaxis(segments[classes == one], 1, 0))
+            width = float(widths[classes == one].mean())
+            field = minimum(field, Distance(row, h_min=width, slope=slope))
     return field

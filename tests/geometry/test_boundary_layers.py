@@ -12,8 +12,10 @@ from clvoro.finite_volumes.prisms import cell_loops
 from clvoro.geometry.boundary_layers import (
     Layers,
     chosen_segments,
+    columns_of,
     count_rows,
     free_domain,
+    outer_segments,
     place_layers,
 )
 from tests.reference import shores
@@ -167,10 +169,39 @@ def test_layers_in_corners_and_gaps_belong_to_the_nearest_wall():
     corner = np.min([np.hypot(*(rows - c).T) for c in ((1, 0.15), (2, 0.15))], axis=0)
     away = corner > layers.rows[1] * 1.01
     assert gaps[away].min() >= 0.6 * 0.02 - 1e-12
-    # Two generators of each row around re-entrant corners, at the distance of the row.
+    # Four generators of each row around each of the two re-entrant corners, at the distance of the row.
     for row in layers.rows[:2]:
-        assert np.count_nonzero(np.abs(corner - row) < 1e-12) == 4
-    assert gaps.min() == pytest.approx(2 * layers.rows[0] * np.sin(np.pi / 8))
+        assert np.count_nonzero(np.abs(corner - row) < 1e-12) == 8
+    assert gaps.min() == pytest.approx(2 * layers.rows[0] * np.sin(np.pi / 12))
+
+
+def test_columns_are_narrow_where_the_wall_is_curved_and_beside_sharp_edges():
+    """A wing: the wall leaves the chord of a cell by a quarter of the first height at most."""
+    wing = clvoro.curves.naca("0012", name="wing")
+    domain = clvoro.Polygon(clvoro.curves.circle((0.5, 0), 6), [wing])
+    layers = Layers(1e-3, count=3, growth=1.3, spacing=0.05, edges="wing")
+    segments, _ = outer_segments(domain, layers)
+    feet, normals = columns_of(domain, layers)
+    gaps = np.hypot(*np.diff(feet, axis=0).T)
+    turns = np.arccos(np.clip((normals[1:] * normals[:-1]).sum(axis=1), -1, 1))
+    assert (gaps * turns / 8).max() < 1.2 * 0.25 * layers.height  # w^2 / (8 r), and r is w / turn
+    assert gaps.max() == pytest.approx(0.05, rel=0.1)
+    tail = np.hypot(*(feet - (1, 0)).T)
+    assert np.sort(tail)[:2] == pytest.approx(2 * [8 * layers.height], rel=0.25)
+    # Neighboring columns differ by little, so the last row has no jumps, either.
+    ratio = np.maximum(gaps[1:] / gaps[:-1], gaps[:-1] / gaps[1:])
+    assert ratio.max() < 1.5
+    assert domain.contains(segments.reshape(-1, 2)).all()
+
+
+def test_wings_with_thin_layers_are_accepted_by_solvers(adapter):
+    wing = clvoro.curves.naca("0012", name="wing")
+    domain = clvoro.Polygon([(-1, -1), (2, -1), (2, 1), (-1, 1)], [wing])
+    layers = Layers(2e-4, count=6, growth=1.35, spacing=0.01, edges="wing")
+    size = clvoro.sizing.Distance(wing, h_min=0.03, slope=0.3)
+    mesh = adapter.run(domain, size, layers=layers, effort="fast")
+    report = mesh.check(solver="openfoam")
+    assert report, report
 
 
 @pytest.mark.parametrize("spacing", [0.01, 0.04])
