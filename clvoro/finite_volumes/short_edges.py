@@ -72,9 +72,9 @@ def _collapse_some(
     coupled = mesh.neighbor >= 0
     thinner[coupled] = np.minimum(thinner[coupled], width[mesh.neighbor[coupled]])
     ratio = lengths / np.maximum(thinner, 1e-300) / np.where(coupled, SHORT, SHORT_ON_WALL)
-    # One side of each seam; no face between two walls or two corners.
+    # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
     tried = (ratio < 1) & (mesh.twin < np.arange(len(a))) & (images[a] != images[b])
-    tried &= (kind[a] != kind[b]) | (kind[a] == _FREE) | ((kind[a] == _WALL) & ~coupled)
+    tried &= np.minimum(kind[a], kind[b]) == np.where(coupled, _FREE, _WALL)
     tried[failed] = False
     faces = np.flatnonzero(tried)
     if not faces.size:
@@ -156,7 +156,10 @@ def _independent(
     n: int,
 ) -> np.ndarray:
     """Return those of `faces`, the first ones preferred, whose points and their images touch no common cell."""
-    pairs = np.unique(images[loop] * n + cell)
+    moving = np.zeros(images.max() + 1, bool)
+    moving[images[a[faces]]] = moving[images[b[faces]]] = True
+    rows = np.flatnonzero(moving[images[loop]])
+    pairs = np.unique(images[loop[rows]] * n + cell[rows])
     of_class, cells = pairs // n, pairs % n
     first = np.searchsorted(of_class, np.arange(images.max() + 2))
     ends = np.concatenate([images[a[faces]], images[b[faces]]])

@@ -195,7 +195,9 @@ def make_solver_mesh(
 
 def compact(mesh: SolverMesh) -> SolverMesh:
     """Return `mesh` without points that no face has."""
-    used, corners = np.unique(mesh.corners, return_inverse=True)
-    if len(used) == len(mesh.points):
+    used = np.zeros(len(mesh.points), bool)
+    used[mesh.corners] = True
+    if used.all():
         return mesh
-    return replace(mesh, points=mesh.points[used], corners=corners.ravel())
+    place = np.cumsum(used) - 1
+    return replace(mesh, points=mesh.points[used], corners=place[mesh.corners])

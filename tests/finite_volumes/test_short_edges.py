@@ -27,7 +27,7 @@ def ratios(mesh) -> np.ndarray:
     """The length of each face over the width of its thinner cell."""
     a, b = mesh.points[mesh.corners.reshape(-1, 2)].swapaxes(0, 1)
     width = widths(mesh)
-    there = np.where(mesh.neighbor >= 0, width[mesh.neighbor], np.inf)
+    there = np.where(mesh.neighbor >= 0, width[np.maximum(mesh.neighbor, 0)], np.inf)
     return np.hypot(*(b - a).T) / np.minimum(width[mesh.owner], there)
 
 
@@ -113,3 +113,13 @@ def test_corners_and_changes_of_names_stay(ctx):
     )
     assert length == pytest.approx(0.501)
     assert sum(p.area for p in polygons(mesh)) == pytest.approx(1)
+
+
+def test_a_throat_stays_open(ctx):
+    """The only face between two cells is shorter than a fiftieth of them, from a wall to the tip of another one."""
+    domain = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.7, 1), (0.5, 0.005), (0.3, 1), (0, 1)])
+    diagram = clvoro.Adapter(ctx).diagram(domain, np.array([(0.2, 0.5), (0.8, 0.5)]))
+    mesh = diagram.solver_mesh()
+    assert mesh.inner == 1
+    assert ratios(mesh)[0] < short_edges.SHORT
+    assert sum(p.area for p in polygons(mesh)) == pytest.approx(domain.measure)
