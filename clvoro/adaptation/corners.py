@@ -28,8 +28,9 @@ SPACING, LEAST_SPACING, FAN = 1.1, 0.15, 0.5
 Cells fan out around a corner, so sharp corners may be close to each other."""
 JOINED = 1.6
 """Distance over h up to which two corners may share a generator. They belong to the same group then."""
-NEAR = 4.0
-"""Distance over h up to which a group has to know the corners of other groups."""
+NEAR = 4.4
+"""Distance over h up to which a group has to know the corners of other groups: twice REACH in the kernel, so that no
+two groups move the same generator."""
 WALL_REACH = 0.5
 """Distance over h along the boundary from a corner up to which cells at the wall are candidates."""
 GROUP = 4
@@ -256,6 +257,7 @@ class PlacedCorners:
     """Corner groups on the device, in the frame of a domain."""
 
     def __init__(self, engine: Engine, domain: Polygon, groups: CornerGroups) -> None:
+        self.domain = domain
         origin, scale = domain.frame
         at = (domain.oriented.vertices[groups.vertices] - origin) / scale
         measures = (groups.directions, groups.angles, groups.sizes / scale, groups.slack / scale)
@@ -291,7 +293,6 @@ class Corners:
     def share(
         self,
         placed: PlacedCorners,
-        domain: Polygon,
         t: Tessellation,
         points: cla.Array,
         velocity: cla.Array,
@@ -321,7 +322,7 @@ class Corners:
             )  # fmt: skip
         engine.run_each(
             k.share_corners, p.groups, t.starts, t.neighbors, np.int32(t.n), points, labels, np.int32(fixed),
-            p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds, *domain.device_args(engine),
+            p.starts, p.corners, p.shapes, p.other_starts, p.others, p.seeds, *p.domain.device_args(engine),
             p.moved, p.targets, group=GROUP,
         )  # fmt: skip
         engine.run_each(

@@ -259,7 +259,7 @@ class MeshState:
     @cached_property
     def _has_thin_walls(self) -> bool:
         return self.corners is not None and has_thin_walls(
-            self.setup.domain, self._sizes_at_vertices
+            self.corners.domain, self._sizes_at_vertices
         )
 
     @property
@@ -275,10 +275,10 @@ class MeshState:
             return
         if self._has_thin_walls:
             self.stages.thin_walls.pair(
-                self.domain, self.t, self.h, self.points, self.velocity, self.labels, self.fixed
+                self.corners.domain, self.t, self.h, self.points, self.velocity, self.labels, self.fixed
             )  # fmt: skip
         self.stages.corners.share(
-            self.corners, self.domain, self.t, self.points, self.velocity, self.labels, self.fixed
+            self.corners, self.t, self.points, self.velocity, self.labels, self.fixed
         )  # fmt: skip
 
     def settle_at_walls(self) -> None:
@@ -295,7 +295,7 @@ class MeshState:
                 ahead[:] = self.points
                 self.stages.motion.add_momentum(1.0, ahead, displacement, 1.0)
                 self.stages.corners.share(
-                    self.corners, self.domain, self.t, ahead, displacement, self.labels, self.fixed
+                    self.corners, self.t, ahead, displacement, self.labels, self.fixed
                 )  # fmt: skip
 
     def _target_sizes(self, points: np.ndarray) -> np.ndarray:

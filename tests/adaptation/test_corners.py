@@ -164,7 +164,7 @@ def project(ctx, domain, points, real="float64", fixed=0):
     mesh = make_mesh(ctx, domain, points, real, fixed)
     assert mesh.corners is not None
     mesh.stages.corners.share(
-        mesh.corners, domain, mesh.t, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
+        mesh.corners, mesh.t, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
     )
     origin, scale = domain.frame
     return origin + mesh.to_host(mesh.points, scale), mesh.to_host(mesh.velocity, scale)
