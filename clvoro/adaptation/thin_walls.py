@@ -72,15 +72,6 @@ class ThinWalls:
                 h, labels, np.int32(fixed), *args, partners,
             )  # fmt: skip
             engine.run_each(
-                k.place_pairs,
-                u,
-                chords.touched,
-                n,
-                chords.slots,
-                partners,
-                points,
-                h,
-                *args,
-                targets,
-            )
+                k.place_pairs, u, chords.touched, n, chords.slots, partners, points, h, *args, targets
+            )  # fmt: skip
             engine.run_each(k.move_pairs, u, chords.touched, n, targets, points, velocity)

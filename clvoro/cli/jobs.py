@@ -354,10 +354,10 @@ class Job:
         """Check the main mesh by the criteria of the solver; its own program has the last word."""
         *_, main = results.values()
         walls = self.walls or "straight"
+        assert self.solver is not None
         report = main.check(self.solver, walls=walls)
-        simple = (
-            report.criteria[0].name != "cells around islands"
-        )  # else OpenFOAM cannot hold the mesh
+        # OpenFOAM cannot hold cells around islands.
+        simple = report.criteria[0].name != "cells around islands"
         verdict = run_check_mesh(main, walls) if simple else None
         self.rejected = not (report.ok if verdict is None else verdict.ok)
         if simple and verdict is None:

@@ -77,8 +77,9 @@ def straight_walls(mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> Sol
     parts : (k,) int
         Index of the named part of the boundary for each wall. A straight face has walls of one part.
     """
-    mesh = _on_curves(mesh, diagram.domain)
-    work = _Work(mesh, diagram, parts)
+    domain = diagram.domain
+    assert isinstance(domain, Polygon)
+    work = _Work(_on_curves(mesh, domain), along_rings(diagram, domain), parts)
     while True:
         made = work.straightened()
         if not work.spare(np.flatnonzero(~_starlike(made)).tolist()):
@@ -101,7 +102,7 @@ def _on_curves(mesh: SolverMesh, domain: Polygon) -> SolverMesh:
 class _Work:
     """The walls of one mesh."""
 
-    def __init__(self, mesh: SolverMesh, diagram: Diagram, parts: np.ndarray) -> None:
+    def __init__(self, mesh: SolverMesh, onward: np.ndarray, parts: np.ndarray) -> None:
         self.mesh, self.walls = mesh, np.arange(mesh.inner, mesh.outer)
         self.points: list[Point] = list(map(tuple, mesh.points.tolist()))
         self.ends = mesh.corners.reshape(-1, 2)
@@ -112,15 +113,17 @@ class _Work:
         self.part = parts[-1 - mesh.neighbor[self.walls]].tolist()
         # 1: the ends of the cell do not move; 2: its walls remain as they are.
         self.spared, self.most = np.zeros(len(mesh), int), np.where(_starlike(mesh), 2, 1)
-        self.next = self._following(diagram)
+        self.next = self._following(onward)
         self.at = self._single_faces()
         self.starts, self.loops, broken = simple_loops(mesh)
         self.broken = set(broken.tolist())
         self.costs: dict[tuple[int, int, int], float] = {}
 
-    def _following(self, diagram: Diagram) -> list[int]:
-        """Return the next wall face on the ring for each one, counted from the first; -1 at an end."""
-        onward = along_rings(diagram, diagram.domain)
+    def _following(self, onward: np.ndarray) -> list[int]:
+        """Return the next wall face on the ring for each one, counted from the first; -1 at an end.
+
+        `onward` (m,) is the next half-face of the diagram on its ring; see `along_rings`.
+        """
         place = np.full(len(onward) + 1, -1)
         rows = self.mesh.half_face[self.walls]
         place[rows] = np.arange(len(rows))

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     import pyvista
     from numpy.typing import ArrayLike
 
-    from ..finite_volumes.solver_mesh import WallShape
     from .fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
 
 __all__ = [

@@ -106,7 +106,7 @@ class MeshOutput:
         """
         from ..finite_volumes.solver_mesh import make_solver_mesh
 
-        diagram = getattr(self._self, "diagram", self._self)
+        diagram: Any = getattr(self._self, "diagram", self._self)
         return make_solver_mesh(diagram, walls, collapse)
 
     def plot(
