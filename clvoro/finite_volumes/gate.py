@@ -103,8 +103,8 @@ class SolverReport:
         verdict = "accepted" if self.ok else f"rejected: {', '.join(failed)}"
         changed = ""
         if self.area_change:
-            changed = f", {self.area_change:+.2g} of the domain by straight walls"
-        head = f"{self.cells} cells, {self.faces} faces{changed}, for {self.solver}: {verdict}"
+            changed = f"; straight walls change the area by {self.area_change:+.2g} of the domain"
+        head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}"
         columns = f"{'criterion':28}{'worst':>12}  {'limit':<12}{'verdict':<12}where"
         return "\n  ".join([head, columns, *map(str, self.criteria)])
 

@@ -85,7 +85,7 @@ class SolverMesh(Sealed):
         return self.cells
 
     def __repr__(self) -> str:
-        changed = f", {self.area_change:+.2g} of the domain" if self.area_change else ""
+        changed = f", area {self.area_change:+.2g} of the domain" if self.area_change else ""
         return f"SolverMesh({self.cells} cells, {len(self.owner)} faces{changed})"
 
     @cached_property

@@ -173,7 +173,7 @@ def unroll(ring: Any, name: str) -> tuple[np.ndarray, CurvedEdges]:
     items = [ring] if isinstance(ring, Curve) else list(ring)
     if isinstance(ring, Curve) and not ring.closed:
         raise InputError(
-            f"Polygon's {name} is open: {ring!r} does not return to its begin; write [curve] to close it by a straight "
+            f"Polygon's {name} is open: {ring!r} does not return to its start; write [curve] to close it by a straight "
             "edge, or a list of curves and points"
         )
     whole = len(items) == 1 and items[0].closed

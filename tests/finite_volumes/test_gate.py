@@ -31,8 +31,8 @@ def test_a_good_mesh_is_accepted(good):
     assert (report.cells, report.faces) == (len(mesh), len(mesh.owner))
     assert report.area_change == mesh.area_change
     text = str(report)
-    assert "for openfoam: accepted" in text.splitlines()[0]
-    assert "of the domain by straight walls" in text.splitlines()[0]
+    assert "openfoam: accepted" in text.splitlines()[0]
+    assert "straight walls change the area by" in text.splitlines()[0]
     assert len(text.splitlines()) == 2 + len(report.criteria)
     assert report.as_dict()["criteria"][0]["name"] == "boundary openness"
 

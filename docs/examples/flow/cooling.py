@@ -41,7 +41,7 @@ for _ in range(10):
 mesh.plot(heat.value, label="temperature after t = 0.1")
 
 fipy.DiffusionTerm(coeff=1.0).solve(heat)
-mesh.plot(heat.value, label="temperature at last")
+mesh.plot(heat.value, label="steady temperature")
 
 flux = (heat.faceGrad.value * np.asarray(cells.faceNormals)).sum(axis=0) * cells._faceAreas
 for name in ("hot", "pipe", "sides"):
