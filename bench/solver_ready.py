@@ -5,8 +5,8 @@
 
 Each mesh is adapted, written as polyMesh with default settings, and given to OpenFOAM's `checkMesh`. A row has the
 largest non-orthogonality and skewness that `checkMesh` prints, the number of concave cells, the largest angle by which
-a cell of a 2D mesh is concave, the error and quality of cells on walls and of the others, and the verdict. Without
-OpenFOAM the script ends with a message. Debian's package `openfoam` is enough.
+a cell is concave, the error and quality of cells on walls and of the others, and the verdict. Without OpenFOAM the
+script ends with a message. Debian's package `openfoam` is enough.
 
 The domains are in `bench/_walled.py`; S3 has 1e5 cells, and S2 and S3 run with their default effort only unless they
 are named in --only.
@@ -14,10 +14,8 @@ are named in --only.
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -28,20 +26,8 @@ from _common import Report, heading, make_adapter, names, off_walls, parser
 from _walled import WALLED
 
 import clvoro
-from clvoro.io.polymesh import PolyMesh, poly_mesh
+from clvoro.io.check_mesh import Verdict, check_case
 
-CONTROL = """application checkMesh; startFrom startTime; startTime 0; stopAt endTime; endTime 1; deltaT 1;
-writeControl timeStep; writeInterval 1;
-"""
-HEAD = "FoamFile {{ version 2.0; format ascii; class dictionary; object {name}; }}\n"
-SCHEMES = [
-    f"{kind}Schemes" for kind in ("ddt", "grad", "div", "laplacian", "interpolation", "snGrad")
-]
-SYSTEM = {
-    "controlDict": CONTROL,
-    "fvSchemes": " {}\n".join(SCHEMES) + " {}\n",
-    "fvSolution": "",
-}
 NUMBER = r"([-+.\deE]*\d)"
 FIGURES = {
     "non_orthogonality": rf"non-orthogonality Max: {NUMBER}",
@@ -51,61 +37,30 @@ FIGURES = {
 LARGE = ("S2", "S3")
 
 
-def check_mesh(case: Path) -> str:
-    """Return what checkMesh prints for the polyMesh of a case."""
-    (case / "system").mkdir(parents=True, exist_ok=True)
-    for name, text in SYSTEM.items():
-        (case / "system" / name).write_text(HEAD.format(name=name) + text)
-    environment = {"WM_PROJECT_DIR": "/usr/share/openfoam", **os.environ}
-    command = ["checkMesh", "-allGeometry", "-allTopology", "-case", str(case)]
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    return run.stdout + run.stderr
-
-
-def read_verdict(text: str) -> dict[str, Any]:
-    """Return the figures in the output of checkMesh."""
-    matches = {name: re.search(pattern, text) for name, pattern in FIGURES.items()}
+def figures_of(verdict: Verdict) -> dict[str, Any]:
+    """Return the figures in the output of checkMesh, and what it says of the mesh."""
+    matches = {name: re.search(pattern, verdict.text) for name, pattern in FIGURES.items()}
     found: dict[str, Any] = {k: float(m.group(1)) if m else 0.0 for k, m in matches.items()}
-    found["ok"] = "Mesh OK." in text
-    stars = re.findall(r"^ \*+(.*)$", text, re.MULTILINE)
-    found["complaints"] = "; ".join(line.strip()[:70] for line in stars)
-    return found
-
-
-def concave_angle(mesh: PolyMesh, n_cells: int) -> float:
-    """Return the largest interior angle of the bottoms of prisms, minus 180 degrees."""
-    first = len(mesh.owner) - 2 * n_cells
-    starts = mesh.starts[first : first + n_cells + 1]
-    corners = mesh.corners[starts[0] : starts[-1]]
-    cell = np.repeat(np.arange(n_cells), np.diff(starts))
-    place = np.arange(len(corners))
-    begin, end = (starts - starts[0])[cell], (starts - starts[0])[cell + 1]
-    after = np.where(place + 1 < end, place + 1, begin)
-    before = np.where(place > begin, place - 1, end - 1)
-    x = mesh.points[corners, :2]
-    a, b = x - x[before], x[after] - x
-    turn = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1))
-    sign = np.where(np.bincount(cell, turn)[cell] < 0, -1.0, 1.0)  # bottoms are seen from below
-    return float(np.degrees(-(turn * sign).min()))
+    complaints = "; ".join(line[:70] for line in verdict.complaints)
+    return {**found, "ok": verdict.ok, "complaints": complaints}
 
 
 def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     """Write the mesh, check it, and return its figures."""
     result.save(case / "constant" / "polyMesh")
-    text = check_mesh(case)
-    (case / "checkMesh.log").write_text(text)
-    d = result.diagram
+    verdict = check_case(case)
+    (case / "checkMesh.log").write_text(verdict.text)
+    d, solver = result.diagram, result.measures.solver
     inner = off_walls(d)
     wall, e = ~inner, np.abs(result.size_error)
 
     def of(values: np.ndarray, part: np.ndarray, how: str) -> float:
         return float(getattr(values[part], how)()) if part.any() else float("nan")
 
-    flat = d.domain.dim == 2
     return {
-        "cells": len(d), **read_verdict(text),
-        "concave_degrees": concave_angle(poly_mesh(d), len(d)) if flat else float("nan"),
-        "shortest": float(result.measures.solver.shortest_edge.min()),
+        "cells": len(d), **figures_of(verdict),
+        "concave_degrees": float(solver.concavity.max()),
+        "shortest": float(solver.shortest_edge.min()),
         "wall_error": of(e, wall, "mean"), "wall_quality": of(result.quality, wall, "min"),
         "inner_error": of(e, inner, "mean"), "inner_quality": of(result.quality, inner, "mean"),
     }  # fmt: skip
@@ -119,7 +74,7 @@ COLUMNS = {
     "non-orth.": lambda r: f"{r['non_orthogonality']:.1f}",
     "skewness": lambda r: f"{r['skewness']:.2f}",
     "concave cells": lambda r: f"{r['concave']:.0f}",
-    "by degrees": lambda r: f"{max(r['concave_degrees'], 0):.2g}",
+    "by degrees": lambda r: f"{r['concave_degrees']:.2g}",
     "shortest edge": lambda r: f"{r['shortest']:.1e}",
     "mean e, min Q at walls": lambda r: f"{r['wall_error']:.4f}, {r['wall_quality']:.3f}",
     "mean e, mean Q inside": lambda r: f"{r['inner_error']:.4f}, {r['inner_quality']:.4f}",

@@ -55,21 +55,25 @@ def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Ver
     InputError
         If OpenFOAM cannot hold the mesh.
     """
-    program = shutil.which("checkMesh")
-    if program is None:
+    if shutil.which("checkMesh") is None:
         return None
     with tempfile.TemporaryDirectory(prefix="clvoro-") as name:
         case = Path(name)
         write_foam(Contents.of(mesh), case / "constant" / "polyMesh", walls=walls)
-        (case / "system").mkdir()
-        for file, text in _SYSTEM.items():
-            head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {file}; }}\n"
-            (case / "system" / file).write_text(head + text + "\n", encoding="ascii")
-        settings = {"WM_PROJECT_DIR": str(_DEBIAN)} if _DEBIAN.is_dir() else {}
-        command = [program, "-allGeometry", "-allTopology", "-case", str(case)]
-        done = subprocess.run(
-            command, env={**settings, **os.environ}, capture_output=True, text=True, check=False
-        )
+        return check_case(case)
+
+
+def check_case(case: Path) -> Verdict:
+    """Return the verdict of `checkMesh`, which is installed, on the mesh of a case; its folder `system` is written."""
+    (case / "system").mkdir(exist_ok=True)
+    for file, text in _SYSTEM.items():
+        head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {file}; }}\n"
+        (case / "system" / file).write_text(head + text + "\n", encoding="ascii")
+    settings = {"WM_PROJECT_DIR": str(_DEBIAN)} if _DEBIAN.is_dir() else {}
+    command = ["checkMesh", "-allGeometry", "-allTopology", "-case", str(case)]
+    done = subprocess.run(
+        command, env={**settings, **os.environ}, capture_output=True, text=True, check=False
+    )
     text = done.stdout + done.stderr
     stars = re.findall(r"^ *\*\*\*(.*)$", text, re.MULTILINE)
     return Verdict("Mesh OK." in text, tuple(line.strip() for line in stars), text)
