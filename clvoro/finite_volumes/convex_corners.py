@@ -11,10 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from ..mesh.connectivity import following
+from .geometry import turns
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
 _STRAIGHT = 1e-4
+"""Least turn in a corner of a convex cell."""
 _ASIDE = 1e-3
 """Turn in a corner after its point has moved."""
 _ROUNDS = 8
@@ -87,10 +89,7 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
         return False
 
     for _ in range(_ROUNDS):
-        ahead = points[loops[after]] - points[loops]
-        behind = np.empty_like(ahead)
-        behind[after] = ahead
-        turn = np.arctan2(_cross(behind, ahead), (behind * ahead).sum(axis=1))
+        turn = turns(points[loops], after)
         moved = False
         for place in np.flatnonzero((turn < _STRAIGHT) & ~in_broken).tolist():
             at, end = starts[cell[place]], starts[cell[place] + 1]
@@ -124,15 +123,9 @@ def _beyond(x: np.ndarray, p: np.ndarray, y: np.ndarray, side: int) -> np.ndarra
     return p + along + side * _ASIDE * np.array([-along[1], along[0]])
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
 def _bent(corners: np.ndarray) -> float:
     """Return the sum of the angles of a polygon beyond 180 degrees, infinite if it is not simple."""
-    ahead = np.roll(corners, -1, axis=0) - corners
-    behind = np.roll(ahead, 1, axis=0)
-    turn = np.arctan2(_cross(behind, ahead), (behind * ahead).sum(axis=1))
+    turn = turns(corners, np.roll(np.arange(len(corners)), -1))
     if len(corners) < 3 or abs(turn.sum() - 2 * np.pi) > 1:
         return np.inf
     return float(np.maximum(_STRAIGHT - turn, 0).sum())

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..mesh.connectivity import following
 from ..mesh.read_only import Sealed
+from ..mesh.straightening import cross
 
 if TYPE_CHECKING:
     from .solver_mesh import SolverMesh
@@ -111,7 +112,22 @@ def polygon_sides(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 def polygon_areas(mesh: SolverMesh) -> np.ndarray:
     """Return the area of each cell in 2D, (n,)."""
     cell, p, q, _ = polygon_sides(mesh)
-    return np.bincount(cell, p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0], len(mesh)) / 2
+    return np.bincount(cell, cross(p, q), len(mesh)) / 2
+
+
+def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the angle by which polygons turn to the left in each corner, (k,), -pi to pi.
+
+    Parameters
+    ----------
+    corners : (k, 2) float
+    after : (k,) int
+        Place of the next corner of the same polygon.
+    """
+    ahead = corners[after] - corners
+    behind = np.empty_like(ahead)
+    behind[after] = ahead
+    return np.arctan2(cross(behind, ahead), (behind * ahead).sum(axis=1))
 
 
 def sum_rows(places: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from .geometry import cell_geometry, face_geometry, sum_rows
 _BASE = 64
 """Offsets of images, three numbers between -32 and 31, are digits of one integer: offsets add as integers."""
 _TRIES = 4
+"""Vertices of a group, the nearest to its mean first, that are tried as the place where all meet."""
 _WORSE = 0.02
 """Change of non-orthogonality, in degrees, and relative change of skewness that is accepted anywhere."""
 _CHUNK = 2048
@@ -208,7 +209,7 @@ class Cells:
             cells = np.concatenate([self.owner[faces], self.neighbor[faces]])
             sets = np.concatenate([sets, sets])[cells >= 0]
             cells = cells[cells >= 0]
-            chosen = _independent(sets, cells, merges.priority, self.n)
+            chosen = independent(sets, cells, merges.priority, self.n)
             part = chosen[sets]
             rank = np.cumsum(chosen) - 1
             done += self._try(merges.take(np.flatnonzero(chosen)), rank[sets[part]], cells[part])
@@ -454,7 +455,7 @@ def _pairs(groups: np.ndarray, items: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return items[first], items[ranges(np.arange(len(groups)) + 1, later)]
 
 
-def _independent(sets: np.ndarray, cells: np.ndarray, priority: np.ndarray, n: int) -> np.ndarray:
+def independent(sets: np.ndarray, cells: np.ndarray, priority: np.ndarray, n: int) -> np.ndarray:
     """Return a maximal choice of sets without a cell in common, those of least priority first, (k,) bool."""
     k = len(priority)
     rank = np.empty(k, np.int64)

@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..mesh.connectivity import following, take_rows
+from ..mesh.straightening import cross
+from .geometry import turns
+from .merging import independent
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
 
@@ -15,10 +18,12 @@ SHORT = 0.02
 SHORT_ON_WALL = 0.05
 """The same for a face on a wall: OpenFOAM divides the skewness of such a face by its length."""
 _SHARP = np.pi / 6
+"""Turn of a wall that is a corner: its point does not move."""
 _STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
 _FREE, _WALL, _CORNER = range(3)
+"""Kinds of points: of two with different kinds, the one of the larger kind stays."""
 
 
 def collapse_short_edges(mesh: SolverMesh, parts: np.ndarray) -> SolverMesh:
@@ -63,8 +68,7 @@ def _collapse_some(
     here = mesh.points[loop]
     there = here[following(starts)]
     base = here[np.minimum(starts[:-1], len(here) - 1)][cell]
-    cross = _cross(here - base, there - base)
-    area = np.bincount(cell, cross, n) / 2
+    area = np.bincount(cell, cross(here - base, there - base), n) / 2
     perimeter = np.bincount(both, np.concatenate([lengths, lengths[:k]]), n)
     width = 4 * area / np.maximum(perimeter, 1e-300)
     width[broken] = 0
@@ -96,9 +100,8 @@ def _collapse_some(
     target = p.copy()
     choices = [(p + q) / 2, p, q]
     equal = kind[a[faces]] == kind[b[faces]]
-    free = equal & (
-        kind[a[faces]] == _FREE
-    )  # the middle of two points on a wall may be off a curve
+    # The middle of two points on a wall may be off a curve.
+    free = equal & (kind[a[faces]] == _FREE)
     allowed = [
         free,
         equal | (kind[a[faces]] > kind[b[faces]]),
@@ -140,7 +143,7 @@ def _kinds(mesh: SolverMesh, parts: np.ndarray, images: np.ndarray) -> np.ndarra
     behind[images[b]] = np.column_stack([along, part])
     met = np.bincount(images[a], minlength=classes) + np.bincount(images[b], minlength=classes)
     turn = np.abs(
-        np.arctan2(_cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1))
+        np.arctan2(cross(behind[:, :2], ahead[:, :2]), (behind[:, :2] * ahead[:, :2]).sum(axis=1))
     )
     smooth = (met == 2) & (turn < _SHARP) & (ahead[:, 2] == behind[:, 2])
     return np.where(met == 0, _FREE, np.where(smooth, _WALL, _CORNER))[images]
@@ -166,15 +169,7 @@ def _independent(
     rank = np.tile(np.arange(len(faces)), 2)
     starts, touched = take_rows(first, cells, ends)
     ranks = np.repeat(rank, np.diff(starts))
-    left, chosen, taken = np.ones(len(faces), bool), np.zeros(len(faces), bool), np.zeros(n, bool)
-    while left.any():
-        best = np.full(n, len(faces))
-        np.minimum.at(best, touched[left[ranks]], ranks[left[ranks]])
-        first = left & (np.bincount(ranks, best[touched] != ranks, len(faces)) == 0)
-        chosen |= first
-        taken[touched[first[ranks]]] = True
-        left &= np.bincount(ranks, taken[touched], len(faces)) == 0
-    return faces[chosen]
+    return faces[independent(ranks, touched, np.arange(len(faces)), n)]
 
 
 def _shifts(mesh: SolverMesh, points: np.ndarray, origins: np.ndarray) -> np.ndarray:
@@ -220,10 +215,7 @@ def _moved(
 
 def _least_turns(corners: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Return the least angle to the left in the corners of polygons, given as ragged rows; -pi for fewer than 3."""
-    ahead = corners[following(starts)] - corners
-    behind = np.empty_like(ahead)
-    behind[following(starts)] = ahead
-    turn = np.arctan2(_cross(behind, ahead), (behind * ahead).sum(axis=1))
+    turn = turns(corners, following(starts))
     enough = np.diff(starts) >= 3
     least = np.full(len(starts) - 1, -np.pi)
     rows = np.repeat(np.arange(len(least)), np.diff(starts))
@@ -231,7 +223,3 @@ def _least_turns(corners: np.ndarray, starts: np.ndarray) -> np.ndarray:
     np.minimum.at(full, rows, turn)
     least[enough] = full[enough]
     return least
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

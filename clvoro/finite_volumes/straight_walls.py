@@ -20,7 +20,7 @@ import numpy as np
 
 from ..geometry.polygon import Polygon
 from ..mesh.diagram import Diagram
-from ..mesh.straightening import SIDE_TURN, along_rings
+from ..mesh.straightening import SIDE_TURN, along_rings, cross
 from .geometry import polygon_sides, sum_rows
 from .prisms import simple_loops
 from .solver_mesh import SolverMesh
@@ -31,9 +31,14 @@ _FILLED = 0.25
 """A kink into the cell is cut off if it is nearer than this to the chord, over the size of the cell."""
 _CUT = 0.03
 """The same for a kink out of the cell."""
-_SLIVER, _SHORT, _SHARP, _CONVEX = 0.1, 0.03, np.pi / 3, 1e-4
+_SLIVER, _SHORT = 0.1, 0.03
+"""Lengths over the size of the cell: wall faces below the first are slivers; faces below the second may be bad."""
+_SHARP, _CONVEX = np.pi / 3, 1e-4
+"""Turn into the cell beyond which a chord cuts off a sharp corner; least turn in a corner of a convex cell."""
 _CONCAVE_PRICE, _SHARP_PRICE, _OFF_PRICE, _SKEW_PRICE = 0.5, 0.1, 0.2, 0.03
 _SLIVER_PRICE, _WAY_PRICE, _TILT_PRICE = 0.02, 0.02, 0.1
+"""Prices in squares of the size of the cell. Concave corners cost by their angle in radians, chords by their distance
+from the boundary, face ends by their way, both over the size; skew and turned faces by the square."""
 
 Point = tuple[float, float]
 
@@ -354,10 +359,10 @@ class _Work:
 def _centroids(mesh: SolverMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return area and centroid of each cell, (n,) and (n, 2)."""
     cell, p, q, origins = polygon_sides(mesh)
-    n, cross = len(mesh), _cross(p, q)
-    area = np.bincount(cell, cross, n)
+    n, twice = len(mesh), cross(p, q)
+    area = np.bincount(cell, twice, n)
     safe = np.where(area > 0, area, np.inf)
-    middle = sum_rows(cell, cross[:, None] * (p + q), n) / (3 * safe)[:, None]
+    middle = sum_rows(cell, twice[:, None] * (p + q), n) / (3 * safe)[:, None]
     return area / 2, origins + middle
 
 
@@ -366,13 +371,9 @@ def _starlike(mesh: SolverMesh) -> np.ndarray:
     cell, p, q, origins = polygon_sides(mesh)
     areas, centroids = _centroids(mesh)
     middle = (centroids - origins)[cell]
-    seen = _cross(p - middle, q - middle) > 0
+    seen = cross(p - middle, q - middle) > 0
     seen |= ((q - p) ** 2).sum(axis=1) < 2 * _SHORT**2 * areas[cell]
     return (areas > 0) & (np.bincount(cell, ~seen, len(mesh)) == 0)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _turn(a: Point, b: Point, c: Point) -> float:

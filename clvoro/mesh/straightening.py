@@ -74,11 +74,11 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     # Positions are relative to the generator. A side of a single face changes nothing.
     ends = face_ends(diagram)
     p, q = (diagram.vertices[v] - diagram.points[owner] for v in ends.T)
-    length, area = (np.bincount(of[rows], x[rows], last) for x in (measures, _cross(p, q) / 2))
+    length, area = (np.bincount(of[rows], x[rows], last) for x in (measures, cross(p, q) / 2))
     begin, end = p[first], q[final]
     several = np.bincount(of[rows], minlength=last) > 1
     longer = np.where(several, length - np.hypot(*(end - begin).T), 0.0)
-    beyond = np.where(several, area - _cross(begin, end) / 2, 0.0)
+    beyond = np.where(several, area - cross(begin, end) / 2, 0.0)
     sides = np.bincount(owner[diagram.neighbors >= 0], minlength=n)
     sides += np.bincount(cells, minlength=n)
     polygons = sides >= 3
@@ -89,7 +89,8 @@ def straighten(diagram: Diagram, real: DTypeLike = np.float64) -> Straightened:
     )
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products of vectors in 2D, (k, 2) each: (k,)."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
