@@ -20,6 +20,8 @@ _STRAIGHT = 1e-4
 _ASIDE = 1e-3
 """Turn in a corner after its point has moved."""
 _ROUNDS = 8
+_NO_LENGTH = 1e-12
+"""Length of an edge, over the extent of its cell, below which it has no direction."""
 
 
 def join_faces(mesh: SolverMesh) -> SolverMesh:
@@ -100,7 +102,9 @@ def move_concave_points(mesh: SolverMesh) -> SolverMesh:
                 moved |= moves(p, _onto_line(points[p], points[a], points[b]))
                 continue
             for x, y, side in ((b, a, 1), (a, b, -1)):
-                if not held[x] and moves(x, _beyond(points[x], points[p], points[y], side)):
+                if held[x] or (points[p] == points[y]).all():
+                    continue
+                if moves(x, _beyond(points[x], points[p], points[y], side)):
                     moved = True
                     break
         if not moved:
@@ -125,6 +129,8 @@ def _beyond(x: np.ndarray, p: np.ndarray, y: np.ndarray, side: int) -> np.ndarra
 
 def _bent(corners: np.ndarray) -> float:
     """Return the sum of the angles of a polygon beyond 180 degrees, infinite if it is not simple."""
+    length = abs(np.roll(corners, -1, axis=0) - corners).max(axis=1)
+    corners = corners[length > _NO_LENGTH * np.ptp(corners, axis=0).max()]
     turn = turns(corners, np.roll(np.arange(len(corners)), -1))
     if len(corners) < 3 or abs(turn.sum() - 2 * np.pi) > 1:
         return np.inf

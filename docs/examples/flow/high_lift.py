@@ -51,7 +51,8 @@ mesh.plot("size", window=((-0.3, -0.3), (1.3, 0.3)))
 mesh.plot("size", window=((0.6, -0.06), (0.9, 0.09)), key=False)
 
 # %%
-# All points on walls of the mesh that a solver reads lie on the curves. OpenFOAM reads the folder.
+# All points on walls of the mesh that a solver reads lie on the curves. OpenFOAM accepts it, and reads the folder.
 
 print(mesh.solver_mesh().measures)
+assert mesh.check(solver="openfoam")
 mesh.save("high_lift/high_lift.foam", types={"far-field": "patch"})
