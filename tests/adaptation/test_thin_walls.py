@@ -7,6 +7,7 @@ import pytest
 import clvoro
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
+from clvoro.adaptation.thin_walls import has_thin_walls
 from clvoro.opencl.engine import Engine
 from clvoro.sizing import Sizing, as_field
 from tests.reference import patch
@@ -72,6 +73,17 @@ def test_pairs(ctx, real):
     tolerance = 200 * float(np.finfo(real).eps)
     assert origin + mesh.to_host(mesh.points, scale) == pytest.approx(expected, abs=tolerance)
     assert mesh.to_host(mesh.velocity, scale) == pytest.approx(expected - x, abs=tolerance)
+
+
+@pytest.mark.parametrize(("thickness", "expected"), [(0.02, True), (0.28, True), (0.32, False)])
+def test_walls_that_are_thin(thickness, expected):
+    half = thickness * H / 2
+    post = [(0.5 - half, 0.2), (0.5 + half, 0.2), (0.5 + half, 0.8), (0.5 - half, 0.8)]
+    for hole in (post, post[::-1]):
+        domain = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)], [hole])
+        assert has_thin_walls(domain, np.full(8, H)) == expected
+    # A thin channel is no thin wall.
+    assert not has_thin_walls(clvoro.Polygon(post), np.full(4, H))
 
 
 def test_cells_beside_a_slit():
