@@ -146,9 +146,9 @@ def shared(domain, points, h):
     return new, own
 
 
-def make_mesh(ctx, domain, points, real, fixed=0):
+def make_mesh(ctx, domain, points, real, fixed=0, h=H):
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.kind(np.dtype(real)))
-    sizing = Sizing(engine, domain, as_field(H))
+    sizing = Sizing(engine, domain, as_field(h))
     on_device = engine.upload(domain.place(points, engine.real))
     return MeshState.create(Stages(engine), domain, sizing, on_device, fixed=fixed)
 
@@ -205,6 +205,25 @@ def test_shared_by_two_corners(ctx):
     for corner in corners_of(POST)[1]:
         d = tree.query(corner, k=2)[0]
         assert np.ptp(d) < 1e-14
+
+
+def test_no_two_groups_move_the_same_generator(ctx):
+    """Sixteen triangles about four cells apart, among random generators."""
+    rng = np.random.default_rng(23)
+    h, holes = 0.05, []
+    for center in 0.13 + 0.25 * np.indices((4, 4)).reshape(2, -1).T:
+        middle = center + rng.uniform(-0.015, 0.015, 2)
+        angle = rng.uniform(0, 6) + np.array([0, 2.1, 4.2])
+        holes.append(middle + 0.035 * np.column_stack([np.cos(angle), np.sin(angle)]))
+    domain, points = clvoro.Polygon(SQUARE, holes), rng.random((250, 2))
+    mesh = make_mesh(ctx, domain, points[domain.contains_well(points, 0.003)], "float64", h=h)
+    mesh.stages.corners.share(
+        mesh.corners, mesh.t, mesh.points, mesh.velocity, mesh.labels, mesh.fixed
+    )
+    moved = mesh.corners.moved.get()
+    moved = moved[moved >= 0]
+    assert len(moved) > 50
+    assert len(np.unique(moved)) == len(moved)
 
 
 def test_domains_without_corners_have_no_kernel(ctx):
