@@ -9,7 +9,7 @@
 #define FINEST R(2e-5)
 #endif
 
-inline REAL noise_length(REAL distance)
+static inline REAL noise_length(REAL distance)
 {
     return 4 * REAL_EPS * distance + fmin(4 * REAL_EPS, FINEST * distance);
 }
