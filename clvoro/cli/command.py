@@ -170,11 +170,11 @@ def _add_output(run: Any) -> None:
     run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
 
 
-def _add_walls(command: Any) -> None:
+def _add_walls(command: Any, more: str = "") -> None:
     command.add_argument(
         "--walls",
         choices=("straight", "exact"),
-        help="boundary of a mesh for OpenFOAM: straight faces (the default), or as in the domain",
+        help=f"boundary of a mesh for OpenFOAM: straight faces (the default), or as in the domain{more}",
     )
 
 
@@ -191,7 +191,7 @@ def _add_convert(commands: Any) -> None:
     convert.add_argument(
         "--convention", choices=("ugrid", "mpas"), help="content of a .nc file (default: ugrid)"
     )
-    _add_walls(convert)
+    _add_walls(convert, more="; of a .vtu file: as in the domain is the default")
 
 
 def _add_check(commands: Any) -> None:
