@@ -16,6 +16,7 @@ from __future__ import annotations
 import collections
 import functools
 import hashlib
+import re
 import shutil
 import struct
 import subprocess
@@ -193,7 +194,8 @@ def write_job(path, kernel, signature, at_once, size, group, buffers, before, af
     parts = [int_(len(name)), name, b"\0"]
     parts += map(int_, (at_once, group, size // group, len(buffers)))
     for buffer, content in zip(buffers, before, strict=True):
-        real = {"double*": 8, "float*": 4}.get(types[buffer.int_ptr], 0)
+        kind = re.fullmatch(r"(double|float)\d*\*", types[buffer.int_ptr])
+        real = {"double": 8, "float": 4}[kind[1]] if kind else 0
         parts += [int_(real), int_(len(content)), content]
     place = {each.int_ptr: k for k, each in enumerate(buffers)}
     parts.append(int_(len(kernel.noted)))
